@@ -1,13 +1,13 @@
 """Calibration of drawn plants from logs as people have them: is it better than the catalogue's file, and honest?
 
-    python benchmarks/calibration_draws.py [--draws 50] [--method auto] [--first 0] [--json FILE]
+    python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE]
 
 Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
 pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
 0.1 s, a tether that pulls with up to 2 N, a stiffness that the file does not know, and in every second draw no roll or
 pitch. Fitted on the lowest level, compared on two higher ones; intervals against the truth. The plant itself replays
 these trials no better than its tether, noise and clock allow; a file that does as well by chance leaves nothing to
-gain.
+gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def logged(trial: Trial, lead: float, tilt: bool) -> Trial:
     return replace(trial, t=trial.t[rows] - trial.t[rows[0]], channels=channels, phase=None, header=header)
 
 
-def draw(seed: int, method: str) -> dict[str, object]:
+def draw(seed: int) -> dict[str, object]:
     """One plant: scores of both files by axis, and each interval with its truth."""
     rng = np.random.default_rng([7, seed])
     vehicle = load_vehicle("bluerov2_heavy")
@@ -108,7 +109,7 @@ def draw(seed: int, method: str) -> dict[str, object]:
     )  # fmt: skip
     trials = [logged(trial, lead, tilt=seed % 2 == 0) for trial in trials]
     low = f"_{round(100 * LEVELS[0]):03d}"
-    fit = fit_hydrodynamics([t for t in trials if t.name.endswith(low)], vehicle, method=method)
+    fit = fit_hydrodynamics([t for t in trials if t.name.endswith(low)], vehicle)
     after = calibrated(fit)
     held = [t for t in trials if not t.name.endswith(low)]
     true = plant.replace(scaled_thrust(plant, scale))
@@ -130,7 +131,7 @@ def draw(seed: int, method: str) -> dict[str, object]:
         for name, value in truth.items()
         if name in fit.estimates
     }
-    return {"seed": seed, "method": fit.method, "scores": scores, "estimates": found}
+    return {"seed": seed, "scores": scores, "estimates": found}
 
 
 def _by_axis(vehicle: Vehicle, trials: list[Trial]) -> dict[str, float]:
@@ -148,22 +149,29 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--method", default="auto")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows: list[dict[str, object]] = []
+    if args.json and args.json.exists():
+        rows = json.loads(args.json.read_text())
+    done = {row["seed"] for row in rows}
     for seed in range(args.first, args.first + args.draws):
-        rows.append(draw(seed, args.method))
+        if seed in done:
+            continue
+        begin = time.perf_counter()
+        rows.append(draw(seed))
         scores = rows[-1]["scores"]
         assert isinstance(scores, dict)
         print(
             seed,
-            rows[-1]["method"],
             {a: f"{scores['calibrated'][a]:.3f} < {v:.3f}" for a, v in scores["file"].items()},
+            f"{time.perf_counter() - begin:.0f} s",
             flush=True,
         )
         if args.json:
-            args.json.write_text(json.dumps(rows))
+            part = args.json.with_suffix(".part")
+            part.write_text(json.dumps(rows))
+            part.replace(args.json)
     report(rows)
 
 

@@ -1,7 +1,7 @@
 """Wall time of calibrating four axes on 32 trials of 15 s: `python benchmarks/calibration_speed.py [--json FILE]`.
 
-Measured for both methods: the call in this process, a second time when everything is compiled, and the whole command
-`finssim calibrate hydrodynamics` in a process of its own.
+Measured: the call in this process, a second time when everything is compiled, and the whole command `finssim calibrate
+hydrodynamics` in a process of its own.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from finssim.identification.programme import Programme, programmes
-from finssim.identification.regression.regress import regress
-from finssim.identification.simulation.fit import fit_by_simulation
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.trial import Trial
 from finssim.trials.trial_files import write_trial
@@ -59,36 +58,28 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     trials, vehicle = make_trials(), load_vehicle("finsrov")
-    calls = {
-        "regression": lambda: regress(trials, vehicle, axes=AXES.split(",")),
-        "simulation": lambda: fit_by_simulation(trials, vehicle, axes=AXES.split(",")),
-    }
-    figures: dict[str, dict[str, float]] = {}
+    times = []
+    for _ in range(2):
+        start = time.perf_counter()
+        fit_by_simulation(trials, vehicle, axes=AXES.split(","))
+        times.append(time.perf_counter() - start)
     with tempfile.TemporaryDirectory() as folder:
         for trial in trials:
             write_trial(trial, Path(folder) / "trials" / trial.name)
-        for method, call in calls.items():
-            times = []
-            for _ in range(2):
-                start = time.perf_counter()
-                call()
-                times.append(time.perf_counter() - start)
-            start = time.perf_counter()
-            words = (
-                f"calibrate hydrodynamics {folder}/trials --vehicle finsrov --axes {AXES} --method {method}"
-            )
-            words += f" --out {folder}/{method}.yaml"
-            subprocess.run(
-                [sys.executable, "-m", "finssim", *words.split()], check=True, stdout=subprocess.DEVNULL
-            )
-            figures[method] = {
-                "first_call": times[0],
-                "second_call": times[1],
-                "command": time.perf_counter() - start,
-            }
-    print(f"{TRIALS} trials of {DURATION:g} s, {AXES} [s]")
-    for method, f in figures.items():
-        print(f"  {method:<12}" + "  ".join(f"{name} {value:.2f}" for name, value in f.items()))
+        words = (
+            f"calibrate hydrodynamics {folder}/trials --vehicle finsrov --axes {AXES} --out {folder}/v.yaml"
+        )
+        start = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "finssim", *words.split()], check=True, stdout=subprocess.DEVNULL
+        )
+    figures = {
+        "first_call": times[0],
+        "second_call": times[1],
+        "command": time.perf_counter() - start,
+    }
+    line = "  ".join(f"{name} {value:.2f}" for name, value in figures.items())
+    print(f"{TRIALS} trials of {DURATION:g} s, {AXES} [s]: {line}")
     if given.json:
         given.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 

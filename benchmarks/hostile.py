@@ -162,7 +162,7 @@ def kinds() -> list[Kind]:
         Kind("header of a trial", "trials/surge_plus_9/trial.yaml", ("trials check {}",), folder=1, weight=2),
         Kind("table of a trial", "trials/surge_plus_9/data.csv", (
             "trials check {}", "replay {} --vehicle finsrov", "replay {} --vehicle finsrov --out OUT/replay",
-            "calibrate hydrodynamics {} --vehicle finsrov --method regression --out OUT/v.yaml",
+            "calibrate hydrodynamics {} --vehicle finsrov --out OUT/v.yaml",
         ), folder=1, weight=4),
         Kind("Parquet", "bare.parquet", ("trials check {} --vehicle finsrov",)),
         Kind("steps of motors", "steps/surge_plus_9/data.csv", (
@@ -236,7 +236,7 @@ def kinds() -> list[Kind]:
             "train t1 --steps 1024 --worlds 16 --set learning_rate=NUMBER --out OUT/policy",
             "train t1 --steps 1024 --worlds 16 --set discount=NUMBER --until NUMBER --out OUT/policy",
             "replay SEEDS/trials --vehicle finsrov --horizon NUMBER",
-            "calibrate hydrodynamics SEEDS/trials --vehicle finsrov --method regression --fix surge.m=NUMBER --out OUT/v.yaml",  # noqa: E501
+            "calibrate hydrodynamics SEEDS/trials --vehicle finsrov --fix surge.m=NUMBER --out OUT/v.yaml",
             f"localize SEEDS/log/detections.csv {located} --depth NUMBER --pixel-std NUMBER",
             f"localize SEEDS/log/detections.csv {located} --depth 0.5 --tilt-std-deg NUMBER",
             f"fuse SEEDS/log {located} --rate NUMBER", f"fuse SEEDS/log {located} --pixel-std NUMBER",
@@ -250,8 +250,7 @@ def kinds() -> list[Kind]:
 
 
 REFUSED = (
-    "calibrate hydrodynamics SEEDS/mm --vehicle finsrov --method regression --out OUT/v.yaml",
-    "calibrate hydrodynamics SEEDS/mm --vehicle finsrov --method simulation --out OUT/v.yaml",
+    "calibrate hydrodynamics SEEDS/mm --vehicle finsrov --out OUT/v.yaml",
     "record repair SEEDS/run.mcap --out SEEDS/run.mcap",
     "train t1 --steps 1024 --worlds 16 --set learning_rate=-1 --out OUT/policy",
     "evaluate SEEDS/strong --trials 1",

@@ -1,17 +1,16 @@
 """How well hydrodynamics are identified from synthetic trials whose truth is known.
 
-    python benchmarks/identification.py [PART ...] [--vehicle finsrov] [--repetitions 200] [--json FILE]
+    python benchmarks/identification.py [PART ...] [--vehicle finsrov] [--repetitions 5] [--json FILE]
 
 Parts:
     coverage    published levels, 50 Hz, the vehicle's sensors: errors, and how often a 95 % interval holds the truth
-    simulation  the same trials by simulation error, with fewer repetitions
-    slow        5 Hz, wrench and velocity alone, by simulation error
+    slow        5 Hz, wrench and velocity alone
     replay      half of the trials fitted, the other half replayed
     published   trials simulated with FinsROV's published raw fits, and what its published noise lets anyone tell
     shape       plants whose drag is linear or quadratic alone: is that what `auto` chooses where the other shape alone
-                fits worse by a factor of 1.5 (RMSE)? Decays of a heading, driven trials by either method
+                fits worse by a factor of 1.5 (RMSE)? Decays of a heading, and driven trials
 
-The estimators start from a file whose hydrodynamics are wrong by a factor of two.
+The fits start from a file whose hydrodynamics are wrong by a factor of two.
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ from numpy.typing import NDArray
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.prediction import replay
 from finssim.identification.programme import Programme, programmes
-from finssim.identification.regression.passive import passive
-from finssim.identification.regression.regress import regress
-from finssim.identification.simulation.fit import fit_by_simulation
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.trials.trial import Header, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
@@ -159,18 +156,17 @@ def measured_again(
 
 
 def coverage(
-    vehicle: Vehicle, axes: str, repetitions: int, method: str, *, repeats: int = 1, **arguments: Any
+    vehicle: Vehicle, axes: str, repetitions: int, *, repeats: int = 1, **arguments: Any
 ) -> dict[str, Any]:
-    """Errors and coverage over repetitions of the noise, of one method."""
+    """Errors and coverage over repetitions of the noise."""
     plan = programmes(axes, vehicle, repeats=repeats)
     recording = record(plan, vehicle, seed=1)
     guess = blind(vehicle)
     start = time.perf_counter()
     fits = []
     for trials in measured_again(recording, plan, vehicle, repetitions, **arguments):
-        fits.append(regress(trials, guess) if method == "regression" else fit_by_simulation(trials, guess))
+        fits.append(fit_by_simulation(trials, guess))
     return {
-        "method": method,
         "repetitions": repetitions,
         "seconds": time.perf_counter() - start,
         "parameters": collect(fits, truth(vehicle)),
@@ -178,12 +174,12 @@ def coverage(
     }
 
 
-def held_out(vehicle: Vehicle, axes: str, method: str) -> dict[str, Any]:
+def held_out(vehicle: Vehicle, axes: str) -> dict[str, Any]:
     """NRMSE of replaying trials at validation levels with what was fitted to the published ones."""
     fitted = simulate_programme(programmes(axes, vehicle), vehicle, seed=1)
     kept = simulate_programme(programmes(axes, vehicle, kind="validation"), vehicle, seed=2)
     guess = blind(vehicle)
-    fit = regress(fitted, guess) if method == "regression" else fit_by_simulation(fitted, guess)
+    fit = fit_by_simulation(fitted, guess)
     report = replay(kept, guess.replace(fit.changes), hydrodynamics=("calibrated",), seed=0)
     return report.as_json()
 
@@ -218,30 +214,22 @@ def of_one_shape(vehicle: Vehicle, axis: str, shape: str, size: float) -> Vehicl
     )
 
 
-def shapes(vehicle: Vehicle, axes: str, count: int, method: str) -> dict[str, Any]:
+def shapes(vehicle: Vehicle, axes: str, count: int, kind: str) -> dict[str, Any]:
     """How often the shape of drag is right, over draws of plant and noise: `right` alone, `both`, or `wrong` alone."""
     rng, guess = np.random.default_rng(5), blind(vehicle)
-    estimators = {
-        "decay": lambda trials, body, **_: passive(trials, body),
-        "regression": regress,
-        "simulation": fit_by_simulation,
-    }
-    estimate, counts = estimators[method], dict.fromkeys(("right", "both", "wrong"), 0)
+    counts = dict.fromkeys(("right", "both", "wrong"), 0)
     cycle = (FOUR if axes == "all" else axes).split(",")
     for k in range(count):
         shape, other = ("linear", "quadratic")[:: 1 if k % 2 else -1]
-        size, axis = rng.uniform(0.5, 2.0), "yaw" if method == "decay" else cycle[k // 2 % len(cycle)]
-        if method == "decay":
+        size, axis = rng.uniform(0.5, 2.0), "yaw" if kind == "decay" else cycle[k // 2 % len(cycle)]
+        if kind == "decay":
             trials = spins(rng, *((0.25 * size, 0.0) if shape == "linear" else (0.0, 0.7 * size)))
         else:
             plant = of_one_shape(vehicle, axis, shape, size)
             trials = simulate_programme(programmes(axis, plant), plant, seed=k)
-        fit = estimate(trials, guess, damping="auto")
-        if method == "decay":
-            rmse = {name: fit.quality["yaw"][f"rmse_{name}"] for name in (shape, other)}
-        else:
-            separate = {name: estimate(trials, guess, damping=name) for name in (shape, other)}
-            rmse = {name: one.quality[axis]["rmse"] for name, one in separate.items()}
+        fit = fit_by_simulation(trials, guess)
+        separate = {name: fit_by_simulation(trials, guess, damping=name) for name in (shape, other)}
+        rmse = {name: one.quality[axis]["rmse"] for name, one in separate.items()}
         if rmse[other] < APART * rmse[shape]:
             continue
         selected = {
@@ -249,7 +237,7 @@ def shapes(vehicle: Vehicle, axes: str, count: int, method: str) -> dict[str, An
             for name, term in (("linear", "d1"), ("quadratic", "d2"))
         }
         counts["wrong" if not selected[shape] else "both" if selected[other] else "right"] += 1
-    return {"method": method, "draws": count, **counts}
+    return {"trials": kind, "draws": count, **counts}
 
 
 def raw_fits(vehicle: Vehicle) -> Vehicle:
@@ -282,13 +270,12 @@ def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the parts asked for, print tables, write JSON."""
-    parts = ("coverage", "simulation", "slow", "replay", "published", "shape")
+    parts = ("coverage", "slow", "replay", "published", "shape")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help="which parts; all if none")
     parser.add_argument("--vehicle", default="finsrov", help="name or file")
     parser.add_argument("--axes", default="all", help="axes, separated by commas")
-    parser.add_argument("--repetitions", type=int, default=200, help="of the noise, for the regression")
-    parser.add_argument("--few", type=int, default=5, help="of the noise, for the simulation method")
+    parser.add_argument("--repetitions", type=int, default=5, help="of the noise, or draws of a plant")
     parser.add_argument("--repeats", type=int, default=1, help="of every programme in a set of trials")
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
@@ -305,43 +292,40 @@ def main() -> None:
 
 def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
     """Measure and print one part."""
-    if part in ("coverage", "simulation"):
-        method = "regression" if part == "coverage" else "simulation"
-        count = given.repetitions if part == "coverage" else given.few
-        out = coverage(vehicle, given.axes, count, method, repeats=given.repeats)
+    if part == "coverage":
+        out = coverage(vehicle, given.axes, given.repetitions, repeats=given.repeats)
         print_parameters(
-            f"{vehicle.name}, 50 Hz, {method}, {count} repetitions of the noise", out["parameters"]
+            f"{vehicle.name}, 50 Hz, {given.repetitions} repetitions of the noise", out["parameters"]
         )
         return out
     if part == "slow":
         columns = ("u", "v", "w", "p", "q", "r")
         arguments = {"rate": 5.0, "columns": columns, "inputs": ("wrench",), "repeats": given.repeats}
-        out = coverage(vehicle, _without_pulses(given.axes, vehicle), given.few, "simulation", **arguments)
-        print_parameters(f"{vehicle.name}, 5 Hz, wrench and velocity, simulation", out["parameters"])
+        out = coverage(vehicle, _without_pulses(given.axes, vehicle), given.repetitions, **arguments)
+        print_parameters(f"{vehicle.name}, 5 Hz, wrench and velocity", out["parameters"])
         return out
     if part == "replay":
-        out = {method: held_out(vehicle, given.axes, method) for method in ("regression", "simulation")}
-        for method, report in out.items():
-            print(f"\n{vehicle.name}, held-out replay after {method}: NRMSE {report['aggregate']:.4f}")
-            for axis, by_trial in report["nrmse"].items():
-                scores = [x for x in by_trial.values() if x is not None]
-                print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
+        out = held_out(vehicle, given.axes)
+        print(f"\n{vehicle.name}, held-out replay: NRMSE {out['aggregate']:.4f}")
+        for axis, by_trial in out["nrmse"].items():
+            scores = [x for x in by_trial.values() if x is not None]
+            print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
         return out
     if part == "shape":
-        counts = {"decay": given.repetitions, "regression": given.repetitions, "simulation": given.few}
-        out = {method: shapes(vehicle, given.axes, count, method) for method, count in counts.items()}
-        for method, one in out.items():
+        kinds = ("decay", "driven")
+        out = {kind: shapes(vehicle, given.axes, given.repetitions, kind) for kind in kinds}
+        for kind, one in out.items():
             apart = sum(one[key] for key in ("right", "both", "wrong"))
             print(
-                f"{method}: in {apart} of {one['draws']} draws the shapes differ by a factor of {APART}; the right one "
+                f"{kind}: in {apart} of {one['draws']} draws the shapes differ by a factor of {APART}; the right one "
                 f"alone {one['right']}, both {one['both']}, the wrong one alone {one['wrong']}"
             )
         return out
     raw = raw_fits(load_vehicle("finsrov"))
-    out = {"raw": coverage(raw, FOUR, given.few, "regression")}
-    print_parameters("FinsROV's raw fits, regression", out["raw"]["parameters"])
-    out["noise"] = coverage(load_vehicle("finsrov"), "all", given.few, "regression", noise="published")
-    print_parameters("FinsROV's profile under its published noise, regression", out["noise"]["parameters"])
+    out = {"raw": coverage(raw, FOUR, given.repetitions)}
+    print_parameters("FinsROV's raw fits", out["raw"]["parameters"])
+    out["noise"] = coverage(load_vehicle("finsrov"), "all", given.repetitions, noise="published")
+    print_parameters("FinsROV's profile under its published noise", out["noise"]["parameters"])
     return out
 
 

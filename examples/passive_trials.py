@@ -8,6 +8,7 @@ FOLDER holds NAME_mocap.csv and NAME_imu.csv as in tests/data/hinsdale. The pict
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,20 +57,30 @@ def draw(curves: list[Curve], path: Path) -> None:
 
 
 def main() -> None:
-    """Print what the trials determine, with the file of a BlueROV2 Heavy for the rest."""
+    """Print what each trial determines, with the file of a BlueROV2 Heavy for what it does not."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=HINSDALE)
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     names = sorted(path.name.removesuffix("_mocap.csv") for path in given.folder.glob("*_mocap.csv"))
-    trials = [read(given.folder, name) for name in names]
-    fit = fs.identify("bluerov2_heavy", trials, axes=["roll", "pitch"])
-    for e in fit.estimates.values():
-        print(f"{e.name:24s} {e.estimate:9.4g} [{e.ci95[0]:.4g}, {e.ci95[1]:.4g}] {e.unit:8s} {e.note}")
-    for finding in fit.findings:
-        print(finding)
+    curves: list[Curve] = []
+    for name in names:
+        print(name)
+        try:
+            fit = fs.identify("bluerov2_heavy", [read(given.folder, name)], axes=["roll", "pitch"])
+        except ValueError as error:
+            print(f"  {error}")
+            continue
+        for e in fit.estimates.values():
+            ends = f"[{e.ci95[0]:.4g}, {e.ci95[1]:.4g}]"
+            print(f"  {e.name:24s} {e.estimate:9.4g} {ends} {e.unit:8s} {e.note}")
+        for finding in fit.findings:
+            print(f"  {finding}")
+        for curve in fit.curves:
+            if fit.quality[curve.title.partition(":")[0]]["r2"] > 0.5:
+                curves.append(replace(curve, title=f"{name}, {curve.title}"))
     if given.picture:
-        draw(list(fit.curves), given.picture)
+        draw(curves, given.picture)
 
 
 if __name__ == "__main__":

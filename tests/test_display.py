@@ -46,7 +46,7 @@ def fit():
     estimate = Estimate.within("surge.d1", 12.0, 1.5, "N s/m", True)
     return Fit(
         kind="hydrodynamics",
-        method="regression",
+        method="simulation",
         before=FINSROV,
         estimates={"surge.d1": estimate},
         changes={},
@@ -68,7 +68,7 @@ def test_every_object_is_one_line():
     simulator = Simulator("finsrov", worlds=3)
     assert repr(simulator) == "<Simulator: 3 worlds of finsrov (calibrated), 0.1 s in 4 substeps, cpu>"
     assert repr(trial()) == "<Trial surge_050: 2.0 s, 21 rows, u depth>"
-    assert repr(fit()) == "<Fit hydrodynamics (regression) of finsrov: 1 estimates, 0 changes, 0 findings>"
+    assert repr(fit()) == "<Fit hydrodynamics (simulation) of finsrov: 1 estimates, 0 changes, 0 findings>"
 
 
 def test_notebooks_show_tables():

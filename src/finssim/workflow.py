@@ -32,7 +32,6 @@ def identify(
     axes: Sequence[str] | None = None,
     estimate: Sequence[str] = (),
     damping: str = "auto",
-    method: str = "auto",
     progress: bool = False,
 ) -> Fit:
     """Fit a vehicle's added mass, damping, buoyancy and stiffness to trials.
@@ -43,10 +42,9 @@ def identify(
         trials: Trials, or paths of trial folders, of folders of them, or of tables with a trial's columns. Trials whose
             `role` is held-out are not fitted; the fit is judged by them.
         axes: Axes to fit, of surge, sway, heave, roll, pitch and yaw; those that the trials excite if None.
-        estimate: Further parameters to fit by simulation: thrust_scale, thrust_lag, thrust_delay, buoyancy_excess, k,
+        estimate: Further parameters to fit: thrust_scale, thrust_lag, thrust_delay, buoyancy_excess, k,
             or a parameter of one of the vehicle's terms.
         damping: Drag: linear, quadratic, both, or auto, which chooses.
-        method: auto, regression or simulation.
         progress: Whether progress is shown on standard error.
 
     Returns:
@@ -73,7 +71,6 @@ def identify(
             axes=axes,
             estimate=estimate,
             damping=damping,
-            method=method,
             held_out=[trial for trial in read if trial.header.role == "held-out"],
             progress=show,
         )

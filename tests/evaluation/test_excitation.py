@@ -11,7 +11,7 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.evaluation.excitation import PoolRun, play_programme, record_programmes
 from finssim.identification.programme import Programme, programmes
-from finssim.identification.regression.regress import regress
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import load_vehicle
@@ -64,7 +64,7 @@ def test_the_way_stays_in_the_pool_and_the_other_axes_where_they_were(surge):
 
 def test_the_trial_tells_damping_and_mass_of_the_plant(surge):
     """Nominal: the file's 27.1 kg with added mass and 39.1 N s/m. One trial, 5 %."""
-    fit = regress([surge], FINSROV, axes=["surge"], damping="linear")
+    fit = fit_by_simulation([surge], FINSROV, axes=["surge"], damping="linear")
     assert fit.estimates["surge.d1"].estimate == pytest.approx(39.07, rel=0.05)
     assert fit.estimates["surge.m_eff"].estimate == pytest.approx(27.14, rel=0.1)
 

@@ -71,9 +71,9 @@ def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
         excite(out, robot(wiring, unattended=True), "surge", levels=[12.0])
-    from finssim.identification.regression.regress import regress
+    from finssim.identification.simulation_error import fit_by_simulation
 
-    fit = regress(load_trials([out]), FINSROV, axes=["surge"], damping="linear")
+    fit = fit_by_simulation(load_trials([out]), FINSROV, axes=["surge"], damping="linear")
     assert fit.estimates["surge.d1"].estimate == pytest.approx(39.07, rel=0.05)
     calibrate = ["calibrate", "hydrodynamics", str(out), "--vehicle", "finsrov"]
     assert boundary.run(app, [*calibrate, "--out", str(tmp_path / "new.yaml")]) == 0

@@ -2,8 +2,8 @@
 
 from functools import cache
 
+from finssim.identification.plant_terms import matrices
 from finssim.identification.programme import programmes
-from finssim.identification.regression.plant_terms import matrices
 from finssim.identification.synthetic import NoiseProfile, record, trials_of
 from finssim.vehicles import AXES, load_vehicle
 

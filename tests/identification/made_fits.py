@@ -37,7 +37,7 @@ def made_fit(vehicle: Vehicle | None = None, **changes: Any) -> Fit:
     return Fit(
         **{
             "kind": "hydrodynamics",
-            "method": "regression",
+            "method": "simulation",
             "before": vehicle or load_vehicle("finsrov"),
             "estimates": {
                 n: Estimate(name=n, estimate=e, ci95=ci, unit=u, identifiable=i, note=note, path=path)

@@ -40,7 +40,7 @@ def test_only_what_the_data_determine_is_written():
     origin = after.origin_of(f"{SET}.linear_damping.0")
     assert origin == (
         "measured",
-        "calibration 1: hydrodynamics by regression on 2 trials",
+        "calibration 1: hydrodynamics by simulation on 2 trials",
         "95 % interval 37.9 to 40.2",
     )
     assert after.origin_of(f"{SET}.linear_damping.0.0") == origin

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from finssim.identification.axis_result import trim
 from finssim.identification.fit import Estimate
 from finssim.identification.hydrodynamics import _worse, fit_hydrodynamics
 from finssim.identification.prediction import replay
 from finssim.identification.programme import programmes
-from finssim.identification.regression.axis_estimates import trim
 from finssim.identification.synthetic import simulate_programme
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials
-from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import load_vehicle
 
@@ -45,13 +44,14 @@ def joystick(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_sticks_and_motion_capture_at_5_hz(joystick):
-    """Fitted at a quarter of the sticks' range, replayed at twice that: below 0.1, and better than the catalogue."""
+    """Fitted at a quarter of the sticks' range, replayed at twice that: below 0.04, and better than the catalogue."""
     fitted, held = joystick
     vehicle = load_vehicle("bluerov2_heavy")
-    fit = fit_hydrodynamics(fitted, vehicle, method="regression")
+    fit = fit_hydrodynamics(fitted, vehicle)
     found, before = scores(calibrated(fit), held), scores(vehicle, held)
-    assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.10, found
+    assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.04, found
     assert all(found[axis] < 0.8 * before[axis] for axis in found), (found, before)
     scale = fit.estimates["thrust_scale"]
     assert scale.ci95[0] < scale.estimate < scale.ci95[1] and scale.ci95[1] > 1.5 * scale.ci95[0]
@@ -60,12 +60,13 @@ def test_sticks_and_motion_capture_at_5_hz(joystick):
     assert "voltage_unknown" in {one.code for one in fit.findings}
 
 
+@pytest.mark.slow
 def test_a_known_voltage_leaves_the_thrust_alone(joystick):
     """With the voltage in the header no scale is estimated, and the masses are surer."""
     fitted, _ = joystick
     vehicle = load_vehicle("bluerov2_heavy")
     told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in fitted]
-    fit = fit_hydrodynamics(told, vehicle, method="regression", axes=["yaw"])
+    fit = fit_hydrodynamics(told, vehicle, axes=["yaw"])
     assert "thrust_scale" not in fit.estimates
     assert fit.estimates["yaw.m_eff"].identifiable
 
@@ -82,7 +83,6 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
             report.findings
         )
     fit = fit_hydrodynamics(fitted, vehicle)
-    assert fit.method == "simulation"
     assert "not_converged" not in {one.code for one in fit.findings}
     result = replay(held, calibrated(fit), horizon=3.0)
     ahead = {axis: result.ahead[axis]["calibrated"].nrmse[-1] for axis in ("roll", "pitch", "yaw")}
@@ -95,23 +95,26 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
     assert yaw < 0.10
 
 
+@pytest.mark.slow
 def test_a_heading_that_decays(tmp_path):
     """Spun by hand and weighed by nobody: quadratic drag over inertia, with an interval; an inertia scales it."""
     vehicle = load_vehicle("bluerov2")
     trials = read(["*.csv"], "decay.yaml", "yaw_decay", tmp_path)
     fit = fit_hydrodynamics(trials, vehicle)
     ratio = fit.estimates["yaw.d2/m_eff"]
-    assert ratio.estimate == pytest.approx(0.775, rel=0.02) and ratio.identifiable
+    assert ratio.estimate == pytest.approx(0.775, rel=0.01) and ratio.ci95[0] < 0.775 < ratio.ci95[1]
+    assert ratio.identifiable
     assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
-    assert fit.quality["yaw"]["rmse_quadratic"] < 0.2 * fit.quality["yaw"]["rmse_linear"]
     assert scores(calibrated(fit), trials)["yaw"] < 0.02
-    linear = fit_hydrodynamics(trials, vehicle, damping="linear").estimates
-    assert linear["yaw.d1/m_eff"].estimate > 0.1 and linear["yaw.d2/m_eff"].estimate == 0.0
+    linear = fit_hydrodynamics(trials, vehicle, damping="linear")
+    assert linear.estimates["yaw.d1/m_eff"].estimate > 0.1 and "yaw.d2/m_eff" not in linear.estimates
+    assert fit.quality["yaw"]["rmse"] < 0.2 * linear.quality["yaw"]["rmse"]
     known = fit_hydrodynamics(trials, vehicle, known={"yaw": 0.5})
-    assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate)
+    assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate, rel=0.01)
     assert calibrated(known).mass_matrix()[5, 5] == pytest.approx(0.5, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
     """Held-out trials where there are any, else each trial by a fit of the others, and the finding says which."""
     vehicle = load_vehicle("bluerov2")
@@ -120,38 +123,25 @@ def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
     told = lambda part, text: words.append((part, text))  # noqa: E731
     fit = fit_hydrodynamics(slow, vehicle, progress=told)
     assert not {"replays_worse"} & {one.code for one in fit.findings}
-    assert words[0][0] <= words[-1][0] <= 1.0 and any("free motion of yaw" in text for _, text in words)
+    assert words[0][0] <= words[-1][0] <= 1.0 and any("replay" in text for _, text in words)
     (drag,) = (path for path in fit.changes if "quadratic_damping" in path)
     bad = replace(fit, changes={**fit.changes, drag: 5.0})
-    before = {"yaw": 1e-3}
-    held = _worse(bad, vehicle, slow, slow, {}, None)
+    held = _worse(bad, vehicle, slow, slow, None)
     assert [one.values["judged"] for one in held] == ["the held-out trials"]
     wild = replace(fit, changes={**fit.changes, drag: 500.0})  # no replay stays finite
-    assert _worse(wild, vehicle, slow, slow, {}, None)
-    crossed = _worse(fit, vehicle, slow, (), before, lambda k: bad)
+    assert _worse(wild, vehicle, slow, slow, None)
+    crossed = _worse(bad, vehicle, slow, (), lambda k: bad)
     assert [one.values["judged"] for one in crossed] == ["trials left out of the fit in turn"]
 
 
-def test_options_belong_to_their_method(joystick):
-    """What a method cannot do is refused before anything is fitted."""
-    fitted, _ = joystick
-    vehicle = load_vehicle("bluerov2_heavy")
-    for options in (
-        {"method": "regression", "horizon": 5.0},
-        {"method": "simulation", "known": {"yaw": 1.0}},
-        {"method": "x"},
-    ):
-        with pytest.raises(CalibrationError):
-            fit_hydrodynamics(fitted, vehicle, **options)
-
-
+@pytest.mark.slow
 def test_a_known_inertia_tells_the_thrust(joystick):
     """Yaw's inertia given: the scale is what makes the motion agree with it, and is surer than batteries are."""
     fitted, _ = joystick
     vehicle = load_vehicle("bluerov2_heavy")
-    free = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"])
+    free = fit_hydrodynamics(fitted, vehicle, axes=["yaw"])
     ratio = free.estimates["yaw.m_eff"].estimate / free.estimates["thrust_scale"].estimate
-    fit = fit_hydrodynamics(fitted, vehicle, method="regression", axes=["yaw"], known={"yaw": 0.9})
+    fit = fit_hydrodynamics(fitted, vehicle, axes=["yaw"], known={"yaw": 0.9})
     scale = fit.estimates["thrust_scale"]
     assert scale.estimate == pytest.approx(0.9 / ratio, rel=0.03)
     assert scale.ci95[1] < 1.2 * scale.ci95[0]

@@ -11,7 +11,7 @@ from finssim.vehicles import CalibrationRecord, Provenance, VehicleError, catalo
 
 RECORD = CalibrationRecord(
     kind="hydrodynamics",
-    method="regression",
+    method="simulation",
     trials={"surge_1": "1e5" + "0" * 61, "2024-05-04": "ab" * 32},
     settings={"seed": 3, "axes": ["surge", "yaw"], "horizon": None, "note": "a: b # c"},
     start="cd" * 32,

@@ -278,7 +278,7 @@ def believed(lift):
 @pytest.mark.slow
 def test_a_calibration_estimates_its_parameter(trials, tmp_path):
     """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
-    from finssim.identification.simulation.fit import fit_by_simulation
+    from finssim.identification.simulation_error import fit_by_simulation
     from finssim.identification.vehicle_file import calibrated, write_ranges
 
     fit = fit_by_simulation(trials, believed(0.0), axes=("surge", "heave"), estimate=("wing.lift",))
@@ -297,19 +297,19 @@ def test_a_calibration_estimates_its_parameter(trials, tmp_path):
 @pytest.mark.slow
 def test_a_known_wing_does_not_bias_what_is_fitted(trials):
     """The damping of heave from trials with a wing: as the file has it where the file has the wing, not without."""
-    from finssim.identification.regression.regress import regress
+    from finssim.identification.simulation_error import fit_by_simulation
 
     vehicle = believed(40.0)
     chosen = vehicle.hydrodynamics["calibrated"]
     drag = lambda fit: sum(fit.estimates[f"heave.d{i}"].estimate * 0.4**i for i in (1, 2))  # noqa: E731
     true = chosen.linear_damping[2, 2] * 0.4 + chosen.quadratic_damping[2, 2] * 0.4**2
-    assert drag(regress(trials, vehicle, axes=("heave",))) == pytest.approx(true, rel=0.03)
-    assert drag(regress(trials, load_vehicle("bluerov2"), axes=("heave",))) > 1.2 * true
+    assert drag(fit_by_simulation(trials, vehicle, axes=("heave",))) == pytest.approx(true, rel=0.03)
+    assert drag(fit_by_simulation(trials, load_vehicle("bluerov2"), axes=("heave",))) > 1.2 * true
 
 
 @pytest.mark.slow
 def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
-    from finssim.identification.simulation.fit import fit_by_simulation
+    from finssim.identification.simulation_error import fit_by_simulation
     from finssim.trials.findings import CalibrationError
 
     for vehicle, name in ((load_vehicle("bluerov2"), "wing.lift"), (believed(1.0), "wing.lft")):

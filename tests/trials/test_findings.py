@@ -50,7 +50,7 @@ def test_a_sentence_names_exactly_what_its_producers_give():
 
 def test_what_holds_for_several_subjects_is_one_sentence():
     found = [finding("taken_level", f"run{i}") for i in (1, 2, 3, 4, 4)]
-    found += [finding("axis_idle", "run1", axis="surge"), finding("axis_idle", "run2", axis="sway")]
+    found += [finding("axis_still", "run1", axis="surge"), finding("axis_still", "run2", axis="sway")]
     assert sentences(found) == [
         f"run1, run2, run3 and 1 more: {found[0].text}",
         f"run1: {found[-2].text}",

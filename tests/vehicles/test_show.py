@@ -70,7 +70,7 @@ def test_a_file_of_ones_own_is_printed_like_the_catalogue(tmp_path):
 
 def test_a_list_of_mixed_origin_and_a_calibration_are_shown():
     """One entry measured, the others as before: the list has the mark of its least known entry; fits are named."""
-    record = CalibrationRecord(kind="hydrodynamics", method="regression", trials={"a": "1" * 64})
+    record = CalibrationRecord(kind="hydrodynamics", method="simulation", trials={"a": "1" * 64})
     vehicle = load_vehicle("finsrov")
     vehicle = vehicle.replace({"body.center_of_buoyancy.2": 0.02}, Provenance("guessed"))
     origins = {f"body.center_of_buoyancy.{i}": Provenance("measured") for i in (0, 1)}
@@ -79,4 +79,4 @@ def test_a_list_of_mixed_origin_and_a_calibration_are_shown():
     screen = console()
     print_vehicle(vehicle, screen)
     assert "0 0 0.02 ?" in printed(screen)
-    assert "calibrated: hydrodynamics by regression on 1 trial" in printed(screen)
+    assert "calibrated: hydrodynamics by simulation on 1 trial" in printed(screen)

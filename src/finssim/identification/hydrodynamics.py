@@ -1,9 +1,4 @@
-"""The hydrodynamics of a vehicle from its trials: which method, what scale of thrust, and whether it helps.
-
-Two methods share trials, damping models and reports: the regression of each axis (`regression.regress`), and
-simulation error over all of them (`simulation.fit`). `auto` begins with the first, and takes the second where that
-replays the trials better.
-"""
+"""The hydrodynamics of a vehicle from its trials: the scale of thrust, the fit, and whether it replays better."""
 
 from __future__ import annotations
 
@@ -16,25 +11,15 @@ from typing import Any
 import numpy as np
 
 from finssim.core.progress import progress_bar
+from finssim.identification.axis_result import CERTAIN
 from finssim.identification.fit import Estimate, Fit
-from finssim.identification.regression.axis_estimates import CERTAIN
-from finssim.identification.regression.plant_terms import matrices
-from finssim.identification.regression.regress import regress
+from finssim.identification.plant_terms import matrices
 from finssim.identification.report import finish, refuse_places, usable_trials
 from finssim.identification.vehicle_file import calibrated, scaled_thrust
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.inputs import drive, require_axes
 from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
-
-METHODS = ("auto", "regression", "simulation")
-
-ENOUGH = 0.03
-"""NRMSE of the replay of every fitted axis up to which a regression is not tried to be bettered."""
-
-PREFERRED = 1.1
-"""Factor on the regression's NRMSE up to which simulation error is preferred: it fits what a replay scores, and carries
-further to speeds that no trial had."""
 
 WORSE = 1.05
 """Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
@@ -71,7 +56,6 @@ def fit_hydrodynamics(
     vehicle: Vehicle,
     *,
     axes: Sequence[str] | None = None,
-    method: str = "auto",
     estimate: Sequence[str] = (),
     damping: str = "auto",
     known: Mapping[str, float] | None = None,
@@ -81,123 +65,57 @@ def fit_hydrodynamics(
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
 
-    Where every driven trial is of pulse widths without a battery voltage, nobody knows the thrust: its scale is then
-    estimated from what voltages a battery has and what added mass the vehicle file expects, goes to the file with the
-    rest, and its uncertainty is in every interval.
+    Where every driven trial is of pulse widths without a battery voltage, the thrust is unknown: its scale is then
+    estimated from the voltages that batteries have and the added mass that the vehicle file expects, goes to the file
+    with the rest, and its uncertainty is in every interval.
 
     Args:
         trials: None of them held out.
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        method: One of `METHODS`.
-        estimate: Further parameters, of `EXTRAS` and of the vehicle's terms; simulation only.
+        estimate: Further parameters, of `EXTRAS` and of the vehicle's terms.
         damping: `auto`, `linear`, `quadratic` or `both`.
-        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²]; regression only.
-        horizon: Longest stretch that is simulated without a restart [s]; simulation only.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
+        horizon: Longest stretch that is simulated without a restart [s].
         held_out: Further trials that show whether the calibrated vehicle replays worse than the file. Without any, a
-            regression that does not replay the fitted trials much better is judged by trials left out in turn.
+            fit that does not replay the fitted trials much better is judged by trials left out in turn.
         progress: Called with the part done and a few words.
 
     Raises:
-        CalibrationError: No trial can be used, or an option is not the method's.
+        CalibrationError: No trial can be used, or an option is unknown.
     """
-    known = dict(known or {})
-    only_simulation = {"--estimate": bool(estimate), "--horizon": horizon is not None}
-    asked = [name for name, given in only_simulation.items() if given]
-    if method not in METHODS:
-        raise CalibrationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
-    if asked and (method == "regression" or known):
-        raise CalibrationError(
-            f"{asked[0]} needs --method simulation: the regression fits one axis at a time"
-        )
-    if known and method == "simulation":
-        raise CalibrationError("known inertias need the regression: the simulation method fits every inertia")
+    from finssim.identification.simulation_error import fit_by_simulation
 
-    tell = progress or (lambda part, text: None)
-
-    def regression(
-        body: Vehicle, own: Sequence[Trial] = trials, span: tuple[float, float] = (0.1, 0.3), **given: Any
-    ) -> Fit:
-        settings = {"known": known} | given
-        return regress(own, body, axes=axes, damping=damping, progress=_within(tell, *span), **settings)
-
-    def simulation(body: Vehicle, begin: Fit | None = None) -> Fit:
-        from finssim.identification.simulation.fit import fit_by_simulation
-
-        begin = begin or _or_none(lambda body: regression(body, known={}, file_prior=False), body)
-        return fit_by_simulation(
-            trials, body, axes=axes, estimate=estimate, damping=damping, horizon=horizon, begin=begin,
-            progress=_within(tell, 0.3, 0.95),
-        )  # fmt: skip
-
-    scale, std = 1.0, 0.0
+    known, show = dict(known or {}), progress or (lambda part, text: None)
+    options: dict[str, Any] = {"axes": axes, "estimate": estimate, "horizon": horizon}
+    body, scale, std, begin, part = vehicle, 1.0, 0.0, None, 0.0
     if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        free = _or_none(lambda body: regression(body, span=(0.0, 0.1), known={}, file_prior=False), vehicle)
-        scale, std = _thrust_scale(free, vehicle, known)
-    body = vehicle.replace(scaled_thrust(vehicle, scale)) if std else vehicle
-    tell(0.1, "replay by the vehicle file")
-    before = _scores(vehicle, trials)
-    driven = [trial for trial in trials if not trial.header.passive]
-    if method == "simulation" or asked:
-        fit = simulation(body)
-    elif method == "regression" or known or not driven:
-        fit = regression(body)
-    else:
-        fit = _better(regression, simulation, body, trials, before)
+        likely = vehicle.replace(scaled_thrust(vehicle, LIKELY_SCALE))
+        both = "both" if damping == "auto" else damping
+        begin = fit_by_simulation(trials, likely, damping=both, progress=_within(show, 0.0, 0.5), **options)
+        scale, std = _thrust_scale(begin, vehicle, known)
+        body, part = vehicle.replace(scaled_thrust(vehicle, scale)), 0.5
+    fit = fit_by_simulation(
+        trials, body, damping=damping, known=known, begin=begin, progress=_within(show, part, 0.9), **options
+    )
+    whole = fit
     if std:
         fit = _with_scale(fit, vehicle, scale, std, known)
     if fit.interrupted:
         return fit
-    tell(0.95, "replay by the calibrated vehicle")
+    show(0.9, "replay by the calibrated vehicle")
 
     def without(k: int) -> Fit:
-        part = 0.95 + 0.05 * k / len(trials)
-        return regression(body, [*trials[:k], *trials[k + 1 :]], (part, part))
+        part, others = 0.9 + 0.1 * k / len(trials), [*trials[:k], *trials[k + 1 :]]
+        own = options | {"axes": whole.settings["axes"], "damping": whole.settings["drag"], "begin": whole}
+        return fit_by_simulation(others, body, known=known, progress=_within(show, part, part), **own)
 
-    judge = without if fit.method == "regression" else None
-    return replace(fit, findings=(*fit.findings, *_worse(fit, vehicle, trials, held_out, before, judge)))
+    return replace(fit, findings=(*fit.findings, *_worse(fit, vehicle, trials, held_out, without)))
 
 
 def _within(progress: Progress, low: float, high: float) -> Progress:
     """Return the progress of a part of the work."""
     return lambda part, text: progress(low + (high - low) * part, text)
-
-
-def _or_none(fit: Callable[[Vehicle], Fit], vehicle: Vehicle) -> Fit | None:
-    try:
-        return fit(vehicle)
-    except CalibrationError:
-        return None
-
-
-def _better(
-    regression: Callable[[Vehicle], Fit],
-    simulation: Callable[..., Fit],
-    body: Vehicle,
-    trials: Sequence[Trial],
-    before: Mapping[str, float],
-) -> Fit:
-    """The regression where it replays every axis very well and better than the file; else simulation error, unless that
-    replays worse."""
-    first = _or_none(regression, body)
-    if first is None:
-        return simulation(body)
-    after = _scores(calibrated(first), trials)
-    if after and all(
-        value <= ENOUGH and value <= before.get(axis, math.inf) for axis, value in after.items()
-    ):
-        return first
-    second = _or_none(lambda body: simulation(body, first), body)
-    if second is None:
-        return first
-    other = _scores(calibrated(second), trials)
-    means = [_mean(scores, {*after, *other}) for scores in (after, other)]
-    return second if means[1] <= PREFERRED * means[0] else replace(first, interrupted=second.interrupted)
-
-
-def _mean(scores: Mapping[str, float], axes: set[str]) -> float:
-    """Over the axes; an axis without a score, or one that is further off than no model, counts 1."""
-    return float(np.mean([min(scores.get(axis, 1.0), 1.0) for axis in axes])) if axes else 1.0
 
 
 def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
@@ -228,18 +146,16 @@ def _worse(
     vehicle: Vehicle,
     trials: Sequence[Trial],
     held_out: Sequence[Trial],
-    before: Mapping[str, float],
-    without: Callable[[int], Fit] | None,
+    without: Callable[[int], Fit],
 ) -> list[Finding]:
-    """A finding for each axis that the calibrated vehicle replays worse than the file it came from.
+    """Return a finding for each axis that the calibrated vehicle replays worse than the file it came from.
 
     Args:
         fit: The fit.
         vehicle: The file.
-        trials: That were fitted.
-        held_out: That were not, which judge alone where there are any.
-        before: NRMSE of the fitted trials by the file.
-        without: The fit without one of the trials, where that is cheap.
+        trials: Trials that were fitted.
+        held_out: Trials that were not, which judge alone where there are any.
+        without: Fits without one of the trials.
     """
     if not fit.changes:
         return []
@@ -247,14 +163,13 @@ def _worse(
         judged, before = "the held-out trials", _scores(vehicle, held_out)
         after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), held_out)
     else:
-        judged, after = "the fitted trials", dict.fromkeys(before, math.inf)  # where it cannot be replayed
-        after |= _scores(calibrated(fit), trials)
+        judged, before = "the fitted trials", _scores(vehicle, trials)
+        after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), trials)
         doubtful = [axis for axis, value in after.items() if value > CLEARLY * before.get(axis, math.inf)]
-        if without is not None and doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
+        if doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
             judged, after = "trials left out of the fit in turn", _left_out(without, trials)
-    other = "simulation" if fit.method == "regression" else "regression"
     return [
-        finding("replays_worse", axis, judged=judged, after=value, before=before[axis], method=other)
+        finding("replays_worse", axis, judged=judged, after=value, before=before[axis])
         for axis, value in after.items()
         if axis in before and value > WORSE * before[axis] + 0.01
     ]
@@ -287,28 +202,32 @@ def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
     return sources == {"pwm"} and silent
 
 
-def _thrust_scale(fit: Fit | None, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
-    """Thrust over that of the file, and the standard deviation of its logarithm.
+def _thrust_scale(fit: Fit, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
+    """Return thrust over that of the file, and the standard deviation of its logarithm.
 
     Motion shows inertia over thrust; the vehicle file expects an inertia, and batteries have a voltage:
-    ln s is the mean of ln(m_file / m_fit) over the axes and of ln `LIKELY_SCALE`, weighted by their certainty.
+    ln s is the mean of ln(s_fit m_file / m_fit) over the axes and of ln `LIKELY_SCALE`, weighted by their certainty.
+
+    Args:
+        fit: Fit with thrust of `LIKELY_SCALE`, and no inertia given.
+        vehicle: Vehicle as its file has it.
+        known: Effective inertias that are known, by axis [kg, kg m²].
     """
     plant = matrices(vehicle)
-    said, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
+    logs, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
     for i, axis in enumerate(AXES):
-        found = fit.estimates.get(f"{axis}.m_eff") if fit is not None else None
+        found = fit.estimates.get(f"{axis}.m_eff")
         if found is None or not found.estimate > 0.0 or (axis in ("roll", "pitch") and axis not in known):
             continue  # an unknown stiffness is confounded with the inertia of roll and pitch
         expected = known.get(axis, float(plant.M_RB[i, i] + plant.M_A[i, i]))
         std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
         std = GIVEN_STD if axis in known else std
-        value = found.estimate
-        half = 0.5 * (found.ci95[1] - found.ci95[0]) / value
+        half = 0.5 * (found.ci95[1] - found.ci95[0]) / found.estimate
         if math.isfinite(half) and half < 0.5:
-            said.append(math.log(expected / value))
+            logs.append(math.log(LIKELY_SCALE * expected / found.estimate))
             weight.append(1.0 / (std**2 + (0.5 * half) ** 2 + 1e-4))
     total = sum(weight)
-    return math.exp(sum(w * x for w, x in zip(weight, said, strict=True)) / total), total**-0.5
+    return math.exp(sum(w * x for w, x in zip(weight, logs, strict=True)) / total), total**-0.5
 
 
 def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Mapping[str, float]) -> Fit:
@@ -359,7 +278,6 @@ def calibrate_hydrodynamics(
     vehicle: str,
     out: Path,
     axes: str | None = None,
-    method: str = "auto",
     estimate: str = "",
     damping: str = "auto",
     fix: str = "",
@@ -368,7 +286,7 @@ def calibrate_hydrodynamics(
     ranges: Path | None = None,
     as_json: bool = False,
 ) -> Vehicle:
-    """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, axis by axis or by simulation.
+    """Fit added mass [kg, kg m²] and damping [N s/m, N s²/m², ...] to trials, by least simulation error.
 
     Example: finssim calibrate hydrodynamics trials/fit --vehicle mine.yaml --out fitted.yaml --report report
 
@@ -377,13 +295,11 @@ def calibrate_hydrodynamics(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; the excited ones if not given.
-        method (METHOD): regression: each axis by its equation of motion; simulation: least simulation error; auto:
-            regression if it replays the trials very well, otherwise simulation unless that replays them worse.
         estimate (NAMES): Further parameters to fit, of thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or the
-            parameters of the vehicle's terms, such as lift.coefficient (simulation method).
+            parameters of the vehicle's terms, such as lift.coefficient.
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
-        fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24 (regression).
-        horizon: Longest segment simulated without a restart [s] (simulation method).
+        fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24.
+        horizon: Longest segment simulated without a restart [s].
         report (DIR): Directory for report.html, report.md, figures and fit.json.
         ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
         as_json: Print one JSON object instead of tables.
@@ -409,7 +325,6 @@ def calibrate_hydrodynamics(
             used,
             body,
             axes=chosen,
-            method=method,
             estimate=further,
             damping=damping,
             known=known,

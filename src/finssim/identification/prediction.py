@@ -22,7 +22,7 @@ from finssim.core.provenance import provenance
 from finssim.core.quiet import start_warp
 from finssim.core.rotations import quat_rotate, quat_to_euler
 from finssim.identification.report import new_figure
-from finssim.identification.simulation.rollout import Response, Rollouts, Segment, Streams, segments, streams
+from finssim.identification.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.trials.findings import CalibrationError, Finding, finding, plain, sentences
 from finssim.trials.motion import phase_at, white_noise

@@ -2,7 +2,7 @@
 
 Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
 matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. Nothing else
-is needed, so this serves linear regressions and simulation-error fits alike.
+is needed.
 """
 
 from __future__ import annotations

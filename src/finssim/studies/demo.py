@@ -45,8 +45,8 @@ from finssim.evaluation.trials import GoalTrial
 from finssim.identification.fit import Fit
 from finssim.identification.prediction import Replay, draw_response_envelopes, replay
 from finssim.identification.programme import RATE, STEADY, Programme, programmes, which_axes
-from finssim.identification.regression.regress import regress
 from finssim.identification.report import interval_text, number_text, state_text, write_report
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
@@ -232,7 +232,7 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     write_vehicle(rough_vehicle(truth), folder / start_file)
     folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
     recorded = {role: load_trials(paths) for role, paths in folders.items()}
-    fit = regress(recorded["fit"], load_vehicle(folder / start_file))
+    fit = fit_by_simulation(recorded["fit"], load_vehicle(folder / start_file))
     identified = calibrated(fit)
     findings = tuple(all_findings(fit, identified))
     identified = _named(

@@ -30,7 +30,7 @@ from finssim.identification.prediction import (
     replay,
 )
 from finssim.identification.programme import Programme, programmes
-from finssim.identification.regression.regress import regress
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, trials_of
 from finssim.identification.vehicle_file import calibrated, write_vehicle
 from finssim.pool.plant_spec import CoupledMatrix
@@ -279,7 +279,7 @@ def experiment_seed(
 ) -> ReplaySeed:
     """One seed of the experiment; arguments as for `replay_experiment`."""
     trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)
-    fit = regress(trials[0::2], vehicle, axes=axes)
+    fit = fit_by_simulation(trials[0::2], vehicle, axes=axes)
     fitted = calibrated(fit)
     same = replay(trials[1::2], fitted, hydrodynamics=MODELS)
     sweeps = plant.trials(programmes(axes, vehicle, kind="validation"), vehicle, seed + 1_000_000)

@@ -117,7 +117,7 @@ class CalibrationRecord(Part):
     kind: Literal["thruster", "motor", "hydrodynamics", "mounts"]
     """Kind of the calibration."""
     method: str
-    """Estimator, such as `regression` or `simulation`."""
+    """Estimator, such as `simulation`."""
     trials: dict[str, str]
     """Name of each trial or table -> SHA-256 of its numbers."""
     settings: dict[str, Any] = Field(default_factory=dict)
@@ -132,7 +132,7 @@ class CalibrationRecord(Part):
     """True if it was stopped before it converged."""
 
     def sentence(self) -> str:
-        """`hydrodynamics by regression on 24 trials`, for lists and notes."""
+        """`hydrodynamics by simulation on 24 trials`, for lists and notes."""
         count = len(self.trials)
         noun = {"thruster": "table", "mounts": "recording"}.get(self.kind, "trial")
         text = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"

@@ -206,7 +206,7 @@ def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
     (report,) = check_trials(trials)
     told = {axis.axis: {name for name, one in axis.tells.items() if one.can} for axis in report.axes}
     assert {"m_eff", "d1", "d2"} <= told["surge"] & told["yaw"] and "d1" not in told["sway"]
-    found = fit_hydrodynamics(trials, HEAVY, axes=["surge", "yaw"], method="regression", known={}).estimates
+    found = fit_hydrodynamics(trials, HEAVY, axes=["surge", "yaw"], known={}).estimates
     for name, true in (
         ("surge.d2", 141.0),
         ("surge.m_eff", 19.86),

@@ -18,29 +18,31 @@ from finssim.core.rotations import (
     quat_rotate,
     wrap_angle,
 )
-from finssim.identification.fit import Curve, Estimate, Fit
-from finssim.identification.regression.axis_estimates import (
+from finssim.identification.axis_result import (
     CERTAIN,
     SET,
     UNITS,
     AxisResult,
     Number,
-    drag_known,
     hydrostatics,
 )
-from finssim.identification.regression.axis_fit import DAMPING, SIGNIFICANT
-from finssim.identification.regression.plant_terms import matrices
-from finssim.identification.simulation.rollout import (
+from finssim.identification.fit import Curve, Estimate, Fit
+from finssim.identification.plant_terms import matrices
+from finssim.identification.release import released
+from finssim.identification.rollout import (
     CHANNELS,
+    DETERMINED_BY,
     Response,
     Rollouts,
     Segment,
     Streams,
     segments,
     streams,
+    without,
 )
 from finssim.identification.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
 from finssim.identification.vehicle_file import scaled_thrust
+from finssim.identification.weak_form import weak_form
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.sim.plant_arrays import twist_shift
 from finssim.survey.least_squares import (
@@ -147,6 +149,7 @@ class Parameters:
         imposed: Sequence[str] = (),
         unseen: Sequence[str] = (),
         retained: Sequence[str] = (),
+        held: Mapping[str, float] | None = None,
     ) -> None:
         """Choose what is free.
 
@@ -160,8 +163,9 @@ class Parameters:
             start: Coordinate -> where it starts, in place of the vehicle file's number.
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
-            unseen: Those of `imposed` that no trial measured, and that therefore are simulated: their drag is free too.
+            unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
             retained: Damping that is not free and stays the vehicle file's, such as `pitch.d2`.
+            held: Effective inertias M_RB + M_A that are not free, by axis [kg, kg m²].
 
         Raises:
             CalibrationError: The calibrated set holds no coefficients.
@@ -179,6 +183,10 @@ class Parameters:
         self.r_h = np.asarray(self.set.reference_point, float)
         self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
         self.D1, self.D2 = plant.D1, plant.D2
+        self.held = dict(held or {})
+        for a, m in self.held.items():
+            i = AXES.index(a)
+            self.M_A[i, i] = m - self.M_RB[i, i]
         for a, i in zip(self.axes, self.index, strict=True):
             if damping[a] == "linear" and f"{a}.d2" not in retained:
                 self.D2[i, :] = self.D2[:, i] = 0.0
@@ -203,7 +211,7 @@ class Parameters:
         kinds = {"linear": ("d1",), "quadratic": ("d2",), "both": ("d1", "d2")}
         out = []
         for axis, floor in zip(self.axes, self.mass_floor().tolist(), strict=True):
-            out += [self._of_axis(axis, "added_mass", floor)]
+            out += [self._of_axis(axis, "added_mass", floor)] if axis not in self.held else []
             out += [self._of_axis(axis, kind) for kind in kinds[self.damping[axis]]]
         w, inf = self.vehicle, np.inf
         weight, B = w.weight, w.buoyancy
@@ -680,6 +688,12 @@ OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth"
 """Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes [rad/s],
 levels that were mounted askew [rad], pressure at the surface [m]."""
 
+DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
+"""Angle and rate of an equilibrium that moves at a constant speed within a segment, as while a manipulator moves."""
+
+REST_STD, DRIFT_STD = 0.3, 0.02
+"""Standard deviations of the equilibrium of a free swing [rad] and of its speed [rad/s]."""
+
 LATEST = 0.3
 """Greatest lag or lead of a stream relative to the inputs [s]."""
 
@@ -689,11 +703,11 @@ LATE_STD = 0.05
 
 # Where each segment begins: what was measured there, and how far a fit may move it.
 
-STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
-"""Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
-
 UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
 """Standard deviation of unmeasured values; heading and place do not matter then."""
+
+UNMOVED = np.array([0.05] * 6 + [0.3, 0.3, *UNKNOWN[8:]])
+"""The same in a free motion, where nothing drives the axes that were not measured."""
 
 LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
 """Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
@@ -714,6 +728,10 @@ STEPS = np.array([0.002] * 9 + [0.005] * 3)
 RELATIVE_STEP = 0.006
 """Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
 
+FORCE_STEP = 0.15
+"""The same of damping and excess of a rise, which nearly trade off: the rounding of small steps would look like
+knowledge."""
+
 GRAIN = 0.004
 """Share of a number that is negligible."""
 
@@ -726,6 +744,10 @@ VAGUE = 8.0
 EXACT_CLOCK = 1e-3
 """Greatest lag of the stream that serves as the clock [s]."""
 
+CONSTANT = 1e-3
+"""Noise of a channel that never changes, as where a sensor was missing [m, rad, m/s, rad/s]: single precision shows no
+less."""
+
 FLOOR = 1e-4
 """Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
 
@@ -735,7 +757,7 @@ class Shooting:
 
     Attributes:
         streams: Names of the streams in use; each may lag the inputs.
-        offsets: Names of the channels with an offset of their own in every segment.
+        offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
         free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
             heading and place where some segment knows them.
         edges: First sample of each segment, and N, (S + 1,).
@@ -754,6 +776,7 @@ class Shooting:
         channels: Sequence[str],
         *,
         lagged: NDArray[np.bool_] | None = None,
+        swinging: NDArray[np.bool_] | None = None,
         few: bool = False,
     ) -> None:
         """Set up.
@@ -763,6 +786,7 @@ class Shooting:
             parameters: What is free.
             channels: Measured columns to compare.
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
+            swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
             few: Whether some axis is excited by too few trials to show how trials differ.
         """
         self.segments, self.parameters = tuple(segments), parameters
@@ -771,7 +795,8 @@ class Shooting:
         known = np.stack([s.known for s in segments])
         self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
         seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
-        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), UNKNOWN)[:, self.free]
+        unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
+        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
         self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
         # The initial height already takes up an offset of the depth, unless z is measured too.
         self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
@@ -779,6 +804,15 @@ class Shooting:
         self._stream = np.array([stream_of[c] for c in names], int)[self.measured.channel]
         rows = [names.index(name) for name in self.offsets]
         self._offset = (self.measured.channel[:, None] == np.array(rows, int)).astype(float)
+        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
+        for name, (angle, rate) in DRIFTING_REST.items() if swinging is not None and swinging.any() else ():
+            if angle in names:
+                channel = np.array(names)[self.measured.channel]
+                column = np.where(channel == angle, self.measured.time, channel == rate)
+                self.offsets += (name,)
+                self._offset = np.column_stack([self._offset, column])
+                offsets_std = np.column_stack([offsets_std, np.where(swinging, DRIFT_STD, 1e-9)])
+                offsets_std[swinging, self.offsets.index(angle)] = REST_STD
         self.rollouts = Rollouts(
             parameters.vehicle,
             segments,
@@ -800,14 +834,17 @@ class Shooting:
         size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
         known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
         self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0])
-        if "thrust_delay" in parameters.names:
-            # A common lag of all streams is a delay of the thrust: the first stream is the clock then.
+        free = bool(swinging is not None and swinging.all())
+        forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
+        self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
+        if "thrust_delay" in parameters.names or free:
+            # Nothing tells a common lag of all streams from a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
-        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
-        self._floor = FLOOR * self.measured.spread() + 1e-12
-        self.first_noise = np.maximum(self.measured.roughness(), self._floor)
+        noise = self.measured.roughness()
+        self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
+        self.first_noise = np.maximum(noise, self._floor)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -887,7 +924,7 @@ class Shooting:
         theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
         up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
         i = np.arange(P)
-        step = RELATIVE_STEP * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
+        step = self._relative_step * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
         theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
         theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
         wide = theta[up[:P], i] - theta[down[:P], i]
@@ -897,12 +934,17 @@ class Shooting:
         return Point(theta, z), np.concatenate([wide, 2.0 * steps])
 
     def growth(self, point: Point) -> Array:
-        """Largest factor by which a small change of the initial velocity grows within each segment, (S,)."""
-        own = np.abs(self.linearise(point).own[:, :6])
+        """Return the largest factor by which a small change of the initial velocity grows within each segment, (S,).
+
+        It is infinite where the simulation diverges.
+        """
+        linear = self.linearise(point)
+        own = np.abs(linear.own[:, :6])
         speeds = [
             i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
         ]
         own[~np.isin(self.measured.channel, speeds)] = 0.0
+        own[~np.isfinite(linear.residual)] = np.inf
         return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 
     def grain(self, theta: Array) -> Array:
@@ -944,6 +986,18 @@ class Confidence(NamedTuple):
     """Result of the last step without bounds, (P,)."""
     interval: Array
     """95 %, around `free` and containing theta, (P, 2)."""
+
+    def variance(self, slope: Array, at: Sequence[int]) -> float:
+        """Return the variance of a sum of some parameters.
+
+        Args:
+            slope: Factor of each, (n,).
+            at: Their places in theta, (n,).
+        """
+        C = self.covariance
+        matrix = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
+        with np.errstate(invalid="ignore"):
+            return float(slope @ matrix @ slope) if len(slope) else 0.0
 
 
 def confidence(problem: Shooting, solution: Solution) -> Confidence:
@@ -1015,6 +1069,9 @@ def _blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
 LAG_CERTAIN = 0.05
 """Half width of the interval of a delay up to which it counts as identifiable [s]."""
 
+EXCESS_CERTAIN = 0.02
+"""The same of buoyancy less weight, as a part of the weight."""
+
 PATHS = {
     "buoyancy_excess": "body.displaced_volume",
     "thrust_scale": None,
@@ -1040,7 +1097,8 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
         if np.isfinite(local[c]):
             free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
             width = float(np.hypot(half[c], own_error * abs(value + rigid_part(p, name))))
-            low, high = max(min(free - width, value), p.low[c]), max(free + width, value)
+            low = max(min(free - width, value), p.low[c])
+            high = free + width if free + width > value else value + width
         out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
     return out
 
@@ -1063,9 +1121,11 @@ def axis_result(
         axis: Which.
         known: Further fields of `AxisResult`.
     """
-    mass, rigid = numbers[f"{axis}.added_mass"], rigid_part(p, f"{axis}.added_mass")
-    free = None if mass.free is None else mass.free + rigid
-    own = {"m_eff": Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)}
+    own = dict[str, Number]()
+    if f"{axis}.added_mass" in numbers:
+        mass, rigid = numbers[f"{axis}.added_mass"], rigid_part(p, f"{axis}.added_mass")
+        free = None if mass.free is None else mass.free + rigid
+        own["m_eff"] = Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)
     own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
     if "k" in numbers and axis in ("roll", "pitch"):
         own["k"] = numbers["k"]
@@ -1091,8 +1151,8 @@ def other_estimates(
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
         half, note = 0.5 * (high - low), ""
-        # An excess may well be zero: it is determined wherever it has an interval.
-        limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": np.inf}
+        # Delay and excess may well be zero, so that their uncertainty is not judged as a part of them.
+        limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": EXCESS_CERTAIN * p.vehicle.weight}
         limit = limits.get(name, CERTAIN * abs(value))
         if free is not None:
             note = f"held at its bound; free, it would be {free:.3g} {unit}"
@@ -1116,16 +1176,6 @@ def other_estimates(
 
 # Content of the trials: excited axes, measurements of each axis, response time of the vehicle.
 
-TELL = {
-    "surge": ("u", "x", "y"),
-    "sway": ("v", "x", "y"),
-    "heave": ("w", "z", "depth"),
-    "roll": ("p", "roll"),
-    "pitch": ("q", "pitch"),
-    "yaw": ("r", "yaw"),
-}
-"""Measured columns that determine an axis, the most direct first."""
-
 DRIFTING = {"x": "u", "y": "v", "z": "w", "depth": "w", "yaw": "r"}
 """Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
 
@@ -1139,11 +1189,13 @@ ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
 """Range of a velocity below which an axis does not answer [m/s, rad/s]."""
 
 
-def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
+def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: bool = False) -> Segment:
     """The segment as a fit of some axes uses it.
 
     Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
-    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift.
+    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift. An
+    axis whose motion does not stand out of its noise is simulated instead, for the noise would shake the others; but
+    not in a free motion, where nothing drives it.
     """
     held = np.full((segment.steps + 1, 6), np.nan)
     t = segment.t0 + segment.step * np.arange(segment.steps + 1)
@@ -1152,8 +1204,9 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
     for i, axis in enumerate(AXES):
         good = inside & np.isfinite(motion.nu[:, i])
         if axis not in axes and good.sum() >= max(2.0, SEEN * inside.sum()):
-            held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
-            drop |= {TELL[axis][0]}
+            if free or axis in SWINGING or answers(motion, i):
+                held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
+            drop |= {DETERMINED_BY[axis][0]}
     if not np.isnan(held[:, 3:5]).any():
         drop |= {"roll", "pitch"}
     measured = {c: pair for c, pair in segment.measured.items() if c not in drop}
@@ -1163,12 +1216,11 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str]) -> Segment:
 def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
     """Axes that some trial measures anything of."""
     columns = {c for s in trials for c in s.measured}
-    return tuple(a for a in AXES if columns & set(TELL[a]))
+    return tuple(a for a in AXES if columns & set(DETERMINED_BY[a]))
 
 
 def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
-    """Axes that the trials excite: those their headers name, else those that were driven, or moved while passive, and
-    answered."""
+    """Return the axes that the trials excite, of those that some trial measures."""
     found = {axis for s in trials for axis in excites(s, vehicle)}
     return tuple(a for a in AXES if a in found and a in observable(trials))
 
@@ -1182,7 +1234,10 @@ def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) ->
 
 
 def excites(s: Streams, vehicle: Vehicle) -> set[str]:
-    """Axes that one trial excites: those its header names, else those that were driven, or moved while passive."""
+    """Return the axes that one trial excites: without thrust those that move freely, else those its header names, else
+    those that were driven, or swing."""
+    if s.drive.source == "passive":
+        return set(s.released)
     return set(s.trial.header.axis) or _moved(s, vehicle)
 
 
@@ -1194,16 +1249,19 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
     tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
     out: set[str] = set()
     for i, axis in enumerate(AXES):
-        nu = s.motion.nu[:, i]
-        noise = s.motion.noise_std[i]
-        answers = _range(nu) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
         pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
         # Weight rights roll and pitch: a small swing determines them, whatever started it. If they were not
         # fitted, the file's stiffness, which may be a guess, would determine the later course of surge and sway.
         swings = i in (3, 4)
-        if answers and (pushed or swings or s.drive.source == "passive"):
+        if answers(s.motion, i) and (pushed or swings):
             out.add(axis)
     return out
+
+
+def answers(motion: Motion, i: int) -> bool:
+    """Return whether the velocity of an axis, 0 surge to 5 yaw, stands out of its noise."""
+    noise = motion.noise_std[i]
+    return _range(motion.nu[:, i]) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
 
 
 def _range(values: Array) -> float:
@@ -1260,7 +1318,7 @@ def _shown_by(
     """Return the most direct used channel that determines an axis, its samples (n,), their trials (n,), and the range
     of the channel in each trial, from the 5th to the 95th percentile; no samples without such a channel."""
     m = problem.measured
-    name = next((c for c in TELL[axis] if c in m.names), "")
+    name = next((c for c in DETERMINED_BY[axis] if c in m.names), "")
     rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
     trial = problem.groups[m.segment][rows]
     spans = {
@@ -1296,6 +1354,21 @@ def quality(
             "noise": float(np.median(solution.std[rows])),
         }
     return out
+
+
+def unexplained(
+    problem: Shooting, solution: Solution, axis: str, used: Sequence[Streams]
+) -> tuple[str, float]:
+    """Return the trial of a free motion that the fit explains least, and its R²; infinite without any."""
+    _, rows, trial, _ = _shown_by(problem, axis)
+    worst, least = "", np.inf
+    for g, one in enumerate(used):
+        those = rows[trial == g]
+        if axis in one.released and len(those):
+            residual, value = solution.linear.residual[those], problem.measured.value[those]
+            r2 = 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300)
+            worst, least = min((worst, least), (one.trial.name, r2), key=lambda pair: pair[1])
+    return worst, least
 
 
 def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
@@ -1334,7 +1407,11 @@ def fit_findings(
     ):
         if abs(late) > LATE and (low > 0.0 or high < 0.0):
             sense = "lags" if late > 0.0 else "leads"
-            out.append(finding("motion_late", stream, sense=sense, lag=abs(late), low=low, high=high))
+            given = {"sense": sense, "lag": abs(late), "low": low, "high": high}
+            if all(one.released for one in used):
+                out.append(finding("streams_apart", stream, other=problem.streams[0], **given))
+            else:
+                out.append(finding("motion_late", stream, **given))
     if found.evidence.unit == "blocks":
         out.append(finding("block_intervals", trials=len(used)))
     return out
@@ -1368,7 +1445,13 @@ class Clock:
 
 
 def changes(
-    p: Parameters, x: Array, found: Mapping[str, Estimate], axes: dict[str, Any], scaled: bool
+    p: Parameters,
+    x: Array,
+    found: Mapping[str, Estimate],
+    axes: dict[str, Any],
+    *,
+    unmeasured: Sequence[str],
+    scaled: bool,
 ) -> dict[str, Any]:
     """Changes of the vehicle file.
 
@@ -1377,14 +1460,14 @@ def changes(
         x: Where it ended, (P,).
         found: All estimates.
         axes: Changes of the axes' own numbers.
+        unmeasured: Axes that were simulated because no trial measured them: the others hold with their numbers.
         scaled: Whether a thrust scale belongs to the thrusters' curves.
     """
     out = dict(axes)
     for path, matrix in _matrices(p, x).items():
         old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
         for i, axis in enumerate(AXES):
-            # Axes without measurements were simulated: the others hold with their numbers.
-            if f"{path}.{i}.{i}" in axes or axis in p.unseen:
+            if f"{path}.{i}.{i}" in axes or axis in unmeasured:
                 for j in range(6):
                     # Couplings are written where the fit did away with them.
                     if i == j or matrix[i, j] != old[i, j]:
@@ -1401,17 +1484,22 @@ def changes(
     return out
 
 
+USEFUL_DRAG = 0.5
+"""Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
+
+
 def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
-    """`drag_known` at one speed."""
+    """Return whether the drag at one speed is known to `USEFUL_DRAG`, or excludes that of the vehicle file."""
     i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
     at = [p.names.index(name) for name in names if name in p.names]
-    free = np.isin(names, p.names)
-    C = found.covariance
-    C = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
-    before = float(p.set.linear_damping[i][i]), float(p.set.quadratic_damping[i][i])
+    free, powers = np.isin(names, p.names), np.array([speed, speed**2])
+    before = np.array([p.set.linear_damping[i][i], p.set.quadratic_damping[i][i]], float)
     d = np.where(np.isin(names, p.retained), before, 0.0)
     d[free] = x[at]
-    return drag_known(d, free, [C], 2.0, [speed], before)
+    force = float(powers @ d)
+    half = 2.0 * np.sqrt(np.maximum(found.variance(powers[free], at), 0.0))
+    known = half < USEFUL_DRAG * force or abs(powers @ before - force) > half
+    return bool(np.isfinite(half) and force > 0.0 and known)
 
 
 STEP = 0.02
@@ -1455,17 +1543,20 @@ class Stages:
         vehicle: Vehicle,
         axes: tuple[str, ...],
         estimate: tuple[str, ...],
+        known: Mapping[str, float],
         length: float | None,
-        starts: Sequence[dict[str, float]],
         say: Clock,
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
-        self.given, self.starts = length, starts
+        self.given, self.known = length, dict(known)
         self.excites = [excites(s, vehicle) for s in prepared]
-        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does.
-        self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes)
-        measured = observable(prepared)
-        self.unseen = tuple(a for a in self.imposed if a not in measured)
+        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
+        # without thrust nothing does.
+        driven = any(one.drive.source != "passive" for one in prepared)
+        self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes and driven)
+        self.unseen = tuple(
+            a for a in self.imposed if not any(answers(one.motion, AXES.index(a)) for one in prepared)
+        )
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
@@ -1475,33 +1566,102 @@ class Stages:
         self.extras = set(estimate)
         if "heave" in axes:
             self.extras.add("buoyancy_excess")
-        if {"roll", "pitch"} & set(axes):
+        self.free = self._free_axes()
+        swinging = [a for a in axes if a in SWINGING]
+        self.held, self.notes = self._assumed(swinging)
+        if any(a not in self.free or a in self.held for a in swinging):
             self.extras.add("k")
-        self.biases = [a for a in axes if a != "heave"]
+        self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
+        self.remarks: list[Finding] = []
+        self.weak_start = self._weak_start()
 
-    def first(self, kinds: dict[str, str]) -> Stage:
-        """Short segments from the better of the starts, then segments of the length that the answer calls for."""
+    def _free_axes(self) -> tuple[str, ...]:
+        """Return the axes that move only in trials without thrust, which show ratios alone."""
+        driven = {
+            axis
+            for one, moved in zip(self.prepared, self.excites, strict=True)
+            if one.drive.source != "passive"
+            for axis in moved
+        }
+        moving = {axis for one in self.prepared for axis in one.released}
+        return tuple(a for a in self.axes if a in moving - driven)
+
+    def _assumed(self, swinging: Sequence[str]) -> tuple[dict[str, float], dict[str, str]]:
+        """Return effective inertias that are not fitted [kg, kg m²], and what the numbers of an axis rest on.
+
+        Where the weight rights the vehicle, the file's stiffness gives the scale of a free motion, elsewhere the file's
+        inertia does, unless an inertia is given.
+        """
+        plant = matrices(self.vehicle)
+        k = float(plant.arm[2])
+        stiff = k > 0.0 and not any(a in self.known or a not in self.free for a in swinging)
+        held, notes = dict(self.known), dict[str, str]()
+        for axis in self.free:
+            i, unit = AXES.index(axis), "kg" if AXES.index(axis) < 3 else "kg m²"
+            if axis in held:
+                notes[axis] = f"with the given inertia {held[axis]:.4g} {unit}"
+            elif axis in SWINGING and stiff:
+                notes[axis] = f"with the file's k = {k:.4g} N m/rad"
+            elif axis not in SWINGING or not any(a in self.known or a not in self.free for a in swinging):
+                held[axis] = float((plant.M_RB + plant.M_A)[i, i])
+                notes[axis] = f"with the file's inertia {held[axis]:.4g} {unit}"
+        return held, notes
+
+    def _weak_start(self) -> dict[str, float]:
+        """Return the numbers of the weak form, and cut the trials where it finds a jolt."""
+        plant, start = matrices(self.vehicle), dict[str, float]()
+        gaps: dict[int, list[tuple[float, float]]] = {}
+        for axis in self.axes:
+            known = {"m_eff": self.held[axis]} if axis in self.held else {}
+            known |= {"k": float(plant.arm[2])} if axis in SWINGING and "k" not in self.extras else {}
+            those = [g for g, moved in enumerate(self.excites) if axis in moved]
+            found, jolts = weak_form([self.prepared[g] for g in those], axis, self.vehicle, known)
+            for k, begin, end in jolts:
+                gaps.setdefault(those[k], []).append((begin, end))
+                name = self.prepared[those[k]].trial.name
+                self.remarks.append(finding("jolt", name, axis=axis, begin=begin, end=end))
+            start |= {f"{axis}.{name}": value for name, value in found.items()}
+            if found:
+                start[f"{axis}.added_mass"] = found["m_eff"] - float(
+                    plant.M_RB[AXES.index(axis), AXES.index(axis)]
+                )
+            if found and axis == "heave":
+                start["buoyancy_excess"] = -found["bias"]
+            if found and axis in SWINGING:
+                start["k"] = found["k"]
+        self.prepared = [without(s, gaps.get(g, [])) for g, s in enumerate(self.prepared)]
+        return start
+
+    def rough(self, kinds: dict[str, str], starts: Sequence[Mapping[str, float]]) -> Stage:
+        """Fit short segments from the best of several starts, without regard to outliers and clocks."""
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
-        problem = min(
-            (self.problem(kinds, start) for start in self.starts), key=lambda one: one.cost(one.start())
-        )
+        problem = min((self.problem(kinds, start) for start in starts), key=lambda one: one.cost(one.start()))
         point = problem.start()
         problem.hold_clocks(True)
         rough = solve(
             problem, point, iterations=12, std=problem.size(), rough=True, report=self.report("start", 0.3)
         )
-        if not np.isfinite(rough.cost):
+        self.refuse_divergence(rough)
+        problem.hold_clocks(False)
+        return Stage(problem, rough, confidence(problem, rough))
+
+    def refuse_divergence(self, solution: Solution) -> None:
+        """Raise a `CalibrationError` if the simulation has no finite answer."""
+        if not np.isfinite(solution.cost):
             raise CalibrationError(
-                "the simulation diverges with the vehicle file's numbers: give better ones, or shorter segments "
-                f"(now {self.length:.3g} s)"
+                f"the simulation diverges within segments of {self.length:.3g} s: give a vehicle file with better "
+                "numbers, or a shorter --horizon"
             )
-        p, x = problem.parameters, rough.point.theta[: len(problem.parameters.names)]
-        if rough.interrupted:
-            problem.hold_clocks(False)
-            return Stage(problem, rough, confidence(problem, rough))
-        self.cut(self.given or horizon(self.vehicle.replace(_matrices(p, x)), self.prepared, self.axes))
-        problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
+
+    def first(self, kinds: dict[str, str], start: Mapping[str, float]) -> Stage:
+        """Fit segments of the length that the numbers of a start call for.
+
+        If the simulation with them diverges, the fit begins with the vehicle file's numbers instead.
+        """
+        p = self.parameters(kinds, start)
+        self.cut(self.given or horizon(self.vehicle.replace(_matrices(p, p.start)), self.prepared, self.axes))
+        problem = self.problem(kinds, start)
         for _ in range(0 if self.given else HALVINGS):
             growth = problem.growth(problem.start())
             wild = {self.used[g].trial.name for g in np.unique(problem.groups[growth > GROWTH])}
@@ -1510,7 +1670,10 @@ class Stages:
             for name in wild:
                 self.shorter[name] = 0.5 * self.shorter.get(name, 1.0)
             self.cut(self.length)
-            problem = self.problem(kinds, dict(zip(p.names, x, strict=True)))
+            problem = self.problem(kinds, start)
+        if start and not np.isfinite(problem.cost(problem.start())):
+            self.shorter.clear()
+            return self.first(kinds, {})
         return self.finish(problem, problem.start(), 0.6)
 
     def next(self, kinds: dict[str, str], before: Stage) -> Stage:
@@ -1537,6 +1700,7 @@ class Stages:
             point = rough.point
             if rough.interrupted:
                 return Stage(problem, rough, confidence(problem, rough))
+            self.refuse_divergence(rough)
         solution = solve(problem, point, std=std, report=self.report("fit", toward))
         return Stage(problem, solution, confidence(problem, solution))
 
@@ -1549,15 +1713,20 @@ class Stages:
 
     def cut(self, length: float) -> None:
         """Cut the trials into segments of about a length [s]."""
-        tells = {column for axis in self.axes for column in TELL[axis]}
+        shown = {column for axis in self.axes for column in DETERMINED_BY[axis]}
         cut = [
             [
-                compared(s, one.motion, self.axes)
+                compared(
+                    s,
+                    one.motion,
+                    [a for a in self.axes if a in one.released or not one.released],
+                    free=bool(one.released),
+                )
                 for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
             ]
             for one in self.prepared
         ]
-        kept = [[s for s in stretch if tells & set(s.measured)] for stretch in cut]
+        kept = [[s for s in stretch if shown & set(s.measured)] for stretch in cut]
         self.length = length
         self.used = [one for one, stretch in zip(self.prepared, kept, strict=True) if stretch]
         self.segments = [replace(s, index=g) for g, stretch in enumerate(filter(None, kept)) for s in stretch]
@@ -1572,9 +1741,9 @@ class Stages:
     def _part(self, one: Streams) -> float:
         return self.shorter.get(one.trial.name, 1.0)
 
-    def problem(self, kinds: dict[str, str], start: dict[str, float]) -> Shooting:
-        """Return the problem of the free parameters, over the segments."""
-        parameters = Parameters(
+    def parameters(self, kinds: dict[str, str], start: Mapping[str, float]) -> Parameters:
+        """Return the free parameters for a choice of damping, from a start."""
+        return Parameters(
             self.vehicle,
             axes=self.axes,
             damping=kinds,
@@ -1584,12 +1753,17 @@ class Stages:
             imposed=self.imposed,
             unseen=self.unseen,
             retained=self.retained,
+            held=self.held,
         )
+
+    def problem(self, kinds: dict[str, str], start: Mapping[str, float]) -> Shooting:
+        """Return the problem of the free parameters, over the segments."""
         return Shooting(
             self.segments,
-            parameters,
+            self.parameters(kinds, start),
             sorted({c for s in self.segments for c in s.measured}),
             lagged=self.lagged,
+            swinging=np.array([bool(self.used[s.index].released) for s in self.segments]),
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
@@ -1600,30 +1774,51 @@ class Stages:
         remarks: list[Finding],
         *,
         damping: str,
+        kinds: Mapping[str, str],
     ) -> Fit:
-        """The finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
+        """Return the finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
         p, x = stage.problem.parameters, stage.x
         numbers = self.numbers(stage)
         for name in numbers.keys() & first.keys():
             (low, high), (a, b) = numbers[name].ends, first[name].ends
             numbers[name] = numbers[name]._replace(ends=(min(low, a), max(high, b)))
+        figures = quality(stage.problem, stage.solution, self.axes, self.used)
         found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
+        others, held = other_estimates(p, numbers)
         for axis in self.axes:
             own = speeds([s.motion for s in self.used], axis)
             known = _drag_known(p, x, stage.found, axis, own[1])
-            result = axis_result(p, numbers, first, axis, speeds=own, drag_known=known)
+            result = axis_result(
+                p, numbers, first, axis, speeds=own, drag_known=known, given=self.known.get(axis)
+            )
+            reason = ""
+            worst, r2 = unexplained(stage.problem, stage.solution, axis, self.used)
+            if figures.get(axis, {}).get("r2", 1.0) < EXPLAINED:
+                reason = f"the model explains nothing of this axis' motion: R² {figures[axis]['r2']:.2f}"
+            elif r2 < EXPLAINED:
+                reason = (
+                    f"the model explains nothing of how {worst} moves, R² {r2:.2f}: fit its releases apart"
+                )
+            if reason:
+                result.believe_nothing(reason)
+            if axis == "heave":
+                others["buoyancy_excess"], said = self.buoyancy(others["buoyancy_excess"], reason)
+                result.findings += said
             found |= result.estimates
+            if axis in self.free:
+                found |= result.estimates if reason else self.free_estimates(stage, result)
             axes |= result.changes
             bounds += result.findings
-        others, held = other_estimates(p, numbers)
         found |= others
         sources = {s.drive.source for s in self.used}
-        new = changes(p, x, found, axes, scaled=sources <= {"rpm", "pwm"})
+        unmeasured = [axis for axis in p.unseen if axis not in observable(self.prepared)]
+        new = changes(p, x, found, axes, unmeasured=unmeasured, scaled=sources <= {"rpm", "pwm"})
         P, local = stage.problem.judged, stage.found.covariance.local
         correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
         left_out = [one.trial.name for one in self.prepared if one not in self.used]
         remarks = [
             *remarks,
+            *self.remarks,
             *(finding("trial_left_out", name) for name in left_out),
             *fit_findings(stage.problem, stage.solution, stage.found, self.used),
             *bounds,
@@ -1633,11 +1828,14 @@ class Stages:
         settings: dict[str, Any] = {
             "axes": list(self.axes),
             "damping": damping,
+            "drag": dict(kinds),
             "estimate": sorted(self.extras),
+            "fix": {f"{axis}.m": m for axis, m in self.known.items()},
             "horizon": round(self.length, 3),
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
+            "end": dict(zip(p.names, x.tolist(), strict=True)),
         }
         self.say("done")
         return Fit(
@@ -1646,7 +1844,7 @@ class Stages:
             before=self.vehicle,
             estimates=found,
             changes=new,
-            quality=quality(stage.problem, stage.solution, self.axes, self.used),
+            quality=figures,
             correlation=correlation,
             findings=tuple(dict.fromkeys(remarks)),
             curves=pictures(stage.problem, stage.solution, self.axes),
@@ -1654,6 +1852,131 @@ class Stages:
             settings=settings,
             interrupted=stage.solution.interrupted,
         )
+
+    def buoyancy(self, excess: Estimate, reason: str) -> tuple[Estimate, list[Finding]]:
+        """Return the excess of buoyancy, not identifiable where it rests on an assumed mass, and what contradicts it.
+
+        Args:
+            excess: Estimate from the simulation.
+            reason: Why the axis cannot be believed; empty where it can.
+        """
+        file = matrices(self.vehicle).excess
+        assumed = "heave" in self.free and "heave" not in self.known
+        if not (assumed or reason):
+            return excess, []
+        note = reason or f"from the acceleration, {self.notes['heave']}"
+        low, high = excess.ci95
+        said = [] if reason or low <= file <= high else [
+            finding("buoyancy_contradicted", "heave", file=file, low=low, high=high)
+        ]  # fmt: skip
+        return replace(excess, identifiable=False, note=note), said
+
+    def free_estimates(self, stage: Stage, result: AxisResult) -> dict[str, Estimate]:
+        """Return the estimates of an axis that moved without thrust: ratios, and the others with their assumption."""
+        axis, (_, top) = result.axis, result.speeds
+        p, i, out = stage.problem.parameters, AXES.index(result.axis), dict[str, Estimate]()
+        for name, e in result.estimates.items():
+            # The equilibrium of a swing may be that of a sensor that was mounted askew.
+            sure = e.identifiable and not name.endswith(".bias")
+            out[name] = replace(
+                e, identifiable=sure, note="; ".join(filter(None, [e.note, self.notes.get(axis)]))
+            )
+
+        def plant(x: Array) -> tuple[float, float, float, float, float]:
+            """Return m, d1, d2, k and the excess of buoyancy of a vector."""
+            M_A, D1, D2 = (matrix[0, i, i] for matrix in p.matrices(x))
+            file = matrices(self.vehicle)
+            k = p.value(x[None], "k", float(file.arm[2]))
+            excess = p.value(x[None], "buoyancy_excess", file.excess)
+            return float(p.M_RB[i, i] + M_A), float(D1), float(D2), float(np.max(k)), float(np.max(excess))
+
+        def add(
+            name: str, of: Callable[..., float], unit: str, note: str = "", positive: bool = True
+        ) -> None:
+            value, (low, high) = derived(stage, lambda x: of(*plant(x)), self.own_error, positive)
+            sure = bool(value > 0.0 and 0.5 * (high - low) <= CERTAIN * value)
+            note = note or ("" if sure else "uncertain by more than a fifth of its value")
+            out[f"{axis}.{name}"] = Estimate(
+                name=f"{axis}.{name}",
+                estimate=value,
+                ci95=(low, high),
+                unit=unit,
+                identifiable=sure,
+                note=note,
+            )
+
+        if axis in SWINGING:
+            rubbed = 8.0 / (3.0 * np.pi) * top
+            add("natural_frequency", lambda m, d1, d2, k, e: float(np.sqrt(k / m)), "rad/s")
+            # A quadratic term counts as the linear one that takes as much energy out of the largest swing.
+            add(
+                "damping_ratio", lambda m, d1, d2, k, e: (d1 + rubbed * d2) / (2.0 * float(np.sqrt(k * m))), "-",
+                f"at a swing of {top:.2g} rad/s",
+            )  # fmt: skip
+        if axis == "heave":
+            add("terminal_speed", lambda m, d1, d2, k, e: terminal_speed(d1, d2, e), "m/s", "of a rise")
+            return out
+        for name, unit in (("d1", "1/s"), ("d2", "1/m" if i < 3 else "1/rad")):
+            drag = result.estimates.get(f"{axis}.{name}")
+            if drag is None:
+                continue
+            if name in result.dropped:
+                m = plant(stage.x)[0]
+                out[f"{axis}.{name}/m_eff"] = replace(
+                    drag, name=f"{axis}.{name}/m_eff", estimate=drag.estimate / m,
+                    ci95=(drag.ci95[0] / m, drag.ci95[1] / m), unit=unit, path=None,
+                )  # fmt: skip
+            else:
+                of = (lambda m, d1, d2, k, e: d1 / m) if name == "d1" else (lambda m, d1, d2, k, e: d2 / m)
+                add(f"{name}/m_eff", of, unit, positive=False)
+        return out
+
+
+EXPLAINED = 0.2
+"""R² below which the model of an axis explains nothing: at 0 the mean of the measurements does as well."""
+
+SWINGING = ("roll", "pitch")
+"""Axes that the weight rights."""
+
+
+def terminal_speed(d1: float, d2: float, excess: float) -> float:
+    """Return the speed at which drag equals an excess of buoyancy [m/s].
+
+    Args:
+        d1: Linear damping of heave [N s/m].
+        d2: Quadratic damping of heave [N s²/m²].
+        excess: Buoyancy less weight [N].
+    """
+    e = max(excess, 0.0)
+    return 2.0 * e / max(d1 + float(np.sqrt(d1**2 + 4.0 * d2 * e)), 1e-12)
+
+
+def derived(
+    stage: Stage, of: Callable[[Array], float], own_error: float, positive: bool
+) -> tuple[float, tuple[float, float]]:
+    """Return a function of the parameters and its 95 % interval, to first order.
+
+    Args:
+        stage: A finished fit.
+        of: Vector of parameters (P,) -> the number.
+        own_error: Of the simulation itself, as a part of the number.
+        positive: Whether the interval is that of the logarithm.
+    """
+    from scipy.stats import t
+
+    p, x, C = stage.problem.parameters, stage.x, stage.found.covariance
+    h = 1e-4 * np.maximum(np.abs(x), 1e-2 * p.scale)
+    value, steps = of(x), np.diag(h)
+    slope = np.array([(of(x + s) - of(np.maximum(x - s, p.low))) for s in steps])
+    slope /= x + h - np.maximum(x - h, p.low)
+    at = np.flatnonzero(slope).tolist()
+    dof = float(np.min(C.dof[at], initial=np.inf))
+    half = float(t.ppf(0.975, min(dof, 1e6))) * float(np.sqrt(stage.found.variance(slope[at], at)))
+    half = float(np.hypot(half, own_error * value))
+    if positive and value > 0.0:
+        factor = float(np.exp(min(half / value, 50.0)))
+        return value, (value / factor, value * factor)
+    return value, (max(value - half, 0.0), value + half)
 
 
 def _matrices(p: Parameters, x: Array) -> dict[str, Any]:
@@ -1671,7 +1994,8 @@ def fit_by_simulation(
     *,
     axes: Sequence[str] | None = None,
     estimate: Sequence[str] = (),
-    damping: str = "auto",
+    damping: str | Mapping[str, str] = "auto",
+    known: Mapping[str, float] | None = None,
     horizon: float | None = None,
     begin: Fit | None = None,
     progress: Progress | None = None,
@@ -1688,9 +2012,10 @@ def fit_by_simulation(
         axes: Axes to fit; those that the trials excite if None.
         estimate: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
             with heave, stiffness with roll and pitch, a bias with the others.
-        damping: `auto`, `linear`, `quadratic` or `both`.
+        damping: `auto`, `linear`, `quadratic` or `both`; or one of the last three by axis.
+        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         horizon: Length of the segments [s]; from the data if None.
-        begin: Of another method: it begins with its numbers where these simulate the trials better than the file's.
+        begin: Fit whose numbers are near the answer; from the vehicle file and the weak form if None.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -1699,35 +2024,94 @@ def fit_by_simulation(
     Raises:
         CalibrationError: No trial can be used, one is held out, or a word is unknown.
     """
-    _check(trials, vehicle, axes, damping, estimate)
-    prepared = [streams(trial, vehicle) for trial in trials]
-    chosen, remarks = _axes(prepared, vehicle, axes)
-    say = Clock(progress)
-    starts = [{}] if begin is None else [{}, {name: e.estimate for name, e in begin.estimates.items()}]
-    fit = Stages(telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), horizon, starts, say)
-    kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
-    stage = fit.first(kinds)
+    _check(trials, vehicle, axes, damping, estimate, horizon)
+    prepared, remarks = prepare(trials, vehicle, axes)
+    chosen, more = _axes(prepared, vehicle, axes)
+    strange = [axis for axis in known or {} if axis not in chosen]
+    if strange:
+        raise CalibrationError(
+            f"the inertia of {', '.join(strange)} was given, but the fitted axes are {', '.join(chosen)}"
+        )
+    remarks, say = [*remarks, *more], Clock(progress)
+    say("preparing")
+    fit = Stages(
+        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), known or {}, horizon, say
+    )
+    if isinstance(damping, str):
+        kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
+    else:
+        kinds = {axis: damping.get(axis, "both") for axis in chosen}
+    if begin is None:
+        stage = fit.rough(kinds, [{}, fit.weak_start])
+        start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
+    else:
+        start = dict(begin.settings["end"])
+    if begin is not None or not stage.solution.interrupted:
+        stage = fit.first(kinds, start)
     first: dict[str, Number] = {}
     if damping == "auto" and not stage.solution.interrupted:
         chosen_kinds = _select(kinds, stage)
         if chosen_kinds != kinds:
             first = fit.numbers(stage)
             tops = {axis: speeds([t.motion for t in fit.used], axis)[1] for axis in chosen}
-            fit.retained = _retained(chosen_kinds, first, stage.problem.parameters, tops)
-            stage = fit.next(chosen_kinds, stage)
-    return fit.result(stage, first, remarks, damping=damping)
+            driven_kinds = {axis: kind for axis, kind in chosen_kinds.items() if axis not in fit.free}
+            fit.retained = _retained(driven_kinds, first, stage, tops)
+            stage, kinds = fit.next(chosen_kinds, stage), chosen_kinds
+    return fit.result(stage, first, remarks, damping=str(damping), kinds=kinds)
+
+
+def prepare(
+    trials: Sequence[Trial], vehicle: Vehicle, axes: Sequence[str] | None = None
+) -> tuple[list[Streams], list[Finding]]:
+    """Return the trials that can be used, and findings on what was assumed of them and on those that cannot.
+
+    A trial without thrust is cut to the free motions of its axes.
+
+    Raises:
+        CalibrationError: No trial can be used.
+    """
+    prepared, remarks, reasons = list[Streams](), list[Finding](), list[str]()
+    for trial in trials:
+        try:
+            one = streams(trial, vehicle)
+            if trial.header.passive:
+                named = trial.header.axis or AXES
+                one = released(one, [a for a in AXES if a in named and (axes is None or a in axes)])
+        except CalibrationError as error:
+            remarks.append(finding("unusable", trial.name, severity="care", reason=error.reason))
+            reasons.append(str(error))
+            continue
+        prepared.append(one)
+        remarks += [item.about(trial.name) for item in one.motion.findings]
+    if not prepared:
+        others = f"; and {len(reasons) - 1} trials more" if len(reasons) > 1 else ""
+        raise CalibrationError(f"no trial can be used: {reasons[0]}{others}")
+    return prepared, remarks
+
+
+DAMPING = ("auto", "linear", "quadratic", "both")
+
+HORIZONS = (0.5, 60.0)
+"""Shortest and longest segments that can be asked for [s]."""
+
+SIGNIFICANT = 0.03
+"""Level at which a second damping term has to be significant: one that is superfluous should be rare, for it is carried
+to speeds that no trial had."""
 
 
 def _check(
     trials: Sequence[Trial],
     vehicle: Vehicle,
     axes: Sequence[str] | None,
-    damping: str,
+    damping: str | Mapping[str, str],
     estimate: Sequence[str],
+    horizon: float | None,
 ) -> None:
     require_fittable(trials, vehicle)
     require_axes(axes)
-    if damping not in DAMPING:
+    if horizon is not None and not HORIZONS[0] <= horizon <= HORIZONS[1]:
+        raise CalibrationError(f"horizon is {horizon:g} s, expected {HORIZONS[0]:g} to {HORIZONS[1]:g} s")
+    if isinstance(damping, str) and damping not in DAMPING:
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     chosen = vehicle.hydrodynamics.get("calibrated")
     known = [*EXTRAS, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
@@ -1749,10 +2133,15 @@ def _axes(
             raise CalibrationError(
                 f"no trial excites an axis of {vehicle.name}: name the axes, or give trials with larger inputs"
             )
-        return moved, []
+        named = {axis for s in prepared for axis in s.trial.header.axis}
+        return moved, [finding("axis_untold", axis) for axis in AXES if axis in named and axis not in seen]
+    driven = any(s.drive.source != "passive" for s in prepared)
     remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
-    remarks += [finding("axis_doubtful", axis) for axis in axes if axis in seen and axis not in moved]
-    chosen = tuple(a for a in AXES if a in axes and a in seen)
+    unmoved = [axis for axis in axes if axis in seen and axis not in moved]
+    remarks += [
+        finding("axis_doubtful", axis) if driven else finding("axis_not_free", axis) for axis in unmoved
+    ]
+    chosen = tuple(a for a in AXES if a in axes and a in seen and (driven or a in moved))
     if not chosen:
         raise CalibrationError(f"no measurement that determines {', '.join(axes)} is in these trials")
     return chosen, remarks
@@ -1783,20 +2172,25 @@ NEGLIGIBLE = 0.1
 
 
 def _retained(
-    kinds: dict[str, str], first: Mapping[str, Number], p: Parameters, tops: Mapping[str, float]
+    kinds: dict[str, str], first: Mapping[str, Number], stage: Stage, tops: Mapping[str, float]
 ) -> tuple[str, ...]:
     """Damping that was left out and stays the vehicle file's, because the data exclude that no more than zero.
 
     Slow swings show no quadratic drag, and a vehicle without any would tumble at speeds that no trial had. None where
     the scale of thrust is free: the file's number would decide that; nor where the interval holds no more than
-    `NEGLIGIBLE` of the drag at the top speed: there the axis was seen to have one shape alone.
+    `NEGLIGIBLE` of the drag at the top speed: there the axis was seen to have one shape alone; nor where the file's
+    number is as significantly off as zero is not.
 
     Args:
         kinds: Damping of each axis.
         first: Estimates with both dampings.
-        p: What is free.
+        stage: The fit of both dampings.
         tops: Top speed of each axis [m/s, rad/s].
     """
+    from scipy.stats import norm
+
+    p, found = stage.problem.parameters, stage.found
+    std = np.sqrt(np.diagonal(found.covariance.local))
     if "thrust_scale" in p.names:
         return ()
     absent = {"linear": ("d2", p.set.quadratic_damping), "quadratic": ("d1", p.set.linear_damping)}
@@ -1810,6 +2204,8 @@ def _retained(
                 first[f"{axis}.{'d1' if name == 'd2' else 'd2'}"].value,
             )
             drag, rest = (high * tops[axis], other) if name == "d2" else (high, other * tops[axis])
-            if 0.0 < D[i][i] <= high and drag > NEGLIGIBLE * rest:
+            c = p.names.index(f"{axis}.{name}")
+            off = abs(D[i][i] - found.free[c]) > norm.isf(0.5 * SIGNIFICANT) * std[c]
+            if 0.0 < D[i][i] <= high and drag > NEGLIGIBLE * rest and not off:
                 out.append(f"{axis}.{name}")
     return tuple(out)

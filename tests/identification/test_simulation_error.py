@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from finssim.identification.programme import programmes
-from finssim.identification.simulation.fit import compared, excites, fit_by_simulation
-from finssim.identification.simulation.rollout import segments, streams
+from finssim.identification.rollout import segments, streams
+from finssim.identification.simulation_error import compared, excites, fit_by_simulation
 from finssim.identification.synthetic import simulate_programme
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import AXES, load_vehicle
+from identification import known_trials
+from identification.test_weak_form import with_bursts
 
 SET = "hydrodynamics.calibrated"
 
@@ -34,6 +36,11 @@ def wrong(vehicle):
             f"{SET}.quadratic_damping": 0.5 * np.diag(np.diag(chosen.quadratic_damping)) + 0.1 * np.eye(6),
         }
     )
+
+
+def without(some, *columns):
+    """Return trials that lack these columns."""
+    return [replace(t, channels={n: c for n, c in t.channels.items() if n not in columns}) for t in some]
 
 
 def trials_of(vehicle, axes, *, count=None, **options):
@@ -61,6 +68,7 @@ CASES = {
         0.10,
     ),
     "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
+    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("surge", "heave", "pitch"), {}, 0.05),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
         ("roll",),
@@ -186,6 +194,140 @@ def test_one_trial_says_what_its_intervals_rest_on():
     fit = fit_by_simulation(trials_of(vehicle, "yaw", count=1), wrong(vehicle))
     assert "block_intervals" in {one.code for one in fit.findings}
     assert np.isfinite(fit.estimates["yaw.m_eff"].ci95).all()
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth():
+    """Over 8 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 6."""
+    names = ("surge.m_eff", "surge.d1", "surge.d2")
+    hits = np.zeros(3)
+    for seed in range(8):
+        vehicle, some = known_trials.trials("bluerov2_heavy", "surge", seed=seed)
+        found, expected = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
+        hits += [found[n].ci95[0] <= expected[n] <= found[n].ci95[1] for n in names]
+    assert (hits >= 6).all()  # 7.6 expected; 1 in 170 has fewer
+
+
+@pytest.mark.slow
+def test_a_velocity_later_than_the_gyro_costs_no_mass():
+    """u is logged 120 ms late and the gyro is not: the lag of the one stream is found, the mass is within 5 %."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "surge")
+    late = []
+    for t in some:
+        shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
+        late.append(replace(t, channels=shifted))
+    fit = fit_by_simulation(without(late, "x", "y", "z", "depth", "ax", "ay", "az"), vehicle)
+    mass, expected = fit.estimates["surge.m_eff"], known_trials.truth(vehicle)["surge.m_eff"]
+    assert mass.estimate == pytest.approx(expected, rel=0.05) and mass.ci95[0] < expected < mass.ci95[1]
+    (lag,) = (one.values["lag"] for one in fit.findings if one.code == "motion_late")
+    assert lag == pytest.approx(0.12, abs=0.02)
+
+
+@pytest.mark.slow
+def test_all_axes_moving_at_once():
+    """A multi-sine on all axes: Coriolis terms and couplings are part of the simulation."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", *AXES, kind="multisine")
+    found, expected = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
+    for axis in AXES:
+        assert found[f"{axis}.m_eff"].estimate == pytest.approx(expected[f"{axis}.m_eff"], rel=0.03), axis
+
+
+@pytest.mark.slow
+def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
+    """Only rates and attitude are logged: yaw and roll are fitted, and surge is named as unmeasured."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "surge", "roll", "yaw")
+    fit = fit_by_simulation(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
+    assert {n.partition(".")[0] for n in fit.estimates} == {"roll", "yaw"}
+    assert ("axis_untold", "surge") in {(one.code, one.subject) for one in fit.findings}
+
+
+@pytest.mark.slow
+def test_roll_without_attitude_rests_on_its_swing():
+    """Without any angle the gyro alone shows how fast roll swings back: stiffness and mass are in their intervals."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "roll")
+    found = fit_by_simulation(without(some, "qx", "qy", "qz", "qw"), vehicle).estimates
+    for name in ("roll.m_eff", "roll.k"):
+        low, high = found[name].ci95
+        assert low <= known_trials.truth(vehicle)[name] <= high and high - low < 0.3 * found[name].estimate
+
+
+@pytest.mark.slow
+def test_bursts_of_a_wrong_wrench_make_the_intervals_wide():
+    """Two quarters of a second with three times the largest wrench in each trial: reported, nothing is identifiable."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "surge")
+    bad = [with_bursts(t, j)[0] for j, t in enumerate(some)]
+    fit, expected = fit_by_simulation(bad, vehicle), known_trials.truth(vehicle)
+    assert len([one for one in fit.findings if one.code == "jolt"]) >= 6
+    for name in ("surge.m_eff", "surge.d1", "surge.d2"):
+        low, high = fit.estimates[name].ci95
+        assert low <= expected[name] <= high and not fit.estimates[name].identifiable
+
+
+@pytest.mark.slow
+def test_axes_that_hardly_move_do_not_shake_the_others():
+    """Small pulses on roll and pitch, with velocities that are noise: both come back, and surge's numbers stay."""
+    vehicle, some = known_trials.trials("finsrov", "roll", "pitch")
+    fit, expected = fit_by_simulation(some, wrong(vehicle)), known_trials.truth(vehicle)
+    for name in ("roll.m_eff", "roll.k", "pitch.m_eff", "pitch.d1"):
+        assert fit.estimates[name].estimate == pytest.approx(expected[name], rel=0.05), name
+        low, high = fit.estimates[name].ci95
+        assert low <= expected[name] <= high
+    assert not any(path.startswith(SET) and path.rsplit(".", 2)[1] in "0125" for path in fit.changes)
+
+
+@pytest.mark.slow
+def test_dive_and_coast_gives_the_buoyancy():
+    """The coast after a dive shows the excess by itself; where it goes in the file reproduces it."""
+    vehicle, some = known_trials.trials("bluerov2", "heave")
+    fit = fit_by_simulation(some, vehicle)
+    excess = fit.estimates["buoyancy_excess"]
+    assert excess.identifiable
+    assert excess.estimate == pytest.approx(known_trials.truth(vehicle)["buoyancy_excess"], rel=0.05)
+    changed = vehicle.replace({"body.displaced_volume": fit.changes["body.displaced_volume"]})
+    assert changed.buoyancy - changed.weight == pytest.approx(excess.estimate, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_file_that_is_too_heavy_is_reported():
+    """An effective mass below the file's rigid mass: no negative added mass is written."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "surge", inputs=("wrench",))
+    fit = fit_by_simulation(some, vehicle.replace({"body.mass": 25.0, "body.displaced_volume": 0.0249}))
+    assert not fit.estimates["surge.added_mass"].identifiable
+    assert not any("added_mass.0" in path for path in fit.changes)
+    (said,) = (one for one in fit.findings if one.code == "inertia_too_small")
+    assert said.values["rigid"] == pytest.approx(25.0)
+
+
+@pytest.mark.slow
+def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
+    """The velocity of heave is another vehicle's: nothing of it is identifiable or written, and yaw is as usual."""
+    vehicle, some = known_trials.trials("bluerov2_heavy", "heave", "yaw")
+    rng = np.random.default_rng(3)
+    foreign = []
+    for t in some:
+        wander = np.convolve(rng.normal(size=len(t.t) + 100), np.hanning(101) / 20.0, "valid")
+        foreign.append(replace(t, channels=t.channels | {"w": wander}))
+    fit = fit_by_simulation(without(foreign, "x", "y", "z", "depth", "ax", "ay", "az"), vehicle)
+    of_heave = [e for n, e in fit.estimates.items() if n.startswith(("heave.", "buoyancy"))]
+    assert len(of_heave) == 5 and not any(estimate.identifiable for estimate in of_heave)
+    assert not any(".2.2" in path or path.startswith("body.") for path in fit.changes)
+    yaw = fit.estimates["yaw.m_eff"]
+    assert yaw.identifiable and yaw.estimate == pytest.approx(
+        known_trials.truth(vehicle)["yaw.m_eff"], rel=0.02
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", [("surge", "yaw"), ("surge", "heave")])
+def test_a_vehicle_that_turns_over_is_simulated_as_it_turned(axes):
+    """Surge steps pitch bluerov2 to 80°: from a wrong file, surge and the other axis come back all the same."""
+    levels = (("surge", (41.0, 82.0, 123.0)), ("sway", (31.0, 62.0, 93.0)))
+    vehicle, some = known_trials.trials("bluerov2", *axes, levels=levels)
+    added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
+    found = fit_by_simulation(some, vehicle.replace({f"{SET}.added_mass": added.tolist()})).estimates
+    for axis in axes:
+        expected = known_trials.truth(vehicle)[f"{axis}.m_eff"]
+        assert found[f"{axis}.m_eff"].estimate == pytest.approx(expected, rel=0.02), axis
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.identification.simulation.rollout import Rollouts, Segment
+from finssim.identification.rollout import Rollouts, Segment
 from finssim.sim.simulator import Simulator
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import load_vehicle
@@ -163,7 +163,7 @@ def test_the_passes_of_a_large_batch_change_nothing(monkeypatch):
     rollouts = Rollouts(vehicle, [segment(vehicle, steps_of(vehicle, 20))])
     mass = np.linspace(10.0, 14.0, 7)[:, None]
     at_once = rollouts.run({"mass": mass}).nu
-    monkeypatch.setattr("finssim.identification.simulation.rollout.BUDGET", 3 * 8000.0)
+    monkeypatch.setattr("finssim.identification.rollout.BUDGET", 3 * 8000.0)
     assert np.array_equal(rollouts.run({"mass": mass}).nu, at_once)
 
 

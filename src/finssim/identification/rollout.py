@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.core.rotations import quat_rotate, quat_to_euler
+from finssim.core.rotations import quat_from_euler, quat_rotate, quat_to_euler
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.sim.simulator import Simulator
@@ -26,6 +26,19 @@ Array = NDArray[np.float64]
 
 CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")
 """Measured columns that a simulation is compared with."""
+
+STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
+"""Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
+
+DETERMINED_BY = {
+    "surge": ("u", "x", "y"),
+    "sway": ("v", "x", "y"),
+    "heave": ("w", "z", "depth"),
+    "roll": ("p", "roll"),
+    "pitch": ("q", "pitch"),
+    "yaw": ("r", "yaw"),
+}
+"""Measured columns that determine an axis, the most direct first."""
 
 MEMORY = 1.0
 """Commands before a segment that are kept, for delay and lag of the motors [s]."""
@@ -108,6 +121,8 @@ class Streams:
     motion: Motion
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times on the trial's clock [s] and values."""
+    released: frozenset[str] = frozenset()
+    """Axes that move freely, of a trial without thrust that was cut to its free motions."""
 
 
 def streams(trial: Trial, vehicle: Vehicle) -> Streams:
@@ -163,11 +178,21 @@ def segments(
     return out
 
 
+def without(s: Streams, gaps: Sequence[tuple[float, float]]) -> Streams:
+    """Return a trial without some stretches [s]."""
+    spans = [(float(a), float(b)) for a, b in s.drive.spans]
+    for begin, end in gaps:
+        spans = [
+            part for a, b in spans for part in ((a, min(b, begin)), (max(a, end), b)) if part[1] > part[0]
+        ]
+    return replace(s, drive=replace(s.drive, spans=np.array(spans).reshape(-1, 2)))
+
+
 def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
     header, d = s.trial.header, s.drive
     memory = max(1, int(round(MEMORY / step)))
     force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
-    position, quaternion, nu, known = _start(s.motion, t0)
+    position, quaternion, nu, known = _start(s, t0)
     measured = {}
     for column, (t, values) in s.measured.items():
         # The first sample is where the segment begins, so that neighbours do not share it.
@@ -226,8 +251,9 @@ def _means(d: InputForces, edges: Array) -> Array:
     return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None])
 
 
-def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """State at a time and which of its twelve numbers are known."""
+def _start(s: Streams, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return the state at a time and which of its twelve numbers are known."""
+    m = s.motion
     i = int(np.argmin(np.abs(m.t - t0)))
     near = slice(max(i - 3, 0), i + 4)
 
@@ -243,6 +269,10 @@ def _start(m: Motion, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]
     attitude = bool(np.isfinite(quaternion).all())
     known = np.concatenate([np.isfinite(nu), np.full(3, attitude), np.isfinite(position)])
     level = np.array([0.0, 0.0, 0.0, 1.0])
+    if not attitude and "yaw" in s.measured:
+        t, heading = s.measured["yaw"]
+        level = quat_from_euler(0.0, 0.0, np.interp(t0, t, np.unwrap(heading)))
+        known[STATES.index("yaw")] = True
     return np.nan_to_num(position), quaternion if attitude else level, np.nan_to_num(nu), known
 
 

@@ -1,4 +1,4 @@
-"""From the regression of one axis to estimates, changes of the vehicle file, figures and findings."""
+"""Estimates, changes of the vehicle file and findings of one axis, from its fitted numbers."""
 
 from __future__ import annotations
 
@@ -9,154 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.identification.fit import Curve, Estimate
-from finssim.identification.regression.axis_fit import TERMS, AxisData, Selection
-from finssim.identification.regression.plant_terms import Matrices, matrices
+from finssim.identification.fit import Estimate
+from finssim.identification.plant_terms import Matrices, matrices
 from finssim.trials.findings import Finding, finding
 from finssim.vehicles import AXES, Vehicle
 
 Array = NDArray[np.float64]
-
-# How much the regression of one axis is worth: figures of the fit, whether it explains anything, and findings.
-
-EXPLAINED = 0.2
-"""R² below which the model of an axis explains nothing: at 0 the mean of the wrench does as well."""
-
-MOST_TILTED = 0.4
-"""Share of samples at large tilt beyond which what remains is not believed: pitching fast through level."""
-
-USEFUL_DRAG = 0.5
-"""Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
-
-LARGE_DELAY = 0.02
-"""Lag of the motion behind the wrench worth a warning [s]."""
-
-
-def worthless(data: AxisData, figures: dict[str, float], chosen: Selection) -> str:
-    """Why nothing that was found of an axis can be believed; empty where it can.
-
-    Args:
-        data: Its trials.
-        figures: `quality`.
-        chosen: Its model.
-    """
-    if not figures["r2"] >= EXPLAINED:
-        return f"the model explains nothing of this axis' wrench: R² {figures['r2']:.2f}"
-    if not chosen.fit.theta[M] > 0.0:
-        return f"the fit finds no inertia on this axis: free, it would be {chosen.fit.free[M]:.3g}"
-    if data.tilted > MOST_TILTED:
-        return (
-            f"{100.0 * data.tilted:.0f} % of the samples are at large tilt, where the file's numbers for other axes "
-            "decide: fit surge, sway and heave together, or push less"
-        )
-    return ""
-
-
-def drag_known(
-    d: Array,
-    free: NDArray[np.bool_],
-    covariances: Sequence[Array],
-    quantile: float,
-    speeds: Sequence[float],
-    before: tuple[float, float],
-) -> bool:
-    """Whether the drag of an axis is known at some speeds: to `USEFUL_DRAG`, or to exclude that of the vehicle file.
-
-    Args:
-        d: d1 [N s/m, N m s] and d2 [N s²/m², N m s²], (2,).
-        free: Which of them were fitted, (2,).
-        covariances: Of those that were; the widest counts.
-        quantile: Half widths of an interval, in standard deviations.
-        speeds: At which the drag has to be known [m/s, rad/s].
-        before: d1 and d2 of the file.
-    """
-    for speed in speeds:
-        powers = np.array([speed, speed**2])
-        force, w = float(powers @ d), powers[free]
-        with np.errstate(invalid="ignore"):
-            half = quantile * np.sqrt(max(max(w @ C @ w for C in covariances), 0.0))
-        if not (np.isfinite(half) and force > 0.0):
-            return False
-        if not (half < USEFUL_DRAG * force or abs(powers @ before - force) > half):
-            return False
-    return True
-
-
-def _damping_known(data: AxisData, chosen: Selection, before: tuple[float, float]) -> bool:
-    """`drag_known` at the median and near the top of the speeds of the trials."""
-    from scipy.stats import t
-
-    fit, C = chosen.fit, chosen.fit.covariance
-    at = np.flatnonzero(np.isin(np.flatnonzero(fit.terms), (D1, D2)))
-    covariances = [V[np.ix_(at, at)] for V in ((C.local, C.trials) if C.alone.any() else (C.trials,))]
-    quantile = float(t.ppf(0.975, min(float(np.min(C.dof[at], initial=np.inf)), 1e6)))
-    speeds = np.percentile(_moving(data, chosen), [50.0, 95.0]).tolist()
-    return drag_known(fit.theta[[D1, D2]], fit.terms[[D1, D2]], covariances, quantile, speeds, before)
-
-
-def _moving(data: AxisData, chosen: Selection) -> Array:
-    """Speeds of the rows that stand out of their noise; a zero where none does."""
-    speed = np.concatenate(
-        [np.abs(rows.X[used, 1]) for rows, used in zip(data.rows, chosen.fit.used, strict=True)]
-    )
-    top = float(np.percentile(speed, 95.0)) if len(speed) else 0.0
-    moving = speed[speed > 0.02 * top]
-    return moving if len(moving) else np.zeros(1)
-
-
-def speed_range(data: AxisData, chosen: Selection) -> tuple[float, float]:
-    """5th and 95th percentile of the speeds that damping rests on: rows whose speed stands out of its noise."""
-    moving = _moving(data, chosen)
-    if len(moving) < 5:
-        return 0.0, float(moving.max())
-    low, high = np.percentile(moving, [5.0, 95.0])
-    return float(low), float(high)
-
-
-def quality(data: AxisData, chosen: Selection) -> dict[str, float]:
-    """Figures of the fit."""
-    fit = chosen.fit
-    y = np.concatenate([rows.y[used] for rows, used in zip(data.rows, fit.used, strict=True)])
-    p = np.concatenate([line[used] for line, used in zip(fit.fitted, fit.used, strict=True)])
-    rmse = float(np.sqrt(np.mean((y - p) ** 2)))
-    spread = float(np.percentile(y, 95.0) - np.percentile(y, 5.0))
-    low, high = speed_range(data, chosen)
-    return {
-        "r2": 1.0 - rmse**2 / max(float(np.var(y)), 1e-300),
-        "rmse": rmse,
-        "nrmse": rmse / max(spread, 1e-300),
-        "samples": float(sum(rows.samples for rows in data.rows)),
-        "rejected": float(sum(rows.rejected for rows in data.rows)),
-        "trials": float(len(data.rows)),
-        "independent": float(fit.independent),
-        "speed_low": low,
-        "speed_high": high,
-        "delay": float(fit.theta[DELAY] + data.shift),
-        **{f"p_{name}": value for name, value in chosen.p_value.items()},
-    }
-
-
-def axis_findings(axis: str, data: AxisData, chosen: Selection) -> list[Finding]:
-    """What may be wrong with the fit of an axis."""
-    fit, out = chosen.fit, []
-    lag, value = chosen.interval[DELAY] + data.shift, fit.theta[DELAY] + data.shift
-    if abs(value) > LARGE_DELAY and (lag[0] > 0.0 or lag[1] < 0.0):
-        sense = "lags" if value > 0 else "leads"
-        out.append(finding("motion_late", axis, sense=sense, lag=abs(value), low=lag[0], high=lag[1]))
-    if not fit.instrumental:
-        out.append(finding("least_squares", axis))
-    if fit.evidence.unit == "blocks":
-        out.append(finding("block_intervals", axis, trials=len(data.rows)))
-    level = [s.name for s in data.signals if not np.isfinite(s.up).any()]
-    if level:
-        out.append(finding("attitude_missing", axis, trials=tuple(level)))
-    unknown = sorted({j for s in data.signals for j in s.unknown})
-    if unknown:
-        out.append(finding("velocity_unknown", axis, axes=tuple(str(AXES[j]) for j in unknown)))
-    return out
-
-
-M, D1, D2, BIAS, DELAY, SMOOTHING, K = range(len(TERMS))
 
 CERTAIN = 0.2
 """Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
@@ -322,43 +180,6 @@ class AxisResult:
         self.findings.append(finding("axis_refused", self.axis, reason=reason))
 
 
-def regression_result(data: AxisData, chosen: Selection, file: Matrices) -> tuple[AxisResult, str]:
-    """The result of an axis from its regression, and why nothing of it can be believed; empty where it can.
-
-    Args:
-        data: Its trials.
-        chosen: Its model.
-        file: The vehicle as its file has it.
-    """
-    fit, i, axis = chosen.fit, data.axis, AXES[data.axis]
-    numbers = {}
-    for term, name in enumerate(TERMS):
-        if name in UNITS and fit.terms[term]:
-            ends = (float(chosen.interval[term, 0]), float(chosen.interval[term, 1]))
-            free = float(fit.free[term]) if fit.active[term] else None
-            numbers[name] = Number(float(fit.theta[term]), ends, free)
-    dropped = {name: tuple(chosen.interval[TERMS.index(name)]) for name in chosen.dropped}
-    before = (float(file.D1[i, i]), float(file.D2[i, i]))
-    result = AxisResult(
-        axis=axis, numbers=numbers, file=file, speeds=speed_range(data, chosen), dropped=dropped,
-        drag_known=_damping_known(data, chosen, before), given=data.inertia,
-    )  # fmt: skip
-    if data.shift and data.inertia is None and not fit.active[M]:
-        lag = 1e3 * (data.shift + fit.theta[DELAY])
-        late = (
-            f"the motion lags the file's motors by {lag:.0f} ms: if that is a lag of first order and not a delay, the "
-            "inertia may read too high: fit the motors first"
-        )
-        whole = result.estimates[f"{axis}.m_eff"]
-        note = "; ".join(filter(None, [whole.note, late]))
-        result.estimates[whole.name] = replace(whole, note=note)
-    result.findings += axis_findings(axis, data, chosen)
-    reason = worthless(data, quality(data, chosen), chosen)
-    if reason:
-        result.believe_nothing(reason)
-    return result, reason
-
-
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
     """Where the centre of buoyancy sits for the constant moments of roll and pitch, as of a vehicle that lies tilted.
 
@@ -415,21 +236,3 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:
     """Whether a number lies outside an interval that has two ends."""
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
-
-
-def curves_of(data: AxisData, chosen: Selection) -> list[Curve]:
-    """Wrench, and velocity simulated from the wrench alone, over all trials of an axis."""
-    axis, linear, wrench, velocity = AXES[data.axis], data.axis < 3, [], []
-    for g, (s, rows) in enumerate(zip(data.signals, data.rows, strict=True)):
-        wrench.append((s.t[rows.at], rows.y, chosen.fit.fitted[g]))
-        if chosen.fit.simulated:
-            inside = np.zeros(len(s.t), bool)
-            for begin, end in rows.spans:
-                inside[begin:end] = True
-            both = (s.nu[:, data.axis], chosen.fit.simulated[g])
-            velocity.append((s.t, *(np.where(inside, line, np.nan) for line in both)))
-    out = [Curve.joined(f"{axis}: wrench", "force [N]" if linear else "moment [N m]", wrench)]
-    if velocity:
-        title = f"{axis}: velocity, simulated from the wrench alone"
-        out.append(Curve.joined(title, "velocity [m/s]" if linear else "rate [rad/s]", velocity))
-    return out

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.identification.simulation.fit import Linear, Point, blocks_of, solve, step_of, weights_of
+from finssim.identification.simulation_error import Linear, Point, blocks_of, solve, step_of, weights_of
 from finssim.survey.least_squares import Block, arrow_reduced
 
 

@@ -1,0 +1,64 @@
+"""The vehicle's matrices and hydrostatics about the reference point of its coefficients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.sim.plant_arrays import twist_shift
+from finssim.trials.findings import CalibrationError
+from finssim.vehicles import HydrodynamicSet, Vehicle
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matrices:
+    """6x6 matrices and hydrostatics about one point of the body."""
+
+    H: Array
+    """Twist there from the twist at the body origin, (6, 6)."""
+    M_RB: Array
+    """Rigid-body inertia [kg, kg m²]."""
+    M_A: Array
+    """Added mass [kg, kg m²]."""
+    D1: Array
+    """Linear damping [N s/m, N m s]."""
+    D2: Array
+    """Quadratic damping [N s²/m², N m s²]."""
+    excess: float
+    """Buoyancy less weight, submerged [N]."""
+    arm: Array
+    """B r_b - W r_g from the reference point [N m], (3,): the hydrostatic moment is arm × up."""
+
+
+def matrices(vehicle: Vehicle) -> Matrices:
+    """Return the matrices of a vehicle file.
+
+    Args:
+        vehicle: The vehicle.
+
+    Raises:
+        CalibrationError: The set has no coefficients to calibrate.
+    """
+    chosen = vehicle.hydrodynamics.get("calibrated")
+    if not isinstance(chosen, HydrodynamicSet):
+        raise CalibrationError(
+            f"{vehicle.name}: no coefficients in hydrodynamics.calibrated, expected a set with linear_damping and "
+            "quadratic_damping: add one, zeros will do, for the fit to fill"
+        )
+    r = np.asarray(chosen.reference_point, float)
+    H = twist_shift(r.tolist())
+    back = np.linalg.inv(H)
+    body = vehicle.body
+    return Matrices(
+        H=H,
+        M_RB=back.T @ vehicle.rigid_body_mass_matrix() @ back,
+        M_A=np.array(chosen.added_mass, float),
+        D1=np.array(chosen.linear_damping, float),
+        D2=np.array(chosen.quadratic_damping, float),
+        excess=vehicle.buoyancy - vehicle.weight,
+        arm=vehicle.buoyancy * (body.center_of_buoyancy - r) - vehicle.weight * (body.center_of_gravity - r),
+    )

@@ -1,1 +1,0 @@
-"""Hydrodynamics axis by axis, from driven and from passive trials."""

@@ -1,1 +1,0 @@
-"""Hydrodynamics by simulation error: candidate plants as parallel worlds."""
