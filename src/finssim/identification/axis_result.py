@@ -20,7 +20,7 @@ CERTAIN = 0.2
 """Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
 
 USEFUL = 0.5
-"""The same, up to which an inertia is written to the vehicle file: better than a guess."""
+"""Half width, as a part of the estimate, up to which an inertia is written to the vehicle file: better than a guess."""
 
 DECADE = 10.0
 
@@ -38,7 +38,7 @@ UNITS = {
     "bias": ("N", "N m"),
     "k": ("N m/rad", "N m/rad"),
 }
-"""Of the numbers of an axis: along it, and about it."""
+"""Units of the numbers of an axis, along it and about it."""
 
 
 class Number(NamedTuple):
@@ -48,7 +48,7 @@ class Number(NamedTuple):
     ends: tuple[float, float]
     """95 % interval; not finite where the trials do not determine it."""
     free: float | None = None
-    """What it would be without the bound that it rests on; None where it rests on none."""
+    """Estimate without the bound that it rests on; None where it rests on none."""
 
 
 @dataclass(kw_only=True)
@@ -61,17 +61,17 @@ class AxisResult:
 
     axis: str
     numbers: Mapping[str, Number]
-    """Of `UNITS`, what was fitted."""
+    """Fitted numbers by name, of `UNITS`."""
     file: Matrices
     """The vehicle as its file has it."""
     speeds: tuple[float, float]
     """Lowest and highest that the damping rests on [m/s, rad/s]."""
     drag_known: bool
-    """Whether the damping is known well enough to be written; both of its terms are, or neither."""
+    """True if the damping is known well enough to be written; both of its terms are written, or neither."""
     dropped: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Damping that was left out, because the data do not show it -> its 95 % interval."""
     retained: Set[str] = frozenset()
-    """Of that, what stays the vehicle file's, for the data exclude it as little as zero."""
+    """Names of the dropped terms that stay the vehicle file's, for the data exclude it as little as zero."""
     given: float | None = None
     """Effective inertia where it is known [kg, kg m²]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -110,11 +110,11 @@ class AxisResult:
             self.findings.append(finding("few_speeds", self.axis, low=low, high=high, unit=unit))
 
     def path(self, family: str) -> str:
-        """Of the axis' own entry in a matrix of the vehicle file."""
+        """Return the path of the axis' own entry in a matrix of the vehicle file."""
         return f"{SET}.{family}.{self.i}.{self.i}"
 
     def value(self, name: str) -> float:
-        """Of a number; where it was not fitted 0, or the vehicle file's."""
+        """Return a fitted number; 0, or the vehicle file's, where it was not fitted."""
         if name in self.retained:
             return float({"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i])
         return self.numbers[name].value if name in self.numbers else 0.0
@@ -181,7 +181,7 @@ class AxisResult:
 
 
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
-    """Where the centre of buoyancy sits for the constant moments of roll and pitch, as of a vehicle that lies tilted.
+    """Return the centre of buoyancy that gives the constant moments of roll and pitch of a vehicle that lies tilted.
 
     B r_b - W r_g = (b_pitch, -b_roll, k), of which the centre of gravity stays.
 
@@ -234,5 +234,5 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
 
 
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:
-    """Whether a number lies outside an interval that has two ends."""
+    """Return whether a number lies outside an interval that has two ends."""
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])

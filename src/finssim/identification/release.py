@@ -113,7 +113,7 @@ def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
     if after.sum() < FEWEST_SAMPLES or span < 1.0:
         raise refusal
     frequencies = np.linspace(max(SLOWEST, 1.0 / span), FASTEST, 400)
-    fade = np.exp(-2.0 * (t[after] - begin) / span)  # the first swings stand out most
+    fade = np.exp(-2.0 * (t[after] - begin) / span)  # the first swings are the largest
     power = lombscargle(t[after], (smooth[after] - smooth[after].mean()) * fade, 2.0 * np.pi * frequencies)
     period = 1.0 / float(frequencies[int(np.argmax(power))])
     end, swing = begin, np.inf

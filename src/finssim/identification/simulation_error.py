@@ -707,7 +707,7 @@ UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e
 """Standard deviation of unmeasured values; heading and place do not matter then."""
 
 UNMOVED = np.array([0.05] * 6 + [0.3, 0.3, *UNKNOWN[8:]])
-"""The same in a free motion, where nothing drives the axes that were not measured."""
+"""Standard deviation of unmeasured values in a free motion, where nothing drives the other axes."""
 
 LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
 """Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
@@ -729,7 +729,7 @@ RELATIVE_STEP = 0.006
 """Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
 
 FORCE_STEP = 0.15
-"""The same of damping and excess of a rise, which nearly trade off: the rounding of small steps would look like
+"""Relative step of damping and excess of a rise, which nearly trade off: the rounding of small steps would look like
 knowledge."""
 
 GRAIN = 0.004
@@ -838,7 +838,7 @@ class Shooting:
         forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
         self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
         if "thrust_delay" in parameters.names or free:
-            # Nothing tells a common lag of all streams from a delay of the thrust: the first stream is the clock then.
+            # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
             self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
@@ -1070,7 +1070,7 @@ LAG_CERTAIN = 0.05
 """Half width of the interval of a delay up to which it counts as identifiable [s]."""
 
 EXCESS_CERTAIN = 0.02
-"""The same of buoyancy less weight, as a part of the weight."""
+"""Half width of the interval of buoyancy less weight, as a part of the weight, up to which it is identifiable."""
 
 PATHS = {
     "buoyancy_excess": "body.displaced_volume",
@@ -1259,7 +1259,7 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
 
 
 def answers(motion: Motion, i: int) -> bool:
-    """Return whether the velocity of an axis, 0 surge to 5 yaw, stands out of its noise."""
+    """Return whether the velocity of an axis, 0 surge to 5 yaw, exceeds its noise."""
     noise = motion.noise_std[i]
     return _range(motion.nu[:, i]) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
 

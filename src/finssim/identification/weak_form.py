@@ -90,7 +90,7 @@ def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Map
     loud = size > max(JOLT * std, PART * pushed) if known_force else np.zeros(len(y), bool)
     jolts, row = list[tuple[int, float, float]](), 0
     for g, matrix, _, at in parts:
-        # A velocity that was derived from places jumps by itself.
+        # A velocity that was derived from positions has jumps without any force.
         seen = loud[row : row + len(matrix)] & (DETERMINED_BY[axis][0] in trials[g].measured)
         jolts += [(g, float(at[a]) - WIDER, float(at[b - 1]) + WIDER) for a, b in spans_of(seen)]
         row += len(matrix)
