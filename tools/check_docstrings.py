@@ -15,7 +15,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -37,19 +37,7 @@ NAMED = {"quaternion", "orientation", "rotation", "pixel", "pixels", "mask"}
 REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat)\d*[df]?|transform")
 VECTORS = re.compile(r"(vec|mat|quat)\d*[df]?")
 ARRAYS = {"NDArray", "ndarray", "ArrayLike", "Tensor", "array", "array2d", "array3d", "array4d"}
-SEVERAL = {
-    "Mapping",
-    "Sequence",
-    "Iterable",
-    "Iterator",
-    "tuple",
-    "list",
-    "dict",
-    "str",
-    "Any",
-    "Annotated",
-    "Optional",
-}
+SEVERAL = set("Mapping Sequence Iterable Iterator tuple list dict str Any Annotated Optional".split())
 """Types of which nothing is known of the numbers in them."""
 UNIT = re.compile(
     r"\[[^\]\n]*\]|\bunits?\b|\bpixels?\b|\bin (metres|seconds|radians|degrees)\b", re.IGNORECASE
@@ -64,11 +52,6 @@ PURE = re.compile(
 REFERENCE = re.compile(r"\b(as|see)\b[^.;\n]*`", re.IGNORECASE)
 SHAPE = re.compile(r"\((?:[A-Za-z0-9_.+* -]+,)+[A-Za-z0-9_.+* ,-]*\)")
 FRAME = re.compile(r"\b(frame|axes|body|world|pool|camera|optical|map|reference)\b", re.IGNORECASE)
-
-PENDING = {
-    "finssim.identification",
-}
-"""Packages of which only parameters that are named as a quantity are judged yet."""
 
 
 @cache
@@ -152,22 +135,19 @@ def entry(text: str, name: str) -> str | None:
     return found and found.group(2)
 
 
-def missing(
-    function: ast.FunctionDef, module: str = "", about: str = "", by_type: bool = True
-) -> Iterator[str]:
+def missing(function: ast.FunctionDef, module: str = "", about: str = "") -> Iterator[str]:
     """Yield what the docstring of a function does not state.
 
     Args:
         function: The function.
         module: Module whose names its annotations use.
         about: Docstring of the class, of a constructor.
-        by_type: Whether types are judged; otherwise only parameters that are named as a quantity.
     """
     text = f"{ast.get_docstring(function) or ''}\n{about}"
     for parameter in [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]:
         names = types(module, parameter.annotation)
         words = set(parameter.arg.lower().split("_"))
-        if not is_real(names) or not (by_type or words & QUANTITIES):
+        if not is_real(names):
             continue
         own = entry(text, parameter.arg) or text
         if not has_unit(own) and not words & NAMED:
@@ -177,7 +157,7 @@ def missing(
         vector = names & ARRAYS or any(VECTORS.fullmatch(name) for name in names)
         if vector and words & DIRECTED and not FRAME.search(text):
             yield f"{parameter.arg}: frame"
-    if by_type and is_real(types(module, function.returns)):
+    if is_real(types(module, function.returns)):
         section = re.search(r"^ *(?:Returns|Yields):\n(.*?)(?:\n\n|\Z)", text, re.MULTILINE | re.DOTALL)
         if not has_unit(section.group(1) if section else text.partition("Args:\n")[0]):
             yield "what it returns: unit"
@@ -201,37 +181,26 @@ def missing_of_fields(kind: ast.ClassDef, module: str = "") -> Iterator[str]:
                 yield f"{name}: unit"
 
 
-def lacking(tree: ast.Module, module: str, by_type: bool) -> Iterator[tuple[str, list[str]]]:
+def lacking(tree: ast.Module, module: str) -> Iterator[tuple[str, list[str]]]:
     """Yield what is missing for each public function, class and method of a module."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
-            yield node.name, list(missing(node, module, by_type=by_type))
+            yield node.name, list(missing(node, module))
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-            if by_type:
-                yield node.name, list(missing_of_fields(node, module))
+            yield node.name, list(missing_of_fields(node, module))
             for own in node.body:
                 if isinstance(own, ast.FunctionDef) and "setter" in "".join(
                     map(ast.unparse, own.decorator_list)
                 ):
                     continue  # its property has the docstring
-                made = isinstance(own, ast.FunctionDef) and own.name == "__init__" and by_type
+                made = isinstance(own, ast.FunctionDef) and own.name == "__init__"
                 if isinstance(own, ast.FunctionDef) and (made or not own.name.startswith("_")):
                     about = ast.get_docstring(node) or "" if made else ""
-                    yield f"{node.name}.{own.name}", list(missing(own, module, about, by_type))
+                    yield f"{node.name}.{own.name}", list(missing(own, module, about))
 
 
-def package_of(module: str) -> str:
-    """Return the package of a module: two names, of an extension three."""
-    parts = module.split(".")
-    return ".".join(parts[: 3 if parts[1:2] == ["extensions"] else 2])
-
-
-def found(pending: Collection[str] = PENDING) -> dict[str, list[str]]:
-    """Return what is missing, by function or class.
-
-    Args:
-        pending: Packages of which only parameters that are named as a quantity are judged.
-    """
+def found() -> dict[str, list[str]]:
+    """Return what is missing, by function or class."""
     out = {}
     files = [(path, ROOT / "src") for path in sorted((ROOT / "src").rglob("*.py"))]
     for path, source in [*files, *((path, ROOT) for path in sorted((ROOT / "studies").rglob("*.py")))]:
@@ -240,7 +209,7 @@ def found(pending: Collection[str] = PENDING) -> dict[str, list[str]]:
         module = ".".join(path.relative_to(source).with_suffix("").parts).removesuffix(".__init__")
         tree = tree_of(module)
         assert tree is not None
-        for name, what in lacking(tree, module, package_of(module) not in pending):
+        for name, what in lacking(tree, module):
             if what:
                 out[f"{module}:{name}"] = what
     return out

@@ -46,9 +46,9 @@ class Number(NamedTuple):
 
     value: float
     ends: tuple[float, float]
-    """95 % interval; not finite where the trials do not determine it."""
+    """95 % interval in the unit of the number; not finite where the trials do not determine it."""
     free: float | None = None
-    """Estimate without the bound that it rests on; None where it rests on none."""
+    """Estimate without the bound that it rests on, in the unit of the number; None where it rests on none."""
 
 
 @dataclass(kw_only=True)
@@ -69,7 +69,7 @@ class AxisResult:
     drag_known: bool
     """True if the damping is known well enough to be written; both of its terms are written, or neither."""
     dropped: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Damping that was left out, because the data do not show it -> its 95 % interval."""
+    """Damping that was left out, because the data do not show it -> its 95 % interval in the unit of the damping."""
     retained: Set[str] = frozenset()
     """Names of the dropped terms that stay the vehicle file's, for the data exclude it as little as zero."""
     given: float | None = None
@@ -114,7 +114,7 @@ class AxisResult:
         return f"{SET}.{family}.{self.i}.{self.i}"
 
     def value(self, name: str) -> float:
-        """Return a fitted number; 0, or the vehicle file's, where it was not fitted."""
+        """Return a fitted number in its unit; 0, or the vehicle file's, where it was not fitted."""
         if name in self.retained:
             return float({"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i])
         return self.numbers[name].value if name in self.numbers else 0.0
@@ -128,7 +128,7 @@ class AxisResult:
         note: str,
         path: str | None = None,
     ) -> Estimate:
-        """Take an estimate."""
+        """Take an estimate. Value and interval are in `unit`."""
         unit = UNITS["m_eff" if name == "added_mass" else name][self.i > 2]
         name, ends = f"{self.axis}.{name}", (float(ends[0]), float(ends[1]))
         self.estimates[name] = Estimate(
@@ -155,7 +155,7 @@ class AxisResult:
         return self.note(name, value, (low, high), sure, note, path)
 
     def added_mass(self, rigid: float) -> None:
-        """m_eff less the rigid part."""
+        """m_eff less the rigid part. The rigid part is in [kg] or [kg m²]."""
         whole = self.estimates[f"{self.axis}.m_eff"]
         value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
         sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
@@ -185,6 +185,8 @@ def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]
 
     B r_b - W r_g = (b_pitch, -b_roll, k), of which the centre of gravity stays.
 
+    Places are in [m].
+
     Args:
         found: Estimates, `roll.bias` and `pitch.bias` among them.
         buoyancy: B [N].
@@ -206,7 +208,7 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
         vehicle: As its file has it.
 
     Returns:
-        Changes of the vehicle file, and a finding where roll and pitch disagree.
+        Changes of the vehicle file in its units, and a finding where roll and pitch disagree.
     """
     body, water, findings = vehicle.body, vehicle.water, list[Finding]()
     changes: dict[str, float] = {}
@@ -234,5 +236,5 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
 
 
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:
-    """Return whether a number lies outside an interval that has two ends."""
+    """Return whether a number lies outside an interval of the same unit that has two ends."""
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])

@@ -19,7 +19,7 @@ class Matrices:
     """6x6 matrices and hydrostatics about one point of the body."""
 
     H: Array
-    """Twist there from the twist at the body origin, (6, 6)."""
+    """Twist there from the twist at the body origin [-, m], (6, 6)."""
     M_RB: Array
     """Rigid-body inertia [kg, kg m²]."""
     M_A: Array

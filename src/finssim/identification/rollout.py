@@ -67,7 +67,8 @@ class Segment:
     """Command of the motors in each step [N, N m]: the mean of a held command; of an applied force, which is linear
     between samples, the value at the step's end. (steps, k)"""
     before: Array
-    """Command in the steps before, the newest last; repeats the first value before the trial began. (m, k)"""
+    """Command in its unit in the steps before, the newest last; repeats the first value before the trial began. (m,
+    k)"""
     B: Array
     """Wrench about the body origin per unit force, (6, k)."""
     commanded: bool
@@ -99,7 +100,8 @@ class Segment:
     depth_at: Array
     """Body point of the pressure sensor [m]."""
     held: Array | None = None
-    """nu that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is free."""
+    """nu [m/s, rad/s] that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is
+    free."""
 
     @property
     def steps(self) -> int:

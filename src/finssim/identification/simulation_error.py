@@ -91,8 +91,11 @@ class Coordinate:
     name: str
     unit: str
     start: float
+    """First value, in the unit of the coordinate."""
     low: float
+    """Lower bound, in the unit of the coordinate."""
     high: float
+    """Upper bound, in the unit of the coordinate."""
     scale: float
     """Size of a large change; finite differences take a small share of it as step."""
 
@@ -102,7 +105,7 @@ class Plants:
     """Simulator's parameters for W vectors."""
 
     fields: dict[str, Array]
-    """Fields of `VehicleParameters`, (W, 1, ...)."""
+    """Fields of `VehicleParameters` in their units, (W, 1, ...)."""
     bias: Array
     """Constant wrench that acts, about the body origin, body frame [N, N m], (W, 1, 6)."""
     lag: Array | None
@@ -160,7 +163,7 @@ class Parameters:
             extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
             biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
                 M nu_dot + D nu + b = tau.
-            start: Coordinate -> where it starts, in place of the vehicle file's number.
+            start: Coordinate -> where it starts, in its unit, in place of the vehicle file's number.
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
             unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
@@ -253,7 +256,7 @@ class Parameters:
         return len(self.imposed) + 2 * len(self.unseen)
 
     def mass_floor(self) -> Array:
-        """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there.
+        """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there [kg, kg m²].
 
         M_RB (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ
         below the smallest eigenvalue of M scaled by c.
@@ -269,11 +272,14 @@ class Parameters:
     # -- plants -------------------------------------------------------------------------------------------------
 
     def value(self, x: Array, name: str, default: float | None = None) -> Any:
-        """Column of a coordinate in vectors (W, P), or a default."""
+        """Column of a coordinate in vectors (W, P), or a default. The unit is that of the coordinate."""
         return x[:, self._at[name]] if name in self._at else default
 
     def matrices(self, x: Array) -> tuple[Array, Array, Array]:
-        """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each."""
+        """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each.
+
+        Units: [kg], [N s/m] and [N s²/m²], with the corresponding ones of moments.
+        """
         x = np.clip(np.atleast_2d(x), self.low, self.high)
         M_A, D1, D2 = (np.repeat(m[None], len(x), axis=0) for m in (self.M_A, self.D1, self.D2))
         for name, c in self._at.items():
@@ -344,20 +350,20 @@ class Point(NamedTuple):
     """Values of all unknowns; with a leading axis of candidates where several are evaluated together."""
 
     theta: Array
-    """Shared by all segments, (P,)."""
+    """Coordinates shared by all segments in their units, (P,)."""
     z: Array
-    """Coordinates of each segment, as deviations from the prior's mean, (S, q)."""
+    """Coordinates of each segment in their units, as deviations from the prior's mean, (S, q)."""
 
 
 class Linear(NamedTuple):
     """Residuals at a point, sorted by segment, and derivatives of the predictions."""
 
     residual: Array
-    """Measured minus predicted, (N,)."""
+    """Measured minus predicted in the unit of the channel, (N,)."""
     shared: Array
-    """d predicted / d theta, (N, P)."""
+    """d predicted / d theta in the units of both, (N, P)."""
     own: Array
-    """d predicted / d z of the sample's own segment, (N, q)."""
+    """d predicted / d z of the sample's own segment, in the units of both, (N, q)."""
 
 
 @dataclass(frozen=True)
@@ -366,15 +372,15 @@ class Solution:
 
     point: Point
     std: Array
-    """Standard deviation of every sample, (N,)."""
+    """Standard deviation of every sample in the unit of its channel, (N,)."""
     cost: float
-    """Half the sum of the losses."""
+    """Half the sum of the losses [-]."""
     linear: Linear
     iterations: int
     converged: bool
     """True if the last step is negligible relative to the error that independent noise would leave."""
     step: Array
-    """Change of theta by an undamped step, (P,)."""
+    """Change of theta, in its units, by an undamped step, (P,)."""
     interrupted: bool = False
 
 
@@ -384,7 +390,10 @@ def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
 
 
 def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
-    """Weighted normal equations of every segment with the prior of z; that of theta is in the first."""
+    """Weighted normal equations of every segment with the prior of z; that of theta is in the first.
+
+    `std` has the unit of each sample; `cut` is in standard deviations [-].
+    """
     root = np.sqrt(weights_of(linear.residual, std, cut))
     shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
     blocks = []
@@ -403,9 +412,11 @@ def step_of(
 ) -> tuple[Array, Array, Array]:
     """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
 
+    They have the units of the coordinates.
+
     Args:
         problem: For its box.
-        reduced: Normal equations of theta alone at the point, and how z follows; of `arrow_reduced`.
+        reduced: Normal equations of theta alone at the point, per unit of theta, and how z follows; of `arrow_reduced`.
         point: Where the step begins.
         damping: What the diagonal of theta's grows by, as a part of itself [-].
     """
@@ -419,7 +430,10 @@ def step_of(
 
 
 def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
-    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer."""
+    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer.
+
+    Residuals and `std` have the unit of each sample; losses have none [-].
+    """
     prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
     prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
     loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
@@ -444,7 +458,8 @@ def solve(
         problem: What to fit.
         start: Where to begin.
         iterations: At most.
-        std: Of every sample at the start, (N,); from the residuals there if None.
+        std: Standard deviation of every sample at the start, in the unit of its channel, (N,); from the residuals there
+            if None.
         rough: Far from a solution: keep `std`, and let no residual count as an outlier, for that is what a wrong
             parameter looks like too. Ends as soon as an iteration gains less than a hundredth.
         report: Called with each iteration and the root mean square of the whitened residuals.
@@ -574,7 +589,7 @@ class Residuals:
         return value, rate
 
     def difference(self, predicted: Array) -> Array:
-        """Measured minus predicted, angles the short way round, (N, C)."""
+        """Measured minus predicted, angles the short way round, (N, C). The unit is that of the channel."""
         out = self.value[:, None] - predicted
         for j, name in enumerate(self.names):
             if name in EULER:
@@ -585,9 +600,11 @@ class Residuals:
     def noise(self, residual: Array, floor: Array) -> Array:
         """Standard deviation of each channel from clipped residuals, (channels,).
 
+        It has the unit of the channel.
+
         Args:
-            residual: Measured minus predicted, (N,).
-            floor: Smallest per channel, (channels,).
+            residual: Measured minus predicted in the unit of the channel, (N,).
+            floor: Smallest per channel, in its unit, (channels,).
         """
         out = np.array(floor, float)
         for j in range(len(self.names)):
@@ -604,7 +621,10 @@ class Residuals:
         return out
 
     def spread(self) -> Array:
-        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,)."""
+        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,).
+
+        It has the unit of the channel.
+        """
         out = np.zeros(len(self.names))
         for a, b in zip(self.edges, self.edges[1:], strict=False):
             for j in np.unique(self.channel[a:b]):
@@ -613,7 +633,10 @@ class Residuals:
         return out
 
     def roughness(self) -> Array:
-        """Noise of each channel from third differences of successive samples, robust, (channels,)."""
+        """Noise of each channel from third differences of successive samples, robust, (channels,).
+
+        It has the unit of the channel.
+        """
         out = np.zeros(len(self.names))
         for j in range(len(self.names)):
             parts = [
@@ -638,7 +661,7 @@ def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArr
         segments: Give the sensors' places.
 
     Returns:
-        (n + 1, C, S)
+        Values in the unit of the response, (n + 1, C, S).
     """
     nu, q = response.nu, response.quaternion
     if name in ("p", "q", "r"):
@@ -862,7 +885,7 @@ class Shooting:
         return float(costs_of(self, self.residuals(one), self.size(), one)[0])
 
     def residuals(self, points: Point) -> Array:
-        """Measured minus predicted of several points, (N, C)."""
+        """Measured minus predicted of several points, (N, C). They have the unit of the channel."""
         return self._residual(points, self._predicted(points)[0])
 
     def _residual(self, points: Point, value: Array) -> Array:
@@ -948,7 +971,7 @@ class Shooting:
         return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 
     def grain(self, theta: Array) -> Array:
-        """Return negligible differences of theta, (P,)."""
+        """Return negligible differences of theta, (P,). They have the units of theta."""
         P = len(self.parameters.names)
         size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
         return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
@@ -959,12 +982,15 @@ class Shooting:
         self.low[late], self.high[late] = -far, far
 
     def size(self) -> Array:
-        """Return the size of a large residual of every sample far from a solution, (N,)."""
+        """Return the size of a large residual of every sample far from a solution, (N,).
+
+        It has the unit of the channel.
+        """
         size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
         return np.asarray(size[self.measured.channel])
 
     def noise(self, residual: Array) -> Array:
-        """Standard deviation of every sample: that of its channel."""
+        """Standard deviation of every sample: that of its channel. It has the unit of the channel."""
         return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
 
 
@@ -983,12 +1009,14 @@ class Confidence(NamedTuple):
     evidence: Evidence
     covariance: Covariance
     free: Array
-    """Result of the last step without bounds, (P,)."""
+    """Result of the last step without bounds, in the units of theta, (P,)."""
     interval: Array
-    """95 %, around `free` and containing theta, (P, 2)."""
+    """95 % interval in the units of theta, around `free` and containing theta, (P, 2)."""
 
     def variance(self, slope: Array, at: Sequence[int]) -> float:
         """Return the variance of a sum of some parameters.
+
+        It has the unit of the sum squared.
 
         Args:
             slope: Factor of each, (n,).
@@ -1086,7 +1114,7 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
 
     Args:
         p: What was free.
-        x: Where it ended, (P,).
+        x: Where the fit ended, in the units of the coordinates, (P,).
         found: Evidence there.
         own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
     """
@@ -1330,7 +1358,10 @@ def _shown_by(
 def quality(
     problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
 ) -> dict[str, dict[str, float]]:
-    """Figures of each axis over the trials that move it: the simulated against the measured channel."""
+    """Figures of each axis over the trials that move it: the simulated against the measured channel.
+
+    Units are those of the channel; R² and NRMSE have none.
+    """
     out = {}
     for axis in axes:
         name, rows, trial, spans = _shown_by(problem, axis)
@@ -1359,7 +1390,10 @@ def quality(
 def unexplained(
     problem: Shooting, solution: Solution, axis: str, used: Sequence[Streams]
 ) -> tuple[str, float]:
-    """Return the trial of a free motion that the fit explains least, and its R²; infinite without any."""
+    """Return the trial of a free motion that the fit explains least, and its R²; infinite without any.
+
+    R² has no unit.
+    """
     _, rows, trial, _ = _shown_by(problem, axis)
     worst, least = "", np.inf
     for g, one in enumerate(used):
@@ -1457,7 +1491,7 @@ def changes(
 
     Args:
         p: What was free.
-        x: Where it ended, (P,).
+        x: Where the fit ended, in the units of the coordinates, (P,).
         found: All estimates.
         axes: Changes of the axes' own numbers.
         unmeasured: Axes that were simulated because no trial measured them: the others hold with their numbers.
@@ -1530,7 +1564,7 @@ class Stage:
 
     @property
     def x(self) -> Array:
-        """Return the final parameters, (P,)."""
+        """Return the final parameters, (P,). They have the units of the coordinates."""
         return self.solution.point.theta[: len(self.problem.parameters.names)]
 
 
@@ -1633,7 +1667,10 @@ class Stages:
         return start
 
     def rough(self, kinds: dict[str, str], starts: Sequence[Mapping[str, float]]) -> Stage:
-        """Fit short segments from the best of several starts, without regard to outliers and clocks."""
+        """Fit short segments from the best of several starts, without regard to outliers and clocks.
+
+        Starts have the units of the coordinates.
+        """
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
         problem = min((self.problem(kinds, start) for start in starts), key=lambda one: one.cost(one.start()))
@@ -1709,6 +1746,7 @@ class Stages:
         return numbers_of(stage.problem.parameters, stage.x, stage.found, self.own_error)
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
+        """Return a function that reports an iteration and its residual; `toward` is the share of the work done then."""
         return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
 
     def cut(self, length: float) -> None:
@@ -1742,7 +1780,10 @@ class Stages:
         return self.shorter.get(one.trial.name, 1.0)
 
     def parameters(self, kinds: dict[str, str], start: Mapping[str, float]) -> Parameters:
-        """Return the free parameters for a choice of damping, from a start."""
+        """Return the free parameters for a choice of damping, from a start.
+
+        The start has the units of the coordinates.
+        """
         return Parameters(
             self.vehicle,
             axes=self.axes,
@@ -1757,7 +1798,10 @@ class Stages:
         )
 
     def problem(self, kinds: dict[str, str], start: Mapping[str, float]) -> Shooting:
-        """Return the problem of the free parameters, over the segments."""
+        """Return the problem of the free parameters, over the segments.
+
+        The start has the units of the coordinates.
+        """
         return Shooting(
             self.segments,
             self.parameters(kinds, start),
@@ -1955,6 +1999,8 @@ def derived(
     stage: Stage, of: Callable[[Array], float], own_error: float, positive: bool
 ) -> tuple[float, tuple[float, float]]:
     """Return a function of the parameters and its 95 % interval, to first order.
+
+    It has the unit of the function.
 
     Args:
         stage: A finished fit.

@@ -46,7 +46,7 @@ class Found(NamedTuple):
     """Result of the weak form for one axis."""
 
     values: dict[str, float]
-    """Numbers by name, of `TERMS`; none where the trials determine no positive inertia."""
+    """Numbers by name, of `TERMS`, in their units; none where the trials determine no positive inertia."""
     jolts: list[tuple[int, float, float]]
     """Index of a trial, begin and end [s] of a stretch whose force nothing in the log explains, as an impact."""
 
