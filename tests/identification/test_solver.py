@@ -5,7 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finssim.identification.simulation_error import Linear, Point, blocks_of, solve, step_of, weights_of
+from finssim.identification.simulation_error import (
+    Linearization,
+    Point,
+    blocks_of,
+    solve,
+    step_of,
+    weights_of,
+)
 from finssim.survey.least_squares import Block, arrow_reduced
 
 
@@ -43,7 +50,7 @@ class Decays:
         theta = (-self.t * decay * point.z).reshape(-1, 1)
         offset = np.repeat(self.groups, len(self.t))[:, None] == np.unique(self.groups)
         own = np.tile(decay, len(self.groups))[:, None]
-        return Linear(residual, np.concatenate([theta, offset], axis=1), own)
+        return Linearization(residual, np.concatenate([theta, offset], axis=1), own)
 
     def noise(self, residual):
         return np.full(len(residual), self.size)

@@ -355,7 +355,7 @@ class Point(NamedTuple):
     """Coordinates of each segment in their units, as deviations from the prior's mean, (S, q)."""
 
 
-class Linear(NamedTuple):
+class Linearization(NamedTuple):
     """Residuals at a point, sorted by segment, and derivatives of the predictions."""
 
     residual: Array
@@ -367,7 +367,7 @@ class Linear(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Solution:
+class FitSolution:
     """End of a fit."""
 
     point: Point
@@ -375,7 +375,7 @@ class Solution:
     """Standard deviation of every sample in the unit of its channel, (N,)."""
     cost: float
     """Half the sum of the losses [-]."""
-    linear: Linear
+    linear: Linearization
     iterations: int
     converged: bool
     """True if the last step is negligible relative to the error that independent noise would leave."""
@@ -389,7 +389,9 @@ def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
     return huber_weight(np.abs(residual / std), cut) / std**2
 
 
-def blocks_of(problem: Shooting, linear: Linear, std: Array, point: Point, cut: float = CUT) -> list[Block]:
+def blocks_of(
+    problem: Shooting, linear: Linearization, std: Array, point: Point, cut: float = CUT
+) -> list[Block]:
     """Weighted normal equations of every segment with the prior of z; that of theta is in the first.
 
     `std` has the unit of each sample; `cut` is in standard deviations [-].
@@ -448,7 +450,7 @@ def solve(
     std: Array | None = None,
     rough: bool = False,
     report: Callable[[int, float], None] | None = None,
-) -> Solution:
+) -> FitSolution:
     """Fit; noise and robust weights are estimated along the way.
 
     Converged where the undamped step moves no judged parameter by more than `CLOSE` of its standard error and grain
@@ -470,7 +472,7 @@ def solve(
     point, damping, done = start, 1e-2, 0
     linear = problem.linearise(point)
     if not np.isfinite(linear.residual).all():
-        return Solution(
+        return FitSolution(
             point, np.ones(len(linear.residual)), np.inf, linear, 0, False, np.full(len(point.theta), np.inf)
         )
     std = problem.noise(linear.residual) if std is None else std
@@ -518,7 +520,7 @@ def solve(
             cost = cost_at(std)
     except KeyboardInterrupt:
         interrupted = True
-    return Solution(point, std, cost, linear, done, converged, step, interrupted)
+    return FitSolution(point, std, cost, linear, done, converged, step, interrupted)
 
 
 # What a simulation would have measured, against what was measured.
@@ -920,7 +922,7 @@ class Shooting:
         same = bool((late == late[:1]).all())
         return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
 
-    def linearise(self, point: Point) -> Linear:
+    def linearise(self, point: Point) -> Linearization:
         """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
         points, wide = self._neighbours(point)
         value, rate = self._predicted(points)
@@ -934,7 +936,7 @@ class Shooting:
         late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
         P = len(self.parameters.names)
         one = Point(*(part[:1] for part in points))
-        return Linear(
+        return Linearization(
             self._residual(one, value[:, :1])[:, 0],
             np.concatenate([slopes[:, :P], late], axis=1),
             np.concatenate([slopes[:, P:], self._offset], axis=1),
@@ -1028,7 +1030,7 @@ class Confidence(NamedTuple):
             return float(slope @ matrix @ slope) if len(slope) else 0.0
 
 
-def confidence(problem: Shooting, solution: Solution) -> Confidence:
+def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
     evidence = evidence_of(problem, solution)
     covariance = trial_covariance(evidence)
@@ -1049,7 +1051,7 @@ def confidence(problem: Shooting, solution: Solution) -> Confidence:
     return Confidence(evidence, covariance, free, ends)
 
 
-def evidence_of(problem: Shooting, solution: Solution) -> Evidence:
+def evidence_of(problem: Shooting, solution: FitSolution) -> Evidence:
     """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
     linear = solution.linear
     weight = weights_of(linear.residual, solution.std)
@@ -1356,7 +1358,7 @@ def _shown_by(
 
 
 def quality(
-    problem: Shooting, solution: Solution, axes: Sequence[str], used: Sequence[Streams]
+    problem: Shooting, solution: FitSolution, axes: Sequence[str], used: Sequence[Streams]
 ) -> dict[str, dict[str, float]]:
     """Figures of each axis over the trials that move it: the simulated against the measured channel.
 
@@ -1388,7 +1390,7 @@ def quality(
 
 
 def unexplained(
-    problem: Shooting, solution: Solution, axis: str, used: Sequence[Streams]
+    problem: Shooting, solution: FitSolution, axis: str, used: Sequence[Streams]
 ) -> tuple[str, float]:
     """Return the trial of a free motion that the fit explains least, and its R²; infinite without any.
 
@@ -1405,7 +1407,7 @@ def unexplained(
     return worst, least
 
 
-def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tuple[Curve, ...]:
+def pictures(problem: Shooting, solution: FitSolution, axes: Sequence[str]) -> tuple[Curve, ...]:
     """Measured and simulated channel of each axis, over the trials that move it most."""
     m, out = problem.measured, []
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
@@ -1425,7 +1427,7 @@ def pictures(problem: Shooting, solution: Solution, axes: Sequence[str]) -> tupl
 
 def fit_findings(
     problem: Shooting,
-    solution: Solution,
+    solution: FitSolution,
     found: Confidence,
     used: Sequence[Streams],
 ) -> list[Finding]:
@@ -1451,7 +1453,7 @@ def fit_findings(
     return out
 
 
-def _close(solution: Solution, found: Confidence, judged: int) -> bool:
+def _close(solution: FitSolution, found: Confidence, judged: int) -> bool:
     """Return whether one step more would keep every parameter within its 95 % interval.
 
     Trials differ by more than independent noise, so that a step far above the error that such noise leaves may still be
@@ -1461,7 +1463,7 @@ def _close(solution: Solution, found: Confidence, judged: int) -> bool:
     return bool(np.all(np.abs(solution.step[:judged]) <= 0.5 * (high - low)[:judged]))
 
 
-class Clock:
+class FitProgress:
     """Progress over several stages: iteration, cost, rate and remaining time."""
 
     def __init__(self, progress: Callable[[float, str], None] | None) -> None:
@@ -1559,7 +1561,7 @@ class Stage:
     """One fit of one set of parameters."""
 
     problem: Shooting
-    solution: Solution
+    solution: FitSolution
     found: Confidence
 
     @property
@@ -1579,7 +1581,7 @@ class Stages:
         estimate: tuple[str, ...],
         known: Mapping[str, float],
         length: float | None,
-        say: Clock,
+        say: FitProgress,
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known = length, dict(known)
@@ -1683,7 +1685,7 @@ class Stages:
         problem.hold_clocks(False)
         return Stage(problem, rough, confidence(problem, rough))
 
-    def refuse_divergence(self, solution: Solution) -> None:
+    def refuse_divergence(self, solution: FitSolution) -> None:
         """Raise a `CalibrationError` if the simulation has no finite answer."""
         if not np.isfinite(solution.cost):
             raise CalibrationError(
@@ -2078,7 +2080,7 @@ def fit_by_simulation(
         raise CalibrationError(
             f"the inertia of {', '.join(strange)} was given, but the fitted axes are {', '.join(chosen)}"
         )
-    remarks, say = [*remarks, *more], Clock(progress)
+    remarks, say = [*remarks, *more], FitProgress(progress)
     say("preparing")
     fit = Stages(
         telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), known or {}, horizon, say

@@ -291,18 +291,23 @@ def _word(value: Any) -> str:
     return _yaml([value], flow=True).strip()[1:-1]
 
 
-class _Dumper(yaml.SafeDumper):
+class _VehicleDumper(yaml.SafeDumper):
     """Quotes digests and other words that are numbers to our reader, as 1e5 is in YAML 1.2."""
 
 
-_Dumper.add_implicit_resolver(
+_VehicleDumper.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+$"), list("-+0123456789.")
 )
 
 
 def _yaml(value: Any, *, flow: bool) -> str:
     text = yaml.dump(
-        value, Dumper=_Dumper, default_flow_style=flow, sort_keys=False, allow_unicode=True, width=math.inf
+        value,
+        Dumper=_VehicleDumper,
+        default_flow_style=flow,
+        sort_keys=False,
+        allow_unicode=True,
+        width=math.inf,
     )
     return str(text)
 
