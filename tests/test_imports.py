@@ -46,12 +46,6 @@ ARROWS = {
 TOP = {"workflow", "cli", "__main__"}
 """What may import anything, and what only they import."""
 
-PENDING = {
-    "identification/simulation_error.py": {"survey"},
-    "identification/weak_form.py": {"survey"},
-}
-"""Imports against the arrows that are still to go."""
-
 
 HOMES = {
     "torch": {
@@ -220,7 +214,7 @@ def test_imports_follow_the_arrows():
             continue
         allowed = {own} | below(own)
         against[path.relative_to(SOURCE).as_posix()] = imported_layers(path) - allowed
-    assert {path: layers for path, layers in against.items() if layers} == PENDING
+    assert {path: layers for path, layers in against.items() if layers} == {}
 
 
 def loaded_with(path: Path) -> set[str]:

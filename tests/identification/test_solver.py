@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from finssim.core.least_squares import Block, arrow_reduced
 from finssim.identification.simulation_error import (
     Linearization,
     Point,
@@ -13,7 +14,6 @@ from finssim.identification.simulation_error import (
     step_of,
     weights_of,
 )
-from finssim.survey.least_squares import Block, arrow_reduced
 
 
 class Decays:

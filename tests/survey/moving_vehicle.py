@@ -22,8 +22,8 @@ from finssim.core.rotations import (
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import corners
 from finssim.localization.overhead_camera import Pool
-from finssim.survey.least_squares import Pose
 from finssim.survey.mounts import Moment
+from finssim.survey.pose import Pose
 
 EDGE = 0.093
 PORT = np.array([0.02, -0.03, -0.115])

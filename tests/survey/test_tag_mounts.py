@@ -7,7 +7,6 @@ import pytest
 
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.families import corners
-from finssim.survey.least_squares import Pose
 from finssim.survey.mounts import (
     Moment,
     MountNoise,
@@ -21,6 +20,7 @@ from finssim.survey.mounts import (
     residuals,
     start_state,
 )
+from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError
 from survey.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 

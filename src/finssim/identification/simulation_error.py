@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.least_squares import Block, arrow_reduced, block_of, boxed, huber_cost, huber_weight
 from finssim.core.registry import TERMS
 from finssim.core.rotations import (
     quat_conjugate,
@@ -45,14 +46,6 @@ from finssim.identification.vehicle_file import scaled_thrust
 from finssim.identification.weak_form import weak_form
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.sim.plant_arrays import twist_shift
-from finssim.survey.least_squares import (
-    Block,
-    arrow_reduced,
-    block_of,
-    boxed,
-    huber_cost,
-    huber_weight,
-)
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.inputs import require_axes, require_fittable

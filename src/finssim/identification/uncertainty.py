@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.least_squares import Block, eliminated
 from finssim.identification.fit import Correlation
 from finssim.trials.findings import CalibrationError, Finding, finding
 
 __all__ = [
     "Covariance",
     "Evidence",
+    "arrow_evidence",
     "correlated_samples",
     "correlation",
     "degeneracy",
@@ -289,3 +291,24 @@ def _traded(group: list[str], ratio: float) -> Finding:
     if kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
         return finding("inertia_traded", **fields)
     return finding("stiffness_traded", **fields) if "k" in kinds else finding("traded", **fields)
+
+
+def arrow_evidence(
+    blocks: Sequence[Block], names: tuple[str, ...], unit: str, groups: int | None = None
+) -> Evidence:
+    """Return the evidence of each group on the shared unknowns without its own.
+
+    Args:
+        blocks: At the solution.
+        names: Of the shared unknowns.
+        unit: What a group is.
+        groups: Join consecutive blocks into that many; None keeps each for itself.
+    """
+    normal, score, _ = zip(*(eliminated(block, 0.0) for block in blocks), strict=True)
+    parts = np.array_split(np.arange(len(blocks)), min(groups or len(blocks), len(blocks)))
+    return Evidence(
+        names=names,
+        normal=np.array([np.sum([normal[i] for i in p], axis=0) for p in parts]),
+        score=np.array([np.sum([score[i] for i in p], axis=0) for p in parts]),
+        unit=unit,
+    )

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.least_squares import boxed, huber_weight
 from finssim.identification.plant_terms import matrices
 from finssim.identification.rollout import DETERMINED_BY, Streams
-from finssim.survey.least_squares import boxed, huber_weight
 from finssim.trials.motion import spans_of, up_in_body
 from finssim.vehicles import AXES, Vehicle
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from finssim.core.least_squares import block_of, rms
 from finssim.core.optics import COEFFICIENTS, Lens
 from finssim.core.provenance import provenance
 from finssim.core.rotations import quat_from_rotvec, quat_to_matrix, skew
@@ -33,11 +34,18 @@ from finssim.identification.report import (
     publish,
     refuse_places,
 )
-from finssim.identification.uncertainty import Covariance, Evidence, correlation, intervals, trial_covariance
+from finssim.identification.uncertainty import (
+    Covariance,
+    Evidence,
+    arrow_evidence,
+    correlation,
+    intervals,
+    trial_covariance,
+)
 from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.pictures import pictures
 from finssim.localization.poses.methods import plane_pose, refine_pose, through_lens
-from finssim.survey.least_squares import Pose, arrow_evidence, block_of, rms
+from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
 
 if TYPE_CHECKING:

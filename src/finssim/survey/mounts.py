@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.least_squares import Step, descend
+from finssim.core.least_squares import Block, Step, arrow_step, block_of, descend, huber_cost, huber_weight
 from finssim.core.optics import back_project, project, projection_jacobians
 from finssim.core.rotations import (
     matrix_to_quat,
@@ -31,21 +31,13 @@ from finssim.core.rotations import (
 )
 from finssim.identification.fit import Curve, Estimate, Fit
 from finssim.identification.report import finish, refuse_places
-from finssim.identification.uncertainty import Covariance, intervals, trial_covariance
+from finssim.identification.uncertainty import Covariance, arrow_evidence, intervals, trial_covariance
 from finssim.localization.detection.detections import best_detections, read_detections
 from finssim.localization.detection.families import corners
 from finssim.localization.fusion.attitude import TiltGains, follow, tilt_from
 from finssim.localization.fusion.fuse_log import Series, imu_columns, read_stream_table, series
 from finssim.localization.overhead_camera import Pool, load_pool
-from finssim.survey.least_squares import (
-    Block,
-    Pose,
-    arrow_evidence,
-    arrow_step,
-    block_of,
-    huber_cost,
-    huber_weight,
-)
+from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.motion import RATE, offset, smooth
 from finssim.vehicles import Vehicle, load_vehicle

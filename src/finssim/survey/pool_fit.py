@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from scipy.stats import t as student
 
+from finssim.core.least_squares import huber_weight, rms
 from finssim.core.optics import Camera, Interface, Lens, back_project
 from finssim.core.provenance import provenance
 from finssim.core.rotations import matrix_to_quat, quat_from_rotvec, quat_to_euler, quat_to_matrix
@@ -35,7 +36,6 @@ from finssim.identification.report import (
 from finssim.identification.uncertainty import correlation
 from finssim.localization.camera_file import CameraFile, load_camera
 from finssim.localization.overhead_camera import Pool, write_pool
-from finssim.survey.least_squares import huber_weight, rms
 from finssim.survey.points import Observations
 from finssim.survey.pool_model import (
     LENS_NAMES,
