@@ -190,6 +190,6 @@ def eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
     [abᵀ b], (Q, P + 1)."""
     diagonal = np.diagonal(block.bb)
     bb = block.bb + damping * np.diag(diagonal) + 1e-14 * float(diagonal.max()) * np.eye(len(diagonal))
-    inner: Array = np.linalg.solve(bb, np.column_stack([block.ab.T, block.b]))
+    inner = np.asarray(np.linalg.solve(bb, np.column_stack([block.ab.T, block.b])), float)
     aa = block.aa + damping * np.diag(np.diagonal(block.aa))
     return aa - block.ab @ inner[:, :-1], block.a - block.ab @ inner[:, -1], inner
