@@ -22,6 +22,7 @@ COMMANDS = [
     "simulate",
     "vehicles",
     "vehicles show",
+    "vehicles import",
     "doctor",
     "trials",
     "trials check",

@@ -24,6 +24,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     "Describe and simulate": {
         "vehicles": "finssim.cli.commands:vehicles",
         "vehicles show": "finssim.cli.commands:show_vehicle",
+        "vehicles import": "finssim.cli.commands:import_vehicle",
         "simulate": "finssim.cli.simulate:simulate",
     },
     "Identify a vehicle": {
@@ -183,3 +184,41 @@ def show_vehicle(
         with atomic_write(picture) as temporary:
             draw_vehicle(vehicle, temporary)
         typer.echo(f"thruster layout: {picture}", err=as_json)
+
+
+def import_vehicle(file: Path, *, out: Path, as_json: bool = False) -> None:
+    """Write a vehicle file from the model of another simulator, and list what was guessed and what was not read.
+
+    Read is SDF as gz-sim has it: the plugins Hydrodynamics, Thruster and Buoyancy, links, joints and collision shapes.
+
+    Example: finssim vehicles import model.sdf --out rov.yaml
+
+    Args:
+        file (FILE): Model of the other program; the files that it names are in its folder or below.
+        out (FILE): Vehicle file to write (.yaml); the mesh of the hull goes beside it.
+        as_json: Print one JSON object instead of text.
+    """
+    from tempfile import TemporaryDirectory
+
+    from finssim.identification.vehicle_file import write_vehicle, yaml_path
+    from finssim.vehicles import check_vehicle, load_vehicle
+    from finssim.vehicles.importers.draft import read_foreign
+
+    yaml_path(out, "vehicle")
+    draft = read_foreign(file)
+    with TemporaryDirectory() as folder:
+        write_vehicle(draft.vehicle(Path(folder)), out)
+    failed = [finding.sentence for finding in check_vehicle(load_vehicle(out)) if not finding.passed]
+    lists = {
+        "guessed": draft.guesses(),
+        "different": draft.different,
+        "not read": [f"{what} x {n}" if n > 1 else what for what, n in sorted(draft.not_read.items())],
+        "check": failed,
+    }
+    if as_json:
+        print(json.dumps({"file": str(out), **lists}))
+        return
+    print(f"{out}: {draft.source}")
+    for kind, sentences in lists.items():
+        for sentence in sentences:
+            print(f"{kind}: {sentence}")

@@ -20,6 +20,7 @@ from typing import Any
 __all__ = [
     "COMMANDS",
     "FAMILIES",
+    "IMPORTERS",
     "LEARNERS",
     "SENSORS",
     "TASKS",
@@ -262,5 +263,12 @@ COMMANDS = Family("command", {})
 WORLDS = Family("world", {})
 """Kind of a described world -> function of a name or path that returns the world; `described` is that of perception."""
 
-FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS)
+IMPORTERS = Family(
+    "importer",
+    {"vehicle.sdf": "finssim.vehicles.importers.sdf:SDF"},
+    check="finssim.vehicles.importers.draft:check_registered",
+)
+"""What is imported, a dot, and the format -> the importer: of vehicles, a `VehicleImporter`."""
+
+FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS, IMPORTERS)
 """All families."""

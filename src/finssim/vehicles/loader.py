@@ -44,7 +44,7 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
     path, label = _locate(name_or_path)
     values, origins = _with_parents(path, label, ())
     values, origins = _expand_groups(values, origins, label)
-    vehicle = _checked(values, origins, path.stem, path, label)
+    vehicle = checked(values, origins, path.stem, path, label)
     if vehicle.hull is not None and vehicle.hull.file is not None:
         try:
             vehicle.hull_mesh()
@@ -85,7 +85,7 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
             for key in [key for key in origins if key == full or key.startswith(full + ".")]:
                 del origins[key]
             origins[full] = provenance
-    return _checked(values, origins, vehicle.name, vehicle.path, vehicle.name)
+    return checked(values, origins, vehicle.name, vehicle.path, vehicle.name)
 
 
 def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) -> tuple[Path, str]:
@@ -227,8 +227,19 @@ def _expand_groups(values: Tree, origins: Origins, label: str) -> tuple[Tree, Or
     return values, {key: value for key, value in origins.items() if not key.startswith("thruster_groups.")}
 
 
-def _checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
-    """Return the vehicle, with every refusal as one sentence."""
+def checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
+    """Return the vehicle of values and their origins by dotted path, with every refusal as one sentence.
+
+    Args:
+        values: Content of a vehicle file, without origins, in its units.
+        origins: Origin of each number or list.
+        name: Name of the vehicle.
+        path: File that it was read from.
+        label: Name of the file in messages.
+
+    Raises:
+        VehicleError: A value is refused.
+    """
     for key in ("name", "path", "provenance"):
         if key in values:
             raise VehicleError(f"{label}: unknown key '{key}': the name is that of the file")

@@ -1,0 +1,199 @@
+"""What every importer of vehicles shares: the draft that it fills, and how it is found.
+
+An importer is one file with a `VehicleImporter`, registered as `vehicle.FORMAT` in the family `IMPORTERS`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.mesh import Faces, MeshError, Vertices, write_stl
+from finssim.core.registry import IMPORTERS
+from finssim.vehicles.importers.rigid import plain
+from finssim.vehicles.loader import checked
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.vehicle import AXES, Origin, Provenance, Vehicle
+
+__all__ = [
+    "Draft", "VehicleImporter", "check_registered", "put_controlled_axes", "put_envelope", "read_foreign",
+]  # fmt: skip
+
+KIND = "vehicle."
+"""Beginning of the names of importers that read vehicles."""
+HEAD = 1 << 16
+"""Bytes from which an importer recognises its format."""
+
+
+@dataclass
+class Draft:
+    """A vehicle that an importer reads: its numbers with their origins, and what was guessed or not read."""
+
+    label: str
+    """Name of the file in messages."""
+    source: str
+    """Source of the numbers, for their origins."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Content of the vehicle file, without origins."""
+    origins: dict[str, Provenance] = field(default_factory=dict)
+    """Origin of each number or list by dotted path."""
+    guessed: dict[str, str] = field(default_factory=dict)
+    """Dotted path of each number that the file does not give -> how it was guessed."""
+    not_read: Counter[str] = field(default_factory=Counter)
+    """What the file holds and the vehicle does not -> how often."""
+    different: list[str] = field(default_factory=list)
+    """Sentences about what the other program computes and FinsSim does not, or differently."""
+    hull: tuple[Vertices, Faces] | None = None
+    """Closed mesh in body axes, vertices (n, 3) [m] and faces (m, 3), that becomes the hull's file."""
+
+    def put(self, path: str, value: Any, origin: Origin = "published", note: str = "") -> None:
+        """Set a value that the file gives or that follows from it; the unit is that of the vehicle file."""
+        node = self.values
+        *sections, key = path.split(".")
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[key] = np.asarray(value).tolist() if isinstance(value, np.ndarray) else value
+        self.origins[path] = Provenance(origin, self.source, note)
+
+    def guess(self, path: str, value: Any, how: str) -> None:
+        """Set a value that the file does not give; the unit is that of the vehicle file."""
+        self.put(path, value)
+        self.origins[path] = Provenance("guessed", "", how)
+        self.guessed[path] = how
+
+    def guesses(self) -> list[str]:
+        """Return a sentence for each guess; the same guess of several thrusters is one sentence."""
+        grouped: dict[tuple[str, str, str], list[str]] = {}
+        for path, how in self.guessed.items():
+            section, _, rest = path.partition(".")
+            name, _, key = rest.rpartition(".")
+            value: Any = self.values
+            for step in path.split("."):
+                value = value[step]
+            number = f"{value:.6g}" if isinstance(value, float) else str(np.round(value, 6).tolist())
+            grouped.setdefault((f"{section}.*.{key}" if name else path, number, how), []).append(name)
+        return [
+            f"{path} = {number}{f' ({len(names)} times)' if len(names) > 1 else ''}: {how}"
+            for (path, number, how), names in grouped.items()
+        ]
+
+    def vehicle(self, folder: Path) -> Vehicle:
+        """Return the vehicle, checked as its file will be.
+
+        Args:
+            folder: Existing folder for the mesh of the hull; `write_vehicle` copies it.
+
+        Raises:
+            VehicleError: The numbers are refused; the message names the file.
+        """
+        values = dict(self.values)
+        if self.hull is not None:
+            file = folder / f"{Path(self.label).stem}.stl"
+            write_stl(file, *self.hull)
+            return checked(values | {"hull": {"file": file}}, self.origins, file.stem, None, self.label)
+        try:
+            parametric = values | {"hull": {"parametric": True}}
+            vehicle = checked(parametric, self.origins, Path(self.label).stem, None, self.label)
+            vehicle.hull_mesh()
+        except (VehicleError, MeshError):  # a volume that fits no hull of this size
+            return checked(values, self.origins, Path(self.label).stem, None, self.label)
+        return vehicle
+
+
+@dataclass(frozen=True)
+class VehicleImporter:
+    """An importer of vehicles."""
+
+    title: str
+    """Name of the format."""
+    recognises: Callable[[Path, bytes], bool]
+    """Function of a path and the first bytes of its file: whether the file is of this format."""
+    read: Callable[[Path], Draft]
+    """Function that reads a file; it refuses by a `VehicleError` of one sentence."""
+
+
+def check_registered(name: str, member: Any) -> None:
+    """Refuse what is no importer.
+
+    Args:
+        name: Name in the family: what is imported, a dot, and the format.
+        member: The object that is registered under it.
+
+    Raises:
+        VehicleError: The name or the object does not fit.
+    """
+    if not name.startswith(KIND) or not isinstance(member, VehicleImporter):
+        raise VehicleError(
+            f"{name} is {member!r}, expected a VehicleImporter with a name such as {KIND}sdf: register it so"
+        )
+
+
+def importers() -> Iterator[VehicleImporter]:
+    """Yield the importers of vehicles."""
+    for name, member in IMPORTERS.usable().items():
+        if name.startswith(KIND):
+            yield member
+
+
+def read_foreign(path: Path) -> Draft:
+    """Read the vehicle of another program, by the importer that recognises its file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        VehicleError: It cannot be read, or is of no known format.
+    """
+    if not path.is_file():
+        raise VehicleError(f"{path}: no such file: give the file of a vehicle")
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    for importer in importers():
+        if importer.recognises(path, head):
+            return importer.read(path)
+    known = ", ".join(sorted(importer.title for importer in importers()))
+    raise VehicleError(f"{path}: is of no format that is read, expected one of {known}")
+
+
+# Numbers that no format gives.
+
+
+def put_envelope(draft: Draft, corners: Sequence[NDArray[np.float64]]) -> None:
+    """Guess the size: the box around shapes and thrusters, large enough for the displaced volume.
+
+    Args:
+        draft: Draft with volume and thrusters.
+        corners: Points of the shapes in the body frame [m], (n, 3) each.
+    """
+    positions = [np.array(thruster["position"])[None] for thruster in draft.values["thrusters"].values()]
+    points = np.concatenate([*corners, *positions])
+    shortest = 0.5 * draft.values["body"]["displaced_volume"] ** (1.0 / 3.0)
+    size = np.maximum(np.ptp(points, axis=0), shortest)
+    size *= max(1.0, (1.01 * draft.values["body"]["displaced_volume"] / np.prod(size)) ** (1.0 / 3.0))
+    draft.guess("body.size", plain(size), "box around the collision shapes and the thrusters")
+    draft.guess("body.surface_half_height", float(size[2] / 2.0), "half of the height of the size")
+
+
+def put_controlled_axes(draft: Draft) -> None:
+    """Set the controlled axes: those along which the thrusters can push without much of another."""
+    thrusters, centre = draft.values["thrusters"].values(), draft.values["body"]["center_of_gravity"]
+    axes_of = np.array([thruster["axis"] for thruster in thrusters])
+    arms = np.array([thruster["position"] for thruster in thrusters]) - centre
+    B = np.vstack([axes_of.T, np.cross(arms, axes_of).T])
+    B[3:] /= max(float(np.linalg.norm(draft.values["body"]["size"])) / 2.0, 1e-9)
+    U, singular, _ = np.linalg.svd(B)
+    reach = U[:, : int((singular > 0.1 * singular[0]).sum())]
+    rest = np.linalg.norm(np.eye(6) - reach @ reach.T, axis=0)
+    axes = [axis for axis, left in zip(AXES, rest, strict=True) if left < 0.3]
+    if 0 < len(axes) < 6:
+        draft.values["controlled_axes"] = axes
+        missing = ", ".join(axis for axis in AXES if axis not in axes)
+        draft.different.append(
+            f"the thrusters do not control {missing}: controlled_axes leaves it to the water"
+        )

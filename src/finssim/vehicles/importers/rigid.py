@@ -1,0 +1,59 @@
+"""Rigid bodies that importers assemble: poses of their links, and mass and inertia of all together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["IDENTITY", "LinkPose", "combined", "plain"]
+
+Array = NDArray[np.float64]
+
+
+class LinkPose(NamedTuple):
+    """Pose of one frame in another."""
+
+    turn: Array
+    """Rotation from the frame to the other [-], (3, 3)."""
+    place: Array
+    """Origin of the frame in the other [m], (3,)."""
+
+    def after(self, inner: LinkPose) -> LinkPose:
+        """Return the pose of a frame that is given in this one."""
+        return LinkPose(self.turn @ inner.turn, self.turn @ inner.place + self.place)
+
+    def inverse(self) -> LinkPose:
+        """Return the pose of the other frame in this one."""
+        return LinkPose(self.turn.T, -self.turn.T @ self.place)
+
+
+IDENTITY = LinkPose(np.eye(3), np.zeros(3))
+
+
+def combined(
+    masses: Sequence[float], centres: Sequence[Array], tensors: Sequence[Array]
+) -> tuple[float, Array, Array]:
+    """Return mass [kg], centre of gravity (3,) [m] and inertia about it (3, 3) [kg m²] of parts fixed to one another.
+
+    Args:
+        masses: Of the parts [kg].
+        centres: Their centres of gravity in the body frame [m], (3,) each.
+        tensors: Their inertias about these, in body axes [kg m²], (3, 3) each.
+    """
+    centre = np.average(centres, axis=0, weights=masses)
+    total = np.zeros((3, 3))
+    for m, place, tensor in zip(masses, centres, tensors, strict=True):
+        r = place - centre
+        total += tensor + m * (r @ r * np.eye(3) - np.outer(r, r))
+    return math.fsum(masses), centre, total
+
+
+def plain(value: Any) -> Any:
+    """Return a number or array, in its unit, without what rounding leaves beside its greatest entry."""
+    array = np.asarray(value, dtype=np.float64)
+    cleaned = np.where(np.abs(array) < 1e-12 * np.abs(array).max(initial=0.0), 0.0, array)
+    return float(cleaned) if cleaned.ndim == 0 else cleaned

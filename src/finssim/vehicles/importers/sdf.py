@@ -1,0 +1,834 @@
+"""Importer of SDF as gz-sim reads it: a model with the plugins Hydrodynamics, Thruster and Buoyancy.
+
+Equations of gz-sim as of July 2026, in its own symbols; body axes x forward, y left, z up, as here:
+
+    force = Ma nu_dot + C nu + sum_j (xU_j + sum_k xU_jabsU_k |nu_k|) nu_j          about the origin of the link
+    thrust = thrust_coefficient fluid_density propeller_diameter⁴ n |n|             n in rad/s, along the joint's axis
+    buoyancy = density g volume of the collision shapes, at the mean of their poses, weighted by their volumes
+
+Ma holds xDotU and the like, which are negative, and C is Fossen's Coriolis matrix of -Ma: gz-sim adds it where Fossen
+subtracts it, which FinsSim does not follow. Propellers and other jointed links are fixed where the file puts them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.mesh import MeshError, check_closed, load_stl, mesh_volume
+from finssim.core.rotations import quat_from_euler, quat_to_matrix
+from finssim.vehicles.importers.draft import Draft, VehicleImporter, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.rigid import IDENTITY, LinkPose, combined, plain
+from finssim.vehicles.importers.xml_file import Element, file_of_model, flag, number, numbers, read_xml
+from finssim.vehicles.part import VehicleError, did_you_mean
+
+__all__ = ["SDF", "added_mass", "axis_of_joint", "damping", "read_sdf", "shape_volume", "thrust_factor"]
+
+Array = NDArray[np.float64]
+
+FORCES, VELOCITIES = "xyzkmn", "UVWPQR"
+COEFFICIENT = re.compile(r"([xyzkmn])(Dot)?([UVWPQR])(?:(abs)?([UVWPQR]))?")
+"""A coefficient: force, whether it is of added mass, velocity, and the second velocity of a quadratic one."""
+
+HYDRODYNAMICS = {
+    "link_name", "water_density", "disable_coriolis", "disable_added_mass", "default_current", "namespace",
+    "lookup_current_x", "lookup_current_y", "lookup_current_z",
+}  # fmt: skip
+"""Words of the plugin Hydrodynamics besides coefficients."""
+THRUSTER = {
+    "namespace", "topic", "joint_name", "thrust_coefficient", "propeller_diameter", "fluid_density", "use_angvel_cmd",
+    "velocity_control", "max_thrust_cmd", "min_thrust_cmd", "deadband", "p_gain", "i_gain", "d_gain", "battery_name",
+    "power_load", "wake_fraction", "alpha_1", "alpha_2",
+}  # fmt: skip
+"""Words of the plugin Thruster."""
+INERTIA = {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"}
+"""Words of an inertia."""
+CONTROL = {
+    "jointName", "cmd_topic", "multiplier", "offset", "type", "servo_min", "servo_max", "useForce", "p_gain", "i_gain",
+    "d_gain", "i_max", "i_min", "cmd_max", "cmd_min", "controlVelocitySlowdownSim", "frequencyCutoff",
+}  # fmt: skip
+"""Words of a control of the plugin ArduPilotPlugin."""
+BUOYANCY = {"uniform_fluid_density", "graded_buoyancy", "enable"}
+"""Words of the plugin Buoyancy."""
+SHAPES = {
+    "box": ("size",), "ellipsoid": ("radii",), "sphere": ("radius",), "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"), "cone": ("radius", "length"), "mesh": ("uri", "scale"),
+    "plane": ("normal", "size"), "empty": (),
+}  # fmt: skip
+"""Shape -> its words."""
+NO_FORCE = {"visual", "sensor", "light", "surface", "laser_retro", "max_contacts", "self_collide"}
+"""Elements that say nothing about the motion in free water."""
+PROPELLER = {"thrust_coefficient": 1.0, "fluid_density": 1000.0, "propeller_diameter": 0.02}
+"""Words that give the thrust -> gz-sim's number without them [-, kg/m³, m]."""
+CURVES = {"alpha_1", "alpha_2", "wake_fraction"}
+"""Words of a thrust coefficient that falls with the speed."""
+WRENCHES = ("LiftDrag", "BuoyancyEngine", "JointPositionController", "AddedMass", "Wind")
+"""Plugins that act on a vehicle and are not read; others are named as well, without a warning."""
+
+GRAVITY = 9.8
+"""Gravity of a world that gives none [m/s²]."""
+DENSITY = 1000.0
+"""Density of water where the plugins give none [kg/m³]."""
+SHARE = 0.3
+"""Guessed limit of a thruster, as a share of the weight of the vehicle."""
+LAG = 0.05
+"""Guessed time constant of a thruster [s]; gz-sim has none."""
+
+
+# The conversions: each from the words of gz-sim to those of a vehicle file.
+
+
+def pose_of(element: Element | None, where: str) -> LinkPose:
+    """Return the pose of an element `pose`: x y z, then roll pitch yaw, or a quaternion.
+
+    Args:
+        element: None: the identity.
+        where: What a message calls the element.
+    """
+    if element is None or not (element.text or "").strip():
+        return IDENTITY
+    if element.get("rotation_format", "euler_rpy") == "quat_xyzw":
+        values = numbers(element.text, 7, f"{where}: pose")
+        length = float(np.linalg.norm(values[3:]))
+        if length < 1e-6:
+            raise VehicleError(f"{where}: pose has a quaternion of length 0, expected 1")
+        return LinkPose(quat_to_matrix(values[3:] / length), values[:3])
+    values = numbers(element.text, 6, f"{where}: pose")
+    angles = (
+        np.radians(values[3:]) if element.get("degrees", "false").lower() in ("true", "1") else values[3:]
+    )
+    return LinkPose(quat_to_matrix(quat_from_euler(*angles)), values[:3])
+
+
+def added_mass(coefficients: Mapping[str, float], where: str) -> Array:
+    """Return M_A [kg, kg m, kg m²], (6, 6), which is minus Ma.
+
+    Args:
+        coefficients: Word, such as `xDotU`, -> number; others are left alone.
+        where: What a message calls them.
+
+    Raises:
+        VehicleError: A diagonal one is positive, or the matrix is not symmetric.
+    """
+    Ma = np.zeros((6, 6))
+    for name, value in coefficients.items():
+        match = COEFFICIENT.fullmatch(name)
+        if match and match[2]:
+            Ma[FORCES.index(match[1]), VELOCITIES.index(match[3])] = value
+    _refuse_positive(np.diag(Ma), "Dot", where)
+    if not np.allclose(Ma, Ma.T, rtol=1e-3, atol=1e-9):
+        raise VehicleError(f"{where}: the added mass is not symmetric: give each coupling in both places")
+    return 0.0 - Ma
+
+
+def damping(coefficients: Mapping[str, float], where: str) -> tuple[Array, Array]:
+    """Return D1 [N s/m, N s, N m s] and D2 [N s²/m², N s², N m s²], (6, 6) each, which are minus the coefficients.
+
+    Args:
+        coefficients: Word, such as `xU` or `yRabsR`, -> number; those of added mass are left alone.
+        where: What a message calls them.
+
+    Raises:
+        VehicleError: A diagonal one is positive, or a product of two velocities is not of the form v|v|.
+    """
+    linear, quadratic = np.zeros((6, 6)), np.zeros((6, 6))
+    for name, value in coefficients.items():
+        match = COEFFICIENT.fullmatch(name)
+        if match is None or match[2]:
+            continue
+        force, velocity = FORCES.index(match[1]), VELOCITIES.index(match[3])
+        if match[5] is None:
+            linear[force, velocity] = -value
+        elif match[4] and match[5] == match[3]:
+            quadratic[force, velocity] = -value
+        elif value and match[4]:
+            raise VehicleError(
+                f"{where}: {name} couples two velocities, which a vehicle file cannot hold: set it to 0 or leave it out"
+            )
+        elif value:
+            abs_name = f"{match[1]}{match[3]}abs{match[5]}"
+            raise VehicleError(
+                f"{where}: {name} drives the vehicle in one direction, since its velocities have a sign: "
+                f"use {abs_name} if it is drag"
+            )
+    _refuse_positive(-np.diag(linear), "", where)
+    _refuse_positive(-np.diag(quadratic), "abs", where)
+    return linear + 0.0, quadratic + 0.0
+
+
+def _refuse_positive(diagonal: Array, kind: str, where: str) -> None:
+    for k in np.flatnonzero(diagonal > 0.0):
+        force, velocity = FORCES[k], VELOCITIES[k]
+        name = {"Dot": f"{force}Dot{velocity}", "": f"{force}{velocity}"}.get(
+            kind, f"{force}{velocity}abs{velocity}"
+        )
+        raise VehicleError(
+            f"{where}: {name} is {diagonal[k]:g}, expected 0 or less: gz-sim gives added mass and damping as negative "
+            "numbers, older files as positive ones; change its sign"
+        )
+
+
+def fluid_added_mass(element: Element, where: str) -> Array:
+    """Return M_A [kg, kg m, kg m²], (6, 6), of an element `fluid_added_mass`, whose numbers are positive."""
+    letters, matrix = "xyzpqr", np.zeros((6, 6))
+    for child in element:
+        i, j = (letters.find(letter) for letter in child.tag) if len(child.tag) == 2 else (-1, -1)
+        if not 0 <= i <= j:
+            raise VehicleError(
+                f"{where}: fluid_added_mass: unknown element '{child.tag}', expected xx, xy ... rr"
+            )
+        matrix[i, j] = matrix[j, i] = numbers(child.text, 1, f"{where}: fluid_added_mass: {child.tag}")[0]
+    return matrix
+
+
+def thrust_factor(coefficient: float, density: float, diameter: float) -> float:
+    """Return c of thrust = c n|n| [N s²/rad²], without its sign, which only says how the propeller turns.
+
+    Args:
+        coefficient: Of n in rad/s, not in revolutions per second [-].
+        density: Of the water [kg/m³].
+        diameter: Of the propeller [m].
+    """
+    return abs(coefficient) * density * diameter**4
+
+
+def axis_of_joint(joint: LinkPose, axis: Array) -> Array:
+    """Return the direction of positive thrust in the body frame, unit length, (3,).
+
+    Args:
+        joint: Pose of the joint in the body frame.
+        axis: Axis in the frame of the joint, of any length [-], (3,).
+    """
+    turned = joint.turn @ axis
+    return np.asarray(turned / np.linalg.norm(turned))
+
+
+def shape_volume(shape: Element, where: str) -> float:
+    """Return the volume of a shape other than a mesh [m³]."""
+
+    def of(tag: str) -> float:
+        length = number(shape, tag, where)
+        if length < 0.0:
+            raise VehicleError(f"{where}: {tag} is {length:g}, expected 0 or more")
+        return length
+
+    if shape.tag in ("box", "ellipsoid"):
+        tag, factor = ("size", 1.0) if shape.tag == "box" else ("radii", 4.0 / 3.0 * math.pi)
+        sides = numbers(shape.findtext(tag), 3, f"{where}: {tag}")
+        if sides.min() < 0.0:
+            raise VehicleError(f"{where}: {tag} is {sides.tolist()}, expected 3 numbers of 0 or more")
+        return factor * float(np.prod(sides))
+    if shape.tag in ("plane", "empty"):
+        return 0.0
+    ball = 4.0 / 3.0 * math.pi * of("radius") ** 3
+    if shape.tag == "sphere":
+        return ball
+    column = math.pi * of("radius") ** 2 * of("length")
+    return column / 3.0 if shape.tag == "cone" else column + (ball if shape.tag == "capsule" else 0.0)
+
+
+def _half_size(shape: Element) -> Array:
+    """Return half the box around a shape other than a mesh, in its frame [m], (3,)."""
+    if shape.tag == "box":
+        return numbers(shape.findtext("size"), 3, "size") / 2.0
+    if shape.tag == "ellipsoid":
+        return numbers(shape.findtext("radii"), 3, "radii")
+    radius, length = number(shape, "radius", shape.tag, 0.0), number(shape, "length", shape.tag, 0.0)
+    ends = radius if shape.tag in ("capsule", "sphere") else 0.0
+    return np.array([radius, radius, length / 2.0 + ends])
+
+
+# The model: its frames, and the rigid body that its links form.
+
+
+class Model:
+    """A model whose links and frames have poses in the body frame, which is that of the link with hydrodynamics."""
+
+    def __init__(self, element: Element, label: str, draft: Draft) -> None:
+        """
+        Args:
+            element: The element `model`.
+            label: What messages call it.
+            draft: Draft that notes what is not read.
+        """
+        self.element, self.label, self.draft = element, label, draft
+        self.links = self._named("link")
+        self.joints = self._named("joint")
+        self.frames = self._named("frame")
+        for tag in ("include", "model"):
+            if element.find(tag) is not None:
+                raise VehicleError(
+                    f"{label}: has a {tag} inside: write it as one model with 'gz sdf -p FILE'"
+                )
+        if flag(element, "static", label):
+            raise VehicleError(f"{label}: is static, expected a model that moves")
+        self._poses: dict[str, LinkPose] = {}
+        self.body = IDENTITY
+
+    def _named(self, tag: str) -> dict[str, Element]:
+        found: dict[str, Element] = {}
+        for element in self.element.findall(tag):
+            name = element.get("name", "")
+            if not name or name in found:
+                raise VehicleError(f"{self.label}: {tag} '{name}' is there twice or has no name: rename it")
+            found[name] = element
+        return found
+
+    def pose(self, name: str, above: tuple[str, ...] = ()) -> LinkPose:
+        """Return the pose of a link, joint or frame in the body frame."""
+        return self.body.inverse().after(self._in_model(name, above))
+
+    def _in_model(self, name: str, above: tuple[str, ...]) -> LinkPose:
+        if name == "__model__":
+            return IDENTITY
+        if name in above:
+            raise VehicleError(f"{self.label}: the pose of '{name}' depends on itself: {' -> '.join(above)}")
+        if name in self._poses:
+            return self._poses[name]
+        element = self.links.get(name, self.joints.get(name, self.frames.get(name)))
+        if element is None:
+            known = [*self.links, *self.joints, *self.frames]
+            raise VehicleError(f"{self.label}: no link, joint or frame '{name}'{did_you_mean(name, known)}")
+        pose, default = element.find("pose"), "__model__"
+        if name in self.joints:
+            default = self.text(element, "child")
+        elif name in self.frames:
+            default = element.get("attached_to") or "__model__"
+        reference = (None if pose is None else pose.get("relative_to")) or default
+        if len(above) > 50:
+            raise VehicleError(
+                f"{self.label}: the pose of '{name}' depends on more than 50 frames: make it fewer"
+            )
+        outer = self._in_model(reference, (*above, name))
+        self._poses[name] = outer.after(pose_of(pose, f"{self.label}: {element.tag} '{name}'"))
+        return self._poses[name]
+
+    def text(self, element: Element, tag: str) -> str:
+        """Return the text of a child element that must be there."""
+        text = (element.findtext(tag) or "").strip()
+        if not text:
+            raise VehicleError(
+                f"{self.label}: {element.tag} '{element.get('name', '')}': {tag} is missing: add it"
+            )
+        return text
+
+    def link_of(self, name: str) -> str:
+        """Return the link that a joint names: itself, or that a frame is attached to."""
+        for _ in range(50):
+            if name in self.links or name not in self.frames:
+                break
+            name = self.frames[name].get("attached_to", "")
+        if name not in self.links:
+            raise VehicleError(f"{self.label}: a joint names '{name}', expected a link of the model")
+        return name
+
+    def refuse_loose(self, base: str) -> None:
+        """Refuse links that no joints hold to the body."""
+        pairs = [
+            (self.link_of(self.text(j, "parent")), self.link_of(self.text(j, "child")))
+            for j in self.joints.values()
+        ]
+        held, before = {base}, 0
+        while len(held) > before:
+            before = len(held)
+            held |= {name for pair in pairs for name in pair if held & set(pair)}
+        for name in self.links.keys() - held:
+            raise VehicleError(f"{self.label}: link '{name}' is not joined to '{base}': join it or remove it")
+
+    def pose_in(self, link: str, element: Element, where: str) -> LinkPose:
+        """Return the pose in the body frame of what a link holds, such as a collision."""
+        pose = element.find("pose")
+        reference = (None if pose is None else pose.get("relative_to")) or link
+        return self.pose(reference).after(pose_of(pose, where))
+
+
+def _put_body(model: Model, draft: Draft) -> None:
+    """Set mass, centre of gravity and inertia: of all links together, fixed to one another."""
+    masses, centres, tensors, missing = [], [], [], []
+    for name, link in model.links.items():
+        where = f"{model.label}: link '{name}'"
+        inertial = link.find("inertial")
+        if not flag(link, "gravity", where, True) or flag(link, "kinematic", where):
+            raise VehicleError(
+                f"{where}: has no weight (gravity or kinematic), expected a link that falls: change it"
+            )
+        _unread(link, {"inertial", "collision", "pose", "gravity", "kinematic"}, "link", draft)
+        if inertial is None:
+            inertial = Element("inertial")
+            missing.append(name)
+        elif inertial.find("mass") is None or inertial.find("inertia") is None:
+            missing.append(name)
+        if inertial.get("auto", "false").lower() in ("true", "1"):
+            raise VehicleError(
+                f"{where}: its mass is computed from its shapes (auto): write the numbers of it instead"
+            )
+        _unread(inertial, {"mass", "pose", "inertia", "fluid_added_mass"}, "inertial", draft)
+        pose = model.pose_in(name, inertial, where)
+        tensor, inertia = np.zeros((3, 3)), inertial.find("inertia")
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            tag = f"i{'xyz'[i]}{'xyz'[j]}"
+            tensor[i, j] = tensor[j, i] = 1.0 if i == j else 0.0
+            if inertia is not None:
+                tensor[i, j] = tensor[j, i] = number(inertia, tag, where, math.nan if i == j else 0.0)
+        if inertia is not None:
+            _refuse_unknown(inertia, INERTIA, where)
+        masses.append(number(inertial, "mass", where, 1.0))
+        centres.append(pose.place)
+        tensors.append(pose.turn @ tensor @ pose.turn.T)
+    if min(masses) < 0.0 or sum(masses) <= 0.0:
+        raise VehicleError(f"{model.label}: its links weigh {masses} kg, expected more than 0")
+    mass, centre, total = combined(masses, centres, tensors)
+    note = f"sum of {len(masses)} links" if len(masses) > 1 else ""
+    for path, value in (("mass", mass), ("center_of_gravity", centre), ("inertia", total)):
+        if missing:
+            draft.guess(
+                f"body.{path}", plain(value),
+                f"link '{missing[0]}'{' and others' if missing[1:] else ''} gives no mass or inertia: 1 kg and 1 kg m² "
+                "as in SDF",
+            )  # fmt: skip
+        else:
+            draft.put(f"body.{path}", plain(value), "derived" if note else "published", note)
+
+
+def _put_displacement(model: Model, links: Collection[str], density: float, draft: Draft) -> list[Array]:
+    """Set volume, centre of buoyancy and, of a single closed mesh, the hull; return the corners of the shapes.
+
+    Args:
+        model: The model.
+        links: Those on which Buoyancy acts.
+        density: Of the water [kg/m³].
+        draft: Draft to set them in.
+    """
+    volumes, places, corners, meshes = [], [], [], []
+    for name in model.links:
+        for collision in model.links[name].findall("collision"):
+            where = f"{model.label}: link '{name}': collision '{collision.get('name', '')}'"
+            _unread(collision, {"pose", "geometry"}, "collision", draft)
+            shapes = list(collision.find("geometry") or ())
+            if len(shapes) != 1 or shapes[0].tag not in SHAPES:
+                found = ", ".join(shape.tag for shape in shapes) or "nothing"
+                raise VehicleError(
+                    f"{where}: its geometry is {found}, expected one of {', '.join(sorted(SHAPES))}"
+                )
+            _refuse_unknown(shapes[0], SHAPES[shapes[0].tag], where)
+            pose = model.pose_in(name, collision, where)
+            if shapes[0].tag == "mesh":
+                vertices, faces = _mesh(model, shapes[0], where)
+                placed = vertices @ pose.turn.T + pose.place
+                meshes.append((placed, faces))
+                volume = abs(mesh_volume(vertices, faces))
+                corners.append(placed)
+            else:
+                volume = shape_volume(shapes[0], where)
+                half = np.abs(pose.turn) @ _half_size(shapes[0])
+                corners.append(np.stack([pose.place - half, pose.place + half]))
+            if name in links:
+                volumes.append(volume)
+                places.append(pose.place)
+    if sum(volumes) <= 0.0:
+        mass, centre = draft.values["body"]["mass"], draft.values["body"]["center_of_gravity"]
+        draft.guess("body.displaced_volume", mass / density, "no shape displaces water: neutral buoyancy")
+        draft.guess("body.center_of_buoyancy", centre, "no shape displaces water: at the centre of gravity")
+        return corners
+    note = (
+        f"{len(volumes)} collision shape{'s' if len(volumes) > 1 else ''}, as the plugin Buoyancy takes them"
+    )
+    draft.put("body.displaced_volume", float(sum(volumes)), "derived", note)
+    draft.put("body.center_of_buoyancy", plain(np.average(places, axis=0, weights=volumes)), "derived", note)
+    if len(meshes) == len(volumes) == 1:
+        try:
+            check_closed(*meshes[0])
+            draft.hull = meshes[0]
+        except MeshError as error:
+            draft.different.append(f"the collision mesh is no hull: {error}")
+    return corners
+
+
+def _mesh(model: Model, shape: Element, where: str) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (n, 3) [m] and faces (m, 3) of a collision mesh in its own frame."""
+    uri = (shape.findtext("uri") or "").strip()
+    file = file_of_model(Path(model.label).parent, uri, where)
+    if file.suffix.lower() != ".stl":
+        raise VehicleError(
+            f"{where}: its mesh is a {file.suffix or 'file'}, expected .stl: export it so, or use a box"
+        )
+    try:
+        vertices, faces = load_stl(file)
+    except MeshError as error:
+        raise VehicleError(f"{where}: {error}") from None
+    scale = shape.find("scale")
+    factors = np.ones(3) if scale is None else numbers(scale.text, 3, f"{where}: scale")
+    if not np.all(factors > 0.0):
+        raise VehicleError(f"{where}: scale is {factors.tolist()}, expected 3 numbers > 0")
+    if not np.all(factors == 1.0):
+        model.draft.different.append(
+            f"{file.name}: its volume is taken with its scale, which Buoyancy leaves out"
+        )
+    return vertices * factors, faces
+
+
+def _put_hydrodynamics(model: Model, plugin: Element, base: str, draft: Draft) -> None:
+    """Set added mass and damping of the plugin, or added mass of the link."""
+    where = f"{model.label}: plugin Hydrodynamics"
+    coefficients = {}
+    for child in plugin:
+        if COEFFICIENT.fullmatch(child.tag):
+            coefficients[child.tag] = float(numbers(child.text, 1, f"{where}: {child.tag}")[0])
+        elif child.tag not in HYDRODYNAMICS:
+            raise VehicleError(
+                f"{where}: unknown element '{child.tag}'{did_you_mean(child.tag, sorted(HYDRODYNAMICS))} expected "
+                "coefficients such as xDotU, xU and xUabsU: correct or remove it"
+            )
+    for tag in ("default_current", "lookup_current_x", "lookup_current_y", "lookup_current_z"):
+        if plugin.find(tag) is not None:
+            draft.not_read[f"Hydrodynamics: {tag} (a current is of the water, not of the vehicle)"] += 1
+    linear, quadratic = damping(coefficients, where)
+    explicit = added_mass(coefficients, where)
+    inner = {name: link.find("inertial/fluid_added_mass") for name, link in model.links.items()}
+    implicit = {
+        name: fluid_added_mass(e, f"{model.label}: link '{name}'")
+        for name, e in inner.items()
+        if e is not None
+    }
+    for name, matrix in implicit.items():
+        if name != base and np.any(matrix):
+            raise VehicleError(
+                f"{model.label}: link '{name}' has fluid_added_mass, expected it at '{base}' only: move it"
+            )
+    chosen = implicit.get(base, np.zeros((6, 6)))
+    if np.any(explicit) and flag(plugin, "disable_added_mass", where):
+        draft.different.append(
+            "disable_added_mass: the coefficients of added mass in Hydrodynamics are left out"
+        )
+    elif np.any(explicit) and np.any(chosen):
+        raise VehicleError(
+            f"{where}: the link has fluid_added_mass too, which counts twice: remove one of them"
+        )
+    elif np.any(explicit):
+        chosen = explicit
+        if np.any(explicit - np.diag(np.diag(explicit))):
+            draft.different.append(
+                "couplings of added mass are in FinsSim's Coriolis wrench, and not in gz-sim's"
+            )
+        theirs = "gives it the other sign where the plugin has the added mass (seen in July 2026)"
+        if flag(plugin, "disable_coriolis", where):
+            theirs = "leaves it out here (disable_coriolis)"
+        draft.different.append(
+            f"Coriolis wrench of the added mass: FinsSim computes it as Fossen; gz-sim {theirs}"
+        )
+    if not np.any(chosen):
+        draft.different.append("the added mass is 0 on every axis: a real vehicle accelerates more slowly")
+    for path, matrix in (
+        ("added_mass", chosen),
+        ("linear_damping", linear),
+        ("quadratic_damping", quadratic),
+    ):
+        draft.put(f"hydrodynamics.calibrated.{path}", plain(matrix))
+
+
+def _put_thrusters(
+    model: Model, plugins: list[Element], ranges: Mapping[str, tuple[float, float]], draft: Draft
+) -> None:
+    """Set the thrusters: each at the origin of the propeller's link, along the axis of its joint."""
+    weight = draft.values["body"]["mass"] * GRAVITY
+    for plugin in plugins:
+        name = model.text(plugin, "joint_name")
+        where, path = f"{model.label}: Thruster of '{name}'", f"thrusters.{name}"
+        _refuse_unknown(plugin, THRUSTER, where)
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) or name in draft.values.get("thrusters", {}):
+            raise VehicleError(
+                f"{where}: the name is there twice, or not of letters, digits, _ and -: rename the joint"
+            )
+        if name not in model.joints:
+            raise VehicleError(
+                f"{where}: there is no such joint{did_you_mean(name, list(model.joints))} correct it"
+            )
+        joint = model.joints[name]
+        axis = joint.find("axis/xyz")
+        if axis is not None and axis.get("expressed_in"):
+            raise VehicleError(
+                f"{where}: the axis is in another frame, which Thruster leaves out: give it in the joint's"
+            )
+        vector = np.array([0.0, 0.0, 1.0]) if axis is None else numbers(axis.text, 3, f"{where}: xyz")
+        if np.linalg.norm(vector) < 1e-6:
+            raise VehicleError(f"{where}: the axis is {vector.tolist()}, expected a direction")
+        place = model.pose(model.link_of(model.text(joint, "child"))).place
+        draft.put(f"{path}.position", plain(place), "derived", "origin of the propeller's link")
+        direction = axis_of_joint(model.pose(name), vector)
+        draft.put(f"{path}.axis", plain(direction), "derived", "axis of the joint")
+
+        absent = [tag for tag in PROPELLER if plugin.find(tag) is None]
+        for tag in CURVES & {child.tag for child in plugin}:
+            draft.not_read[f"Thruster: {tag} (thrust that falls with the speed)"] += 1
+        k, density, diameter = (number(plugin, tag, where, usual) for tag, usual in PROPELLER.items())
+        if "thrust_coefficient" in absent:
+            k = number(plugin, "alpha_1", where, k)
+        factor = thrust_factor(k, density, diameter)
+        if factor <= 0.0:
+            raise VehicleError(
+                f"{where}: the thrust coefficient, the diameter or the density is 0, expected another"
+            )
+        for key in ("c_plus", "c_minus"):
+            if absent:
+                draft.guess(f"{path}.{key}", factor, f"no {', '.join(absent)} in the file: as in gz-sim")
+            else:
+                draft.put(f"{path}.{key}", factor, "derived", ", ".join(PROPELLER))
+        _put_limits(plugin, where, path, ranges.get(name), np.copysign(factor, k), weight, draft)
+        draft.values["thrusters"][name] |= {"domain": "speed", "group": "propeller"}
+        draft.guess(f"{path}.time_constant", LAG, "gz-sim's thrust follows at once")
+        if plugin.find("deadband") is not None:
+            dead = _rpm(number(plugin, "deadband", where), factor)
+            draft.put(f"{path}.dead_rpm_plus", dead, "derived", "deadband")
+            draft.put(f"{path}.dead_rpm_minus", -dead, "derived", "deadband")
+
+
+def _rpm(force: float, factor: float) -> float:
+    return math.sqrt(abs(force) / factor) * 30.0 / math.pi
+
+
+def _put_limits(
+    plugin: Element,
+    where: str,
+    path: str,
+    commands: tuple[float, float] | None,
+    factor: float,
+    weight: float,
+    draft: Draft,
+) -> None:
+    """Set the limits of force and shaft speed.
+
+    Args:
+        plugin: The Thruster.
+        where: What a message calls it.
+        path: Of the thruster in the vehicle file.
+        commands: Least and greatest command of the autopilot, N or rad/s; None: no autopilot gives it.
+        factor: Of thrust = factor n|n|, with its sign [N s²/rad²].
+        weight: Of the vehicle [N].
+        draft: Draft to set them in.
+    """
+    low = number(plugin, "min_thrust_cmd", where, -math.inf)
+    high = number(plugin, "max_thrust_cmd", where, math.inf)
+    if high < low:
+        raise VehicleError(f"{where}: max_thrust_cmd is {high:g}, expected at least min_thrust_cmd, {low:g}")
+    if commands is not None:
+        low, high = max(low, commands[0]), min(high, commands[1])
+    if flag(plugin, "use_angvel_cmd", where):
+        low, high = sorted((factor * low * abs(low), factor * high * abs(high)))
+    if low >= 0.0 or high <= 0.0:
+        raise VehicleError(
+            f"{where}: its thrust is {low:g} to {high:g} N, expected one that reverses: change its limits"
+        )
+    note = "range of the autopilot's control" if commands is not None else "max_thrust_cmd, min_thrust_cmd"
+    for key, force, sign in (("min", low, -1.0), ("max", high, 1.0)):
+        if math.isfinite(force):
+            draft.put(f"{path}.force_{key}", force, "published" if commands is None else "derived", note)
+            how = "shaft speed of the force limit"
+            draft.put(f"{path}.rpm_{key}", sign * _rpm(force, abs(factor)), "derived", how)
+        else:
+            force, how = sign * SHARE * weight, f"no limit in the file: {SHARE:g} of the vehicle's weight"
+            draft.guess(f"{path}.force_{key}", force, how)
+            draft.guess(f"{path}.rpm_{key}", sign * _rpm(force, abs(factor)), f"{how}, as shaft speed")
+
+
+# The file: its world or its model, its plugins, and what is not read.
+
+
+def _kind(plugin: Element) -> str:
+    """Return the last word of a plugin's name: `Thruster` of gz::sim::systems::Thruster."""
+    return plugin.get("name", "").rpartition("::")[2]
+
+
+def _refuse_unknown(element: Element, known: Collection[str], where: str) -> None:
+    for child in element:
+        if child.tag not in known:
+            raise VehicleError(
+                f"{where}: unknown element '{child.tag}'{did_you_mean(child.tag, sorted(known))} "
+                f"expected one of {', '.join(sorted(known))}"
+            )
+
+
+def _unread(element: Element, known: Collection[str], where: str, draft: Draft) -> None:
+    """Note the children that are not read."""
+    for child in element:
+        if child.tag not in known:
+            kind = f" {child.get('type')}" if child.tag == "sensor" and child.get("type") else ""
+            idle = " (no force)" if child.tag in NO_FORCE else ""
+            draft.not_read[f"{where}: {child.tag}{kind}{idle}"] += 1
+
+
+def _model_of(root: Element, path: Path) -> tuple[Element, Element | None]:
+    """Return the only model with hydrodynamics, and its world if the file has one."""
+    if root.tag != "sdf":
+        raise VehicleError(f"{path}: its root is '{root.tag}', expected sdf")
+    worlds = root.findall("world")
+    around = worlds[0] if len(worlds) == 1 else root
+    models = around.findall("model")
+    wet = [m for m in models if any(_kind(p) == "Hydrodynamics" for p in m.findall("plugin"))]
+    if len(worlds) > 1 or len(wet) != 1:
+        names = ", ".join(m.get("name", "") for m in wet) or "none"
+        hint = (
+            " (the models that it includes have their own files)"
+            if around.find("include") is not None
+            else ""
+        )
+        raise VehicleError(
+            f"{path}: the models with a plugin Hydrodynamics are {names}, expected one: give a file with one{hint}"
+        )
+    return wet[0], worlds[0] if worlds else None
+
+
+def _put_water(
+    model: Model, world: Element | None, plugins: Mapping[str, list[Element]], draft: Draft
+) -> Collection[str]:
+    """Set density and gravity, and return the links on which Buoyancy acts."""
+    gravity = None if world is None else world.findtext("gravity")
+    if gravity is None:
+        draft.guess("water.gravity", GRAVITY, "the file gives none: that of SDF")
+    else:
+        vector = numbers(gravity, 3, f"{model.label}: gravity")
+        if np.any(vector[:2]) or vector[2] >= 0.0:
+            raise VehicleError(f"{model.label}: gravity is {vector.tolist()}, expected it along -z")
+        draft.put("water.gravity", -float(vector[2]))
+    given = {}
+    links: Collection[str] = model.links
+    for plugin in [] if world is None else [p for p in world.findall("plugin") if _kind(p) == "Buoyancy"]:
+        where = f"{model.label}: plugin Buoyancy"
+        _refuse_unknown(plugin, BUOYANCY, where)
+        given["Buoyancy"] = _density(plugin, where)
+        names = {(element.text or "").strip() for element in plugin.findall("enable")}
+        own = model.element.get("name", "")
+        if names and own not in names:
+            links = [link for link in model.links if f"{own}::{link}" in names]
+    if world is not None and not given:
+        draft.different.append(
+            "the world has no plugin Buoyancy: there the vehicle sinks, here its shapes carry it"
+        )
+    for kind, tag in (("Hydrodynamics", "water_density"), ("Thruster", "fluid_density")):
+        for plugin in plugins.get(kind, []):
+            if plugin.find(tag) is not None:
+                given.setdefault(f"{tag} of {kind}", number(plugin, tag, f"{model.label}: plugin {kind}"))
+    if not given:
+        draft.guess("water.density", DENSITY, "the file gives none: that of the plugin Buoyancy")
+        return links
+    first = next(iter(given))
+    draft.put("water.density", given[first], "published", "" if first == "Buoyancy" else first)
+    if len(set(given.values())) > 1:
+        named = ", ".join(f"{value:g} ({what})" for what, value in given.items())
+        draft.different.append(f"the densities differ: {named}; the buoyancy has the first")
+    if first != "Buoyancy":
+        draft.different.append("the density of Buoyancy is in a world's file, which is not read: compare it")
+    return links
+
+
+def _density(plugin: Element, where: str) -> float:
+    """Return the density under water of the plugin Buoyancy [kg/m³]."""
+    graded = plugin.find("graded_buoyancy")
+    if graded is None or plugin.find("uniform_fluid_density") is not None:
+        return number(plugin, "uniform_fluid_density", where, DENSITY)
+    _refuse_unknown(graded, {"default_density", "density_change"}, where)
+    changes = graded.findall("density_change")
+    if any(number(change, "above_depth", where, 0.0) != 0.0 for change in changes):
+        raise VehicleError(
+            f"{where}: the density changes under water, which no vehicle file holds: give one density"
+        )
+    return number(graded, "default_density", where, DENSITY)
+
+
+def _ranges(plugins: list[Element], label: str) -> dict[str, tuple[float, float]]:
+    """Return joint -> least and greatest command to its Thruster, of the controls of ArduPilotPlugin."""
+    ranges = {}
+    for control in (control for plugin in plugins for control in plugin.findall("control")):
+        joint = (control.findtext("jointName") or "").strip()
+        topic = (control.findtext("cmd_topic") or "").strip()
+        if topic.endswith((f"/{joint}/cmd_thrust", f"/{joint}/cmd_vel")):
+            where = f"{label}: control of '{joint}'"
+            _refuse_unknown(control, CONTROL, where)
+            factor, offset = number(control, "multiplier", where, 1.0), number(control, "offset", where, 0.0)
+            low, high = sorted((factor * offset, factor * (1.0 + offset)))
+            ranges[joint] = (low, high)
+    return ranges
+
+
+def read_sdf(path: Path) -> Draft:
+    """Read the model of an SDF file.
+
+    Args:
+        path: File of a model, or of a world with one model that has hydrodynamics. Meshes are in its folder or below.
+
+    Raises:
+        VehicleError: It cannot be read; the message says where, what was expected and what to do.
+    """
+    element, world = _model_of(read_xml(path), path)
+    name = element.get("name", "")
+    draft = Draft(str(path), f"{path.name}, model {name} (SDF of gz-sim)")
+    model = Model(element, str(path), draft)
+    plugins: dict[str, list[Element]] = {}
+    for plugin in element.findall("plugin"):
+        plugins.setdefault(_kind(plugin), []).append(plugin)
+    hydrodynamics = plugins["Hydrodynamics"]
+    if len(hydrodynamics) > 1:
+        raise VehicleError(
+            f"{path}: {len(hydrodynamics)} plugins Hydrodynamics, expected one: a vehicle is one body"
+        )
+    base = model.text(hydrodynamics[0], "link_name")
+    if base not in model.links:
+        raise VehicleError(
+            f"{path}: plugin Hydrodynamics: no link '{base}'{did_you_mean(base, list(model.links))} correct it"
+        )
+    model.body = model.pose(base)
+    model.refuse_loose(base)
+    thrusters = plugins.get("Thruster", [])
+    if not thrusters:
+        raise VehicleError(f"{path}: has no plugin Thruster, expected one or more: add them")
+
+    draft.values |= {
+        "title": f"{name} (gz-sim)",
+        "description": f"Read by FinsSim from {path.name}, a model of gz-sim.",
+    }
+    links = _put_water(model, world, plugins, draft)
+    _put_body(model, draft)
+    corners = _put_displacement(model, links, draft.values["water"]["density"], draft)
+    _put_hydrodynamics(model, hydrodynamics[0], base, draft)
+    _put_thrusters(model, thrusters, _ranges(plugins.get("ArduPilotPlugin", []), str(path)), draft)
+    put_envelope(draft, corners)
+    put_controlled_axes(draft)
+    _note_rest(model, world, plugins, {model.text(plugin, "joint_name") for plugin in thrusters})
+    return draft
+
+
+def _note_rest(
+    model: Model, world: Element | None, plugins: Mapping[str, list[Element]], turned: Collection[str]
+) -> None:
+    """Note plugins, joints and elements around the model that are not read."""
+    draft = model.draft
+    _unread(model.element, {"link", "joint", "frame", "plugin", "pose", "static"}, "model", draft)
+    for kind, found in plugins.items():
+        if kind not in ("Hydrodynamics", "Thruster"):
+            acts = " (its forces are left out)" if kind in WRENCHES else ""
+            partly = " but for the ranges of its commands" if kind == "ArduPilotPlugin" else ""
+            draft.not_read[f"plugin {kind or 'without a name'}{partly}{acts}"] += len(found)
+    for frame in model.frames.values():
+        _unread(frame, {"pose"}, "frame", draft)
+    for name, joint in model.joints.items():
+        _unread(joint, {"pose", "parent", "child", "axis"}, "joint", draft)
+        for axis in joint.findall("axis"):
+            _unread(axis, {"xyz"}, "axis", draft)
+        if joint.get("type") != "fixed" and name not in turned:
+            draft.different.append(f"joint '{name}' ({joint.get('type')}) is held where the file puts it")
+    if world is not None:
+        for child in world:
+            kind = f" {_kind(child)}" if child.tag == "plugin" else ""
+            if child is not model.element and child.tag != "gravity" and kind != " Buoyancy":
+                draft.not_read[f"world: {child.tag}{kind}"] += 1
+
+
+def _recognises(path: Path, head: bytes) -> bool:
+    return b"<sdf" in head or path.suffix.lower() == ".sdf"
+
+
+SDF = VehicleImporter("SDF of gz-sim (.sdf, .world)", _recognises, read_sdf)

@@ -1,0 +1,114 @@
+"""Reader of XML from outside: an element of bounded size, and the numbers and words in it."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.budget import NODES, read_bytes
+from finssim.vehicles.loader import GREATEST
+from finssim.vehicles.part import VehicleError
+
+__all__ = ["Element", "file_of_model", "flag", "number", "numbers", "read_xml"]
+
+LARGEST = 32 << 20
+"""Greatest size of an XML file [bytes]."""
+
+
+def read_xml(path: Path) -> Element:
+    """Return the root of a file.
+
+    Raises:
+        VehicleError: It is no XML, too large, or defines words of its own.
+    """
+    data = read_bytes(path, VehicleError, limit=LARGEST)
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise VehicleError(f"{path}: has a DOCTYPE, which may name other files: remove it")
+    try:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise VehicleError(f"{path}: cannot be read as XML: {error}") from None
+    if sum(1 for _ in root.iter()) > NODES:
+        raise VehicleError(f"{path}: has more than {NODES} elements: make it smaller")
+    return root
+
+
+def numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
+    """Return the finite numbers of a text, in its unit, (count,).
+
+    Args:
+        text: Words with spaces between them.
+        count: How many are expected.
+        where: What the message calls the text.
+
+    Raises:
+        VehicleError: It holds something else.
+    """
+    words = (text or "").split()
+    plain = all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word, re.ASCII) for word in words)
+    if len(words) != count or not plain:
+        expected = "a number" if count == 1 else f"{count} numbers"
+        raise VehicleError(f"{where} is '{(text or '').strip()[:60]}', expected {expected}")
+    values = np.array([float(word) for word in words])
+    if not np.all(np.abs(values) <= GREATEST):
+        raise VehicleError(f"{where} is '{(text or '').strip()[:60]}', expected numbers up to {GREATEST:g}")
+    return values
+
+
+def number(parent: Element, tag: str, where: str, default: float = math.nan) -> float:
+    """Return the number of a child element, in its unit.
+
+    Args:
+        parent: The element around it.
+        tag: Its name.
+        where: What the message calls the parent.
+        default: Number where there is no such child, in its unit; NaN: it must be there.
+    """
+    child = parent.find(tag)
+    if child is None:
+        if math.isnan(default):
+            raise VehicleError(f"{where}: {tag} is missing: add it")
+        return default
+    return float(numbers(child.text, 1, f"{where}: {tag}")[0])
+
+
+def flag(parent: Element, tag: str, where: str, default: bool = False) -> bool:
+    """Return whether a child element says true or 1; the default where there is none."""
+    child = parent.find(tag)
+    text = str(default) if child is None else (child.text or "")
+    word = text.strip().lower()
+    if word not in ("true", "false", "1", "0"):
+        raise VehicleError(f"{where}: {tag} is '{text.strip()[:60]}', expected true or false")
+    return word in ("true", "1")
+
+
+def file_of_model(folder: Path, uri: str, where: str) -> Path:
+    """Return a file that a model names: in the folder of the model or below.
+
+    Args:
+        folder: Folder of the model.
+        uri: `model://NAME/PATH`, `package://NAME/PATH`, or a path below the folder; NAME is that of the model.
+        where: What the message calls the element.
+
+    Raises:
+        VehicleError: It lies elsewhere, or there is none.
+    """
+    kind, scheme, below = uri.partition("://")
+    name = below.partition("/")[2] if scheme else uri
+    strange = re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|[\0\n]", name)
+    foreign = bool(scheme) and kind not in ("model", "package")
+    outside = foreign or name.startswith(("/", "\\", "~")) or strange is not None
+    file = folder if outside or not name.strip() else folder / name
+    if outside or not file.resolve().is_relative_to(folder.resolve()):
+        raise VehicleError(f"{where} names the file '{uri[:200]}': put it into the model's folder or below")
+    if not file.is_file():
+        raise VehicleError(
+            f"{where} names the file '{uri[:200]}', which is not in the model's folder: add it"
+        )
+    return file
