@@ -17,7 +17,7 @@ import warp as wp
 from finssim.sim.state import State
 from finssim.tasks import ObservationPart, Task
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.terms import End, RewardTerm, Terms, place_at_rest
+from finssim.tasks.terms import End, RewardTerm, Terms, each_step, place_at_rest
 
 BEST = 0.5
 """c."""
@@ -87,7 +87,7 @@ class Steady(Guess):
     time_limit: float = 0.5
 
     def terms(self) -> Terms:
-        return Terms(start=draw, rewards=(RewardTerm("one", "1.0", 1.0),))
+        return Terms(start=draw, rewards=(RewardTerm("one", each_step, 1.0),))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,6 @@ from finssim.agents.catalogue import baselines_of
 from finssim.control.modes import AXES, action_mode
 from finssim.evaluation.tables import Table
 from finssim.tasks import TASKS
-from finssim.tasks import terms as library
 from finssim.tasks.catalogue import task_named
 from finssim.tasks.given import crew
 from finssim.tasks.sensing import Sensing, seen_with
@@ -103,17 +102,13 @@ def describe_task(
 
 
 def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
-    """Return the task's text of a term; otherwise the docstring of the function, also of one that is shared by name.
-
-    An expression of which nothing is said is its own text, but in an observation, whose part is named by what it is.
-    """
+    """Return the task's text of a term, or the first paragraph of its function's docstring, also of a shared value."""
     terms, term = task.terms(), part.term
-    shared = {**terms.shared, **terms.seen}
-    while isinstance(term, str) and (term in shared or hasattr(library, term)):
-        term = shared.get(term, getattr(library, term, None))
-    expression = "" if isinstance(part, ObservationPart) or term is None else str(part.term)
-    text = (inspect.getdoc(term.func) or "") if hasattr(term, "func") else expression
-    return terms.meanings.get(part.name) or " ".join(text.split())
+    while isinstance(term, str):
+        term = {**terms.shared, **terms.seen}.get(term)
+    text = "" if term is None else (inspect.getdoc(term.func) or "").partition("\n\n")[0]
+    text = " ".join(text.split()).removeprefix("Return ")
+    return terms.meanings.get(part.name) or text[:1].upper() + text[1:]
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:

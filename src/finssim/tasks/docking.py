@@ -15,7 +15,21 @@ from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
-from finssim.tasks.terms import End, ObservationPart, RewardTerm, Terms, Total, own_velocity, tilted, uniform3
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    Total,
+    action_costs,
+    attitude_error,
+    goal_columns,
+    heading_match,
+    offset_length,
+    own_velocity,
+    tilted,
+    uniform3,
+)
 from finssim.vehicles import Vehicle
 from finssim.vehicles.capability import terminal_speeds
 
@@ -39,11 +53,11 @@ def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
 
 OBSERVATION = (
     ObservationPart("nose to its berth, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset"),
-    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+    ObservationPart("dock rotation relative to the body, first two columns", 6, "1", term=goal_columns),
     *own_velocity(clip=2.0),
     ObservationPart("nose from the throat, dock axes", 3, "m", scale=DISTANCE_SCALE, term="nose"),
     ObservationPart(
-        "distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"
+        "distance of the nose to its berth", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=offset_length
     ),
 )
 
@@ -132,6 +146,54 @@ def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
 
 
 @wp.func
+def from_berth(p: Any, x: wp.vec3) -> float:
+    """Return the distance of the nose from its berth [vehicle lengths].
+
+    The nose is at `x` [m].
+    """
+    return wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length
+
+
+@wp.func
+def at_berth(p: Any, e: float) -> float:
+    """Return 1 with the nose in its berth, 1/e at a distance `e` of `position_scale` [vehicle lengths]."""
+    return wp.exp(-e / p.reward.position_scale)
+
+
+@wp.func
+def contact_force(arrays: TaskArrays, w: int) -> float:
+    """Return the greatest contact force in the step [N]."""
+    return arrays.funnel.force[w, 0]
+
+
+@wp.func
+def contact(p: Any, force: float) -> float:
+    """Return the greatest contact force in the step as a part of the one that ends the episode, at most 1.
+
+    The force is in [N].
+    """
+    return wp.min(force / p.force_limit, 1.0)
+
+
+@wp.func
+def crashes(p: Any, force: float) -> bool:
+    """Return whether the contact force is above `force_limit` [N]."""
+    return force > p.force_limit
+
+
+@wp.func
+def contact_impulse(arrays: TaskArrays, w: int, was: float) -> float:
+    """Return the contact force, integrated over the episode [N s]."""
+    return was + arrays.funnel.impulse[w, 0]
+
+
+@wp.func
+def peak_force(was: float, force: float) -> float:
+    """Return the greatest contact force so far [N]."""
+    return wp.max(was, force)
+
+
+@wp.func
 def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
     """Half a length out of the water, or farther from the dock than the tank is wide."""
     x = state.position[w, 0]
@@ -146,6 +208,12 @@ def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
     still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
     deep = x[0] >= p.inside * p.funnel.tube_length
     return deep and wp.length(wp.vec2(x[1], x[2])) <= 2.0 * p.gap and still
+
+
+@wp.func
+def docked_gently(p: Any, docked: bool, force: float) -> bool:
+    """Return whether the nose is in the tube, slow, and the contact force [N] ends no episode."""
+    return docked and not force > p.force_limit
 
 
 @wp.func
@@ -288,36 +356,30 @@ class Docking(Task):
             start=start,
             shared={
                 "x": nose,
-                "e": "wp.length(wp.vec3(p.berth * p.funnel.tube_length - x[0], x[1], x[2])) / p.hull.length",
-                "theta": "attitude_error",
-                "force": "arrays.funnel.force[w, 0]",
+                "e": from_berth,
+                "theta": attitude_error,
+                "force": contact_force,
                 "docked": is_docked,
             },
             seen={"nose": seen_nose, "offset": berth_offset},
             meanings={
                 "position": f"1 with the nose in its berth, 1/e at {r.position_scale:.3g} vehicle lengths from it.",
-                "distance": "From the nose to its berth, in vehicle lengths.",
                 "heading": f"1 in the dock's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
-                "contact": "Greatest contact force in the step as a part of the one that ends the episode, at most 1.",
                 "crash": f"A contact force above {self.force_limit:.3g} N.",
-                "contact_impulse": "Contact force, integrated over the episode [N s].",
-                "peak_force": "Greatest contact force so far [N].",
             },
             rewards=(
-                RewardTerm("position", "wp.exp(-e / p.reward.position_scale)", r.position),
+                RewardTerm("position", at_berth, r.position),
                 RewardTerm("distance", "e", -r.distance),
                 RewardTerm("corridor", off_corridor, -r.corridor),
-                RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
+                RewardTerm("heading", heading_match, r.heading),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("contact", "wp.min(force / p.force_limit, 1.0)", -r.contact),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("rate", "turning", -r.rate),
+                RewardTerm("contact", contact, -r.contact),
+                *action_costs(r.action, r.change, r.rate),
             ),
-            ends=(End("crash", "force > p.force_limit", -r.loss), End("lost", is_lost, -r.loss)),
-            inside="docked and not force > p.force_limit",
+            ends=(End("crash", crashes, -r.loss), End("lost", is_lost, -r.loss)),
+            inside=docked_gently,
             totals=(
-                Total("contact_impulse", "was + arrays.funnel.impulse[w, 0]"),
-                Total("peak_force", "wp.max(was, force)"),
+                Total("contact_impulse", contact_impulse),
+                Total("peak_force", peak_force),
             ),
         )

@@ -16,8 +16,14 @@ from finssim.tasks.terms import (
     RewardTerm,
     Terms,
     Total,
+    action_costs,
+    goal_offset,
+    offset_length,
+    out_of_pool,
     own_velocity,
+    position_error,
     start_upright,
+    turn_rate,
     uniform3,
 )
 
@@ -39,9 +45,7 @@ OBSERVATION = (
     ),
     ObservationPart("target velocity, body frame", 3, "m/s", scale=TARGET_SCALE, term=target_drift),
     *own_velocity(clip=2.0),
-    ObservationPart(
-        "distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"
-    ),
+    ObservationPart("distance to the target", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=offset_length),
 )
 
 
@@ -115,6 +119,30 @@ def slip(state: State, arrays: TaskArrays, w: int) -> float:
     nu = state.velocity[w, 0]
     drift = wp.quat_rotate_inv(state.quaternion[w, 0], arrays.target.velocity[w])
     return wp.length(wp.vec3(nu[0], nu[1], nu[2]) - drift)
+
+
+@wp.func
+def closeness(p: Any, e: float) -> float:
+    """Return 1 at the target, 1/e at a distance `e` of `near_scale` [m] in proportion to the vehicle."""
+    return wp.exp(-e / (p.fit.size * p.reward.near_scale))
+
+
+@wp.func
+def matching(p: Any, close: float, u: float) -> float:
+    """Return `near`, times 1/e per `match_scale` of the speed `u` relative to the target [m/s]."""
+    return close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))
+
+
+@wp.func
+def spinning(turn: float) -> float:
+    """Return the size of the angular velocity, at most 2 [rad/s]."""
+    return wp.min(turn, 2.0)
+
+
+@wp.func
+def with_target(p: Any, e: float, u: float, turn: float) -> bool:
+    """Return whether the vehicle is near the target, as fast as it, and not turning [m, m/s, rad/s]."""
+    return e <= p.fit.size * p.tolerance and u <= p.fit.pace * p.slip_tolerance and turn <= p.rate_tolerance
 
 
 @wp.func
@@ -207,27 +235,24 @@ class MovingTarget(PoolTask):
             start=start,
             advance=move_target,
             shared={
-                "e": "position_error",
+                "e": position_error,
                 "u": slip,
-                "close": "wp.exp(-e / (p.fit.size * p.reward.near_scale))",
-                "turn": "wp.length(angular_velocity)",
+                "close": closeness,
+                "turn": turn_rate,
             },
-            seen={"offset": "goal_offset"},
+            seen={"offset": goal_offset},
             meanings={
                 "near": f"1 at the target, 1/e at {self.fit.size * r.near_scale:.3g} m from it.",
                 "match": f"`near`, times 1/e per {self.fit.pace * r.match_scale:.3g} m/s off the target's velocity.",
-                "spin": "Size of the angular velocity, at most 2 [rad/s].",
             },
             rewards=(
                 RewardTerm("near", "close", r.near),
-                RewardTerm("match", "close * wp.exp(-u / (p.fit.pace * p.reward.match_scale))", r.match),
+                RewardTerm("match", matching, r.match),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("spin", "wp.min(turn, 2.0)", -r.spin),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("spin", spinning, -r.spin),
+                *action_costs(r.action, r.change),
             ),
-            ends=(End("left", "out_of_pool", -r.loss),),
-            # Near enough, as fast as the target, and not turning.
-            inside="e <= p.fit.size * p.tolerance and u <= p.fit.pace * p.slip_tolerance and turn <= p.rate_tolerance",
+            ends=(End("left", out_of_pool, -r.loss),),
+            inside=with_target,
             totals=(Total("squared_error", squared_error),),
         )

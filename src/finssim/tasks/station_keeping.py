@@ -15,7 +15,15 @@ from finssim.tasks.terms import (
     ObservationPart,
     RewardTerm,
     Terms,
+    action_costs,
+    attitude_error,
+    goal_columns,
+    goal_offset,
+    heading_match,
+    offset_length,
+    out_of_pool,
     own_velocity,
+    position_error,
     tilt_angle,
     tilted,
     uniform3,
@@ -27,10 +35,10 @@ DISTANCE_SCALE = 3.0
 OBSERVATION = (
     ObservationPart("goal offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)),
     ObservationPart(
-        "goal rotation relative to the body, first two columns", 6, "1", term="goal_columns", errors=(1,)
+        "goal rotation relative to the body, first two columns", 6, "1", term=goal_columns, errors=(1,)
     ),
     *own_velocity(clip=2.0),
-    ObservationPart("distance to the goal", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term="wp.length(offset)"),
+    ObservationPart("distance to the goal", 1, "m", scale=DISTANCE_SCALE, clip=1.0, term=offset_length),
 )
 
 
@@ -83,6 +91,12 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
     off = wp.max(wp.max(wp.abs(error[0]), wp.abs(error[1])), wp.abs(error[2]))
     turn = wp.abs(wrapped(heading(arrays.goal_quaternion[w]) - heading(state.quaternion[w, 0])))
     return off <= p.tolerance and turn <= p.yaw_tolerance
+
+
+@wp.func
+def at_goal(p: Any, e: float) -> float:
+    """Return 1 at the goal, 1/e at an error `e` of `position_scale` [m] in proportion to the vehicle."""
+    return wp.exp(-e / (p.fit.size * p.reward.position_scale))
 
 
 @wp.func
@@ -161,22 +175,20 @@ class StationKeeping(PoolTask):
         r = self.reward
         return Terms(
             start=start,
-            shared={"e": "position_error", "theta": "attitude_error"},
+            shared={"e": position_error, "theta": attitude_error},
             meanings={
                 "position": f"1 at the goal, 1/e at {self.fit.size * r.position_scale:.3g} m from it.",
                 "heading": f"1 in the goal's attitude, 1/e at {r.heading_scale:.3g} rad from it.",
             },
-            seen={"offset": "goal_offset"},
+            seen={"offset": goal_offset},
             rewards=(
-                RewardTerm("position", "wp.exp(-e / (p.fit.size * p.reward.position_scale))", r.position),
+                RewardTerm("position", at_goal, r.position),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("heading", "wp.exp(-theta / p.reward.heading_scale)", r.heading),
+                RewardTerm("heading", heading_match, r.heading),
                 RewardTerm("turn", "theta", -r.turn),
                 RewardTerm("leaning", leaning, -r.leaning),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("rate", "turning", -r.rate),
+                *action_costs(r.action, r.change, r.rate),
             ),
-            ends=(End("left", "out_of_pool", -r.loss),),
+            ends=(End("left", out_of_pool, -r.loss),),
             inside=within_tolerance,
         )

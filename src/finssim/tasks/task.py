@@ -1,10 +1,10 @@
 """Tasks: observation, action and reward, as terms, and the length of an episode."""
 
-import ast
 import hashlib
 import inspect
 import itertools
 import linecache
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cache
@@ -260,8 +260,7 @@ class Task:
 # The kernels of a task, written from its terms; and the struct of its settings that they take.
 #
 # Each stage of an episode is one kernel for all tasks but for the terms that it calls: what every task does at the
-# start, in each step and at the end of an episode is here once. A term is called by the names of its arguments, or
-# written out, if it is an expression, with these names in it:
+# start, in each step and at the end of an episode is here once. A term is called by the names of its arguments:
 #
 #     state   the truth                           a     number of the agent; a reward without it is the team's
 #     arrays  what is measured, wanted, counted   k     the index given with the term
@@ -270,7 +269,7 @@ class Task:
 #
 # and after a step any of the task's totals by its name, as it was before, `was` for the total's own, and `held`: the
 # time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name. A
-# function of `finssim.tasks.terms` is used in an expression for its result.
+# term may also be the name of a value alone.
 
 
 APART = ("name", "observation", "training_noise", "communication")
@@ -338,35 +337,28 @@ class _Writer:
         sources = [_function(f"{name}({STAGES[name]})", lines) for name, lines in stages.items() if lines]
         return "\n".join([_function("look(arrays: TaskArrays, p: P, w: int)", self._look()), *sources])
 
-    def _value(self, term: Any, role: str, **scope: str) -> str:
-        """A term in the source: a call with what it takes by name, or the expression."""
-        scope = {name: name for name in ("arrays", "p", "w", "a")} | scope
-
-        def value(name: str, whose: str) -> str:
+    def _value(self, term: Any, role: str, **values: str) -> str:
+        """Return a term in the source: a call with its arguments by name, or a value by its name."""
+        where = f"task '{self.task.name}': {role}"
+        if isinstance(term, str) and term in values:
+            return values[term]
+        if not (isinstance(term, wp.Function) and term.func):
+            known = ", ".join(values) or "none here"
+            raise EnvironmentSetupError(
+                f"{where} is {term!r}, expected a function with @wp.func, or the name of a value ({known})"
+            )
+        scope = {name: name for name in ("arrays", "p", "w", "a")} | values
+        names = inspect.signature(term.func).parameters
+        for name in names:
             if name not in scope:
                 raise EnvironmentSetupError(
-                    f"task '{self.task.name}': {role}{whose} takes '{name}', expected of: {', '.join(scope)}"
+                    f"{where} ({term.key}) takes '{name}', expected of: {', '.join(scope)}"
                 )
-            return scope[name]
-
-        def call(function: Any) -> str:
-            names = inspect.signature(function.func).parameters
-            arguments = ", ".join(value(name, f" ({function.key})") for name in names)
-            label = next(
-                (n for n, f in self.functions.items() if f is function),
-                f"t{len(self.functions)}_{function.key}",
-            )
-            self.functions[label] = function
-            return f"{label}({arguments})"
-
-        if not isinstance(term, str):
-            return call(term)
-        tree = ast.parse(term, mode="eval")
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Name) and node.id not in ("wp", "float", "int"):
-                function = None if node.id in scope else getattr(library, node.id, None)
-                node.id = value(node.id, "") if function is None else call(function)
-        return f"({ast.unparse(tree)})"
+        label = next(
+            (n for n, f in self.functions.items() if f is term), f"t{len(self.functions)}_{term.key}"
+        )
+        self.functions[label] = term
+        return f"{label}({', '.join(scope[name] for name in names)})"
 
     def _shared(self, terms: Mapping[str, Any], scope: dict[str, str]) -> tuple[list[str], dict[str, str]]:
         """Return the lines that compute what terms share, and the names defined by them."""
@@ -443,9 +435,7 @@ class _Writer:
             f"wp.where(e{i}, 1.0, 0.0)" for i, _ in enumerate(self.terms.ends)
         ]
         numbers, count = range(len(values)), float(len(self.task.agents))
-        each = [
-            i for i in numbers if any(getattr(n, "id", "") == "a" for n in ast.walk(ast.parse(values[i])))
-        ]
+        each = [i for i in numbers if re.search(r"\ba\b", values[i])]
         lines = [f"r{i} = weights[{i}] * {values[i]}" for i in numbers]
         means = [f"m{i} / {count!r}" if i in each else f"r{i}" for i in numbers]
         loop = [
@@ -490,8 +480,9 @@ class _Writer:
         if not all(isinstance(first, int | float) for first in firsts.values()):
             shared, scope = self._shared(self.terms.shared, scope)
         for name, first in firsts.items():
-            term = repr(float(first)) if isinstance(first, int | float) else first
-            shared.append(f"{self._totals[name]} = {self._value(term, f'first of total {name!r}', **scope)}")
+            number = isinstance(first, int | float)
+            value = first if number else self._value(first, f"first of total {name!r}", **scope)
+            shared.append(f"{self._totals[name]} = float({value})")
         head = ["w = world_offset + wp.tid()", "if mask[w] == 0:", "    return"]
         return [*head, f"key = {KEY}", "open_episode(arrays, w)", start, *shared]
 

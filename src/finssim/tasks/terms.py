@@ -1,9 +1,8 @@
-"""Terms: the small functions and expressions of which a task is made, each with a name; and those that tasks share.
+"""Terms: the small functions of which a task is made, each with a name; and those that tasks share.
 
-A term is a `wp.func`, which takes its arguments by their names, or an expression of the same names as text, such as
-`"wp.exp(-e / p.scale)"`; in an expression the functions of this module stand for themselves, without arguments. See
-`finssim.tasks.task` for the names. What a policy sees comes from `arrays`, which holds what is measured; what it is
-paid for and how an episode ends comes from `state`, the truth.
+A term is a `wp.func`, which takes its arguments by their names, or the name of a value that the task shares between
+its terms, such as `"e"`. See `finssim.tasks.task` for the names. Observations use `arrays`, which contains
+measurements; rewards and ends use `state`, the truth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -88,8 +87,8 @@ class Terms:
     seen: Mapping[str, Any] = field(default_factory=dict)
     """Values that observation terms share: name -> term of measurements, once for each agent."""
     meanings: Mapping[str, str] = field(default_factory=dict)
-    """Meaning of a reward, an end or a total that is an expression: name -> sentence with the unit. A function has its
-    docstring."""
+    """Meaning of a reward, an end or a total with the task's numbers, in place of the function's docstring: name ->
+    sentence with the unit."""
     shown: bool = True
     """True if the observation is written by the terms of its parts; False: the task writes it."""
     command: Any = None
@@ -229,6 +228,12 @@ def angular_velocity(state: State, w: int) -> wp.vec3:
 
 
 @wp.func
+def turn_rate(state: State, w: int) -> float:
+    """Return the size of the angular velocity of vehicle 0 [rad/s]."""
+    return wp.length(angular_velocity(state, w))
+
+
+@wp.func
 def position_error(state: State, arrays: TaskArrays, w: int) -> float:
     """Return the distance from vehicle 0 to its goal [m]."""
     return wp.length(arrays.goal_position[w] - state.position[w, 0])
@@ -239,6 +244,24 @@ def attitude_error(state: State, arrays: TaskArrays, w: int) -> float:
     """Angle of the rotation from vehicle 0's attitude to its goal's [rad], in [0, π]."""
     d = wp.quat_inverse(state.quaternion[w, 0]) * arrays.goal_quaternion[w]
     return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
+
+
+@wp.func
+def heading_match(p: Any, theta: float) -> float:
+    """Return 1 in the goal's attitude, 1/e at an error `theta` of `reward.heading_scale` [rad]."""
+    return wp.exp(-theta / p.reward.heading_scale)
+
+
+@wp.func
+def near_match(p: Any, e: float) -> float:
+    """Return 1 without an error, 1/e at an error `e` of `reward.near_scale` [m]."""
+    return wp.exp(-e / p.reward.near_scale)
+
+
+@wp.func
+def each_step() -> float:
+    """Return 1 in every step [1]: sooner is better."""
+    return 1.0
 
 
 @wp.func
@@ -264,7 +287,7 @@ def action_change(arrays: TaskArrays, w: int, a: int) -> float:
 
 @wp.func
 def turning(state: State, w: int) -> float:
-    """min(|ω|², 4): no spinning on the way [rad²/s²]."""
+    """Return the square of the turn rate, at most 4: no spinning on the way [rad²/s²]."""
     omega = angular_velocity(state, w)
     return wp.min(wp.dot(omega, omega), 4.0)
 
@@ -315,6 +338,30 @@ def goal_columns(arrays: TaskArrays, w: int, a: int) -> vec6:
     """Return the first two columns of the goal's rotation matrix relative to an agent's body."""
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, a]) * arrays.goal_quaternion[w])
     return vec6(R[0, 0], R[1, 0], R[2, 0], R[0, 1], R[1, 1], R[2, 1])
+
+
+@wp.func
+def offset_length(offset: wp.vec3) -> float:
+    """Return the distance that is left [m]: the length of `offset`."""
+    return wp.length(offset)
+
+
+@wp.func
+def world_up(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Return the world's up, a unit vector, body frame."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))
+
+
+@wp.func
+def measured_depth(arrays: TaskArrays, w: int, a: int) -> float:
+    """Return the measured depth of an agent below the surface [m]."""
+    return -arrays.position[w, a][2]
+
+
+def action_costs(action: float, change: float, rate: float | None = None) -> tuple[RewardTerm, ...]:
+    """Return the rewards with these weights against effort, against changes of the action, and against turning."""
+    effort = (RewardTerm("action", action_effort, -action), RewardTerm("change", action_change, -change))
+    return effort if rate is None else (*effort, RewardTerm("rate", turning, -rate))
 
 
 def own_velocity(clip: float) -> tuple[ObservationPart, ...]:

@@ -33,6 +33,30 @@ def answered_start(state: State, arrays: TaskArrays, w: int):
         arrays.answers.memory[w, i] = arrays.answers.begun[w, i]
 
 
+@wp.func
+def answered_reward(arrays: TaskArrays, w: int, a: int) -> float:
+    """Return what `reward` returned."""
+    return arrays.answers.reward[w, a]
+
+
+@wp.func
+def answered_end(arrays: TaskArrays, w: int) -> bool:
+    """Return whether `terminated` was true."""
+    return arrays.answers.terminated[w] != 0
+
+
+@wp.func
+def answered_inside(arrays: TaskArrays, w: int) -> bool:
+    """Return whether `inside` was true."""
+    return arrays.answers.inside[w] != 0
+
+
+@wp.func
+def answered_count(arrays: TaskArrays, w: int, k: int, was: float) -> float:
+    """Return the sum of what `counted` returned by this name, both in its unit."""
+    return was + arrays.answers.counted[w, k]
+
+
 @wp.kernel(enable_backward=False)
 def draw(
     out: wp.array2d(dtype=float),
@@ -270,17 +294,10 @@ class TorchTask(Task):
         return Terms(
             start=answered_start,
             shown=False,
-            rewards=(RewardTerm("reward", "arrays.answers.reward[w, a]", 1.0),),
-            ends=(End("terminated", "arrays.answers.terminated[w] != 0"),),
-            inside="arrays.answers.inside[w] != 0",
-            meanings={
-                "reward": "What `reward` returns.",
-                "terminated": "Where `terminated` is true.",
-                **dict.fromkeys(self.totals, "Sum of what `counted` returns by this name."),
-            },
-            totals=tuple(
-                Total(name, f"was + arrays.answers.counted[w, {i}]") for i, name in enumerate(self.totals)
-            ),
+            rewards=(RewardTerm("reward", answered_reward, 1.0),),
+            ends=(End("terminated", answered_end),),
+            inside=answered_inside,
+            totals=tuple(Total(name, answered_count, index=i) for i, name in enumerate(self.totals)),
         )
 
     def settings_class(self) -> type:

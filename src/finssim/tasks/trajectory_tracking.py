@@ -19,10 +19,13 @@ from finssim.tasks.terms import (
     ObservationPart,
     RewardTerm,
     Terms,
+    action_costs,
     own_velocity,
+    position_error,
     start_upright,
     tilt_angle,
     uniform3,
+    world_up,
 )
 
 # References to follow: a table of knots per world, filled with the shapes of T2 by a kernel, or from trajectories.
@@ -289,7 +292,7 @@ OBSERVATION = (
         "world up, body frame",
         3,
         "1",
-        term="wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))",
+        term=world_up,
     ),
     ObservationPart("tangent heading in the body, sine and cosine", 2, "1", term=tangent),
     ObservationPart("progress, sine and cosine of one and two turns", 4, "1", term=progress),
@@ -331,6 +334,24 @@ class TrackingReward:
 def lead_reference(arrays: TaskArrays, w: int):
     """Take the goal to where the reference is now."""
     arrays.goal_position[w] = reference_position(arrays.reference, w, arrays.time[w])
+
+
+@wp.func
+def on_reference(p: Any, e: float) -> float:
+    """Return 1 on the reference, 1/e at an error `e` of `track_scale` [m] in proportion to the vehicle."""
+    return wp.exp(-e / (p.fit.size * p.reward.track_scale))
+
+
+@wp.func
+def yaw_speed(state: State, w: int) -> float:
+    """Return the size of the yaw rate [rad/s]."""
+    return wp.abs(state.velocity[w, 0][5])
+
+
+@wp.func
+def within_tolerance(p: Any, e: float) -> bool:
+    """Return whether the error `e` [m] is within `tolerance`."""
+    return e <= p.tolerance
 
 
 @wp.func
@@ -459,20 +480,18 @@ class TrajectoryTracking(FittedTask):
         return Terms(
             start=start,
             advance=lead_reference,
-            shared={"e": "position_error", "pose": "wp.exp(-e / (p.fit.size * p.reward.track_scale))"},
+            shared={"e": position_error, "pose": on_reference},
             seen={"drift": reference_drift},
             meanings={
                 "track": f"1 on the reference, 1/e at {self.fit.size * r.track_scale:.3g} m from it.",
-                "spin": "Size of the yaw rate [rad/s].",
             },
             rewards=(
                 RewardTerm("track", "pose", r.track),
                 RewardTerm("posture", posture, r.posture),
                 RewardTerm("distance", "e", -r.distance / self.fit.size),
-                RewardTerm("spin", "wp.abs(state.velocity[w, 0][5])", -r.spin),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
+                RewardTerm("spin", yaw_speed, -r.spin),
+                *action_costs(r.action, r.change),
             ),
             ends=(End("lost", is_lost, -r.loss),),
-            inside="e <= p.tolerance",
+            inside=within_tolerance,
         )

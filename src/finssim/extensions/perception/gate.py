@@ -17,6 +17,10 @@ from finssim.tasks.terms import (
     ObservationPart,
     RewardTerm,
     Terms,
+    action_costs,
+    attitude_error,
+    goal_columns,
+    goal_offset,
     own_velocity,
     place_tilted,
     world_velocity,
@@ -85,6 +89,36 @@ def off_axis(p: Any, place: wp.vec3) -> float:
 
 
 @wp.func
+def near_bar(p: Any, room: float) -> float:
+    """Return 1 where a bar is touched, falling to 0 at `near_scale` [m] from the nearest one."""
+    return wp.max(1.0 - room / p.reward.near_scale, 0.0)
+
+
+@wp.func
+def touches(room: float) -> bool:
+    """Return whether the vehicle's envelope meets a bar.
+
+    The clearance is `room` [m].
+    """
+    return room < 0.0
+
+
+@wp.func
+def misses(place: wp.vec3) -> bool:
+    """Return whether the body origin went past the gate, outside of it.
+
+    It is at `place` in gate axes [m].
+    """
+    return place[0] >= 0.0 and not wp.max(wp.abs(place[1]), wp.abs(place[2])) < HALF
+
+
+@wp.func
+def passes(p: Any, place: wp.vec3) -> bool:
+    """Return whether the body origin is `behind` the gate; `place` is in gate axes [m]."""
+    return place[0] >= p.behind
+
+
+@wp.func
 def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> bool:
     """Half a length from the surface or the floor, or farther from the gate than an episode can need.
 
@@ -143,8 +177,8 @@ class Gate(SeeingTask):
     title: ClassVar[str] = "pass a gate by camera"
     landmark: ClassVar[str] = "near"
     teacher: ClassVar[tuple[ObservationPart, ...]] = (
-        ObservationPart("way to the gate's middle, body frame", 3, "m", scale=3.0, term="goal_offset"),
-        ObservationPart("gate rotation relative to the body, first two columns", 6, "1", term="goal_columns"),
+        ObservationPart("way to the gate's middle, body frame", 3, "m", scale=3.0, term=goal_offset),
+        ObservationPart("gate rotation relative to the body, first two columns", 6, "1", term=goal_columns),
         *own_velocity(clip=2.0),
     )
     baselines: ClassVar = {"post-servo": "finssim.extensions.perception.servos:PostServo"}
@@ -190,29 +224,24 @@ class Gate(SeeingTask):
     def terms(self) -> Terms:
         """See `GateReward`."""
         r = self.reward
-        inside = f"wp.max(wp.abs(place[1]), wp.abs(place[2])) < {float(HALF)!r}"
         return Terms(
             start=start,
-            shared={"place": in_gate, "room": clearance, "theta": "attitude_error"},
+            shared={"place": in_gate, "room": clearance, "theta": attitude_error},
             meanings={
                 "near": f"1 where a bar is touched, falling to 0 at {r.near_scale:g} m from the nearest one.",
-                "touched": "The vehicle's envelope meets a bar.",
-                "missed": "The body origin went past the gate, outside of it.",
                 "passed": f"Through the gate: the body origin is {self.behind:.3g} m behind it.",
             },
             rewards=(
                 RewardTerm("progress", approach, r.progress),
                 RewardTerm("corridor", off_axis, -r.corridor),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("near", "wp.max(1.0 - room / p.reward.near_scale, 0.0)", -r.near),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("rate", "turning", -r.rate),
+                RewardTerm("near", near_bar, -r.near),
+                *action_costs(r.action, r.change, r.rate),
             ),
             ends=(
-                End("touched", "room < 0.0", -r.loss),
-                End("missed", f"place[0] >= 0.0 and not {inside}", -r.loss),
-                End("passed", "place[0] >= p.behind", r.passed),
+                End("touched", touches, -r.loss),
+                End("missed", misses, -r.loss),
+                End("passed", passes, r.passed),
                 End("lost", is_lost, -r.loss),
             ),
         )

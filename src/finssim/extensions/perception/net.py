@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.extensions.perception.seeing import SeeingTask, up
+from finssim.extensions.perception.seeing import SeeingTask
 from finssim.physics.types import vec6
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
@@ -20,8 +20,11 @@ from finssim.tasks.terms import (
     RewardTerm,
     Terms,
     Total,
+    action_costs,
+    near_match,
     own_velocity,
     place_tilted,
+    world_up,
     world_velocity,
 )
 from finssim.vehicles import Vehicle
@@ -157,6 +160,60 @@ def along_speed(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> flo
 
 
 @wp.func
+def from_line(p: Any, place: wp.vec4, d: float) -> float:
+    """Return the distance from the line along the net [m].
+
+    The vehicle is at `place`, as of `by_net`, at a distance `d` from the net [m].
+    """
+    return wp.length(wp.vec2(d - p.distance, place[2] - p.level))
+
+
+@wp.func
+def pace(p: Any, along: float) -> float:
+    """Return 1 at the set speed along the net, falling to 0 where the vehicle is at rest, or is twice as fast.
+
+    The speed along it is in [m/s].
+    """
+    return wp.max(1.0 - wp.abs(along - p.speed) / p.speed, -1.0)
+
+
+@wp.func
+def is_lost(p: Any, e: float) -> bool:
+    """Return whether the distance `e` from the line along the net is above `lost` [m]."""
+    return e > p.lost
+
+
+@wp.func
+def way_along(p: Any, was: float, along: float) -> float:
+    """Return how far along the net the vehicle has come, at its distance from it [m].
+
+    The speed along it is in [m/s].
+    """
+    return was + p.control_step * along
+
+
+@wp.func
+def distance_error(p: Any, was: float, d: float) -> float:
+    """Return the error of the distance from the net, integrated over the episode [m s].
+
+    The distance `d` is in [m].
+    """
+    return was + p.control_step * wp.abs(d - p.distance)
+
+
+@wp.func
+def has_inspected(arrays: TaskArrays, p: Any, w: int, way: float, error: float) -> bool:
+    """Return whether `way` [m] is long enough and `error` [m s] small enough in the mean."""
+    return way >= p.way and error <= p.tolerance * arrays.time[w]
+
+
+@wp.func
+def range_off(arrays: TaskArrays, p: Any, w: int) -> float:
+    """Return the measured range below, less the set height [m]."""
+    return arrays.ranges[w, 0] - p.height
+
+
+@wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """Start at rest before the net's right side, not quite on the line, turned a little.
 
@@ -226,13 +283,13 @@ class Net(SeeingTask):
             )
             for k, x in enumerate(AHEAD)
         ),
-        ObservationPart("up, body frame", 3, "1", term=up),
+        ObservationPart("up, body frame", 3, "1", term=world_up),
         *own_velocity(clip=2.0),
     )
     baselines: ClassVar = {"wall-follower": "finssim.extensions.perception.servos:WallFollower"}
     name: str = "net"
     observation: tuple[ObservationPart, ...] = (
-        ObservationPart("up, body frame", 3, "1", term=up),
+        ObservationPart("up, body frame", 3, "1", term=world_up),
         *own_velocity(clip=2.0),
         ObservationPart(
             "range below, less the set height",
@@ -240,7 +297,7 @@ class Net(SeeingTask):
             "m",
             scale=RANGE_SCALE,
             clip=4.0,
-            term="arrays.ranges[w, 0] - p.height",
+            term=range_off,
         ),
     )
     world: str = "net"
@@ -318,30 +375,24 @@ class Net(SeeingTask):
                 "place": place_now,
                 "d": distance_now,
                 "along": along_speed,
-                "e": "wp.length(wp.vec2(d - p.distance, place[2] - p.level))",
+                "e": from_line,
                 "theta": misfacing,
             },
             meanings={
                 "near": f"1 on the line along the net, 1/e at {r.near_scale:.3g} m from it.",
-                "distance": "From the line along the net [m].",
                 "lost": f"More than {self.lost:g} m from the line along the net.",
-                "pace": "1 at the set speed along the net, falling to 0 where it stands still, or is twice as fast.",
-                "way": "How far along the net the vehicle has come, at its distance from it [m].",
-                "error": "Error of the distance from the net, integrated over the episode [m s].",
             },
             rewards=(
-                RewardTerm("pace", "wp.max(1.0 - wp.abs(along - p.speed) / p.speed, -1.0)", r.pace),
-                RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),
+                RewardTerm("pace", pace, r.pace),
+                RewardTerm("near", near_match, r.near),
                 RewardTerm("distance", "e", -r.distance),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("rate", "turning", -r.rate),
+                *action_costs(r.action, r.change, r.rate),
             ),
-            ends=(End("touched", touches, -r.loss), End("lost", "e > p.lost", -r.loss)),
-            inside="way >= p.way and error <= p.tolerance * arrays.time[w]",
+            ends=(End("touched", touches, -r.loss), End("lost", is_lost, -r.loss)),
+            inside=has_inspected,
             totals=(
-                Total("way", "was + p.control_step * along"),
-                Total("error", "was + p.control_step * wp.abs(d - p.distance)"),
+                Total("way", way_along),
+                Total("error", distance_error),
             ),
         )

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.extensions.perception.description import load_world
-from finssim.extensions.perception.seeing import SeeingTask, up
+from finssim.extensions.perception.seeing import SeeingTask
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.docking import HullNumbers
@@ -20,8 +20,11 @@ from finssim.tasks.terms import (
     RewardTerm,
     Terms,
     Total,
+    action_costs,
+    near_match,
     own_velocity,
     place_tilted,
+    world_up,
     world_velocity,
 )
 from finssim.vehicles import Vehicle
@@ -99,6 +102,39 @@ def progress(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec4) -
 
 
 @wp.func
+def from_line(p: Any, place: wp.vec4) -> float:
+    """Return the distance from the line above the pipe [m].
+
+    The vehicle is at `place`, as of `beside`.
+    """
+    return wp.length(wp.vec2(place[1], place[2] - p.height))
+
+
+@wp.func
+def is_lost(p: Any, place: wp.vec4) -> bool:
+    """Return whether the line is lost, to a side or above or below; `place` is as of `beside`, in its units."""
+    return wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]
+
+
+@wp.func
+def along_now(place: wp.vec4) -> float:
+    """Return how far along the pipe the vehicle is [m]."""
+    return place[0]
+
+
+@wp.func
+def worst(was: float, e: float) -> float:
+    """Return the greatest distance from the line so far [m]."""
+    return wp.max(was, e)
+
+
+@wp.func
+def has_followed(p: Any, place: wp.vec4, begun: float) -> bool:
+    """Return whether the vehicle is `distance` farther along the pipe than where the episode began [m]."""
+    return place[0] - begun >= p.distance
+
+
+@wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     """Start at rest above the pipe, not quite over it, and turned a little; without a world its heading is drawn."""
     rng = wp.rand_init(key, w)
@@ -156,7 +192,7 @@ class Pipeline(SeeingTask):
             )
             for k, x in enumerate(AHEAD)
         ),
-        ObservationPart("up, body frame", 3, "1", term=up),
+        ObservationPart("up, body frame", 3, "1", term=world_up),
         *own_velocity(clip=2.0),
     )
     baselines: ClassVar = {"line-follower": "finssim.extensions.perception.servos:LineFollower"}
@@ -227,33 +263,25 @@ class Pipeline(SeeingTask):
             start=start,
             shared={
                 "place": place_now,
-                "e": "wp.length(wp.vec2(place[1], place[2] - p.height))",
+                "e": from_line,
                 "theta": heading_off,
             },
             seen={"place": place_seen},
             meanings={
                 "near": f"1 on the line above the pipe, 1/e at {r.near_scale:.3g} m from it.",
-                "distance": "From the line above the pipe [m].",
-                "lost": f"More than {self.lost[0]:g} m to a side of the line, or {self.lost[1]:g} m above or below it.",
                 "begun": "How far along the pipe the episode began [m].",
-                "worst": "Greatest distance from the line so far [m].",
+                "lost": f"More than {self.lost[0]:g} m to a side of the line, or {self.lost[1]:g} m above or below it.",
             },
             rewards=(
                 RewardTerm("progress", progress, r.progress),
-                RewardTerm("near", "wp.exp(-e / p.reward.near_scale)", r.near),
+                RewardTerm("near", near_match, r.near),
                 RewardTerm("distance", "e", -r.distance),
                 RewardTerm("turn", "theta", -r.turn),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("rate", "turning", -r.rate),
+                *action_costs(r.action, r.change, r.rate),
             ),
-            ends=(
-                End(
-                    "lost", "wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]", -r.loss
-                ),
-            ),
-            inside="place[0] - begun >= p.distance",
-            totals=(Total("begun", "was", first="place[0]"), Total("worst", "wp.max(was, e)")),
+            ends=(End("lost", is_lost, -r.loss),),
+            inside=has_followed,
+            totals=(Total("begun", "was", first=along_now), Total("worst", worst)),
         )
 
 

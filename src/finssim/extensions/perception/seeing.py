@@ -4,29 +4,19 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import warp as wp
-
 from finssim.sim import RectangularPool
-from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.task import Task
-from finssim.tasks.terms import ObservationPart, own_velocity
+from finssim.tasks.terms import ObservationPart, measured_depth, own_velocity, world_up
 
 DEPTH_SCALE = 5.0
 """The depth is divided by this in the observation [m]."""
 
-
-@wp.func
-def up(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the world's up, a unit vector, body frame."""
-    return wp.quat_rotate_inv(arrays.quaternion[w, a], wp.vec3(0.0, 0.0, 1.0))
-
-
 OWN = (
-    ObservationPart("up, body frame", 3, "1", term=up),
+    ObservationPart("up, body frame", 3, "1", term=world_up),
     *own_velocity(clip=2.0),
-    ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, term="-arrays.position[w, a][2]"),
+    ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, term=measured_depth),
 )
 """Parts of the observation from the vehicle's own sensors, in any place."""
 

@@ -13,6 +13,7 @@ from finssim.extensions.teams.pursuit import (
     any_outside,
     bumps,
     gap_to,
+    has_held,
     mate,
     motion_of,
     slowest,
@@ -32,7 +33,11 @@ from finssim.tasks.terms import (
     RewardTerm,
     Terms,
     Total,
+    action_costs,
+    each_step,
+    goal_offset,
     level_direction,
+    measured_depth,
     measured_velocity,
     own_velocity,
     place_at_rest,
@@ -158,22 +163,39 @@ def edge_errors(p: Any, net: wp.vec4) -> wp.vec3:
     return (wp.vec3(net[1], net[2], net[3]) - side) / p.side
 
 
+@wp.func
+def target_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
+    """Return the way from the agent to the target, body frame [m]."""
+    return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.net.target[w] - arrays.position[w, a])
+
+
+@wp.func
+def from_net(net: wp.vec4) -> float:
+    """Return the distance from the target to the net [m].
+
+    The net is as of `spanned`.
+    """
+    return net[0]
+
+
+@wp.func
+def stretch_left(p: Any, net: wp.vec4) -> float:
+    """Return how much the longest edge may still stretch [sides].
+
+    The net is as of `spanned`.
+    """
+    return p.stretch - net[3] / p.side
+
+
 OBSERVATION = (
     *own_velocity(clip=VELOCITY_CLIP),
-    ObservationPart(
-        "target from here, body frame",
-        3,
-        "m",
-        NEAR,
-        REACH,
-        "wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.net.target[w] - arrays.position[w, a])",
-    ),
+    ObservationPart("target from here, body frame", 3, "m", NEAR, REACH, target_gap),
     ObservationPart("target's velocity less one's own, body frame", 3, "m/s", clip=REACH, term=target_slip),
-    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, "-arrays.position[w, a][2]"),
+    ObservationPart("depth", 1, "m", DEPTH_SCALE, REACH, measured_depth),
     ObservationPart("bearing of the way out from the net's middle", 1, "rad", PI, 1.0, outward),
     *mate(1, corner_gap, corner_motion),
     *mate(2, corner_gap, corner_motion),
-    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, "goal_offset"),
+    ObservationPart("goal from here, body frame", 3, "m", NEAR, REACH, goal_offset),
     ObservationPart(
         "lengths of the edges less the side, in sides, the shortest first",
         3,
@@ -181,13 +203,13 @@ OBSERVATION = (
         clip=REACH,
         term=edge_errors,
     ),
-    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, "net[0]"),
+    ObservationPart("distance from the target to the net", 1, "m", NEAR, REACH, from_net),
     ObservationPart(
         "what the longest edge may still stretch, in sides",
         1,
         "1",
         clip=REACH,
-        term="p.stretch - net[3] / p.side",
+        term=stretch_left,
     ),
 )
 """34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
@@ -262,8 +284,52 @@ def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float
     return was + (misshape(p, net) - was) / float(state.steps[w])
 
 
-STRETCHED = "wp.where(net[3] > p.stretch * p.side, stretched + p.control_step, 0.0)"
-"""Time that the net has been too long [s]."""
+@wp.func
+def net_gained(net: wp.vec4, to_net: float) -> float:
+    """Return how much nearer the net came to the target in the step [m].
+
+    The net is as of `spanned`.
+    """
+    return to_net - net[0]
+
+
+@wp.func
+def goal_gained(away: float, to_goal: float) -> float:
+    """Return how much nearer the target came to the goal in the step [m]."""
+    return to_goal - away
+
+
+@wp.func
+def from_goal(arrays: TaskArrays, w: int) -> float:
+    """Return the distance from the target to the goal [m]."""
+    return wp.length(arrays.goal_position[w] - arrays.net.target[w])
+
+
+@wp.func
+def held_time(p: Any, was: float, holding: bool) -> float:
+    """Return for how long the net held the target [s]."""
+    return was + wp.where(holding, p.control_step, 0.0)
+
+
+@wp.func
+def stretched_time(p: Any, net: wp.vec4, stretched: float) -> float:
+    """Return for how long an edge has been too long [s].
+
+    The net is as of `spanned`.
+    """
+    return wp.where(net[3] > p.stretch * p.side, stretched + p.control_step, 0.0)
+
+
+@wp.func
+def tears(p: Any, net: wp.vec4, stretched: float) -> bool:
+    """Return whether an edge of the net, which is as of `spanned`, has been too long for more than `grace` [s]."""
+    return stretched_time(p, net, stretched) > p.grace + 0.1 * p.control_step
+
+
+@wp.func
+def at_goal(p: Any, holding: bool, away: float) -> bool:
+    """Return whether the net holds the target within `goal_radius` of the goal [m]."""
+    return holding and away <= p.goal_radius
 
 
 @wp.func
@@ -365,41 +431,33 @@ class Formation(TeamTask):
             advance=move_target,
             shared={
                 "net": true_net,
-                "away": "wp.length(arrays.goal_position[w] - arrays.net.target[w])",
+                "away": from_goal,
                 "holding": holds,
             },
             seen={"left": next_place, "right": last_place, "net": seen_net},
             meanings={
-                "net": "How much nearer the net came to the target in the step [m].",
-                "goal": "How much nearer the target came to the goal in the step [m].",
-                "step": "1 in every step: sooner is better.",
                 "delivered": f"Success: {self.success_rule()}.",
                 "torn": f"An edge longer than {self.stretch:g} sides for more than {self.grace:g} s.",
-                "held_time": "For how long the net held the target [s].",
-                "to_net": "From the target to the net [m].",
-                "to_goal": "From the target to the goal [m].",
-                "stretched": "For how long an edge has been too long [s].",
             },
             rewards=(
-                RewardTerm("net", "to_net - net[0]", r.net),
-                RewardTerm("goal", "to_goal - away", r.goal),
+                RewardTerm("net", net_gained, r.net),
+                RewardTerm("goal", goal_gained, r.goal),
                 RewardTerm("shape", misshape, -r.shape),
-                RewardTerm("step", "1.0", -r.step),
+                RewardTerm("step", each_step, -r.step),
                 RewardTerm("bump", bumps, -r.bump),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
+                *action_costs(r.action, r.change),
             ),
             ends=(
-                End("delivered", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.success),
-                End("torn", f"{STRETCHED} > p.grace + 0.1 * p.control_step", -r.loss),
+                End("delivered", has_held, r.success),
+                End("torn", tears, -r.loss),
                 End("left", any_outside, -r.loss),
             ),
-            inside="holding and away <= p.goal_radius",
+            inside=at_goal,
             totals=(
-                Total("held_time", "was + wp.where(holding, p.control_step, 0.0)"),
+                Total("held_time", held_time),
                 Total("shape_error", shape_error),
-                Total("to_net", "net[0]", first="net[0]"),
+                Total("to_net", from_net, first=from_net),
                 Total("to_goal", "away", first="away"),
-                Total("stretched", STRETCHED),
+                Total("stretched", stretched_time),
             ),
         )

@@ -30,6 +30,8 @@ from finssim.tasks.terms import (
     RewardTerm,
     Terms,
     Total,
+    action_costs,
+    each_step,
     level_direction,
     measured_velocity,
     own_velocity,
@@ -96,16 +98,29 @@ def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
     return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
 
 
+@wp.func
+def prey_distance(gap: wp.vec3) -> float:
+    """Return the distance to the prey [m]."""
+    return wp.length(gap)
+
+
+@wp.func
+def prey_bearing(gap: wp.vec3) -> float:
+    """Return the bearing of the prey, positive to the left [rad].
+
+    The way to it is `gap`, body frame [m].
+    """
+    return wp.atan2(gap[1], gap[0])
+
+
 CHASE = (
     *own_velocity(clip=VELOCITY_CLIP),
     ObservationPart("prey from here, body frame", 3, "m", DISTANCE_SCALE, REACH, term="gap"),
     ObservationPart(
         "prey's velocity less one's own, body frame", 3, "m/s", clip=VELOCITY_CLIP, term=prey_motion
     ),
-    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term="wp.length(gap)"),
-    ObservationPart(
-        "bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term="wp.atan2(gap[1], gap[0])"
-    ),
+    ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term=prey_distance),
+    ObservationPart("bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term=prey_bearing),
 )
 """14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
 
@@ -415,6 +430,63 @@ def relative_motion(state: State, w: int) -> wp.vec3:
 
 
 @wp.func
+def way_to_prey(state: State, w: int) -> wp.vec3:
+    """Return the way from the pursuer to the prey, world frame [m]."""
+    return state.position[w, 1] - state.position[w, 0]
+
+
+@wp.func
+def distance_of(way: wp.vec3) -> float:
+    """Return the distance to the prey [m], never 0."""
+    return wp.max(wp.length(way), 1.0e-6)
+
+
+@wp.func
+def way_gained(p: Any, way: wp.vec3, motion: wp.vec3, d: float) -> float:
+    """Return how much nearer the prey came: closing speed times the length of the step [m]."""
+    return -wp.dot(way, motion) / d * p.control_step
+
+
+@wp.func
+def distance_share(d: float) -> float:
+    """Return the distance to the prey over 8 m, at most 1.
+
+    The distance `d` is in [m].
+    """
+    return wp.min(d / 8.0, 1.0)
+
+
+@wp.func
+def is_near(p: Any, d: float) -> float:
+    """Return 1 at a distance `d` within `near_radius` of the prey [m], otherwise 0."""
+    return wp.where(d < p.reward.near_radius, 1.0, 0.0)
+
+
+@wp.func
+def yaw_rate_squared(state: State, w: int) -> float:
+    """Return the square of the yaw rate [rad²/s²]."""
+    return state.velocity[w, 0][5] * state.velocity[w, 0][5]
+
+
+@wp.func
+def has_held(p: Any, held: float) -> bool:
+    """Return whether the tolerance of success was `held` for `hold` [s]."""
+    return held > 0.0 and held >= p.hold - 0.1 * p.control_step
+
+
+@wp.func
+def closest(was: float, d: float) -> float:
+    """Return the least distance to the prey so far [m]."""
+    return wp.min(was, d)
+
+
+@wp.func
+def with_prey(p: Any, d: float, motion: wp.vec3) -> bool:
+    """Return whether the prey is within `radius` [m], at no more than `relative_speed` [m/s]."""
+    return d <= p.radius and wp.length(motion) <= p.relative_speed
+
+
+@wp.func
 def facing(state: State, w: int, way: wp.vec3, d: float) -> float:
     """Cosine of the angle from the bow to the prey."""
     ahead = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(1.0, 0.0, 0.0))
@@ -467,37 +539,30 @@ class Pursuit(Chase):
             start=start,
             command=command_prey,
             shared={
-                "way": "state.position[w, 1] - state.position[w, 0]",
-                "d": "wp.max(wp.length(way), 1.0e-6)",
+                "way": way_to_prey,
+                "d": distance_of,
                 "motion": relative_motion,
-                "spin": "state.velocity[w, 0][5]",
             },
             seen={"gap": prey_gap},
             meanings={
-                "progress": "How much nearer the prey came: closing speed times the length of the step [m].",
-                "distance": "Distance to the prey over 8 m, at most 1.",
                 "near": f"1 within {r.near_radius:g} m of the prey, otherwise 0.",
-                "spin": "Square of the yaw rate [rad²/s²].",
-                "step": "1 in every step: sooner is better.",
                 "captured": f"The prey {self.success_rule()}.",
-                "closest": "Least distance to the prey so far [m].",
             },
             rewards=(
-                RewardTerm("progress", "-wp.dot(way, motion) / d * p.control_step", r.progress),
-                RewardTerm("distance", "wp.min(d / 8.0, 1.0)", -r.distance),
+                RewardTerm("progress", way_gained, r.progress),
+                RewardTerm("distance", distance_share, -r.distance),
                 RewardTerm("heading", facing, r.heading),
-                RewardTerm("near", "wp.where(d < p.reward.near_radius, 1.0, 0.0)", r.near),
-                RewardTerm("spin", "spin * spin", -r.spin),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
-                RewardTerm("step", "1.0", -r.step),
+                RewardTerm("near", is_near, r.near),
+                RewardTerm("spin", yaw_rate_squared, -r.spin),
+                *action_costs(r.action, r.change),
+                RewardTerm("step", each_step, -r.step),
             ),
             ends=(
-                End("captured", "held > 0.0 and held >= p.hold - 0.1 * p.control_step", r.capture),
+                End("captured", has_held, r.capture),
                 End("left", any_outside, -r.loss),
             ),
-            inside="d <= p.radius and wp.length(motion) <= p.relative_speed",
-            totals=(Total("closest", "wp.min(was, d)", first="d"),),
+            inside=with_prey,
+            totals=(Total("closest", closest, first="d"),),
         )
 
 
@@ -662,6 +727,36 @@ def missing(p: Any, net: float, near: float) -> float:
 
 
 @wp.func
+def shortened(gap: float, gap_now: float) -> float:
+    """Return by how much the step shortened the distance left to a capture [m]."""
+    return gap - gap_now
+
+
+@wp.func
+def gap_share(gap_now: float) -> float:
+    """Return the distance left to a capture [m] over 8 m, at most 1."""
+    return wp.min(gap_now / 8.0, 1.0)
+
+
+@wp.func
+def closest_agent(was: float, near: float) -> float:
+    """Return the least distance of an agent to the prey so far [m]."""
+    return wp.min(was, near)
+
+
+@wp.func
+def closest_to_net(was: float, net: float) -> float:
+    """Return the least distance of the prey to the net so far [m]."""
+    return wp.min(was, net)
+
+
+@wp.func
+def in_net(p: Any, net: float) -> bool:
+    """Return whether the prey is within `net_reach` of the net [m]."""
+    return net <= p.rules.net_reach
+
+
+@wp.func
 def driving(state: State, w: int, a: int) -> float:
     """Herder: cosine of the angle between the way to the prey and the way on to the net's middle."""
     prey = state.position[w, PREY]
@@ -792,29 +887,21 @@ class TeamPursuit(TeamTask, Chase):
             command=command_prey,
             seen={"gap": prey_gap},
             shared={"net": net_gap, "near": nearest_pursuer, "gap_now": missing},
-            meanings={
-                "progress": "By how much the step shortened the distance left to a capture [m].",
-                "distance": "Distance left to a capture over 8 m, at most 1.",
-                "step": "1 in every step: sooner is better.",
-                "closest": "Least distance of an agent to the prey so far [m].",
-                "closest_to_net": "Least distance of the prey to the net so far [m].",
-            },
             rewards=(
-                RewardTerm("progress", "gap - gap_now", r.progress),
-                RewardTerm("distance", "wp.min(gap_now / 8.0, 1.0)", -r.distance),
-                RewardTerm("step", "1.0", -r.step),
+                RewardTerm("progress", shortened, r.progress),
+                RewardTerm("distance", gap_share, -r.distance),
+                RewardTerm("step", each_step, -r.step),
                 RewardTerm("drive", driving, r.drive),
                 RewardTerm("stray", straying, -r.stray),
                 RewardTerm("spread", misfit, -r.spread),
                 RewardTerm("bump", bumps, -r.bump),
-                RewardTerm("action", "action_effort", -r.action),
-                RewardTerm("change", "action_change", -r.change),
+                *action_costs(r.action, r.change),
             ),
             ends=(End("captured", is_captured, stake), End("left", any_outside, -stake)),
-            inside="net <= p.rules.net_reach",
+            inside=in_net,
             totals=(
-                Total("closest", "wp.min(was, near)", first="near"),
-                Total("closest_to_net", "wp.min(was, net)", first="net"),
+                Total("closest", closest_agent, first="near"),
+                Total("closest_to_net", closest_to_net, first="net"),
                 Total("gap", "gap_now", first="gap_now"),
             ),
         )
