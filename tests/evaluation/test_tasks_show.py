@@ -33,7 +33,7 @@ def test_every_task_is_listed(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", (*TASKS, f"{EXAMPLE}:KeepDepth", f"{WARP_EXAMPLE}:KeepDepth"))
 def test_rewards_ends_and_totals_are_told_in_words(name):
-    """Also those that are expressions: a sentence stands in place of the source."""
+    """Each is a sentence, without source code."""
     told = describe_task(name)
     for one in (*told["reward"]["terms"], *told["ends"], *told["totals"]):
         assert one["told"].endswith("."), one

@@ -109,6 +109,22 @@ def test_a_term_that_takes_what_there_is_not_is_named():
 
 
 @dataclass(frozen=True, kw_only=True)
+class Written(KeepDepth):
+    """A term that is code as text."""
+
+    def terms(self):
+        return replace(super().terms(), inside="state.position[w, 0][2] < p.tolerance")
+
+
+def test_code_as_text_is_no_term():
+    with pytest.raises(
+        EnvironmentSetupError,
+        match=r"task 'keep-depth': inside is 'state.position.* expected a function with @wp.func, or the name of",
+    ):
+        Environment(Written())
+
+
+@dataclass(frozen=True, kw_only=True)
 class Miscounting(KeepDepth):
     def metrics(self, arrays):
         measured = super().metrics(arrays)
