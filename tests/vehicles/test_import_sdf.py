@@ -371,6 +371,23 @@ def test_a_file_without_shapes_or_masses_is_guessed_and_says_so(tmp_path):
     assert draft.vehicle(tmp_path).buoyancy == pytest.approx(9.0 * 9.8)
 
 
+def test_a_moment_that_is_missing_is_that_of_sdf_and_says_so(tmp_path):
+    """A public model writes its moments as text: gz-sim takes 1 kg m² then."""
+
+    def change(root):
+        inertia = root.find("world/model/link[2]/inertial/inertia")
+        inertia.remove(inertia.find("ixx"))
+
+    draft = changed(tmp_path, change)
+    assert (
+        "body.inertia" in draft.guessed
+        and "link 'prop0' gives no mass or inertia" in draft.guessed["body.inertia"]
+    )
+    assert np.trace(draft.values["body"]["inertia"]) == pytest.approx(
+        np.trace(imported(tmp_path, HEAVY).body.inertia) + 0.999
+    )
+
+
 LINK, PLUGIN = "world/model/link", "world/model/plugin"
 
 
@@ -420,6 +437,7 @@ def test_other_files_are_refused(tmp_path):
     file = tmp_path / "a.sdf"
     for text, sentence in (
         ("<sdf><model", "cannot be read as XML"),
+        ("", "cannot be read as XML"),
         ("<!DOCTYPE sdf [<!ENTITY a 'b'>]><sdf/>", "has a DOCTYPE"),
         ("<robot name='x'/>", "its root is 'robot', expected sdf"),
         ("<sdf><model name='x'/></sdf>", "are none, expected one"),
@@ -432,6 +450,22 @@ def test_other_files_are_refused(tmp_path):
         read_foreign(tmp_path / "a.txt")
     with pytest.raises(VehicleError, match="no such file"):
         read_foreign(tmp_path / "b.sdf")
+
+
+def test_a_prefix_needs_no_namespace(tmp_path):
+    """As in gz-sim: the element is named as it is written. UTF-16 is read, and its DOCTYPE is seen."""
+    text = tostring(tree(HEAVY)[0], encoding="unicode").replace(
+        '<link name="base_link">', '<link name="base_link"><gz:note/>'
+    )
+    (tmp_path / "a.sdf").write_text(text)
+    assert read_foreign(tmp_path / "a.sdf").not_read["link: gz:note"] == 1
+    (tmp_path / "b.sdf").write_text(f'<?xml version="1.0" encoding="utf-16"?>{text}', encoding="utf-16")
+    assert read_foreign(tmp_path / "b.sdf").values["body"] == read_foreign(tmp_path / "a.sdf").values["body"]
+    (tmp_path / "c.sdf").write_text(
+        f'<?xml version="1.0" encoding="utf-16"?><!DOCTYPE sdf>{text}', encoding="utf-16"
+    )
+    with pytest.raises(VehicleError, match="has a DOCTYPE"):
+        read_foreign(tmp_path / "c.sdf")
 
 
 def test_importers_have_names_of_what_they_import():

@@ -361,7 +361,7 @@ def _put_body(model: Model, draft: Draft) -> None:
         if inertial is None:
             inertial = Element("inertial")
             missing.append(name)
-        elif inertial.find("mass") is None or inertial.find("inertia") is None:
+        elif any(inertial.find(tag) is None for tag in ("mass", "inertia/ixx", "inertia/iyy", "inertia/izz")):
             missing.append(name)
         if inertial.get("auto", "false").lower() in ("true", "1"):
             raise VehicleError(
@@ -372,9 +372,8 @@ def _put_body(model: Model, draft: Draft) -> None:
         tensor, inertia = np.zeros((3, 3)), inertial.find("inertia")
         for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             tag = f"i{'xyz'[i]}{'xyz'[j]}"
-            tensor[i, j] = tensor[j, i] = 1.0 if i == j else 0.0
-            if inertia is not None:
-                tensor[i, j] = tensor[j, i] = number(inertia, tag, where, math.nan if i == j else 0.0)
+            usual = 1.0 if i == j else 0.0
+            tensor[i, j] = tensor[j, i] = usual if inertia is None else number(inertia, tag, where, usual)
         if inertia is not None:
             _refuse_unknown(inertia, INERTIA, where)
         masses.append(number(inertial, "mass", where, 1.0))
