@@ -30,7 +30,7 @@ core: $(STAMP)  ## the quick tests of the core, in a copy without the extensions
 	rm -rf build/core && mkdir -p build/core
 	cp -r src tests examples docs studies benchmarks tools pyproject.toml build/core
 	rm -r build/core/src/finssim/extensions build/core/tests/extensions
-	cd build/core && PYTHONPATH=src OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" \
+	cd build/core && PYTHONPATH=$(CURDIR)/build/core/src OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" \
 		$(filter-out tests/extensions tests/data tests/reference tests/benchmarks tests/studies,$(patsubst %/,%,$(wildcard tests/*/)))
 
 check: $(STAMP)  ## lint, format, types and docstrings
