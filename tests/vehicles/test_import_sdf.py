@@ -379,10 +379,8 @@ def test_a_moment_that_is_missing_is_that_of_sdf_and_says_so(tmp_path):
         inertia.remove(inertia.find("ixx"))
 
     draft = changed(tmp_path, change)
-    assert (
-        "body.inertia" in draft.guessed
-        and "link 'prop0' gives no mass or inertia" in draft.guessed["body.inertia"]
-    )
+    assert "lacks numbers of link 'prop0': 1 kg, 1 kg m²" in draft.guessed["body.inertia"]
+    assert "body.mass" not in draft.guessed
     assert np.trace(draft.values["body"]["inertia"]) == pytest.approx(
         np.trace(imported(tmp_path, HEAVY).body.inertia) + 0.999
     )

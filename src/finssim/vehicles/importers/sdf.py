@@ -349,7 +349,8 @@ class Model:
 
 def _put_body(model: Model, draft: Draft) -> None:
     """Set mass, centre of gravity and inertia: of all links together, fixed to one another."""
-    masses, centres, tensors, missing = [], [], [], []
+    masses, centres, tensors = [], [], []
+    massless, momentless = [], []
     for name, link in model.links.items():
         where = f"{model.label}: link '{name}'"
         inertial = link.find("inertial")
@@ -360,9 +361,10 @@ def _put_body(model: Model, draft: Draft) -> None:
         _unread(link, {"inertial", "collision", "pose", "gravity", "kinematic"}, "link", draft)
         if inertial is None:
             inertial = Element("inertial")
-            missing.append(name)
-        elif any(inertial.find(tag) is None for tag in ("mass", "inertia/ixx", "inertia/iyy", "inertia/izz")):
-            missing.append(name)
+        if inertial.find("mass") is None:
+            massless.append(name)
+        if any(inertial.find(f"inertia/{tag}") is None for tag in ("ixx", "iyy", "izz")):
+            momentless.append(name)
         if inertial.get("auto", "false").lower() in ("true", "1"):
             raise VehicleError(
                 f"{where}: its mass is computed from its shapes (auto): write the numbers of it instead"
@@ -383,13 +385,16 @@ def _put_body(model: Model, draft: Draft) -> None:
         raise VehicleError(f"{model.label}: its links weigh {masses} kg, expected more than 0")
     mass, centre, total = combined(masses, centres, tensors)
     note = f"sum of {len(masses)} links" if len(masses) > 1 else ""
-    for path, value in (("mass", mass), ("center_of_gravity", centre), ("inertia", total)):
-        if missing:
+    for path, value, without in (
+        ("mass", mass, massless),
+        ("center_of_gravity", centre, massless),
+        ("inertia", total, massless + momentless),
+    ):
+        if without:
+            links = f"link '{without[0]}'{' and others' if without[1:] else ''}"
             draft.guess(
-                f"body.{path}", plain(value),
-                f"link '{missing[0]}'{' and others' if missing[1:] else ''} gives no mass or inertia: 1 kg and 1 kg m² "
-                "as in SDF",
-            )  # fmt: skip
+                f"body.{path}", plain(value), f"the file lacks numbers of {links}: 1 kg, 1 kg m² as in SDF"
+            )
         else:
             draft.put(f"body.{path}", plain(value), "derived" if note else "published", note)
 
