@@ -96,9 +96,9 @@ def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
         "import sys; sys.path.insert(0, 'tests')\n"
         "from pathlib import Path\nfrom reference import played\n"
         "from finssim.evaluation.campaign import run_jobs\n"
-        "from finssim.evaluation.robot_trials import Job\n"
+        "from finssim.evaluation.robot_trials import RobotJob\n"
         "if __name__ == '__main__':\n"
-        "    jobs = [Job(row='pid', controller='pid', target='P01')]\n"
+        "    jobs = [RobotJob(row='pid', controller='pid', target='P01')]\n"
         f"    run_jobs(jobs, Path({str(tmp_path)!r}), played.endless, processes=2)\n"
     )
     script = tmp_path / "campaign_of_one.py"
