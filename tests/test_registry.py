@@ -10,6 +10,7 @@ import pytest
 
 from finssim.core.registry import COMMANDS, FAMILIES, SENSORS, TASKS, VEHICLES, Family, RegistryError
 from finssim.learning.learners import LearningError, learner_named
+from finssim.sim import site
 from finssim.tasks import EnvironmentSetupError, StationKeeping, task_named
 from finssim.vehicles import VehicleError, catalogue, load_vehicle
 from reference.commands import EVERY
@@ -172,3 +173,10 @@ def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken):
     lost = command("lost", path=both)
     assert lost.returncode == 2 and "package broken 1.0" in lost.stderr and "Traceback" not in lost.stderr
     assert command("vehicles", path=both).returncode == 0 and "lost" in command("--help", path=both).stdout
+
+
+def test_a_described_world_is_refused_where_no_extension_reads_it(monkeypatch):
+    """In one sentence that names the world."""
+    monkeypatch.setattr(site, "WORLDS", Family("unregistered-world", {}))
+    with pytest.raises(site.SurroundingsError, match="world 'dock': no extension reads described worlds"):
+        site.described_world("dock")

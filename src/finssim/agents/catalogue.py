@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from importlib import import_module
 from typing import Any
 
 from finssim.agents.baselines import Baseline
+from finssim.core.registry import object_at
 from finssim.tasks.catalogue import task_named
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle, load_vehicle
@@ -47,7 +47,6 @@ def baseline(task: Task | str, name: str, vehicle: Vehicle | str = "finsrov") ->
         )
     maker = have[name]
     if isinstance(maker, str):
-        module, _, kind = maker.partition(":")
-        maker = getattr(import_module(module), kind).for_vehicle
+        maker = object_at(maker).for_vehicle
     made: Baseline = maker(load_vehicle(vehicle))
     return made

@@ -83,7 +83,7 @@ def mcap_metadata(path: Path, name: str) -> dict[str, str]:
 
 
 def _examined(path: Path, data: mmap.mmap, notes: list[str]) -> bool:
-    """Return whether a file is whole and has an index; a note names the damage."""
+    """Return True if a file is complete and has an index; a note names the damage."""
     lost: list[int] = []
     for _ in _intact_records(data, lost):
         pass

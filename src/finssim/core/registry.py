@@ -29,6 +29,7 @@ __all__ = [
     "WORLDS",
     "Family",
     "RegistryError",
+    "object_at",
 ]
 
 
@@ -67,12 +68,12 @@ class Family(MutableMapping[str, Any]):
             return self._added[name]
         if name in self._shipped:
             shipped = self._shipped[name]
-            return _object(shipped) if isinstance(shipped, str) else shipped
+            return object_at(shipped) if isinstance(shipped, str) else shipped
         point, package = self._point(name)
         key = (package, point.value)
         if key not in self._imported:
             try:
-                member = _object(point.value)
+                member = object_at(point.value)
                 self._refuse_unfit(name, member)
             except Exception as error:  # a package's code may raise anything when it is imported
                 raise RegistryError(
@@ -159,7 +160,7 @@ class Family(MutableMapping[str, Any]):
 
     def _refuse_unfit(self, name: str, member: Any) -> None:
         if self._check is not None:
-            _object(self._check)(name, member)
+            object_at(self._check)(name, member)
 
     def _point(self, name: str) -> tuple[Any, str]:
         """Return the entry point of a name, and its package."""
@@ -189,7 +190,7 @@ def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, list[tuple[Any
     return points
 
 
-def _object(reference: str) -> Any:
+def object_at(reference: str) -> Any:
     """Return the object of `module:object`."""
     module, _, name = reference.partition(":")
     value: Any = import_module(module)

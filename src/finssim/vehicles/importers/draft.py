@@ -1,4 +1,4 @@
-"""What every importer of vehicles shares: the draft that it fills, and how it is found.
+"""Draft of a vehicle, which an importer fills; the class of importers, and the choice of one by content.
 
 An importer is one file with a `VehicleImporter`, registered as `vehicle.FORMAT` in the family `IMPORTERS`.
 """
@@ -46,7 +46,7 @@ class Draft:
     guessed: dict[str, str] = field(default_factory=dict)
     """Dotted path of each number that the file does not give -> how it was guessed."""
     not_read: Counter[str] = field(default_factory=Counter)
-    """What the file holds and the vehicle does not -> how often."""
+    """Contents of the file that the vehicle lacks -> their number."""
     different: list[str] = field(default_factory=list)
     """Sentences about what the other program computes and FinsSim does not, or differently."""
     hull: tuple[Vertices, Faces] | None = None
