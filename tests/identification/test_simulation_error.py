@@ -7,7 +7,13 @@ import pytest
 
 from finssim.identification.programme import programmes
 from finssim.identification.rollout import segments, streams
-from finssim.identification.simulation_error import compared, excites, fit_by_simulation
+from finssim.identification.simulation_error import (
+    FitProgress,
+    Stages,
+    compared,
+    excites,
+    fit_by_simulation,
+)
 from finssim.identification.synthetic import simulate_programme
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.findings import CalibrationError
@@ -157,6 +163,30 @@ def test_a_small_swing_is_fitted_and_integrals_are_not_compared():
     )
     blind = replace(segment, measured={c: m for c, m in segment.measured.items() if c != "w"})
     assert {"z", "depth"} <= set(compared(blind, one.motion, ("heave",)).measured)
+
+
+@pytest.mark.slow
+def test_an_axis_that_a_trial_does_not_excite_moves_as_it_was_seen_to():
+    """A surge trial that drifts sideways compares surge alone; sway that is only noise is simulated and compared."""
+    vehicle = load_vehicle("finsrov")
+    surge, sway = (trials_of(vehicle, axis, count=1)[0] for axis in ("surge", "sway"))
+    assert surge.header.axis == ("surge",)
+
+    def cut(*some):
+        prepared = [streams(t, vehicle) for t in some]
+        stages = Stages(prepared, vehicle, ("surge", "sway"), (), {}, None, FitProgress(None))
+        stages.cut(5.0)
+        return [next(s for s in stages.segments if s.trial == t.name) for t in some]
+
+    v = surge.channels["v"]
+    drifting = replace(surge, channels=surge.channels | {"v": v + 0.2 * np.sin(np.arange(len(v)) / 50.0)})
+    for trial, shown in ((drifting, {"u"}), (surge, {"u", "v"})):
+        first, second = cut(trial, sway)
+        assert set(first.measured) & {"u", "v"} == shown
+        assert np.isfinite(first.held[:, 1]).all() == (shown == {"u"})
+        assert not np.isfinite(first.held[:, 0]).any() and "v" in second.measured
+    (alone,) = cut(drifting)
+    assert {"u", "v"} <= set(alone.measured), "no trial excites sway: this one has to show it"
 
 
 @pytest.mark.slow

@@ -1579,6 +1579,7 @@ class Stages:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known = length, dict(known)
         self.excites = [excites(s, vehicle) for s in prepared]
+        self.fitted = self._fitted_axes()
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
         # without thrust nothing does.
         driven = any(one.drive.source != "passive" for one in prepared)
@@ -1603,6 +1604,21 @@ class Stages:
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
+
+    def _fitted_axes(self) -> list[list[str]]:
+        """Return the axes of each trial whose motion is simulated and compared; the others move as they were seen to.
+
+        A surge, sway or yaw that a trial does not excite comes from couplings and disturbances, which the model lacks:
+        compared, it would determine the added mass of other axes through their Coriolis moments. Where it is only noise
+        it stays, for it keeps the initial state in place. So do heave, roll and pitch: weight acts on them in every
+        trial.
+        """
+        out, nowhere = list[list[str]](), set(self.axes).difference(*self.excites)
+        for one, moved in zip(self.prepared, self.excites, strict=True):
+            own = moved if one.released else moved | nowhere | {"heave", *SWINGING}
+            still = [a for a in AXES if not (one.released or answers(one.motion, AXES.index(a)))]
+            out.append([a for a in self.axes if a in own or a in still])
+        return out
 
     def _free_axes(self) -> tuple[str, ...]:
         """Return the axes that move only in trials without thrust, which show ratios alone."""
@@ -1749,15 +1765,10 @@ class Stages:
         shown = {column for axis in self.axes for column in DETERMINED_BY[axis]}
         cut = [
             [
-                compared(
-                    s,
-                    one.motion,
-                    [a for a in self.axes if a in one.released or not one.released],
-                    free=bool(one.released),
-                )
+                compared(s, one.motion, axes, free=bool(one.released))
                 for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
             ]
-            for one in self.prepared
+            for one, axes in zip(self.prepared, self.fitted, strict=True)
         ]
         kept = [[s for s in stretch if shown & set(s.measured)] for stretch in cut]
         self.length = length
