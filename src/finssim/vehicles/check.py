@@ -189,13 +189,18 @@ def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
         return
     yield CheckResult("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
     volume, stated = mesh_volume(vertices, faces), vehicle.body.displaced_volume
+    centre, loads, without = vehicle.body.center_of_buoyancy, list(vehicle.payloads.values()), ""
+    if vehicle.hull.file is not None and loads:  # a mesh has no payloads
+        moment = stated * centre - sum(load.volume * load.position for load in loads)
+        stated -= math.fsum(load.volume for load in loads)
+        centre, without = moment / stated, " without payloads"
     yield CheckResult(
         "hull volume",
         abs(volume / stated - 1.0) <= VOLUME_TOLERANCE,
-        f"the hull encloses {volume:.6g} m³, the displaced volume is {stated:.6g} m³, "
+        f"the hull encloses {volume:.6g} m³, the displaced volume{without} is {stated:.6g} m³, "
         f"expected within {100.0 * VOLUME_TOLERANCE:g} %",
     )
-    gap = float(np.linalg.norm(mesh_centroid(vertices, faces) - vehicle.body.center_of_buoyancy))
+    gap = float(np.linalg.norm(mesh_centroid(vertices, faces) - centre))
     yield CheckResult(
         "hull centroid",
         gap <= CENTROID_TOLERANCE * float(vehicle.body.size.max()),

@@ -15,8 +15,9 @@ from pydantic import ValidationError
 from finssim.core.files import plain_name
 from finssim.core.registry import VEHICLES, RegistryError
 from finssim.core.yaml_file import read_mapping
+from finssim.vehicles.importers.rigid import combined
 from finssim.vehicles.part import VehicleError, did_you_mean, sentence_of
-from finssim.vehicles.vehicle import ORIGINS, Provenance, Vehicle
+from finssim.vehicles.vehicle import ORIGINS, Origin, Provenance, Vehicle
 
 GREATEST = 1e12
 """Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
@@ -44,7 +45,7 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
     path, label = _locate(name_or_path)
     values, origins = _with_parents(path, label, ())
     values, origins = _expand_groups(values, origins, label)
-    vehicle = checked(values, origins, path.stem, path, label)
+    vehicle = _with_payloads(checked(values, origins, path.stem, path, label), label)
     if vehicle.hull is not None and vehicle.hull.file is not None:
         try:
             vehicle.hull_mesh()
@@ -85,6 +86,7 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
             for key in [key for key in origins if key == full or key.startswith(full + ".")]:
                 del origins[key]
             origins[full] = provenance
+    values["payloads"] = vehicle.payloads
     return checked(values, origins, vehicle.name, vehicle.path, vehicle.name)
 
 
@@ -252,6 +254,41 @@ def checked(values: Tree, origins: Origins, name: str, path: Path | None, label:
             if detail["type"] != "default_factory_not_called"
         ]
         raise VehicleError("\n".join(sentences)) from None
+
+
+def _with_payloads(vehicle: Vehicle, label: str) -> Vehicle:
+    """Return the vehicle of a file with its payloads in its body; added mass and drag remain those of the file."""
+    if not vehicle.payloads:
+        return vehicle
+    body, loads = vehicle.body, list(vehicle.payloads.values())
+    mass, center_of_gravity, inertia = combined(
+        [body.mass, *(load.mass for load in loads)],
+        [body.center_of_gravity, *(load.position for load in loads)],
+        [body.inertia, *(load.inertia for load in loads)],
+    )
+    volumes = [body.displaced_volume, *(load.volume for load in loads)]
+    places = [body.center_of_buoyancy, *(load.position for load in loads)]
+    sums = {
+        "mass": mass,
+        "inertia": inertia.tolist(),
+        "center_of_gravity": center_of_gravity.tolist(),
+        "displaced_volume": math.fsum(volumes),
+        "center_of_buoyancy": np.average(places, axis=0, weights=volumes).tolist(),
+    }
+    origins = dict(vehicle.provenance)
+    for key in sums:
+        full = f"body.{key}"
+        parts = [
+            p for o, p in origins.items() if (o + ".").startswith(f"{full}.") or o.startswith("payloads.")
+        ]
+        _forget(tuple(full.split(".")), origins)
+        worst = max((p.origin for p in parts), key=ORIGINS.index)
+        origin: Origin = "guessed" if worst == "guessed" else "derived"
+        note = f"that of the file and the payloads {', '.join(vehicle.payloads)} together"
+        origins[full] = Provenance(origin, parts[0].source, note)
+    values = vehicle.values()
+    values["body"] |= sums
+    return checked(values | {"payloads": vehicle.payloads}, origins, vehicle.name, vehicle.path, label)
 
 
 def _set(tree: Any, path: list[str], value: Any, label: str, done: tuple[str, ...] = ()) -> list[str]:

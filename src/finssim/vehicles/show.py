@@ -92,6 +92,7 @@ def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
         "file": None if vehicle.path is None else str(vehicle.path),
         "sha256": vehicle.sha256,
         "values": json.loads(json.dumps(vehicle.values(), default=str)),
+        "payloads": {name: load.values() for name, load in vehicle.payloads.items()},
         "wrench_positive": capability.positive.tolist(),
         "wrench_negative": capability.negative.tolist(),
         "terminal_speeds": by_set(terminal_speeds),
@@ -102,6 +103,14 @@ def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
 
 def _tables(vehicle: Vehicle) -> Iterator[Table]:
     yield _table("Body", ("", "value", "unit"), _body(vehicle))
+    if vehicle.payloads:
+        rho, g = vehicle.water.density, vehicle.water.gravity
+        heads = ("", "mass [kg]", "volume [m³]", "position [m]", "weight in water [N]")
+        loads = (
+            (escape(n), f"{x.mass:g}", f"{x.volume:g}", _rounded(x.position), f"{g * (x.mass - rho * x.volume):.2f}")
+            for n, x in vehicle.payloads.items()
+        )  # fmt: skip
+        yield _table("Payloads (contained in the body above)", heads, loads)
     for name, chosen in vehicle.hydrodynamics.items():
         if isinstance(chosen, MeshSet):
             path = f"hydrodynamics.{name}"

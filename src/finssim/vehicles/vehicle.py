@@ -37,6 +37,7 @@ from finssim.vehicles.equipment import (
 from finssim.vehicles.hydrodynamics import AnyHydrodynamicSet, HydrodynamicSet, MeshSet
 from finssim.vehicles.part import (
     Inertia,
+    NonNegative,
     Part,
     Positive,
     Positive3,
@@ -77,6 +78,33 @@ class Body(Part):
     """Envelope box along x, y, z [m], (3,)."""
     surface_half_height: Positive
     """Half height of the layer in which buoyancy fades out at the surface [m]."""
+
+
+class Payload(Part):
+    """Something fixed to the vehicle, such as a lamp or ballast: a homogeneous box, or a point without a size."""
+
+    mass: NonNegative
+    """Dry mass [kg]."""
+    volume: NonNegative
+    """Volume of water displaced when fully submerged [m³]."""
+    position: Vector3
+    """Centre of gravity and of buoyancy, from the body origin, body frame [m], (3,)."""
+    size: Positive3 | None = None
+    """Sides of the box along x, y, z [m], (3,); without it the payload has no inertia about its own centre."""
+
+    @model_validator(mode="after")
+    def _something(self) -> Payload:
+        if self.mass == self.volume == 0.0:
+            raise refuse_section(
+                "mass and volume are both 0, expected one of them > 0: leave the payload out"
+            )
+        return self
+
+    @property
+    def inertia(self) -> Array:
+        """Return its inertia about its centre, in body axes [kg m²], (3, 3)."""
+        square = np.zeros(3) if self.size is None else self.mass / 12.0 * self.size**2
+        return np.diag(square.sum() - square)
 
 
 class Hull(Part):
@@ -163,6 +191,9 @@ class Vehicle(Part):
     """Description of the vehicle, and what to know before using the numbers."""
     water: ReferenceWater
     body: Body
+    """Rigid body with its payloads: `load_vehicle` has added them to the numbers of the file."""
+    payloads: dict[str, Payload] = Field(default_factory=dict)
+    """Payloads that `body` contains, by name; neither part of `values` nor of `sha256`, which have their sum."""
     hull: Hull | None = None
     hydrodynamics: dict[str, AnyHydrodynamicSet]
     """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
@@ -247,6 +278,10 @@ class Vehicle(Part):
     def file_tags(self) -> Tags | None:
         """The tags that the file gives: what a real camera may look for; None where they are none or defaults."""
         return None if "tags" in self.defaults else self.tags
+
+    def values(self) -> dict[str, Any]:
+        """Return what was given as a plain nested dict, ready to be read again; the payloads are in the body."""
+        return self.model_dump(exclude_unset=True, exclude={"payloads"})
 
     # -- numbers that follow directly -------------------------------------------------------------------------
 
