@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from xml.etree.ElementTree import tostring
 
 import numpy as np
 import pytest
 
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.core.mesh import parametric_hull, write_stl
+from finssim.trials.trial_files import vehicle_reference
 from finssim.vehicles import Vehicle, VehicleError, catalogue, load_vehicle
-from finssim.vehicles.part import sentence_of
+from finssim.vehicles.importers.draft import read_foreign
+from finssim.vehicles.part import VehicleWarning, sentence_of
+from reference.gz_sim import HEAVY, element, tree, write
 from vehicles.minnow import MINNOW
 
 
@@ -318,3 +324,47 @@ def _seconds(name: str) -> float:
     start = time.process_time()
     load_vehicle(name)
     return time.process_time() - start
+
+
+def test_the_model_of_another_program_is_read_directly(tmp_path, monkeypatch, capsys):
+    """By its path or its name in the working directory; what was guessed is listed once in a run."""
+    write(tmp_path / "rov.sdf", HEAVY)
+    monkeypatch.chdir(tmp_path)
+    for name in (tmp_path / "rov.sdf", "rov.sdf", "./rov.sdf"):
+        with pytest.warns(
+            VehicleWarning, match=r"guessed thrusters.*; body.size = .*vehicles import .*rov.sdf"
+        ):
+            vehicle = load_vehicle(name)
+    assert vehicle.sha256 == read_foreign(tmp_path / "rov.sdf").vehicle(tmp_path).sha256
+    assert vehicle.path == Path("rov.sdf") and vehicle.origin_of("body.size").origin == "guessed"
+    assert boundary.run(app, ["vehicles", "show", "rov.sdf"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and said[0].startswith(
+        "finssim: warning: rov.sdf: guessed thrusters.*.time_constant"
+    )
+    with pytest.raises(VehicleError, match=r"rovv\.sdf: no such file"):
+        load_vehicle("rovv.sdf")
+
+
+def test_a_variant_of_another_programs_model_corrects_its_guesses(tmp_path):
+    write(tmp_path / "rov.sdf", HEAVY)
+    text = "origin: measured\nextends: rov.sdf\nthrusters: {t0: {time_constant: 0.2}}\n"
+    with pytest.warns(VehicleWarning):
+        vehicle = load(tmp_path, text)
+    assert [t.time_constant for t in vehicle.thrusters.values()] == [0.2] + [0.05] * 7
+    assert vehicle.origin_of("thrusters.t0.time_constant").origin == "measured"
+
+
+@pytest.mark.slow
+def test_a_mesh_of_another_programs_model_is_there_while_the_program_runs(tmp_path):
+    """And a trial names such a file by its path."""
+    write_stl(tmp_path / "hull.stl", *parametric_hull([0.4, 0.3, 0.2], 0.0135))
+    root = tree(HEAVY)[0]
+    geometry = root.find("world/model/link/collision/geometry")
+    geometry.clear()
+    element(element(geometry, "mesh"), "uri", "hull.stl")
+    (tmp_path / "rov.sdf").write_bytes(tostring(root))
+    with pytest.warns(VehicleWarning):
+        vehicle = load_vehicle(tmp_path / "rov.sdf")
+    assert vehicle.hull.file.is_file() and len(vehicle.hull_mesh()[1]) > 100
+    assert vehicle_reference(str(tmp_path / "rov.sdf")) == str(tmp_path / "rov.sdf")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from types import TracebackType
+from typing import TextIO
 
 import typer
 
@@ -31,6 +33,27 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
     Returns:
         The exit status: 0 well, 2 refused, 130 interrupted, or what the command itself gave.
     """
+    show = warnings.showwarning
+
+    def say_ours(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if _is_ours(category.__module__, script or "finssim"):
+            _say(f"warning: {message}")
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = say_ours
+        return _run(app, arguments, script)
+
+
+def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
     try:
         if script is None:
             status = app(list(arguments) or ["--help"], prog_name="finssim", standalone_mode=False)

@@ -465,6 +465,7 @@ def recording(
 
 def _vehicle_file(vehicle: Vehicle) -> dict[str, bytes]:
     """The vehicle's file; its values where a program changed them after reading."""
-    if vehicle.path is not None and load_vehicle(vehicle.path).sha256 == vehicle.sha256:
-        return {f"{vehicle.name}.yaml": vehicle.path.read_bytes()}
+    path = vehicle.path
+    if path is not None and path.suffix in (".yaml", ".yml") and load_vehicle(path).sha256 == vehicle.sha256:
+        return {f"{vehicle.name}.yaml": path.read_bytes()}
     return {f"{vehicle.name}.json": json.dumps(vehicle.values(), default=str).encode()}

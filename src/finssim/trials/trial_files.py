@@ -510,7 +510,7 @@ ABOVE = 3
 def vehicle_reference(name: str) -> str:
     """Return how a trial names a vehicle: a name of the catalogue, or the absolute path of a file that exists."""
     path = Path(name)
-    is_file = (path.suffix in (".yaml", ".yml") or path.name != name) and path.is_file()
+    is_file = (path.suffix != "" or path.name != name) and path.is_file()
     return str(path.resolve()) if is_file else name
 
 

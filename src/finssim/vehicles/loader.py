@@ -5,22 +5,32 @@ from __future__ import annotations
 import copy
 import math
 import os
+import re
+import warnings
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
 from finssim.core.files import plain_name
-from finssim.core.registry import VEHICLES, RegistryError
+from finssim.core.registry import IMPORTERS, VEHICLES, RegistryError
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.importers.rigid import combined
-from finssim.vehicles.part import VehicleError, did_you_mean, sentence_of
+from finssim.vehicles.part import VehicleError, VehicleWarning, did_you_mean, sentence_of
 from finssim.vehicles.vehicle import ORIGINS, Origin, Provenance, Vehicle
 
 GREATEST = 1e12
 """Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
+KIND = "vehicle."
+"""Beginning of the names of importers that read vehicles."""
+HEAD = 1 << 16
+"""Bytes from which an importer recognises its format."""
+OWN = re.compile(rb"(?m)^(title|extends|origin|body|thrusters)\s*:")
+"""Beginning of a line of which a vehicle file of FinsSim has one or more."""
 
 Tree = dict[str, Any]
 Origins = dict[str, Provenance]
@@ -35,7 +45,8 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
     """Read and check a vehicle.
 
     Args:
-        name_or_path: A catalogue name such as `finsrov`, or the path of a YAML file; a `Vehicle` is returned as it is.
+        name_or_path: A catalogue name such as `finsrov`, or the path of a vehicle file or of another program's model,
+            whose guessed numbers a `VehicleWarning` lists; a `Vehicle` is returned as it is.
 
     Raises:
         VehicleError: Unknown name, or a file that is refused; the message says where, what and what to do.
@@ -94,7 +105,8 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
     """The file of a vehicle and what to call it in messages; `beside` is searched before the catalogue."""
     text = os.fspath(name_or_path)
     path = Path(text)
-    if path.suffix in (".yaml", ".yml") or path.name != text:
+    foreign = path.suffix != "" and text not in VEHICLES and (beside or Path()).joinpath(path).is_file()
+    if path.suffix in (".yaml", ".yml") or path.name != text or foreign:
         path = path if beside is None or path.is_absolute() else beside / path
         if not path.is_file():
             raise VehicleError(
@@ -109,6 +121,42 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
         return VEHICLES[text], f"catalogue/{text}.yaml"
     except RegistryError as error:
         raise VehicleError(str(error)) from error
+
+
+def importers() -> dict[str, Any]:
+    """Return the importers of vehicles (`VehicleImporter`) by name."""
+    return {name: member for name, member in IMPORTERS.usable().items() if name.startswith(KIND)}
+
+
+def importer_of(path: Path) -> Any:
+    """Return the `VehicleImporter` that recognises a file; None for a vehicle file of FinsSim and for other formats."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    if path.suffix in (".yaml", ".yml") and OWN.search(head):
+        return None
+    return next((member for member in importers().values() if member.recognises(path, head)), None)
+
+
+@cache
+def _meshes() -> TemporaryDirectory[str]:
+    """Return the folder for the hulls of vehicles that are read from other programs' files in this process."""
+    return TemporaryDirectory(prefix="finssim-")
+
+
+def _read_foreign(path: Path) -> tuple[Tree, Origins]:
+    """Values and origins of another program's model, with a warning that lists its guesses."""
+    draft = importer_of(path).read(path)
+    vehicle = draft.vehicle(Path(_meshes().name))
+    guessed = "; ".join(draft.guesses()) or "nothing"
+    warnings.warn(
+        f"{path}: guessed {guessed}. 'finssim vehicles import {path} --out {path.stem}.yaml' writes a file in which "
+        f"you can correct these, and lists {len(draft.different)} differences and {sum(draft.not_read.values())} "
+        "contents that are not read",
+        VehicleWarning,
+        stacklevel=2,
+    )
+    groups = {thruster.group: {} for thruster in vehicle.thrusters.values() if thruster.group}
+    return vehicle.values() | {"thruster_groups": groups}, dict(vehicle.provenance)
 
 
 def check_registered(name: str, path: Any) -> None:
@@ -126,6 +174,8 @@ def check_registered(name: str, path: Any) -> None:
 
 
 def _unknown(name: str) -> str:
+    if Path(name).suffix:
+        return f"{name}: no such file: give the path of a vehicle file, or one of {_available()}"
     return f"unknown vehicle '{name}'{did_you_mean(name, catalogue())} available: {_available()}"
 
 
@@ -137,9 +187,9 @@ def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[T
     """Values and origins of a file merged onto the file it extends."""
     if path.resolve() in children:
         raise VehicleError(f"{label}: extends itself through {' -> '.join(child.stem for child in children)}")
-    values, origins = read_file(path, label)
+    values, origins = read_file(path, label) if importer_of(path) is None else _read_foreign(path)
     hull = values.get("hull")
-    if isinstance(hull, dict) and isinstance(hull.get("file"), str):
+    if isinstance(hull, dict) and isinstance(hull.get("file"), str | Path):
         hull["file"] = path.parent.resolve() / hull["file"]
     perception = values.get("perception")
     for name, entry in perception.items() if isinstance(perception, dict) else ():

@@ -229,3 +229,7 @@ def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin
 
 class VehicleError(ValueError):
     """A vehicle file or a value given for a vehicle is refused; the message states where, what and what to do."""
+
+
+class VehicleWarning(UserWarning):
+    """Numbers of a vehicle are guesses because another program's file lacks them."""

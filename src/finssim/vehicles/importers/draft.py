@@ -6,7 +6,7 @@ An importer is one file with a `VehicleImporter`, registered as `vehicle.FORMAT`
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.mesh import Faces, MeshError, Vertices, write_stl
-from finssim.core.registry import IMPORTERS
 from finssim.vehicles.importers.rigid import plain
-from finssim.vehicles.loader import checked
+from finssim.vehicles.loader import KIND, checked, importer_of, importers
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Origin, Provenance, Vehicle
 
 __all__ = [
     "Draft", "VehicleImporter", "check_registered", "put_controlled_axes", "put_envelope", "read_foreign",
 ]  # fmt: skip
-
-KIND = "vehicle."
-"""Beginning of the names of importers that read vehicles."""
-HEAD = 1 << 16
-"""Bytes from which an importer recognises its format."""
 
 
 @dataclass
@@ -134,13 +128,6 @@ def check_registered(name: str, member: Any) -> None:
         )
 
 
-def importers() -> Iterator[VehicleImporter]:
-    """Yield the importers of vehicles."""
-    for name, member in IMPORTERS.usable().items():
-        if name.startswith(KIND):
-            yield member
-
-
 def read_foreign(path: Path) -> Draft:
     """Read the vehicle of another program, by the importer that recognises its file.
 
@@ -152,12 +139,10 @@ def read_foreign(path: Path) -> Draft:
     """
     if not path.is_file():
         raise VehicleError(f"{path}: no such file: give the file of a vehicle")
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    for importer in importers():
-        if importer.recognises(path, head):
-            return importer.read(path)
-    known = ", ".join(sorted(importer.title for importer in importers()))
+    importer: VehicleImporter | None = importer_of(path)
+    if importer is not None:
+        return importer.read(path)
+    known = ", ".join(sorted(member.title for member in importers().values()))
     raise VehicleError(f"{path}: is of no format that is read, expected one of {known}")
 
 
