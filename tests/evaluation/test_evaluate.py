@@ -11,6 +11,7 @@ from torch import nn
 
 from finssim.agents.agent import AgentError, PidAgent
 from finssim.cli import boundary
+from finssim.cli.command_line import read
 from finssim.cli.commands import app
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyDescription, PolicyError, VehicleIdentity
@@ -22,7 +23,6 @@ from finssim.evaluation.metrics import PAPER_T1, T1_SETPOINTS, T1_START
 from finssim.evaluation.plants import PlantChanges, PlantError, available_plants, load_plant
 from finssim.evaluation.trials import run_trials
 from finssim.learning.export import export_policy
-from finssim.robot.run import run
 from finssim.sim import read_run
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
 from finssim.vehicles import load_vehicle
@@ -260,8 +260,13 @@ def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
 
 def test_the_help_names_every_plant_and_every_trajectory():
     """As they are in the catalogue; `run` names the trajectories too."""
-    for page, names in ((evaluate, [*available_plants(), *TRAJECTORIES]), (run, TRAJECTORIES)):
-        words = set(re.findall(r"\w+", page.__doc__))
+    pages = {
+        "evaluation.evaluate:evaluate": [*available_plants(), *TRAJECTORIES],
+        "robot.run:run": TRAJECTORIES,
+    }
+    for path, names in pages.items():
+        helps = " ".join(option.help for option in read(f"finssim.{path}").all_options())
+        words = set(re.findall(r"\w+", helps))
         assert not set(names) - words
 
 

@@ -14,7 +14,7 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import Medium, one_picture
-from finssim.pool.run import MediumServer, swimming
+from finssim.pool.run import MediumServer, SiteChoice, swimming
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record
 from finssim.robot.runtime import Runtime
@@ -50,7 +50,7 @@ def test_a_message_reaches_the_others_and_nobody_under_a_strange_name():
 def test_one_camera_tells_vehicles_apart_by_their_tags():
     """Three FinsROV in the pool, every picture with the tags of all: each knows where it is and goes where it is to."""
     finsrov = load_vehicle("finsrov")
-    fleet, known = swimming([finsrov] * 3, 1, "nominal", "corners", "pool", "none", truth=None, seed=1)
+    fleet, known = swimming([finsrov] * 3, SiteChoice(severity="nominal"), None)
     names, sent = list(fleet.worlds), {name: [] for name in fleet.worlds}
     runtimes, tags = {}, set()
     for i, (name, world) in enumerate(fleet.worlds.items()):

@@ -51,7 +51,10 @@ KINDS: Mapping[str, Any] = {
     "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
 }  # fmt: skip
 """Name of an annotation -> what the command line makes of a word."""
-MAKERS = {"OnRobot": "finssim.evaluation.robot_trials:robot_or_none"}
+MAKERS = {
+    "OnRobot": "finssim.evaluation.robot_trials:robot_or_none",
+    "Wiring": "finssim.robot.wiring:Wiring",
+}
 """Name of an annotation -> function or dataclass that makes it, whose options replace the parameter; besides these, the
 dataclasses that are annotated "options"."""
 SEEDS = (0, 2**31 - 1)
@@ -122,9 +125,10 @@ class Definition:
 
     path: str
     help: str
-    options: tuple[Option, ...]
-    makers: Mapping[str, Definition]
-    """Parameter -> the function that makes its value of options."""
+    arguments: Mapping[str, Option | Definition]
+    """Parameter -> its option, or the function that makes its value of options, in the order of the signature."""
+    positional: bool
+    """Whether its value is given by its place."""
     extra: bool
     """Takes whatever words follow, as `*words`."""
     tabled: bool
@@ -132,19 +136,20 @@ class Definition:
 
     def all_options(self) -> Iterator[Option]:
         """Yield all options, those of the makers included, in the order of the help."""
-        yield from self.options
-        for maker in self.makers.values():
-            yield from maker.options
+        for argument in self.arguments.values():
+            yield from argument.all_options() if isinstance(argument, Definition) else [argument]
 
     def values(self, typed: Mapping[str, Any]) -> dict[str, Any]:
         """Parameter -> what it is called with, of what was typed."""
-        values = {option.name: option.value(typed[option.name]) for option in self.options}
-        return values | {name: maker.call(typed) for name, maker in self.makers.items()}
+        return {
+            name: argument.call(typed) if isinstance(argument, Definition) else argument.value(typed[name])
+            for name, argument in self.arguments.items()
+        }
 
     def call(self, typed: Mapping[str, Any], *extra: str) -> Any:
         """Call it with what was typed."""
         values = self.values(typed)
-        positional = [values.pop(option.name) for option in self.options if option.positional]
+        positional = [values.pop(name) for name, argument in self.arguments.items() if argument.positional]
         return loaded(self.path)(*positional, *extra, **values)
 
 
@@ -173,8 +178,13 @@ def about(path: str) -> str:
 
 
 @cache
-def read(path: str) -> Definition:
-    """Read a function, or a dataclass of settings, from its source."""
+def read(path: str, positional: bool = False) -> Definition:
+    """Read a function, or a dataclass of settings, from its source.
+
+    Args:
+        path: The function or class, module:name.
+        positional: Whether what it makes is given by its place.
+    """
     module, _, name = path.partition(":")
     source = _source(module)
     start = re.search(rf"^(def {name}\(|class {name}[(:])", source, re.MULTILINE)
@@ -186,27 +196,27 @@ def read(path: str) -> Definition:
     about = inspect.cleandoc(ast.get_docstring(node) or "")
     helps = _helps(about)
     arguments = _fields(node) if isinstance(node, ast.ClassDef) else _arguments(node, helps)
-    options, makers = [], {}
-    for argument, annotation, default, positional, (metavar, help_text) in arguments:
+    read_arguments: dict[str, Option | Definition] = {}
+    for argument, annotation, default, by_place, (metavar, help_text) in arguments:
         kind, many, notes = _kind(annotation)
         if kind in MAKERS or "options" in notes:
-            makers[argument] = read(MAKERS.get(kind, f"{module}:{kind}"))
+            read_arguments[argument] = read(MAKERS.get(kind, f"{module}:{kind}"), by_place)
         elif kind is not None and "python" not in notes:
             value = inspect.Parameter.empty if default is None else _literal(default, source)
             help_text = help_text or (JSON if argument == "as_json" else "")
-            options.append(Option(argument, kind, many, positional, value, notes, metavar, help_text))
+            option = Option(argument, kind, many, by_place, value, notes, metavar, help_text)
+            read_arguments[argument] = option
     rest = node.args.kwarg.arg if isinstance(node, ast.FunctionDef) and node.args.kwarg else ""
     reference = re.match(r"As of ([\w.]+)\.(\w+)(?:, without ([\w, ]+))?", helps.get(rest, (None, ""))[1])
     if isinstance(node, ast.FunctionDef) and reference is not None:
         further = read(f"finssim.{reference[1]}:{reference[2]}")
         names = {argument.arg for argument in node.args.args + node.args.kwonlyargs}
         names |= set((reference[3] or "").split(", "))
-        options += [option for option in further.options if option.name not in names]
-        makers |= {name: maker for name, maker in further.makers.items() if name not in names}
+        read_arguments |= {name: one for name, one in further.arguments.items() if name not in names}
     lines_of_help = re.split(r"\n(?:Args|Returns|Raises|Note):\n", about)[0].replace("`", "")
     extra = isinstance(node, ast.FunctionDef) and node.args.vararg is not None
     tabled = re.search(r"^def tables_of\(", source, re.MULTILINE) is not None
-    return Definition(path, lines_of_help, tuple(options), makers, extra, tabled)
+    return Definition(path, lines_of_help, read_arguments, positional, extra, tabled)
 
 
 Help = tuple[str | None, str]

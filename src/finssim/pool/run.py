@@ -50,8 +50,8 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = [
-    "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "make_plan", "run",
-    "serve_realtime", "swimming",
+    "Ends", "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "SiteChoice", "make_plan",
+    "run", "serve_realtime", "swimming",
 ]  # fmt: skip
 
 
@@ -519,151 +519,180 @@ def make_plan(
     return replace(plan, camera=eye, calibrated=calibrated)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SiteChoice:
+    """A site, and the plant of its vehicle."""
+
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    plant: str = "1"
+    """(SEED|FILE) Plant: a seed to draw it from, or a plant file."""
+    severity: Severity = "realistic"
+    """(NAME) How much a drawn plant and its camera differ from the files: nominal, realistic or hard."""
+    site: str | None = None
+    """(NAME) Site: pool (default), tank or open-water (current, waves, 20 m deep); for a world the default is its
+    basin, or open water down to its seabed."""
+    world: str | None = None
+    """(SITE|FILE) World for the vehicle's own cameras, sonars and altimeters, drawn from --seed: a site of finssim
+    worlds, or a world file. Readings are sent like images."""
+    start: str | None = None
+    """(X,Y,Z,YAW) Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint of a world,
+    if not given."""
+    camera: Literal["pictures", "corners", "none"] | None = None
+    """(KIND) Output of the camera: pictures, corners (of the tags) or none. Default: pictures; corners for a team or a
+    tank; none in open water, with a world or a task, and with ardusub."""
+    positioning: str = "none"
+    """(NAME) Position fixes on the robot's link: none, motion-capture or usbl."""
+    firmware: Literal["mcu", "ardusub"] = "mcu"
+    """(NAME) What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot that answers
+    as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+
+    def plan(self) -> tuple[PoolPlan, Station]:
+        """Return the pool of one vehicle, and where the vehicle starts.
+
+        Raises:
+            PlantSpecError: The plant cannot be made, or the start is outside.
+        """
+        usual: Any = {"pool": "pictures", "tank": "corners"}.get(
+            self.site or ("pool" if self.world is None else ""), "none"
+        )
+        plan = make_plan(
+            self.vehicle,
+            self.plant,
+            self.severity,
+            camera=self.camera or ("none" if self.firmware == "ardusub" else usual),
+            seed=self.seed,
+            site=self.site,
+            firmware=self.firmware,
+            world=self.world,
+        )
+        start = self.start
+        if start is None and self.world is not None and self.site is None:
+            view = described_world(self.world).viewpoint
+            start = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
+        start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
+        begin = station_of(start)
+        _check_start(begin, plan.spec.basin, start)
+        return replace(plan, positioning=self.positioning), begin
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ends:
+    """Addresses of a pool."""
+
+    port: int = MCU_PORT
+    """UDP port of the motor controller; images use the next port, lock-step (TCP) the one after. With ardusub, 0
+    selects a free one."""
+    bind: str = "127.0.0.1"
+    """(ADDRESS) Local address; only this machine if not given."""
+    robot: str = "127.0.0.1:54321"
+    """(HOST:PORT) The only robot that may send commands in real time; images are sent to the next port."""
+    ground: str = "127.0.0.1:14550"
+    """(HOST:PORT,...) With ardusub: UDP ground stations to send to; every sender to --port is answered, too."""
+    tcp: str = "127.0.0.1:5760"
+    """(HOST:PORT) With ardusub: TCP address for ground stations; port 0 selects a free one."""
+    dvl: str = "127.0.0.1:16171"
+    """(HOST:PORT) With ardusub: TCP address of the Water Linked DVL; port 0 selects a free one."""
+
+    @property
+    def ours(self) -> tuple[str, int]:
+        """First address of the pool."""
+        return self.bind, self.port
+
+    @property
+    def theirs(self) -> tuple[str, int]:
+        """First address of the robot."""
+        return host_port(self.robot, "--robot")
+
+    def ground_links(self) -> Callable[[], GroundLinks]:
+        """Return a function that opens what an autopilot has instead of the motor controller's wire."""
+        texts = [] if self.ground == "none" else self.ground.split(",")
+        stations = [host_port(text.strip(), "--ground") for text in texts]
+        return partial(
+            GroundLinks, self.ours, stations, host_port(self.tcp, "--tcp"), host_port(self.dvl, "--dvl")
+        )
+
+
 def run(
+    choice: Annotated[SiteChoice, "options"],
+    ends: Annotated[Ends, "options"],
     *,
-    vehicle: str = "finsrov",
-    plant: str = "1",
-    severity: Severity = "realistic",
-    lockstep: bool = False,
-    camera: Literal["pictures", "corners", "none"] | None = None,
-    port: int = MCU_PORT,
-    bind: str = "127.0.0.1",
-    robot: str = "127.0.0.1:54321",
-    pool_file: Path | None = None,
-    truth: Path | None = None,
-    start: str | None = None,
     task: str | None = None,
     team: str | None = None,
-    site: str | None = None,
-    world: str | None = None,
-    positioning: str = "none",
-    firmware: Literal["mcu", "ardusub"] = "mcu",
-    ground: str = "127.0.0.1:14550",
-    tcp: str = "127.0.0.1:5760",
-    dvl: str = "127.0.0.1:16171",
+    lockstep: bool = False,
+    pool_file: Path | None = None,
+    truth: Path | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
-    seed: int = 1,
 ) -> None:
     """Simulate a vehicle and its pool for a robot on this machine, until Ctrl-C.
 
     Example: finssim pool --plant 1 --severity realistic --pool-file pool.yaml --truth truth.fst
 
     Args:
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        plant (SEED|FILE): Plant: a seed to draw it from, or a plant file.
-        severity (NAME): How much a drawn plant and its camera differ from the files: nominal, realistic or hard.
-        lockstep: Advance time as fast as one robot requests, instead of in real time.
-        camera (KIND): Output of the camera: pictures, corners (of the tags) or none. Default: pictures; corners for
-            a team or a tank; none in open water, with a world or a task, and with ardusub.
-        port: UDP port of the motor controller; images use the next port, lock-step (TCP) the one after. With
-            ardusub, 0 selects a free one.
-        bind (ADDRESS): Local address; only this machine if not given.
-        robot (HOST:PORT): The only robot that may send commands in real time; images are sent to the next port.
-        pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
-        truth (FILE): File for the true states, for scoring; for a team a folder.
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint
-            of a world, if not given.
+        choice: The site, and the plant of its vehicle.
+        ends: Addresses.
         task (TASK): Run the site of a task in open water, in real time, with ports as for --team; messages between
             robots use the port of --port plus five. Other agents of the task are simulated, and the task scores the
             truth.
         team (NAME,NAME): Several vehicles at one site, in real time: names or files separated by commas, as agents
             of --task or without a task. The ports of each further motor controller and robot are higher by ten than
             --port and --robot. A camera sees all of them, with different tag ids.
-        site (NAME): Site: pool (default), tank or open-water (current, waves, 20 m deep); for a world the default
-            is its basin, or open water down to its seabed.
-        world (SITE|FILE): World for the vehicle's own cameras, sonars and altimeters, drawn from --seed: a site of
-            finssim worlds, or a world file. Readings are sent like images.
-        positioning (NAME): Position fixes on the robot's link: none, motion-capture or usbl.
-        firmware (NAME): What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot
-            that answers as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log.
-        ground (HOST:PORT,...): With ardusub: UDP ground stations to send to; every sender to --port is answered,
-            too.
-        tcp (HOST:PORT): With ardusub: TCP address for ground stations; port 0 selects a free one.
-        dvl (HOST:PORT): With ardusub: TCP address of the Water Linked DVL; port 0 selects a free one.
+        lockstep: Advance time as fast as one robot requests, instead of in real time.
+        pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
+        truth (FILE): File for the true states, for scoring; for a team a folder.
         duration: Duration, pool's clock [s]; until Ctrl-C if not given.
-        seed: Seed of every random number; equal seeds give equal results.
 
     Raises:
         PlantSpecError, LinkError, GoalError, VehicleError, OutputError: What cannot be used.
     """
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    positioning_of(positioning, seed)  # refuses what is none
-    ardusub = firmware == "ardusub"
+    positioning_of(choice.positioning, choice.seed)  # refuses what is none
+    longest = math.inf if duration is None else duration
     if task is not None or team is not None:
-        if ardusub:
+        if choice.firmware == "ardusub":
             raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
         files = task is not None and (pool_file is not None or truth is not None)
-        if not plant.isdecimal() or lockstep or start is not None or files or world is not None:
+        single = lockstep or choice.start is not None or choice.world is not None
+        if not choice.plant.isdecimal() or single or files:
             raise PlantSpecError(
                 "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
                 "for --plant, leave --lockstep, --start and --world out, and of a task --pool-file and --truth"
             )
-        site = site or "pool"
-        bodies = [load_vehicle(name.strip()) for name in (team or vehicle).split(",")]
-        calibrated = None
-        if task is None:
-            fleet, calibrated = swimming(
-                bodies, int(plant), severity, camera or ("none" if site == "open-water" else "corners"), site,
-                positioning, truth=truth, seed=seed,
-            )  # fmt: skip
-        else:
-            fleet = _playing(task, bodies, int(plant), severity, positioning, seed)
-        _serve_team(fleet, calibrated, (bind, port), host_port(robot, "--robot"), pool_file, duration)
+        bodies = [load_vehicle(name.strip()) for name in (team or choice.vehicle).split(",")]
+        fleet, calibrated = (
+            _playing(task, bodies, choice) if task is not None else swimming(bodies, choice, truth)
+        )
+        _serve_team(fleet, calibrated, ends, pool_file, longest)
         return
-    usual: Any = {"pool": "pictures", "tank": "corners"}.get(
-        site or ("pool" if world is None else ""), "none"
-    )
-    camera = camera or ("none" if ardusub else usual)
-    plan = make_plan(
-        vehicle, plant, severity, camera=camera, seed=seed, site=site, firmware=firmware, world=world
-    )
-    plan = replace(plan, positioning=positioning)
-    if start is None and world is not None and site is None:
-        view = described_world(world).viewpoint
-        start = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
-    start = start or f"0,0,{-0.5 * plan.spec.basin.depth:g},0"
-    begin = station_of(start)
-    _check_start(begin, plan.spec.basin, start)
-    if not (0 < port or (ardusub and not lockstep and camera == "none")) or port > 65533:
+    plan, begin = choice.plan()
+    port, ardusub = ends.port, choice.firmware == "ardusub"
+    if not (0 < port or (ardusub and not lockstep and plan.camera is None)) or port > 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
     if pool_file is not None and plan.calibrated is None:
         raise PlantSpecError("--pool-file describes the camera, and --camera none has none: omit one")
 
     def make_world(eye: Any) -> VirtualPool:
         """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""
-        world = plan.world(eye, start=begin, seed=seed, truth=truth)
+        world = plan.world(eye, start=begin, seed=choice.seed, truth=truth)
         if pool_file is not None and plan.calibrated is not None:
             write_pool(plan.calibrated, pool_file)
         _tell_plant(plan, pool_file, truth)
         return world
 
-    longest = math.inf if duration is None else duration
     if lockstep:
-        _lockstep(plan, make_world, (bind, port + 2), longest)
+        _lockstep(plan, make_world, (ends.bind, port + 2), longest)
     else:
-        links = None
-        if ardusub:
-            stations = (
-                []
-                if ground == "none"
-                else [host_port(text.strip(), "--ground") for text in ground.split(",")]
-            )
-            links = partial(
-                GroundLinks, (bind, port), stations, host_port(tcp, "--tcp"), host_port(dvl, "--dvl")
-            )
-        _realtime(plan, make_world, (bind, port), host_port(robot, "--robot"), longest, links)
+        links = ends.ground_links() if ardusub else None
+        _realtime(plan, make_world, ends.ours, ends.theirs, longest, links)
 
 
 def _serve_team(
-    fleet: Fleet,
-    calibrated: Pool | None,
-    ours: tuple[str, int],
-    theirs: tuple[str, int],
-    pool_file: Path | None,
-    duration: float | None,
+    fleet: Fleet, calibrated: Pool | None, ends: Ends, pool_file: Path | None, duration: float
 ) -> None:
     """Serve several vehicles, each to a separate robot, from their first addresses on ten ports apart."""
-    (bind, port), (host, first) = ours, theirs
+    (bind, port), (host, first) = ends.ours, ends.theirs
     names = fleet.task.agents if isinstance(fleet, TaskSite) else tuple(fleet.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
@@ -687,20 +716,17 @@ def _serve_team(
         if messages is not None and isinstance(fleet, TaskSite):
             _tell_goal(fleet)
             _say(f"messages: {_name(messages.address)}")
-        longest = math.inf if duration is None else duration
         notify = partial(_tell_episode, fleet)
         pace = serve_realtime(
-            fleet, transports, messages, sinks=sinks, duration=longest, until=interrupted, over=notify
+            fleet, transports, messages, sinks=sinks, duration=duration, until=interrupted, over=notify
         )
     if not fleet.over:
         _tell_episode(fleet)
     _say(f"ended after {pace.duration:.1f} s")
 
 
-def _playing(
-    task: str, bodies: Sequence[Vehicle], plant: int, severity: Severity, positioning: str, seed: int
-) -> TaskSite:
-    """The site of a task in open water; its own vehicles are of the first type."""
+def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[TaskSite, None]:
+    """Return the site of a task in open water, without a camera; its own vehicles are of the first type."""
     fitted = fitted_task(task, bodies[0])
     if len(bodies) not in (1, len(fitted.agents)):
         raise PlantSpecError(
@@ -708,44 +734,32 @@ def _playing(
             f"{', '.join(fitted.agents)}"
         )
     agents = list(bodies) * (len(fitted.agents) // len(bodies))
-    return TaskSite(
+    site = TaskSite(
         task,
         [*agents, *[bodies[0]] * len(fitted.others)],
-        lambda v: site_of("open-water", draw_plant(v, plant, severity)),
+        lambda v: site_of("open-water", draw_plant(v, int(choice.plant), choice.severity)),
         None,
         None,
-        seed=seed,
+        seed=choice.seed,
         communication=getattr(fitted, "communication", None),
-        positioning=positioning,
+        positioning=choice.positioning,
     )
+    return site, None
 
 
-def swimming(
-    bodies: Sequence[Vehicle],
-    plant: int,
-    severity: Severity,
-    camera: str,
-    site: str,
-    positioning: str,
-    *,
-    truth: Path | None,
-    seed: int,
-) -> tuple[Fleet, Pool | None]:
-    """Vehicles side by side, robot_1 and so on, and what their robots may know of the one camera.
+def swimming(bodies: Sequence[Vehicle], choice: SiteChoice, truth: Path | None) -> tuple[Fleet, Pool | None]:
+    """Return vehicles side by side, robot_1 and so on, and what their robots may know of the one camera.
 
     Args:
         bodies: As their files have them.
-        plant: Seed of the first plant and of the camera; the others' follow.
-        severity: Of plants and camera.
-        camera: corners or none.
-        site: Where, a name of `SITES`.
-        positioning: On every robot's wire: none, motion-capture or usbl.
+        choice: The site; its plant is the seed of the first vehicle's plant and of the camera, the others' follow.
         truth: Folder that takes NAME.truth of each; none if None.
-        seed: Of instruments and noise.
 
     Raises:
         PlantSpecError: They have no room, or the camera cannot be there.
     """
+    site, plant, severity, seed = choice.site or "pool", int(choice.plant), choice.severity, choice.seed
+    camera = choice.camera or ("none" if site == "open-water" else "corners")
     if camera == "pictures" and site != "open-water":
         raise PlantSpecError("the one camera over a team sends corners: give --camera corners, or none")
     if site == "open-water" and camera != "none":
@@ -780,7 +794,7 @@ def swimming(
             v,
             spec,
             camera=eye,
-            positioning=positioning_of(positioning, seed + i),
+            positioning=positioning_of(choice.positioning, seed + i),
             start=((x, 0.0, -0.5 * basin.depth), quat_from_yaw(0.0)),
             seed=seed + i,
             truth=None if truth is None else truth / f"{name}.truth",

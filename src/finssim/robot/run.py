@@ -9,10 +9,11 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -21,11 +22,11 @@ from rich.text import Text
 
 from finssim.agents.controllers import CONTROLLERS
 from finssim.control import ControlError
-from finssim.control.guidance import Station
+from finssim.control.guidance import Guide, Station
 from finssim.control.policy import read_description
 from finssim.core.rotations import quat_yaw, wrap_angle
 from finssim.core.system import PARENT, SEPARATE, follow_parent, interrupt
-from finssim.localization.overhead_camera import load_pool
+from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.robot.goals import HeardGoal, check_reachable, guide_of, place_of
 from finssim.robot.interrupt import interruptible
 from finssim.robot.links.transports import host_port
@@ -38,7 +39,17 @@ from finssim.robot.wiring import POOL_ADDRESS, RobotDriver, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
-__all__ = ["APART", "FAULT", "POOL_ADDRESS", "UNHEARD", "Wiring", "run", "run_team"]
+__all__ = [
+    "APART",
+    "FAULT",
+    "POOL_ADDRESS",
+    "UNHEARD",
+    "Localization",
+    "Mission",
+    "run",
+    "run_alone",
+    "run_team",
+]
 
 
 # What a person wants to know of a run: how near the goal it was, what stopped it, and whether it was in time.
@@ -183,6 +194,68 @@ def show(report: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Mission:
+    """Controller of a run, and what it is to do."""
+
+    policy: str | None = None
+    """(DIR|NAME) A policy's directory, pid or pid-paper, or with --task one of the task's baselines."""
+    task: str | None = None
+    """(TASK) Task that the policy must have been trained for, by name (see finssim tasks) or FILE.py:CLASS; the
+    policy's if not given."""
+    agent: str | None = None
+    """(NAME) This vehicle's agent in a task with several; the first if not given."""
+    goal: str | None = None
+    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the world frame (z = 0 at the surface, negative below) and heading
+    [deg], or a file with goal: [x, y, z, yaw_deg]."""
+    trajectory: str | None = None
+    """(NAME|FILE) Trajectory to follow instead of a goal: straight, broken, ellipse, lemniscate, circle, figure_eight,
+    helix, or a file."""
+    team: str | None = None
+    """(DIR|NAME) Policy or baseline for all agents of a task, instead of --policy, each in its own process. Their ports
+    are those of --robot and --bind, plus ten for each further agent. An address is used as --messages."""
+    duration: Annotated[float | None, (0.0, None)] = None
+    """Duration [s]; until the end of the trajectory or Ctrl-C if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localization:
+    """Vehicle of a run, and what locates it."""
+
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    pool_file: str | None = None
+    """(FILE|none) Pool file: camera, water plane and frames (.yaml); none without a camera. Default: pool.yaml, with
+    --team none."""
+    site: str | None = None
+    """(NAME) Site: pool, tank or open-water. It sets the workspace, and in open water DVL and compass, as in finssim
+    pool --site. Default: pool, with --team open-water."""
+    number: Annotated[int, (0, 1000)] = 0
+    """This vehicle's index among several under one camera, which offsets its tag ids."""
+    let_in: str | None = None
+    """(X,Y) Position at the start, world frame [m], known to 5 cm: for dead reckoning by DVL and compass, without
+    camera and position fixes."""
+    estimator: str | None = None
+    """(NAME) Estimator: error-state, which uses the IMU's accelerations (default on a vehicle with an IMU), or
+    constant-velocity."""
+
+    def pool(self) -> tuple[Path, Pool] | tuple[None, None]:
+        """Return the pool file and what it holds; None twice without a camera.
+
+        Raises:
+            ControlError: There is none.
+        """
+        if self.pool_file == "none":
+            return None, None
+        if self.pool_file is None and not Path("pool.yaml").exists():
+            raise ControlError(
+                "there is no pool.yaml in this folder: name the pool file that finssim pool or calibrate pool has "
+                "written with --pool-file, or give --pool-file none without a camera"
+            )
+        file = Path(self.pool_file or "pool.yaml")
+        return file, load_pool(file)
+
+
 # `finssim run --team POLICY`: a separate stack for every agent of a task, each in its own process.
 
 
@@ -194,58 +267,64 @@ POLL = 0.05
 """Between looks whether they have ended [s]."""
 
 
+class TeamOutcome(NamedTuple):
+    """Outcome of a team's run."""
+
+    reports: dict[str, Any]
+    """Agent -> result of its run; None where it did not run."""
+    status: int
+    """Greatest exit status of the agents' processes."""
+
+
 def run_team(
-    policy: str,
-    options: Sequence[str],
-    *,
-    task: str | None,
-    vehicle: str,
-    robot: str = "pool",
-    bind: str = "127.0.0.1:54321",
-    messages: str = "",
-    record: Path | None = None,
-    as_json: bool = False,
-) -> int:
-    """Run every agent of a task, and print how each went; one that ends leaves the others alone.
+    mission: Mission, wiring: Wiring, localization: Localization, *, record: Path | None, arm: bool
+) -> TeamOutcome:
+    """Run every agent of a task in its own process; one that ends leaves the others alone.
 
     Args:
-        policy: A policy's directory, or a baseline of the task, for all.
-        options: Of `finssim run`, the same for all.
-        task: Of several vehicles; the policy's if None.
-        vehicle: Name or file.
-        robot: Motor controller of the first; the others' are ten ports on, each. `pool`: that of this machine.
-        bind: Own end of the first, likewise.
-        messages: What carries messages between them; the port five after `robot` if empty.
+        mission: Its `team` is the policy's directory, or a baseline of the task, for all.
+        wiring: Of the first; the others' ports are ten further on, each. What carries messages is five ports after
+            `robot` if it names none.
+        localization: Vehicle, and what locates it: open water without a camera if it names none.
         record: Folder that takes AGENT.mcap of each; nothing is kept if None.
-        as_json: Print one JSON object, by agent.
-
-    Returns:
-        The greatest exit status of them.
+        arm: Arm, as soon as the state is known.
 
     Raises:
         ControlError, PolicyError, LinkError: Policy, task, vehicle and addresses do not fit.
     """
     from finssim.tasks.observer import fitted_task
 
-    task_argument = task or (read_description(Path(policy)).task if Path(policy).is_dir() else None)
-    if task_argument is None:
-        raise ControlError(f"--team {policy} is a baseline: give its task with --task")
-    agents = fitted_task(task_argument, load_vehicle(vehicle)).agents
-    if len(agents) < 2:
+    of_one = (mission.agent, mission.trajectory, localization.let_in)
+    if any(x is not None for x in of_one) or wiring.lockstep or localization.number:
         raise ControlError(
-            f"task '{task_argument}' has one agent: run it with --policy {policy}, and --messages"
+            "--team starts every agent: leave --agent, --trajectory, --lockstep, --number and --let-in out"
         )
+    policy, vehicle, robot = str(mission.team), localization.vehicle, wiring.robot
+    task = mission.task or (read_description(Path(policy)).task if Path(policy).is_dir() else None)
+    if task is None:
+        raise ControlError(f"--team {policy} is a baseline: give its task with --task")
+    agents = fitted_task(task, load_vehicle(vehicle)).agents
+    if len(agents) < 2:
+        raise ControlError(f"task '{task}' has one agent: run it with --policy {policy}, and --messages")
     kind, _, address = (POOL_ADDRESS if robot == "pool" else robot).rpartition("//")
     if kind not in ("", "udp:"):
         raise ControlError(
             f"--robot {robot}: a team's motor controllers are at udp://HOST:PORT, ten ports from each other"
         )
-    (theirs, port), (host, own_port) = host_port(address, "--robot"), host_port(bind, "--bind")
-    alike = [
-        *("--policy", policy, "--task", task_argument, "--vehicle", vehicle, "--json"),
-        *("--messages", messages or f"{theirs}:{port + MESSAGES}"),
-        *options,
-    ]
+    (theirs, port), (host, own_port) = host_port(address, "--robot"), host_port(wiring.bind, "--bind")
+    options = {
+        "--policy": policy,
+        "--task": task,
+        "--vehicle": vehicle,
+        "--messages": wiring.messages or f"{theirs}:{port + MESSAGES}",
+        "--site": localization.site or "open-water",
+        "--pool-file": localization.pool_file or "none",
+        "--goal": mission.goal,
+        "--estimator": localization.estimator,
+        "--duration": mission.duration,
+    }
+    alike = [word for name, x in options.items() if x is not None for word in (name, str(x))]
+    alike += ["--json", *(["--arm"] if arm else [])]
     children: dict[str, subprocess.Popen[str]] = {}
     environment = {**os.environ, PARENT: str(os.getpid())}
     with interruptible() as interrupted:
@@ -272,9 +351,9 @@ def run_team(
             for child in children.values():
                 if child.poll() is None:
                     interrupt(child)
-            outcome = {agent: child.communicate()[0] for agent, child in children.items()}
-    _tell({agent: json.loads(text) if text.strip() else None for agent, text in outcome.items()}, as_json)
-    return max(abs(child.returncode) for child in children.values())
+            texts = {agent: child.communicate()[0] for agent, child in children.items()}
+    reports = {agent: json.loads(text) if text.strip() else None for agent, text in texts.items()}
+    return TeamOutcome(reports, max(abs(child.returncode) for child in children.values()))
 
 
 def _tell(report: dict[str, Any], as_json: bool) -> None:
@@ -300,26 +379,11 @@ _SEEN = Station((0.0, 0.0, 0.0), 0.0, name="sight")
 
 
 def run(
+    mission: Annotated[Mission, "options"],
+    wiring: Wiring,
+    localization: Annotated[Localization, "options"],
     *,
-    policy: str | None = None,
-    task: str | None = None,
-    agent: str | None = None,
-    goal: str | None = None,
-    trajectory: str | None = None,
-    robot: str = "pool",
-    bind: str = "127.0.0.1:54321",
-    pictures: str | None = None,
-    pool_file: str | None = None,
-    site: str | None = None,
-    team: str | None = None,
-    messages: str = "",
-    number: Annotated[int, (0, 1000)] = 0,
-    vehicle: str = "finsrov",
-    let_in: str | None = None,
-    estimator: str | None = None,
     record: Path | None = None,
-    duration: Annotated[float | None, (0.0, None)] = None,
-    lockstep: bool = False,
     arm: bool = False,
     as_json: bool = False,
 ) -> int:
@@ -332,41 +396,10 @@ def run(
     Example: finssim run --team runs/team --duration 60 --arm
 
     Args:
-        policy (DIR|NAME): A policy's directory, pid or pid-paper, or with --task one of the task's baselines.
-        task (TASK): Task that the policy must have been trained for, by name (see finssim tasks) or FILE.py:CLASS;
-            the policy's if not given.
-        agent (NAME): This vehicle's agent in a task with several; the first if not given.
-        goal (X,Y,Z,YAW|FILE): Station to keep: x,y,z [m] in the world frame (z = 0 at the surface, negative below)
-            and
-            heading [deg], or a file with goal: [x, y, z, yaw_deg].
-        trajectory (NAME|FILE): Trajectory to follow instead of a goal: straight, broken, ellipse, lemniscate,
-            circle,
-            figure_eight, helix, or a file.
-        robot (ADDRESS): Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine;
-            or autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked
-            DVL, or mavlink for the virtual pool.
-            With --lockstep: pool, or HOST:PORT.
-        bind (ADDRESS:PORT): Local address and port for udp; images arrive at the next port. Loopback if not given.
-        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
-            otherwise none, if not given.
-        pool_file (FILE|none): Pool file: camera, water plane and frames (.yaml); none without a camera. Default:
-            pool.yaml, with --team none.
-        site (NAME): Site: pool, tank or open-water. It sets the workspace, and in open water DVL and compass, as in
-            finssim pool --site. Default: pool, with --team open-water.
-        team (DIR|NAME): Policy or baseline for all agents of a task, instead of --policy, each in its own process.
-            Their ports are those of --robot and --bind, plus ten for each further agent. An address is used as
-            --messages.
-        messages (ADDRESS): Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team
-            the default is the port of --robot plus five.
-        number: This vehicle's index among several under one camera, which offsets its tag ids.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        let_in (X,Y): Position at the start, world frame [m], known to 5 cm: for dead reckoning by DVL and compass,
-            without camera and position fixes.
-        estimator (NAME): Estimator: error-state, which uses the IMU's accelerations (default on a vehicle with an IMU),
-            or constant-velocity.
+        mission: Controller, and what it is to do.
+        wiring: Connection of the robot.
+        localization: Vehicle, and what locates it.
         record (FILE): Record everything to this file (.mcap); with --team a folder with a file for each.
-        duration: Duration [s]; until the end of the trajectory or Ctrl-C if not given.
-        lockstep: Run in lock-step with finssim pool --lockstep, as fast as possible.
         arm: Arm, as soon as the state is known. Without it the thrusters never turn.
         as_json: Print one JSON object instead of tables.
 
@@ -374,47 +407,39 @@ def run(
         ControlError, PolicyError, GoalError, VehicleError, LinkError, OutputError: What cannot be used.
     """
     follow_parent()
-    if team is not None and _is_address(team):
-        team, messages = None, team
-    if (policy is None) == (team is None):
+    if _is_address(mission.team or ""):
+        mission, wiring = replace(mission, team=None), replace(wiring, messages=str(mission.team))
+    if (mission.policy is None) == (mission.team is None):
         raise ControlError(
             "no controller: give --policy for this vehicle, or --team for all agents of a task"
         )
-    if team is not None:
-        if agent is not None or trajectory is not None or lockstep or number or let_in is not None:
-            raise ControlError(
-                "--team starts every agent: leave --agent, --trajectory, --lockstep, --number and --let-in "
-                "out"
-            )
-        options = {
-            "--site": site or "open-water",
-            "--pool-file": pool_file or "none",
-            "--goal": goal,
-            "--estimator": estimator,
-            "--duration": duration,
-        }
-        tokens = [word for name, x in options.items() if x is not None for word in (name, str(x))]
-        return run_team(
-            team, [*tokens, *(["--arm"] if arm else [])], task=task, vehicle=vehicle, robot=robot, bind=bind,
-            messages=messages, record=record, as_json=as_json,
-        )  # fmt: skip
-    assert policy is not None
-    wiring = Wiring(robot=robot, bind=bind, pictures=pictures, lockstep=lockstep, team=messages)
-    console, site = Console(stderr=True), site or "pool"
-    file = None if pool_file == "none" else Path(pool_file or "pool.yaml")
-    if pool_file is None and not Path("pool.yaml").exists():
-        raise ControlError(
-            "there is no pool.yaml in this folder: name the pool file that finssim pool or calibrate pool has written "
-            "with --pool-file, or give --pool-file none without a camera"
-        )
-    filed = load_vehicle(vehicle)
-    ours = numbered(vehicle_at(site, filed, navigation=robot.startswith("mavlink")), number)
-    pilot = _pilot(policy, filed, task, agent=agent, follows=trajectory is not None)
+    if mission.team is not None:
+        outcome = run_team(mission, wiring, localization, record=record, arm=arm)
+        _tell(outcome.reports, as_json)
+        return outcome.status
+    report = run_alone(mission, wiring, localization, record=record, arm=arm)
+    if as_json:
+        print(json.dumps(report))
+    else:
+        show(report, Console())
+    if report["state"] == "fault":
+        return FAULT
+    return UNHEARD if report["steps"] and not report["telemetry"] else 0
+
+
+def run_alone(
+    mission: Mission, wiring: Wiring, localization: Localization, *, record: Path | None, arm: bool
+) -> dict[str, Any]:
+    """Run one vehicle; return the result as plain data. Arguments and errors as of `run`."""
+    assert mission.policy is not None
+    console, site = Console(stderr=True), localization.site or "pool"
+    file, pool = localization.pool()
+    filed = load_vehicle(localization.vehicle)
+    navigation = wiring.robot.startswith("mavlink")
+    ours = numbered(vehicle_at(site, filed, navigation=navigation), localization.number)
+    pilot = _pilot(mission, filed)
+    guide = _guide(mission, wiring, pilot, ours)
     sees = getattr(pilot, "pictures", {})
-    free = goal is None and trajectory is None
-    guide = _GO if wiring.team and free else _SEEN if sees and free else guide_of(goal, trajectory)
-    if guide not in (_GO, _SEEN):
-        check_reachable(guide, ours)
     if defaults := [name for name in ours.defaults if sees or name != "perception"]:
         console.print(
             f"{ours.name}: {', '.join(defaults)} are defaults, fit for the virtual world; give a real vehicle "
@@ -422,8 +447,8 @@ def run(
             highlight=False,
             markup=False,
         )
-    pool = None if file is None else load_pool(file)
-    perception = Perception(ours, pool, mode=estimator, let_in=None if let_in is None else place_of(let_in))
+    let_in = None if localization.let_in is None else place_of(localization.let_in)
+    perception = Perception(ours, pool, mode=localization.estimator, let_in=let_in)
     team = _team(pilot, wiring)
     heard = HeardGoal(team.tracks) if team is not None and guide is _GO and _alone(pilot) else None
     guide = heard or guide
@@ -435,14 +460,14 @@ def run(
         "armed": arm,
     }
     meta |= {"pool_sha256": pool.sha256} if pool else {}
-    context = recording(record, filed, meta, pool_file=file, lockstep=lockstep)
+    context = recording(record, filed, meta, pool_file=file, lockstep=wiring.lockstep)
     with _opened(connected(wiring, ours, pool), context) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
         runtime = Runtime(
             ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder, team=team
         )
-        monitor = _Monitor(runtime, duration, wiring.robot, console)
+        monitor = _Monitor(runtime, mission.duration, wiring.robot, console)
 
         def look(runtime: Runtime) -> None:
             if heard is not None:
@@ -451,16 +476,21 @@ def run(
 
         line = console.status("waiting for the vehicle", refresh_per_second=2.0)
         with line if console.is_terminal else nullcontext() as monitor.status:
-            longest = math.inf if duration is None else duration
+            longest = math.inf if mission.duration is None else mission.duration
             took = drive(runtime, duration=longest, show=look, until=monitor.over)
-    report = monitor.report(runtime, took)
-    if as_json:
-        print(json.dumps(report))
-    else:
-        show(report, Console())
-    if monitor.state == "fault":
-        return FAULT
-    return UNHEARD if runtime.counters.steps and not runtime.counters.telemetry else 0
+    return monitor.report(runtime, took)
+
+
+def _guide(mission: Mission, wiring: Wiring, pilot: Pilot, vehicle: Vehicle) -> Guide:
+    """Return what the pilot follows: a goal, a trajectory, the others of its team, or what it sees."""
+    if mission.goal is None and mission.trajectory is None:
+        if wiring.messages:
+            return _GO
+        if getattr(pilot, "pictures", {}):
+            return _SEEN
+    guide = guide_of(mission.goal, mission.trajectory)
+    check_reachable(guide, vehicle)
+    return guide
 
 
 def _is_address(text: str) -> bool:
@@ -469,15 +499,16 @@ def _is_address(text: str) -> bool:
     return bool(host) and port.isdecimal()
 
 
-def _pilot(policy: str, vehicle: Vehicle, task: str | None, *, agent: str | None, follows: bool) -> Pilot:
+def _pilot(mission: Mission, vehicle: Vehicle) -> Pilot:
     """Return the pilot; a PID that follows a trajectory is that of T2."""
+    policy, task = str(mission.policy), mission.task
     if task is not None:
         from finssim.tasks.observer import fitted_task
 
         fitted_task(task, vehicle)  # refuses what is no task, or none for this vehicle
     if policy in CONTROLLERS:
-        task = task or ("t2" if follows else None)
-    return make_pilot(policy, vehicle, task=task, agent=agent)
+        task = task or ("t2" if mission.trajectory is not None else None)
+    return make_pilot(policy, vehicle, task=task, agent=mission.agent)
 
 
 def _alone(pilot: Pilot) -> bool:
@@ -494,7 +525,7 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
     """
     observer = getattr(pilot, "observer", None)
     names = observer.task.vehicles if observer is not None else ()
-    if not wiring.team:
+    if not wiring.messages:
         return None
     if observer is None or (_alone(pilot) and not observer.task.moving):
         raise ControlError(

@@ -138,15 +138,19 @@ class Wiring:
     """Connection of the robot."""
 
     robot: str = "pool"
-    """Address of the motor controller or autopilot, or `pool`."""
-    bind: str = DEFAULT_BIND
-    """Own end, for UDP; pictures come to the port after it."""
+    """(ADDRESS) Motor controller: udp://HOST:PORT, serial:DEVICE, or pool for the virtual pool on this machine; or
+    autopilot: mavlink://udpin:HOST:PORT, udpout:, tcp: or serial:, with ?dvl=HOST for a Water Linked DVL, or mavlink
+    for the virtual pool. With --lockstep: pool, or HOST:PORT."""
+    bind: str = "127.0.0.1:54321"
+    """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port. Loopback if not given."""
     pictures: str | None = None
-    """Address of the camera; that of the virtual pool for `pool`, else none, if None."""
+    """(ADDRESS) Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool, otherwise none, if not
+    given."""
     lockstep: bool = False
-    """Take turns with a virtual pool."""
-    team: str = ""
-    """HOST:PORT of what carries messages between vehicles; empty: this one is alone."""
+    """Run in lock-step with finssim pool --lockstep, as fast as possible."""
+    messages: str = ""
+    """(ADDRESS) Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team the default is
+    the port of --robot plus five."""
 
 
 def link_of(robot: str, vehicle: Vehicle) -> Link:
@@ -195,7 +199,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[R
         LinkError, LockstepError: Something cannot be opened.
     """
     with ExitStack() as stack:
-        if wiring.lockstep and wiring.team:
+        if wiring.lockstep and wiring.messages:
             raise LinkError(
                 "a team runs in lock-step within one process: use python -m studies.stack, or omit --lockstep"
             )
@@ -219,8 +223,10 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[R
         camera = open_camera(wiring, vehicle, pool)
         stack.callback(camera.close)
         mates = None
-        if wiring.team:
-            mates = UdpTransport((host_port(wiring.bind, "--bind")[0], 0), host_port(wiring.team, "--team"))
+        if wiring.messages:
+            mates = UdpTransport(
+                (host_port(wiring.bind, "--bind")[0], 0), host_port(wiring.messages, "--messages")
+            )
             stack.callback(mates.close)
 
         def run(runtime: Runtime, **options: Any) -> float:

@@ -13,7 +13,7 @@ pytest.importorskip("newton", reason="finssim[perception] is not installed")
 from finssim.core.rotations import quat_from_yaw
 from finssim.extensions.perception.onboard import OnboardSensors
 from finssim.pool.plant_spec import PlantSpecError
-from finssim.pool.run import LockstepServer, make_plan, run
+from finssim.pool.run import Ends, LockstepServer, SiteChoice, make_plan, run
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import encode_command
 from finssim.robot.lockstep import LockstepClient
@@ -136,7 +136,7 @@ def test_the_hull_meets_the_things_of_the_world(wall):
 def test_a_team_has_no_world():
     """One vehicle sees one world."""
     with pytest.raises(PlantSpecError, match="--world out"):
-        run(team="finsrov,finsrov", world="dock")
+        run(SiteChoice(world="dock"), Ends(), team="finsrov,finsrov")
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from finssim.extensions.ros2.nodes.robot_node import RobotNode
-from finssim.pool.run import MCU_PORT
+from finssim.pool.run import MCU_PORT, Ends, SiteChoice
 from finssim.pool.run import run as serve
 from finssim.robot.links.transports import DEFAULT_BIND
 
@@ -18,28 +18,26 @@ class VirtualPoolNode(RobotNode):
     def __init__(self) -> None:
         super().__init__("virtual_pool")
         self.sends("event", "diagnostics")
-        self.plan = {
-            "plant": str(self.parameter("plant", "1")),
-            "severity": self.parameter("severity", "realistic"),
-            "camera": self.parameter("camera", "pictures"),
-            "port": self.parameter("port", MCU_PORT),
-            "robot": self.parameter("bind", DEFAULT_BIND),
-            "pool_file": _path(self.parameter("pool_file", "")),
-            "truth": _path(self.parameter("truth", "")),
-            "start": self.parameter("start", "") or None,
-            "positioning": self.parameter("positioning", "none"),
-            "seed": self.parameter("seed", 1),
-            "world": self.parameter("world", "") or None,
-        }
-        self._vehicle_name = self.get_parameter("vehicle").value
-        self._site = self.get_parameter("site").value
-        self.event("start", f"plant {self.plan['plant']}, {self.plan['severity']}")
+        site, world = self.get_parameter("site").value, self.parameter("world", "") or None
+        self.choice = SiteChoice(
+            vehicle=self.get_parameter("vehicle").value,
+            plant=str(self.parameter("plant", "1")),
+            severity=self.parameter("severity", "realistic"),
+            site=None if world is not None and site == "open-water" else site,  # as deep as the world
+            world=world,
+            start=self.parameter("start", "") or None,
+            camera=self.parameter("camera", "pictures"),
+            positioning=self.parameter("positioning", "none"),
+            seed=self.parameter("seed", 1),
+        )
+        self._ends = Ends(port=self.parameter("port", MCU_PORT), robot=self.parameter("bind", DEFAULT_BIND))
+        self._pool_file = _path(self.parameter("pool_file", ""))
+        self._truth = _path(self.parameter("truth", ""))
+        self.event("start", f"plant {self.choice.plant}, {self.choice.severity}")
 
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
-        world_is_site = self.plan["world"] is not None and self._site == "open-water"  # as deep as the world
-        options = {"bind": "127.0.0.1", "site": None if world_is_site else self._site, **self.plan}
-        serve(vehicle=self._vehicle_name, **options)
+        serve(self.choice, self._ends, pool_file=self._pool_file, truth=self._truth)
 
 
 def _path(text: str) -> Path | None:
