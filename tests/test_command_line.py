@@ -11,7 +11,7 @@ import typer
 from typer.main import get_command
 
 from finssim.cli import boundary, command_line
-from finssim.cli.command_line import command_app, read, run_script
+from finssim.cli.command_line import Definition, command_app, read, run_script
 from finssim.cli.commands import SECTIONS, app
 from reference.commands import EVERY
 
@@ -136,11 +136,10 @@ def test_what_the_source_says_is_what_python_has(words):
     module, _, name = definition.path.partition(":")
     found = inspect.signature(getattr(import_module(module), name)).parameters
     extra = any(p.kind is p.VAR_KEYWORD for p in found.values())
-    for option in definition.options:
-        assert option.name in found or extra
-        if option.name in found:
-            assert found[option.name].default == option.default
-    assert set(definition.makers) <= found.keys() or extra
+    for name, argument in definition.arguments.items():
+        assert name in found or extra
+        if name in found and not isinstance(argument, Definition):
+            assert found[name].default == argument.default
 
 
 def test_every_option_has_help():

@@ -104,7 +104,7 @@ def train(
         randomize: Ranges of vehicle and water parameters: a name or a file.
         settings: Settings of the learner, such as {"learning_rate": 1e-3}.
         progress: Whether progress is shown on standard error.
-        options: Further arguments of `finssim.learning.train.train`.
+        options: Further fields of `finssim.learning.train.TrainingSettings`, and `resume`.
 
     Returns:
         The policy, which `evaluate` and `run_in_pool` take.
@@ -115,24 +115,18 @@ def train(
     from rich.console import Console
 
     from finssim.control.policy import Policy
+    from finssim.learning.train import TrainingSettings
     from finssim.learning.train import train as train_into
 
     body = load_vehicle(vehicle)
     folder = None if out is not None else tempfile.TemporaryDirectory(prefix="finssim-policy-")
     target = Path(out) if folder is None else Path(folder.name) / "policy"
-    train_into(
-        task,
-        out=target,
-        learner=learner,
-        vehicle=body,
-        seed=seed,
-        worlds=worlds,
-        steps=steps,
-        randomize=randomize,
-        settings=settings or {},
-        console=Console(stderr=True, quiet=not progress),
-        **options,
-    )
+    resume = options.pop("resume", False)
+    training = TrainingSettings(
+        learner=learner, vehicle=body, seed=seed, worlds=worlds, steps=steps, randomize=randomize,
+        settings=settings or {}, **options,
+    )  # fmt: skip
+    train_into(task, training, out=target, resume=resume, console=Console(stderr=True, quiet=not progress))
     policy = Policy.load(target, vehicle=body)
     if folder is not None:
         weakref.finalize(policy, folder.cleanup)

@@ -7,7 +7,7 @@ import pytest
 
 from finssim.cli.playback import PlaybackError, play
 from finssim.learning.gymnasium_env import Env
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 from finssim.sim.site import described_world
 from finssim.tasks import Environment, StationKeeping, make
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    policy = train("t1", out=tmp_path / "hold", seed=1, steps=8192, worlds=64)
+    policy = train("t1", TrainingSettings(seed=1, steps=8192, worlds=64), out=tmp_path / "hold")
     monkeypatch.setattr("finssim.cli.playback.task_named", lambda _: StationKeeping(time_limit=0.5))
     play(policy, video=tmp_path / "hold.mp4", speed=2.0)
     film = cv2.VideoCapture(str(tmp_path / "hold.mp4"))

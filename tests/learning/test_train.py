@@ -23,7 +23,7 @@ from finssim.learning import episodes
 from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
 from finssim.learning.resume import ResumeError, read_state, write_state
-from finssim.learning.train import TrainingError, train
+from finssim.learning.train import TrainingError, TrainingSettings, train
 from finssim.learning.training_loop import TrainingLoop
 from finssim.sim.ranges_file import RangesError
 from finssim.tasks import EnvironmentSetupError, StationKeeping, Task, TrajectoryTracking
@@ -50,7 +50,7 @@ def network(folder: Path) -> str:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A tiny training."""
-    return train("t1", out=tmp_path_factory.mktemp("runs") / "tiny", seed=5, **TINY)
+    return train("t1", TrainingSettings(seed=5, **TINY), out=tmp_path_factory.mktemp("runs") / "tiny")
 
 
 def test_the_policy_loads_for_what_it_was_trained_with(trained):
@@ -93,20 +93,22 @@ def test_curves_and_log_are_written(trained):
 @pytest.mark.slow
 def test_equal_seeds_are_equal_policies(trained, tmp_path):
     """Bit for bit; another seed is another policy."""
-    assert network(train("t1", out=tmp_path / "again", seed=5, **TINY)) == network(trained)
-    assert network(train("t1", out=tmp_path / "other", seed=6, **TINY)) != network(trained)
+    assert network(train("t1", TrainingSettings(seed=5, **TINY), out=tmp_path / "again")) == network(trained)
+    assert network(train("t1", TrainingSettings(seed=6, **TINY), out=tmp_path / "other")) != network(trained)
 
 
 def test_options_reach_the_policy(tmp_path):
     """Action mode, model, ranges and what is seen are recorded as they were used."""
     out = train(
         "t1",
+        TrainingSettings(
+            action="thruster8",
+            hydrodynamics="simplified",
+            randomize="fossen_learn_to_swim",
+            observe="sensors",
+            **TINY,
+        ),
         out=tmp_path / "p",
-        action="thruster8",
-        hydrodynamics="simplified",
-        randomize="fossen_learn_to_swim",
-        observe="sensors",
-        **TINY,
     )
     told = Policy.load(out).description
     assert told.action["mode"] == "thruster8" and told.action_size == 8
@@ -132,7 +134,7 @@ def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch)
     """Ctrl-C in the fourth update: a whole policy directory, that says so, then the interrupt goes on."""
     interrupt_after(3, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
-        train("t1", out=tmp_path / "p", worlds=16, steps=100_000)
+        train("t1", TrainingSettings(worlds=16, steps=100_000), out=tmp_path / "p")
     told = Policy.load(tmp_path / "p").description.training
     assert told["complete"] is False and told["steps_done"] == 3 * 4096
 
@@ -144,7 +146,7 @@ def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_pat
     shutil.copytree(trained, out)
     interrupt_after(2, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
-        train("t1", out=out, worlds=16, steps=100_000)
+        train("t1", TrainingSettings(worlds=16, steps=100_000), out=out)
     kept = tmp_path / "p-training" / "interrupted"
     assert network(out) == network(trained) and Policy.load(out).description.training["complete"] is True
     assert Policy.load(kept).description.training["complete"] is False
@@ -157,7 +159,7 @@ def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_
     shutil.copytree(trained, tmp_path / "earlier")
     for name in ("new", "earlier"):
         with pytest.raises(KeyboardInterrupt):
-            train("t1", out=tmp_path / name, worlds=16, steps=100_000)
+            train("t1", TrainingSettings(worlds=16, steps=100_000), out=tmp_path / name)
         assert "no policy: interrupted before anything was learned" in capsys.readouterr().err
         assert not list((tmp_path / f"{name}-training").rglob("policy.yaml"))
     assert not (tmp_path / "new").exists() and network(tmp_path / "earlier") == network(trained)
@@ -169,7 +171,7 @@ SMALL = {"worlds": 16, "steps": 4096, "seed": 5, "settings": {"rollout": 32, "ba
 
 def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
     """Each stands beside the policy, under the steps it had seen, and loads."""
-    train("t1", out=tmp_path / "p", **SMALL)
+    train("t1", TrainingSettings(**SMALL), out=tmp_path / "p")
     folders = sorted((tmp_path / "p-training").glob("checkpoint-*"))
     assert [folder.name for folder in folders] == ["checkpoint-000003072", "checkpoint-000004096"]
     assert Policy.load(folders[0]).description.training["steps_done"] == 3072
@@ -179,7 +181,7 @@ def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
 def test_checkpoints_of_an_earlier_and_longer_training_go(tmp_path):
     """Else they would be taken for the newest, and those of the training that runs would go."""
     for steps in (4096, 2048):
-        train("t1", out=tmp_path / "p", **{**SMALL, "steps": steps})
+        train("t1", TrainingSettings(**{**SMALL, "steps": steps}), out=tmp_path / "p")
     names = sorted(folder.name for folder in (tmp_path / "p-training").glob("checkpoint-*"))
     assert names == ["checkpoint-000001536", "checkpoint-000002048"]
 
@@ -194,7 +196,7 @@ def die_in_the_sixth_update(out, learner, options):
         return update(self, total)
 
     TrainingLoop._update = dying
-    train("t1", out=out, learner=learner, **options)
+    train("t1", TrainingSettings(learner=learner, **options), out=out)
 
 
 @pytest.mark.slow
@@ -209,7 +211,7 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     if learner == "ppo from pid":
         learner, options["init"] = "ppo", "pid"
         options["settings"] = {**SMALL["settings"], "taught": 0.9}
-    whole = train("t1", out=tmp_path / "whole", learner=learner, **options)
+    whole = train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "whole")
     # A forked child has everything imported.
     run = multiprocessing.get_context("fork").Process(
         target=die_in_the_sixth_update, args=(tmp_path / "p", learner, options)
@@ -218,7 +220,7 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     run.join()
     assert run.exitcode == -signal.SIGKILL
     assert not (tmp_path / "p").exists() and (tmp_path / "p-training" / "checkpoint-000002048").is_dir()
-    resumed = train("t1", out=tmp_path / "p", learner=learner, resume=True, **options)
+    resumed = train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "p", resume=True)
     assert network(resumed) == network(whole)
     clock = {"seconds", "steps_per_s"}
     rows = [
@@ -235,24 +237,24 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
 def test_only_the_same_training_is_resumed(tmp_path, capsys):
     """Other arguments are named; where nothing was begun that is said; before the first checkpoint it begins anew."""
     with pytest.raises(ResumeError, match="nothing to resume: there is no folder .*leave out --resume"):
-        train("t1", out=tmp_path / "p", resume=True, **SMALL)
-    first = network(train("t1", out=tmp_path / "p", **SMALL))
+        train("t1", TrainingSettings(**SMALL), out=tmp_path / "p", resume=True)
+    first = network(train("t1", TrainingSettings(**SMALL), out=tmp_path / "p"))
     with pytest.raises(ResumeError, match="seed was 5 and is 6 now: give the original settings"):
-        train("t1", out=tmp_path / "p", resume=True, **{**SMALL, "seed": 6})
+        train("t1", TrainingSettings(**{**SMALL, "seed": 6}), out=tmp_path / "p", resume=True)
     side = tmp_path / "p-training"
     for path in side.glob("checkpoint-*/resume.npz"):
         state = read_state(path)
         del state["best"]
         write_state(state, path)
     with pytest.raises(ResumeError, match="the checkpoint is of an earlier version: leave out --resume"):
-        train("t1", out=tmp_path / "p", resume=True, **SMALL)
+        train("t1", TrainingSettings(**SMALL), out=tmp_path / "p", resume=True)
     for state in side.glob("checkpoint-*/resume.npz"):
         state.write_bytes(state.read_bytes()[:1000])
     with pytest.raises(ResumeError, match="checkpoint-000003072/resume.npz: cannot be resumed from"):
-        train("t1", out=tmp_path / "p", resume=True, **SMALL)
+        train("t1", TrainingSettings(**SMALL), out=tmp_path / "p", resume=True)
     for folder in side.glob("checkpoint-*"):
         shutil.rmtree(folder)
-    assert network(train("t1", out=tmp_path / "p", resume=True, **SMALL)) == first
+    assert network(train("t1", TrainingSettings(**SMALL), out=tmp_path / "p", resume=True)) == first
     assert "yet: starting from the beginning" in capsys.readouterr().err.replace("\n", " ")
 
 
@@ -261,7 +263,7 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     """One sentence, and no policy."""
     options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
     with pytest.raises((LearningError, EnvironmentSetupError), match="diverged"):
-        train("t1", out=tmp_path / "p", learner=learner, **options)
+        train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "p")
     assert not (tmp_path / "p").exists()
 
 
@@ -304,7 +306,7 @@ def test_what_cannot_be_trained_is_refused_at_once(tmp_path, options, error, sen
     """One sentence, and nothing is left behind."""
     task = options.pop("task", "t1")
     with pytest.raises(error, match=sentence):
-        train(task, out=tmp_path / "p", **{**TINY, **options})
+        train(task, TrainingSettings(**{**TINY, **options}), out=tmp_path / "p")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -312,20 +314,22 @@ def test_somebodys_files_are_not_replaced(tmp_path):
     """A folder that holds anything but a policy is refused before the training."""
     (tmp_path / "thesis.tex").write_text("years", encoding="utf-8")
     with pytest.raises(OutputError, match="already holds files"):
-        train("t1", out=tmp_path, **TINY)
+        train("t1", TrainingSettings(**TINY), out=tmp_path)
 
 
 @pytest.mark.slow
 def test_an_earlier_policy_is_replaced(trained, tmp_path):
     """The same directory may be trained into again."""
-    train("t1", out=tmp_path / "p", seed=6, **TINY)
-    assert network(train("t1", out=tmp_path / "p", seed=5, **TINY)) == network(trained)
+    train("t1", TrainingSettings(seed=6, **TINY), out=tmp_path / "p")
+    assert network(train("t1", TrainingSettings(seed=5, **TINY), out=tmp_path / "p")) == network(trained)
 
 
 @pytest.mark.slow
 def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
     """All eight in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default settings."""
-    result = evaluate_controller(train("t1", out=tmp_path / "p", seed=1), load_plant("nominal")).result
+    result = evaluate_controller(
+        train("t1", TrainingSettings(seed=1), out=tmp_path / "p"), load_plant("nominal")
+    ).result
     assert (result["success"], result["trials"]) == (8, 8)
     assert result["e_p_m"] <= 0.02 and result["e_psi_deg"] <= 1.5
 
@@ -334,7 +338,9 @@ def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
     """Twice in a row, before its steps are done; the curves end there, and the policy is complete."""
     settings = {"learning_rate": 1e-2, "discount": 0.5, "rollout": 16, "batch": 64, "hidden": [16, 16]}
     folder = train(
-        Guess(), out=tmp_path / "p", worlds=32, steps=100_000, until=0.95, settings=settings, seed=1
+        Guess(),
+        TrainingSettings(worlds=32, steps=100_000, until=0.95, settings=settings, seed=1),
+        out=tmp_path / "p",
     )
     with (folder / "curves.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -366,7 +372,7 @@ def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
         return {"evaluation_return": total, "evaluation_success": success}
 
     monkeypatch.setattr(episodes.HeldEvaluation, "__call__", scored)
-    folder = train("t1", out=tmp_path / "p", **SMALL)
+    folder = train("t1", TrainingSettings(**SMALL), out=tmp_path / "p")
     description = Policy.load(folder).description
     assert (folder / "policy.onnx").read_bytes() == onnx_bytes(networks[3], description)
     told = description.training
@@ -375,10 +381,12 @@ def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
 
 def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
     """50,000 steps, an eighth of the default, hold all setpoints; begun from nothing they hold none."""
-    folder = train("t1", out=tmp_path / "p", seed=1, steps=50_000, init="pid")
+    folder = train("t1", TrainingSettings(seed=1, steps=50_000, init="pid"), out=tmp_path / "p")
     result = evaluate_controller(folder, load_plant("nominal")).result
     assert (result["success"], result["trials"]) == (8, 8) and result["e_p_m"] < 0.005
-    again = train("t1", out=tmp_path / "again", seed=2, steps=50_000, init=folder, randomize="pool")
+    again = train(
+        "t1", TrainingSettings(seed=2, steps=50_000, init=folder, randomize="pool"), out=tmp_path / "again"
+    )
     assert evaluate_controller(again, load_plant("nominal")).result["success"] == 8
 
 
@@ -386,7 +394,7 @@ def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
     """In the task's own action mode, unless another teacher or none is asked for."""
     tiny = {"worlds": 8, "steps": 4096, "settings": {"hidden": [16]}}
     for options, teacher in (({}, "formation"), ({"action": "wrench6"}, ""), ({"init": "none"}, "")):
-        folder = train("team-pursuit", out=tmp_path / "p", **tiny, **options)
+        folder = train("team-pursuit", TrainingSettings(**tiny, **options), out=tmp_path / "p")
         assert Policy.load(folder).description.training["teacher"] == teacher
 
 
@@ -399,13 +407,13 @@ def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
 )
 def test_an_end_that_cannot_come_is_refused(tmp_path, task, until, sentence):
     with pytest.raises(TrainingError, match=sentence):
-        train(task, out=tmp_path / "p", until=until, **TINY)
+        train(task, TrainingSettings(until=until, **TINY), out=tmp_path / "p")
     assert not (tmp_path / "p").exists()
 
 
 def test_trajectory_tracking_is_trained_too(tmp_path):
     """T2's own settings and noise, in a policy that the robot's observation fits."""
-    folder = train("t2", out=tmp_path / "t2", seed=1, randomize="hold_for_position", **TINY)
+    folder = train("t2", TrainingSettings(seed=1, randomize="hold_for_position", **TINY), out=tmp_path / "t2")
     policy = Policy.load(
         folder, task={"name": "t2", "observation": TrajectoryTracking().schema.model_dump(mode="json")}
     )
@@ -420,6 +428,6 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
 @pytest.mark.slow
 def test_a_short_training_follows_the_straight_line(tmp_path):
     """After half of the usual steps: within 3 cm, several times better than the paper's best on hardware."""
-    folder = train("t2", out=tmp_path / "t2", seed=1, steps=300_000)
+    folder = train("t2", TrainingSettings(seed=1, steps=300_000), out=tmp_path / "t2")
     result = evaluate_controller(folder, load_plant("nominal"), task="t2", trials=1).result
     assert result["horizontal_rmse_m"] < 0.03 and result["vertical_rmse_m"] < 0.03

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 
 
 @pytest.mark.slow
@@ -15,14 +15,14 @@ def test_curves_go_to_one_run_which_a_resumed_training_goes_on_with(tmp_path, mo
     monkeypatch.setenv("WANDB_MODE", "offline")
     out, side = tmp_path / "policy", tmp_path / "policy-training"
     settings = {"worlds": 16, "steps": 1024, "seed": 1, "wandb": "swim"}
-    train("t1", out=out, **settings)
+    train("t1", TrainingSettings(**settings), out=out)
     (first,) = (side / "wandb").glob("offline-run-*")
     number = (side / "wandb-run.txt").read_text().strip()
     (log,) = first.glob(f"run-{number}.wandb")
     data = log.read_bytes()
     for words in (b"swim", b"policy", b"learner/", b"episodes/", b"evaluation/success"):
         assert words in data
-    train("t1", out=out, **settings, resume=True)
+    train("t1", TrainingSettings(**settings), out=out, resume=True)
     assert all(run.name.endswith(number) for run in (side / "wandb").glob("offline-run-*"))
 
 

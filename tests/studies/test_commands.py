@@ -36,14 +36,14 @@ def test_help_explains_every_option_and_has_an_example(capsys, name):
     example = re.search(rf"Example: (python -m studies\.{name} .*?)(?= Arguments:| Options:)", text)[1]
     assert set(re.findall(r"--[a-z-]+", example)) <= set(re.findall(r"--[a-z-]+", text.replace(example, "")))
     assert "--json" in text and re.search(r"--seed \S+ \S+ (?:(?! --).)*\[default: 1;", text)
-    assert all(option.help for option in read(f"studies.{name}:{STUDIES[name]}").options)
+    assert all(option.help for option in read(f"studies.{name}:{STUDIES[name]}").all_options())
 
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_options_are_parameters_with_the_same_defaults(name):
     """As read from the source, and as Python has them."""
     parameters = inspect.signature(getattr(import_module(f"studies.{name}"), STUDIES[name])).parameters
-    for option in read(f"studies.{name}:{STUDIES[name]}").options:
+    for option in read(f"studies.{name}:{STUDIES[name]}").all_options():
         assert parameters[option.name].default == option.default
 
 

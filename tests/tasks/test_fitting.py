@@ -11,7 +11,7 @@ from finssim.control.axis_model import axis_model
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import Policy
 from finssim.evaluation.metrics import T1_SETPOINTS, in_room
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 from finssim.sim import RectangularPool
 from finssim.tasks import TASKS, EnvironmentSetupError, numeric_tasks
 from finssim.tasks.fitting import authority
@@ -77,7 +77,12 @@ def test_an_agent_may_use_all_of_finsrov_and_a_part_of_a_stronger_vehicle():
 
 def test_a_policy_says_what_its_actions_stand_for(tmp_path):
     """The share of the limits is in its description, and so is what a robot makes of its actions."""
-    path = train("t1", out=tmp_path / "p", vehicle="bluerov2_heavy", worlds=16, steps=512, console=QUIET)
+    path = train(
+        "t1",
+        TrainingSettings(vehicle="bluerov2_heavy", worlds=16, steps=512),
+        out=tmp_path / "p",
+        console=QUIET,
+    )
     vehicle = load_vehicle("bluerov2_heavy")
     mode = mode_from_dict(Policy.load(path, vehicle=vehicle).description.action, vehicle)
     np.testing.assert_allclose(mode.scale, authority(vehicle))
@@ -87,5 +92,5 @@ def test_a_policy_says_what_its_actions_stand_for(tmp_path):
 def test_an_underactuated_vehicle_trains_nothing(tmp_path):
     """No policy, no folder."""
     with pytest.raises(EnvironmentSetupError, match="does not control sway, heave, yaw"):
-        train("t1", out=tmp_path / "p", vehicle="remus100", steps=512, console=QUIET)
+        train("t1", TrainingSettings(vehicle="remus100", steps=512), out=tmp_path / "p", console=QUIET)
     assert not any(tmp_path.iterdir())

@@ -234,11 +234,15 @@ def test_adapters_take_it_and_their_checkers_pass(library):
 def test_it_is_trained_like_any_task(tmp_path):
     """A policy directory with the task's name and observation; equal seeds, equal networks."""
     from finssim.control.policy import Policy
-    from finssim.learning.train import train
+    from finssim.learning.train import TrainingSettings, train
 
     short = replace(KeepDepth(), time_limit=2.0)
     done = [
-        train(short, out=tmp_path / name, worlds=16, steps=8192, seed=2, settings={"epochs": 1})
+        train(
+            short,
+            TrainingSettings(worlds=16, steps=8192, seed=2, settings={"epochs": 1}),
+            out=tmp_path / name,
+        )
         for name in ("a", "b")
     ]
     told = Policy.load(done[0]).description

@@ -289,20 +289,7 @@ def evaluation(
     return Evaluation(result, trials)
 
 
-def evaluate(
-    controller: Sequence[str | Path] | str | Path,
-    *,
-    task: str | None = None,
-    vehicle: str | Vehicle | None = None,
-    hydrodynamics: str = "calibrated",
-    plant: Sequence[str | Path] | str | Path = ("nominal",),
-    observe: str | None = None,
-    trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
-    trials: Annotated[int | None, (1, 100_000)] = None,
-    truth: Path | None = None,
-    seed: int = 1,
-    out: Path | None = None,
-) -> dict[str, Any]:
+def evaluate(controller: Sequence[str | Path] | str | Path, **arguments: Any) -> dict[str, Any]:
     """Evaluate a controller: success, errors [m, deg], settling time [s]; or errors along trajectories [m].
 
     Example: finssim evaluate runs/hold --plant current --trials 64 --out runs/hold-current
@@ -316,6 +303,35 @@ def evaluate(
     Args:
         controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
             on a robot (.mcap).
+        arguments: As of `evaluation.evaluate.evaluate_in_plants`.
+
+    Returns:
+        The result of the evaluation; of several plants `plants`, one for each, in their order.
+
+    Raises:
+        EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
+    """
+    return evaluate_in_plants(controller, **arguments).as_json()
+
+
+def evaluate_in_plants(
+    controller: Sequence[str | Path] | str | Path,
+    *,
+    task: str | None = None,
+    vehicle: str | Vehicle | None = None,
+    hydrodynamics: str = "calibrated",
+    plant: Sequence[str | Path] | str | Path = ("nominal",),
+    observe: str | None = None,
+    trajectories: Annotated[Sequence[str | Path], "--trajectory"] = (),
+    trials: Annotated[int | None, (1, 100_000)] = None,
+    truth: Path | None = None,
+    seed: int = 1,
+    out: Path | None = None,
+) -> Evaluations:
+    """Evaluate a controller in every plant; errors as of `evaluate`.
+
+    Args:
+        controller: A policy's directory or the name of a controller, or records of one on a robot.
         task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle. The
             policy's own if not given, and t1 of a controller that has none.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. That of the policy or of the record if
@@ -334,32 +350,8 @@ def evaluate(
         out: Directory for evaluation.json, trajectories and, for t1 and t2, a figure.
 
     Returns:
-        The result of the evaluation; of several plants `plants`, one for each, in their order.
-
-    Raises:
-        EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
+        The result, with the trials of every plant.
     """
-    return evaluate_in_plants(
-        controller, task=task, vehicle=vehicle, hydrodynamics=hydrodynamics, plant=plant, observe=observe,
-        trajectories=trajectories, trials=trials, truth=truth, seed=seed, out=out,
-    ).as_json()  # fmt: skip
-
-
-def evaluate_in_plants(
-    controller: Sequence[str | Path] | str | Path,
-    *,
-    task: str | None = None,
-    vehicle: str | Vehicle | None = None,
-    hydrodynamics: str = "calibrated",
-    plant: Sequence[str | Path] | str | Path = ("nominal",),
-    observe: str | None = None,
-    trajectories: Sequence[str | Path] = (),
-    trials: int | None = None,
-    truth: Path | None = None,
-    seed: int = 1,
-    out: Path | None = None,
-) -> Evaluations:
-    """Evaluate a controller in every plant; arguments and errors as `evaluate`."""
     names = [controller] if isinstance(controller, str | Path) else controller
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):

@@ -6,7 +6,7 @@ import json
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,25 +27,88 @@ class TrainingError(ValueError):
     """A training that cannot be started."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings:
+    """What a policy is trained with: the vehicle, how it acts and is observed, and the learner."""
+
+    learner: str | None = None
+    """(NAME) Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo, several
+    torchrl-ippo or torchrl-mappo; from demonstrations bc or dagger; tasks with images distill, their default; or your
+    own, FILE.py:CLASS."""
+    vehicle: str | Vehicle = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    hydrodynamics: str = "calibrated"
+    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
+    action: str | None = None
+    """(MODE) Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given."""
+    randomize: str | Path | None = None
+    """(FILE) Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
+    open_water, no_thruster_dynamics, or a file."""
+    observe: str = "training"
+    """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, through a
+    filter), a file of other fixes, estimator (about what localization is off by) or truth."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+    worlds: Annotated[int | None, (1, 10_000_000)] = None
+    """Worlds simulated at once."""
+    steps: Annotated[int | None, (1, 1_000_000_000_000)] = None
+    """Control steps of the training, summed over all worlds; the task's default if not given."""
+    until: float | None = None
+    """(SHARE) Share of successes, such as 0.95, that ends the training early if reached in two consecutive
+    evaluations."""
+    init: str | Path | None = None
+    """(NAME|DIR) Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy directory,
+    informed (a policy trained first that observes the parameters drawn by --randomize), or none; pursuit, team-pursuit
+    and formation default to their baselines. --set taught=FRACTION sets the fraction of the training."""
+    settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = ()
+    """(NAME=VALUE) Change a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be repeated."""
+    wandb: str | None = None
+    """(PROJECT) Project of Weights & Biases to send the curves to, besides TensorBoard; with WANDB_MODE=offline they
+    are stored beside the policy for 'wandb sync'."""
+    device: str = "cpu"
+    """(DEVICE) Compute device: cpu or cuda."""
+
+    def check(self) -> None:
+        """Refuse numbers that do not fit, and Weights & Biases where it is missing.
+
+        Raises:
+            TrainingError: A number is out of its range.
+            ModuleNotFoundError: The package wandb is missing.
+        """
+        for name, number in (("worlds", self.worlds), ("steps", self.steps)):
+            if number is not None and number < 1:
+                raise TrainingError(f"{name} is {number}, expected 1 or more")
+        if self.until is not None and not 0.0 < self.until <= 1.0:
+            raise TrainingError(f"until is {self.until}, expected a share of successes above 0, at most 1")
+        if self.wandb is not None:
+            import_module("wandb")  # where it is missing it is missed before anything is made
+
+    def environment(
+        self, task: Task, worlds: int, randomization: Randomization | None, seed: int, **options: Any
+    ) -> Environment:
+        """Return worlds of a task, with the vehicle's authority as the scale of wrenches.
+
+        Args:
+            task: Task.
+            worlds: Number of worlds.
+            randomization: Ranges of their parameters; None for none.
+            seed: Seed of every random number.
+            options: Further arguments of `finssim.make`.
+        """
+        body = load_vehicle(self.vehicle)
+        scale = authority(body) if (self.action or task.action).startswith("wrench") else 1.0
+        return make(
+            task, worlds=worlds, vehicle=body, hydrodynamics=self.hydrodynamics, action=self.action,
+            randomize=randomization, observe=self.observe, device=self.device, seed=seed, wrench_scale=scale, **options,
+        )  # fmt: skip
+
+
 def train(
     task: str | Task,
+    settings: Annotated[TrainingSettings, "options"] = TrainingSettings(),
     *,
     out: Path,
-    learner: str | None = None,
-    vehicle: str | Vehicle = "finsrov",
-    hydrodynamics: str = "calibrated",
-    action: str | None = None,
-    randomize: str | Path | None = None,
-    observe: str = "training",
-    seed: int = 1,
-    worlds: Annotated[int | None, (1, 10_000_000)] = None,
-    steps: Annotated[int | None, (1, 1_000_000_000_000)] = None,
-    until: float | None = None,
-    init: str | Path | None = None,
-    settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = (),
     resume: bool = False,
-    wandb: str | None = None,
-    device: str = "cpu",
     console: Console | None = None,
     as_json: bool = False,
 ) -> Path:
@@ -64,32 +127,9 @@ def train(
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking,
             pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar net; or
             your own, FILE.py:CLASS.
+        settings: What it is trained with.
         out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
-        learner (NAME): Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo,
-            several torchrl-ippo or torchrl-mappo; from demonstrations bc or dagger; tasks with images
-            distill, their default; or your own, FILE.py:CLASS.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action (MODE): Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
-        randomize (FILE): Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim,
-            equivalent_box, pool, open_water, no_thruster_dynamics, or a file.
-        observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
-            through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
-        seed: Seed of every random number; equal seeds give equal results.
-        worlds: Worlds simulated at once.
-        steps: Control steps of the training, summed over all worlds; the task's default if not given.
-        until (SHARE): Share of successes, such as 0.95, that ends the training early if reached in two consecutive
-            evaluations.
-        init (NAME|DIR): Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy
-            directory, informed (a policy trained first that observes the parameters drawn by --randomize), or none;
-            pursuit, team-pursuit and formation default to their baselines. --set taught=FRACTION sets the fraction
-            of the training.
-        settings (NAME=VALUE): Change a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be
-            repeated.
         resume: Resume a killed training from its last checkpoint.
-        wandb (PROJECT): Project of Weights & Biases to send the curves to, besides TensorBoard; with
-            WANDB_MODE=offline they are stored beside the policy for 'wandb sync'.
-        device (DEVICE): Compute device: cpu or cuda.
         console: Where progress is shown; standard error if None.
         as_json: Print one JSON object about the policy, to standard output.
 
@@ -105,23 +145,15 @@ def train(
         KeyboardInterrupt: After Ctrl-C, when the policy so far, if there is one, has been written.
     """
     console = console or Console(stderr=True)
-    for name, number in (("worlds", worlds), ("steps", steps)):
-        if number is not None and number < 1:
-            raise TrainingError(f"{name} is {number}, expected 1 or more")
-    if until is not None and not 0.0 < until <= 1.0:
-        raise TrainingError(f"until is {until}, expected a share of successes above 0, at most 1")
-    if wandb is not None:
-        import_module("wandb")  # where it is missing it is missed before anything is made
+    settings.check()
     the_task = task_named(task)
-    learner = learner or ("distill" if the_task.pictures else "ppo")
+    learner = settings.learner or ("distill" if the_task.pictures else "ppo")
     kind = learner_named(learner)
     kind.check(the_task)
-    chosen = load_vehicle(vehicle)
-    randomization = Randomization(randomize) if randomize is not None else None
+    load_vehicle(settings.vehicle)
+    randomization = Randomization(settings.randomize) if settings.randomize is not None else None
     refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()
-    mode_name = action or the_task.action
-    scale = authority(chosen) if mode_name.startswith("wrench") else 1.0
     side = Path(out).with_name(f"{Path(out).name}-training")
 
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
@@ -130,43 +162,29 @@ def train(
     from finssim.learning.training_loop import TrainingLoop, TrainingView, last_checkpoint
 
     checkpoint = last_checkpoint(side) if resume else None
-    randomized = randomization is not None
-    changes = dict(settings) if isinstance(settings, Mapping) else parse_settings(settings)
-    values = kind.settings(the_task, randomized=randomized, worlds=worlds, steps=steps, changes=changes)
-    values = _taught(values, init, learner, mode_name == the_task.action)
-
-    def worlds_of(count: int, ranges: Randomization | None, its_seed: int, **more: Any) -> Environment:
-        return make(
-            the_task, worlds=count, vehicle=chosen, hydrodynamics=hydrodynamics, action=action,
-            randomize=ranges, observe=observe, device=device, seed=its_seed, wrench_scale=scale, **more,
-        )  # fmt: skip
-
-    asymmetric = randomized and getattr(values, "asymmetric", False)
-    environment = worlds_of(values.worlds, randomization, seed, privileged=asymmetric)
-    the_task = environment.task  # fitted to the vehicle
-    if until is not None and "success" not in the_task.metrics(environment.arrays):
+    values = _values(settings, kind, learner, the_task)
+    seed, device, until = settings.seed, settings.device, settings.until
+    asymmetric = randomization is not None and getattr(values, "asymmetric", False)
+    environment = settings.environment(the_task, values.worlds, randomization, seed, privileged=asymmetric)
+    fitted = environment.task
+    if until is not None and "success" not in fitted.metrics(environment.arrays):
         raise TrainingError(
-            f"until is {until}, but task '{the_task.name}' has no metric 'success': leave until out"
+            f"until is {until}, but task '{fitted.name}' has no metric 'success': leave until out"
         )
     description = description_of(
-        environment,
-        learner=learner,
-        algorithm=kind.what,
-        **asdict(values),
-        device=device,
-        observe={"name": observe},
-        until=until,
-    )
+        environment, learner=learner, algorithm=kind.what, **asdict(values), device=device,
+        observe={"name": settings.observe}, until=until,
+    )  # fmt: skip
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
+    held = settings.environment(fitted, HELD_WORLDS, full, held_seed(seed))
     with single_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = TrainingLoop(
             kind(environment, values, seed=seed, device=device), description, side,
-            evaluate=HeldEvaluation(worlds_of(HELD_WORLDS, full, held_seed(seed)), device),
-            show=view.update, progress=environment.set_progress,
-            identity=_identity(description), until=until, project=wandb,
+            evaluate=HeldEvaluation(held, device), show=view.update, progress=environment.set_progress,
+            identity=_identity(description), until=until, project=settings.wandb,
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)
@@ -181,6 +199,23 @@ def train(
     if as_json:
         print(json.dumps({"policy": str(folder), "best_steps": loop.best.steps, **loop.curves[-1]}))
     return folder
+
+
+def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> Any:
+    """Return the learner's own settings for a task, with the changes and whom to imitate first.
+
+    Args:
+        settings: Settings of the training.
+        kind: Class of the learner.
+        learner: Name of the learner.
+        task: Task.
+    """
+    given = settings.settings
+    changes = dict(given) if isinstance(given, Mapping) else parse_settings(given)
+    values = kind.settings(
+        task, randomized=settings.randomize is not None, worlds=settings.worlds, steps=settings.steps, changes=changes
+    )  # fmt: skip
+    return _taught(values, settings.init, learner, (settings.action or task.action) == task.action)
 
 
 def _taught(values: Any, init: str | Path | None, learner: str, default_action: bool) -> Any:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,14 +23,14 @@ from finssim.evaluation.campaign import run_jobs, write_json
 from finssim.evaluation.evaluate import ControllerTrials, play
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import Table, cells
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings
 from finssim.studies.transfer import finished, train_policies
 from finssim.tasks import numeric_tasks
 from finssim.vehicles import load_vehicle
 
 RESULT_FILE = "sweep.json"
-SAME_FOR_ALL = ("task", "out", "seed", "console", "as_json", "resume", "device", "vehicle")
-"""Arguments of a training that a sweep sets itself."""
+SAME_FOR_ALL = ("seed", "device", "vehicle")
+"""Settings of a training that a sweep sets itself."""
 MEASURES: dict[str, tuple[str, ...]] = {
     "t1": ("success", "e_p_m", "e_psi_deg", "t_s_s"),
     "t2": ("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
@@ -56,7 +55,7 @@ class Training:
     """Name of the combination."""
     seed: int
     options: Mapping[str, Any]
-    """Arguments of `finssim.learning.train.train`."""
+    """Fields of `TrainingSettings`."""
     run: str
     """Name of its directory: setting, a digest of everything that determines the policy but the seed, and the seed."""
 
@@ -97,7 +96,7 @@ class Sweep(BaseModel):
             raise ValueError(f"task is '{self.task}', expected one of {', '.join(without_pictures)}")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds are {list(self.seeds)}, expected at least one, each once")
-        available = [name for name in inspect.signature(train).parameters if name not in SAME_FOR_ALL]
+        available = [option.name for option in fields(TrainingSettings) if option.name not in SAME_FOR_ALL]
         for name in (*self.train, *self.grid):
             if name not in available and not (name in self.grid and name.startswith("settings.")):
                 raise ValueError(
@@ -221,7 +220,7 @@ def sweep(
     plan = load_sweep(file)
     trainings, errors = {out / "runs" / training.run: training for training in plan.trainings()}, {}
     missing = {
-        policy: {"task": plan.task, "vehicle": plan.vehicle, "seed": training.seed, **training.options}
+        policy: (plan.task, TrainingSettings(vehicle=plan.vehicle, seed=training.seed, **training.options))
         for policy, training in trainings.items()
         if not finished(policy)
     }

@@ -6,7 +6,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,7 +37,7 @@ from finssim.evaluation.robot_trials import (
 from finssim.evaluation.statistics import Statistic, paired_difference, with_interval
 from finssim.evaluation.tables import Columns, Table, cells
 from finssim.evaluation.trials import T2_TRAJECTORIES
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 from finssim.localization.fusion.estimator import MODELS
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -261,7 +261,7 @@ def transfer_experiment(
     firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
     action, site, sees = FIRMWARES[firmware]
     controllers = controllers_of(
-        spec.name, chosen, run_seeds, folder, vehicle, steps, action,
+        spec.name, chosen, run_seeds, folder, TrainingSettings(vehicle=vehicle, steps=steps, action=action),
         lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
     if robot is not None:  # there is one plant, whose severity was not chosen
@@ -300,9 +300,7 @@ def controllers_of(
     rows: Mapping[str, ControllerRow],
     seeds: Sequence[int],
     folder: Path,
-    vehicle: str,
-    steps: int | None = None,
-    action: str | None = None,
+    training: TrainingSettings,
     progress: Progress = lambda part, text: None,
     *,
     processes: int | None = None,
@@ -315,16 +313,14 @@ def controllers_of(
         rows: Of a table.
         seeds: Of the trainings.
         folder: Of the experiment, whose `policies` has the directories.
-        vehicle: Name or file.
-        steps: Control steps of each training; the task's own if None.
-        action: Mode; the task's own if None.
+        training: Vehicle, action mode and control steps of each training; a row and its seed change the rest.
         progress: Told the share that is done and what is left.
         processes, address: Where and how many at once, as of `campaign.spread`.
 
     Returns:
         (row, seed) -> directory of a policy, or the name of a PID.
     """
-    controllers, body, missing = {}, load_vehicle(vehicle), {}
+    controllers, body, missing = {}, load_vehicle(training.vehicle), {}
     for (name, row), seed in product(rows.items(), seeds):
         controllers[name, seed] = row.controller
         if row.training is None:
@@ -334,8 +330,8 @@ def controllers_of(
         policy = folder / "policies" / f"{label}-seed{seed}"
         controllers[name, seed] = str(policy)
         if not finished(policy, body):
-            options |= {"vehicle": vehicle, "action": action, "seed": seed, "steps": steps}
-            missing[policy] = {"task": task, **options, "settings": {} if remembers else FORGETFUL}
+            options |= {"seed": seed, "settings": {} if remembers else FORGETFUL}
+            missing[policy] = (task, replace(training, **options))
     with closing(train_policies(missing, processes, address)) as done:
         for remaining, (_, error) in zip(reversed(range(len(missing))), done, strict=True):
             if error is not None:
@@ -345,12 +341,14 @@ def controllers_of(
 
 
 def train_policies(
-    trainings: Mapping[Path, Mapping[str, Any]], processes: int | None = None, address: str | None = None
+    trainings: Mapping[Path, tuple[str, TrainingSettings]],
+    processes: int | None = None,
+    address: str | None = None,
 ) -> Generator[tuple[Path, BaseException | None], None, None]:
     """Train policies in parallel, on this machine or a cluster.
 
     Args:
-        trainings: Directory of the policy -> arguments of `finssim.learning.train.train`.
+        trainings: Directory of the policy -> its task, and the settings of its training.
         processes, address: As of `campaign.spread`.
 
     Yields:
@@ -368,11 +366,11 @@ def train_policies(
             yield policy, error
 
 
-def _trained(policy: tuple[Path, Mapping[str, Any]]) -> dict[str, bytes]:
+def _trained(policy: tuple[Path, tuple[str, TrainingSettings]]) -> dict[str, bytes]:
     """Train, on whatever machine: the files of the policy directory by name."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "policy"
-        train(out=out, **policy[1], console=Console(stderr=True, quiet=True))
+        train(*policy[1], out=out, console=Console(stderr=True, quiet=True))
         return {path.name: path.read_bytes() for path in out.iterdir()}
 
 

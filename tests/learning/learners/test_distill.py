@@ -21,7 +21,7 @@ from finssim.learning.demonstrations import Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.torch_networks import SeeingNetwork
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 from finssim.tasks import Environment, make
 from finssim.tasks.picture import ObservedPicture
 from finssim.vehicles import load_vehicle
@@ -49,7 +49,9 @@ def test_a_network_that_sees_is_the_same_in_onnx():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    return train(TASK, out=tmp_path_factory.mktemp("seen") / "policy", seed=1, settings=TINY)
+    return train(
+        TASK, TrainingSettings(seed=1, settings=TINY), out=tmp_path_factory.mktemp("seen") / "policy"
+    )
 
 
 def test_a_policy_directory_says_what_it_sees_and_runs_in_episodes(trained):

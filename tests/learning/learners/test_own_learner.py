@@ -4,7 +4,7 @@ import pytest
 
 from finssim.control.policy import Policy
 from finssim.learning.learners import LearningError, learner_named
-from finssim.learning.train import train
+from finssim.learning.train import TrainingSettings, train
 from finssim.tasks import EnvironmentSetupError
 
 CLIMB = '''
@@ -74,12 +74,16 @@ def file(tmp_path):
 
 def test_a_learner_of_ones_own_trains_resumes_and_says_what_it_is(file, tmp_path):
     """Its settings, its name and its steps stand in the policy, which runs without it."""
-    folder = train("t1", out=tmp_path / "p", learner=f"{file}:Climb", seed=3, settings={"spread": 0.2})
+    folder = train(
+        "t1", TrainingSettings(learner=f"{file}:Climb", seed=3, settings={"spread": 0.2}), out=tmp_path / "p"
+    )
     policy = Policy.load(folder)
     told = policy.description.training
     assert (told["learner"], told["spread"], told["steps_done"]) == (f"{file}:Climb", 0.2, 2048)
     assert told["algorithm"] == "Random search on a linear policy."
-    again = train("t1", out=tmp_path / "q", learner=f"{file}:Climb", seed=3, settings={"spread": 0.2})
+    again = train(
+        "t1", TrainingSettings(learner=f"{file}:Climb", seed=3, settings={"spread": 0.2}), out=tmp_path / "q"
+    )
     assert (folder / "policy.onnx").read_bytes() == (again / "policy.onnx").read_bytes()
 
 
