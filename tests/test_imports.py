@@ -111,8 +111,9 @@ HOMES = {
         "pool/ardusub.py",
         "robot/links/mavlink.py",
     },
+    "pyulog": {"trials/importers/ulog.py"},
     "rosbags": {
-        "trials/importers/dispatch.py",
+        "trials/importers/bag.py",
         "robot/record_messages.py",
         "extensions/ros2/codec.py",
     },

@@ -29,6 +29,11 @@ TAIL = 29 + len(MAGIC)
 CHUNK_BEGINS = re.compile(rb"\x06.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)", re.DOTALL)
 
 
+def without_profile(head: bytes) -> bool:
+    """Return whether an MCAP file, by its first bytes, names no profile, as those of BlueOS' recorder."""
+    return head.startswith(MAGIC + b"\x01") and head[len(MAGIC) + 9 :][:4] == bytes(4)
+
+
 @contextmanager
 def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
     """Yield the file; or, of an MCAP file that is cut, damaged or without an index, a temporary copy with one.

@@ -199,6 +199,25 @@ def object_at(reference: str) -> Any:
     return value
 
 
+def check_importer(name: str, member: Any) -> None:
+    """Refuse what is no importer, by the check of what it imports.
+
+    Raises:
+        RegistryError: Its name begins with nothing that can be imported.
+        ValueError: It does not fit.
+    """
+    kind = name.partition(".")[0]
+    checks = {
+        "vehicle": "finssim.vehicles.importers.draft:check_registered",
+        "trial": "finssim.trials.importers.log:check_registered",
+    }
+    if kind not in checks or "." not in name:
+        raise RegistryError(
+            f"importer '{name}': expected a name that begins with {' or '.join(f'{k}.' for k in checks)}"
+        )
+    object_at(checks[kind])(name, member)
+
+
 def _identity(member: Any) -> tuple[str, str] | None:
     """Return module and qualified name of a class or function; None of other objects."""
     name = getattr(member, "__qualname__", None)
@@ -266,10 +285,24 @@ WORLDS = Family("world", {})
 
 IMPORTERS = Family(
     "importer",
-    {"vehicle.sdf": "finssim.vehicles.importers.sdf:SDF"},
-    check="finssim.vehicles.importers.draft:check_registered",
+    {
+        "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
+        **{
+            f"trial.{name}": f"finssim.trials.importers.{module}"
+            for name, module in {
+                "qgroundcontrol": "qgroundcontrol:QGROUNDCONTROL",
+                "acoustic": "acoustic:ACOUSTIC",
+                "waterlinked": "water_linked:WATER_LINKED",
+                "ulog": "ulog:ULOG",
+                "ardupilot": "ardusub:ARDUPILOT",
+                "rosbag": "bag:ROSBAG",
+                "csv": "table:TABLE",
+            }.items()
+        },
+    },
+    check="finssim.core.registry:check_importer",
 )
-"""What is imported, a dot, and the format -> the importer: of vehicles, a `VehicleImporter`."""
+"""What is imported, a dot, and the format -> the importer: of vehicles a `VehicleImporter`, of logs a `LogImporter`."""
 
 FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS, IMPORTERS)
 """All families."""

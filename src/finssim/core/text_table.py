@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
@@ -15,8 +16,8 @@ from typing import Any
 from finssim.core.budget import TEXT, read_bytes
 from finssim.core.files import atomic_write
 
-EMPTY = frozenset({"", "nan", "none", "null", "na", "n/a", "-", "--"})
-"""Words for "no value", in lower case."""
+EMPTY = re.compile(r"nan|none|null|n/?a|[-.:]*")
+"""Words for "no value", in lower case: `--.--` is how ground stations write it."""
 
 COMMENT = ("#",)
 """Beginnings of lines that are no rows."""
@@ -64,7 +65,7 @@ def number(cell: str, *, decimal_comma: bool = False) -> float | None:
     try:
         return float(cell.replace(",", ".") if decimal_comma else cell)
     except ValueError:
-        return math.nan if cell.lower() in EMPTY else None
+        return math.nan if EMPTY.fullmatch(cell.lower()) else None
 
 
 def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str, bool]:
@@ -75,11 +76,15 @@ def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str
         error: What is raised where it cannot be read.
     """
     raw = read_bytes(Path(path), error, limit=TEXT)
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or (len(raw) > 8 and not any(raw[1:9:2])):
+        marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text, _, rest = raw.decode("utf-16" if marked else "utf-16-le", errors="replace").partition("\0")
+        return text, bool(rest)
     intact = raw.split(b"\0", 1)[0]
     try:
         text = intact.decode("utf-8-sig")
     except UnicodeDecodeError:  # spreadsheets write µ and ± in one byte; what holds control bytes is no text
-        codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "latin-1"
+        codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "cp1252"
         text = intact.decode(codec, errors="replace")
     return text, len(intact) < len(raw)
 
@@ -119,6 +124,8 @@ def text_table(
 ) -> TextTable:
     """The cells of a text: separated by whichever of comma, semicolon and tab the first line has most of.
 
+    A line such as `sep=;` before the names gives the separator.
+
     Args:
         text: Of the whole file; blank lines are passed over.
         skip: Lines before the table.
@@ -128,8 +135,10 @@ def text_table(
     """
     every = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if i > skip and line.strip()]
     held = [(i, line) for i, line in every if not line.lstrip().startswith(comment)]
+    named = re.fullmatch(r'"?sep=(.)"?', held[0][1].strip()) if held else None  # a line for Excel
+    held = held[1:] if named else held
     first = held[0][1] if held else ""
-    mark = max(",;\t", key=first.count)
+    mark = named[1] if named else max(",;\t", key=first.count)
     blank = (spaces is None and mark not in first) or bool(spaces)
     split: Callable[[str], list[str]] = str.split
     if not blank:

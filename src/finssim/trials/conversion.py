@@ -15,6 +15,7 @@ from finssim.core.rotations import (
     quat_multiply,
     quat_rotate,
     quat_to_euler,
+    wrap_angle,
 )
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.trial import column_of
@@ -140,6 +141,29 @@ PIECE_GAP = 10.0
 FEW = 3
 """Rows that may arrive late before a step back counts as a jump of the clock."""
 
+LATE = 0.01
+"""Part of the rows that may arrive late."""
+
+REPEATED = 0.4
+"""Part of the samples that may have the time of the one before and other values."""
+
+DEAD_AT_ZERO = (("u", "v"), ("w",))
+"""Velocities, which may be constant without being dead."""
+
+DEAD = (
+    (("qx", "qy", "qz", "qw"), ("roll", "pitch", "yaw"), 0.02),
+    (("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw"), 0.02),
+    (("u", "v"), ("x", "y"), 0.2),
+    (("w",), ("z", "depth"), 0.2),
+    (("x", "y"), ("u", "v"), 0.05),
+    (("z",), ("depth",), 0.1),
+    (("depth",), ("z",), 0.1),
+)
+"""Columns of a sensor, columns of others for the same motion, and their least motion in the unit of a trial."""
+
+ALIVE = 10
+"""Samples from which a column that never changes is taken for dead."""
+
 
 def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str, Array]]:
     """Streams of different times on their union time base.
@@ -171,8 +195,8 @@ def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str,
 def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
     """Times in order, and the order of the rows.
 
-    Rows that arrived a little late, reversed and shuffled logs are sorted. Where the clock itself jumped back (a long
-    piece of rows lies over an earlier one), nobody can know how much time passed: the later piece is moved behind the
+    A few rows that arrived late, and logs with the newest row first, are sorted. Where the clock itself jumped back (a
+    long piece of rows lies over an earlier one), the time that passed is unknown: the later piece is moved behind the
     earlier one with a gap of `PIECE_GAP` seconds between, and nothing is interpolated across gaps.
 
     Args:
@@ -181,17 +205,183 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
 
     Returns:
         Times not decreasing [s], (n,), row numbers in that order (n,), and findings.
+
+    Raises:
+        CalibrationError: The times step back in more than a few rows.
     """
     back = np.flatnonzero(np.diff(t) < 0.0) + 1
     rows = np.arange(len(t))
     if not len(back):
         return t, rows, []
-    if len(back) <= max(1.0, 0.01 * len(t)):
-        jumps = [int(i) for i in back if _collides(t, columns, int(i))]
-        if jumps:
-            return _in_pieces(t, jumps)
-    rows = np.argsort(t, kind="stable")
+    newest_first = not (np.diff(t) > 0.0).any()
+    wraps = _wraps(t, back)
+    if not newest_first and (wraps or len(back) > max(FEW, LATE * len(t))):
+        raise CalibrationError(
+            f"the time steps back at {len(back)} of {len(t)} rows, first from {t[back[0] - 1]:.6g} to "
+            f"{t[back[0]]:.6g} s at row {back[0] + 1}: {wraps or _cause(t)}"
+        )
+    jumps = [int(i) for i in back if not newest_first and _collides(t, columns, int(i))]
+    if jumps:
+        return _in_pieces(t, jumps)
+    rows = np.argsort(t[::-1] if newest_first else t, kind="stable")
+    rows = len(t) - 1 - rows if newest_first else rows
     return t[rows], rows, [finding("times_sorted", rows=len(back), total=len(t))]
+
+
+def _wraps(t: Array, back: NDArray[np.intp]) -> str:
+    """Return the cause if every step back is from the end of a counter's range to its beginning, else nothing."""
+    step = 3.0 * float(np.median(np.abs(np.diff(t))))
+    ranges = [2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-6, 1e-3, 1e-2, 1.0)]
+    for full in (*ranges, float(t[back - 1].max())):
+        if full > 20.0 * step and (full - t[back - 1] <= step).all() and (np.abs(t[back]) <= step).all():
+            if full in ranges or len(back) > 1:
+                return (
+                    f"probably a counter that begins again after {full:.6g} s: give 'time: {{column: NAME, kind: "
+                    "counter}' in a map"
+                )
+    return ""
+
+
+def _cause(t: Array) -> str:
+    """Return the probable cause of times that step back often, and the remedy."""
+    trend = abs(float(np.median(t[len(t) // 2 :]) - np.median(t[: len(t) // 2])))
+    if (t >= 0.0).all() and trend < 0.2 * t.max() and t.sum() > 10.0 * t.max():
+        return (
+            "probably the period since the last row, not a clock: give 'time: {column: NAME, kind: period}' in a map, "
+            "or name the column of a clock"
+        )
+    return "rows of several clocks or sensors are probably mixed: write one table for each, or name another column"
+
+
+def refuse_coarse(t: Array, columns: Mapping[str, Array]) -> None:
+    """Refuse a clock that is too coarse for the samples, of which all but one at a time would be left out.
+
+    Args:
+        t: Not decreasing [s], (n,).
+        columns: Column -> values in any unit, (n,).
+
+    Raises:
+        CalibrationError: Most samples have the time of the one before and other values.
+    """
+    same = np.diff(t) <= SAME_ROW
+    other = np.zeros(len(same), bool)
+    for values in columns.values():
+        other |= np.abs(np.diff(values)) > 0.0  # False for NaN
+    if len(t) >= 10 and np.sum(same & other) > REPEATED * len(t):
+        step = np.median(np.diff(np.unique(t))) if t[-1] > t[0] else math.inf
+        raise CalibrationError(
+            f"{np.sum(same & other)} of {len(t)} samples have the time of the one before, for the clock counts steps "
+            f"of {step:.3g} s: give 'time: {{column: NAME, kind: coarse}}' in a map to spread them over the steps, or "
+            "name a finer column"
+        )
+
+
+def spread(t: Array) -> Array:
+    """Return the times [s] of a coarse clock with the samples of each step spread evenly over it.
+
+    The samples of the first step lie at its end, those of the last at its beginning, at the usual period.
+
+    Args:
+        t: Times as read, not decreasing [s], (n,).
+    """
+    steps, index, counts = np.unique(t, return_inverse=True, return_counts=True)
+    if len(steps) < 2:
+        return t
+    length = np.diff(steps, append=2.0 * steps[-1] - steps[-2])
+    inner = slice(1, -1) if len(steps) > 2 else slice(None)  # a log begins and ends within a step
+    period = float(np.median((length / counts)[inner]))
+    within = np.arange(len(t)) - np.searchsorted(index, np.arange(len(steps)))[index]
+    at = np.minimum(length / counts, 1.5 * period)[index] * within
+    first, last = index == 0, index == len(steps) - 1
+    at[first] = (
+        (length[0] - period * (counts[0] - within))[first] if period * counts[0] <= length[0] else at[first]
+    )
+    at[last] = period * within[last]
+    return t + at
+
+
+def wrapped(channels: Mapping[str, Array], *, everything: bool) -> Channels:
+    """Return the columns with their angles in [-pi, pi) [rad].
+
+    Args:
+        channels: By canonical name, in the units of a trial.
+        everything: Whether angles beyond two turns are wrapped, too, which may be degrees without a unit.
+    """
+    out = dict(channels)
+    for name in EULER:
+        if name in out:
+            largest = float(np.nanmax(np.abs(out[name]), initial=0.0))
+            if largest > math.pi and (everything or largest <= 2.0 * math.pi + 0.01):
+                out[name] = wrap_angle(out[name])
+    return out
+
+
+ABSOLUTE = (7e4, 6e6)
+"""Absolute pressures that a vehicle may measure: at the surface of a lake 3000 m up, and in a depth of 600 m [Pa]."""
+
+
+def pressure_unit(values: Array) -> str | None:
+    """Return the unit of absolute pressures, Pa, hPa or kPa, told from their size; None if no unit fits.
+
+    Args:
+        values: Pressures in an unknown unit, (n,).
+    """
+    finite = values[np.isfinite(values)]
+    for unit in ("Pa", "hPa", "kPa"):
+        low, high = np.quantile(finite, [0.01, 0.99]) * UNITS["pressure"][unit] if len(finite) else (0.0, 0.0)
+        if low >= ABSOLUTE[0] and high <= ABSOLUTE[1]:
+            return unit
+    return None
+
+
+def without_dead(t: Array, channels: Channels) -> list[Finding]:
+    """Remove columns that never change although another measurement of the same motion does, in place.
+
+    Args:
+        t: Times [s], (n,).
+        channels: Column -> values in the units of a trial, (n,).
+
+    Returns:
+        A finding for each group that was removed.
+    """
+    findings, angles = [], {name: channels[name] for name in EULER if name in channels}
+    if not angles and all(name in channels for name in QUATERNION):
+        q = np.stack([channels[name] for name in QUATERNION], axis=-1)
+        q[np.linalg.norm(q, axis=-1) < 0.5] = np.nan
+        angles = dict(zip(EULER, quat_to_euler(q), strict=True))
+    rates = [rate for rate in "pqr" if rate in channels and constant(channels[rate])]
+    against = []
+    for rate, name in zip("pqr", EULER, strict=True):
+        if rate in rates and name in angles:
+            good = np.isfinite(angles[name])
+            angle, turned = np.unwrap(angles[name][good]), np.nanmean(channels[rate]) * t[good]
+            against += [name] if 0.05 < _range(angle) < math.inf and _range(angle - turned) > 0.05 else []
+    if against:
+        for rate in rates:
+            del channels[rate]
+        findings.append(finding("never_changes", columns=tuple(rates), moving=tuple(against)))
+    for names, others, least in DEAD:
+        present = [name for name in names if name in channels and np.isfinite(channels[name]).any()]
+        moving = [name for name in others if name in channels and least < _range(channels[name]) < math.inf]
+        dead = all(constant(channels[name]) for name in present)
+        # A constant speed is possible while the position moves.
+        still = names not in DEAD_AT_ZERO or not any(np.nanmax(np.abs(channels[name])) for name in present)
+        if present and moving and dead and still:
+            for name in present:
+                del channels[name]
+            findings.append(finding("never_changes", columns=tuple(present), moving=tuple(moving)))
+    return findings
+
+
+def _range(values: Array) -> float:
+    """Return the range of the finite values in their unit; infinite for fewer than `ALIVE` values."""
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) >= ALIVE else math.inf
+
+
+def constant(values: Array) -> bool:
+    """Return whether a column in any unit, (n,), has enough samples and never changes."""
+    return _range(values) == 0.0
 
 
 def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
@@ -234,6 +424,7 @@ def sampled(
     Returns:
         Times [s], strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
     """
+    refuse_coarse(t, columns)
     starts = np.concatenate([[True], np.diff(t) > 0.0])
     selected = np.flatnonzero(starts)
     if len(selected) == len(t):

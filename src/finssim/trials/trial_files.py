@@ -18,7 +18,7 @@ from finssim.core.budget import CELLS
 from finssim.core.files import OutputError, atomic_directory
 from finssim.core.text_table import number, read_text_table, write_csv
 from finssim.core.yaml_file import read_mapping, yaml_text
-from finssim.trials.conversion import ordered, sampled, tidy_quaternions, upside_down
+from finssim.trials.conversion import ordered, sampled, tidy_quaternions, upside_down, without_dead
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.trial import (
     COLUMNS,
@@ -320,6 +320,7 @@ def trial_from_table(name: str, table: ColumnTable, header: Header, path: Path |
         channels[column] = np.where(infinite, np.nan, values)
     t, channels, phase = _in_order(t, channels, phase, findings)
     findings += without_repeats(channels)
+    findings += without_dead(t, channels)
     findings += tidy_quaternions(channels)
     if upside_down(channels):
         findings.append(finding("upside_down"))

@@ -13,7 +13,9 @@ from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.pool.ardusub_sitl import SitlWorld
 from finssim.trials.check import check_trials
 from finssim.trials.importers import ardusub
+from finssim.trials.importers.assemble import ColumnMap
 from finssim.trials.importers.dispatch import read_trials
+from finssim.trials.importers.log import Request
 from finssim.vehicles import load_vehicle
 
 pytest.importorskip("pymavlink")
@@ -159,8 +161,8 @@ def test_a_recording_of_blueos_is_what_a_tlog_is(tmp_path):
 def test_without_a_frame_there_are_no_inputs(tmp_path):
     """A log that names no frame, of a vehicle without an autopilot: its motion is read, nothing is made up."""
     path = Dive("channels").tlog(tmp_path / "dive.tlog")
-    streams = ardusub.read_ardusub(path, ardusub.ArduSubMap(), HEAVY.replace({"autopilot": None}))
-    assert not any("pwm_T1" in stream.channels for stream in streams)
+    log = ardusub.read(path, Request(ColumnMap(), HEAVY.replace({"autopilot": None})))
+    assert not any("pwm_T1" in stream.channels for stream in log.streams)
 
 
 def test_check_judges_such_a_dive(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 
 from finssim.core import budget
 from finssim.trials.findings import CalibrationError
-from finssim.trials.importers import dispatch
+from finssim.trials.importers import bag
 from finssim.trials.importers.dispatch import read_trials
 
 pytest.importorskip("rosbags")
@@ -271,7 +271,7 @@ def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
             writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=STORE), START, bytes(300 << 20)
         )
     assert sum(file.stat().st_size for file in (tmp_path / "bomb").iterdir()) < 1 << 20
-    monkeypatch.setattr(dispatch, "limited_memory", lambda: budget.limited_memory(128 << 20))
+    monkeypatch.setattr(bag, "limited_memory", lambda: budget.limited_memory(128 << 20))
     with pytest.raises(CalibrationError, match="Unable to allocate|MemoryError"):
         read_trials([tmp_path / "bomb"])
 

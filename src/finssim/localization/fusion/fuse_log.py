@@ -177,7 +177,7 @@ def read_stream_table(path: str | Path) -> StreamTable:
         raise LocalizationError(f"{path}: holds no rows: give a table with samples")
     for name, cells in zip(names, zip(*complete, strict=True), strict=True):
         values = [_number(cell, text) for cell in cells]
-        no_numbers = all(math.isnan(v) for v in values) and any(c.lower() not in EMPTY for c in cells)
+        no_numbers = all(math.isnan(v) for v in values) and any(not EMPTY.fullmatch(c.lower()) for c in cells)
         if no_numbers or name in TEXT_COLUMNS:
             table.words[name] = list(cells)
         else:

@@ -1,12 +1,13 @@
-"""Foreign logs to trial folders: tables, ArduSub logs, ROS 2 bags."""
+"""Foreign logs to trial folders: one file for each format."""
 
 from typing import TYPE_CHECKING
 
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
-    from finssim.trials.importers.dispatch import FORMATS, import_trials
+    from finssim.trials.importers.dispatch import import_trials
+    from finssim.trials.importers.log import LogImporter
 
-__all__ = ["FORMATS", "import_trials"]
+__all__ = ["LogImporter", "import_trials"]
 
 __getattr__, __dir__ = exports(__name__)

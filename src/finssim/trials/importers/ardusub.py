@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,17 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.ardusub import FULL, NEUTRAL
-from finssim.core.mcap_files import intact_mcap
-from finssim.core.rotations import wrap_angle
+from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.conversion import GRAVITY
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.importers.ardusub_outputs import mixed_pulses, outputs_of
+from finssim.trials.importers.ardusub_outputs import STICK_CHANNELS, mixed_pulses, outputs_of
 from finssim.trials.importers.assemble import ArduSubMap, LogFrame, Stream, in_our_axes
+from finssim.trials.importers.log import LogImporter, Request, TrialStreams
 from finssim.trials.trial import Array
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 
-__all__ = ["ArduPilotLog", "read_ardusub", "velocity_stream"]
+__all__ = ["ARDUPILOT", "ArduPilotLog", "velocity_stream"]
 
 # Messages of ArduPilot logs: DataFlash `.BIN` and telemetry `.tlog`, through pymavlink, and recordings of BlueOS.
 
@@ -56,6 +57,8 @@ class ArduPilotLog:
     """Kind -> fields of each message, n of them."""
     parameters: dict[str, float] = field(default_factory=dict)
     """Parameters of the autopilot in its units, with their latest values."""
+    counts: Counter[str] = field(default_factory=Counter)
+    """Kind -> number of messages in the log, read or not."""
 
     def has(self, kind: str) -> bool:
         """Return whether there are at least two such messages."""
@@ -101,7 +104,9 @@ def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Ar
         raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from None
     log = ArduPilotLog(path.name, not dataflash)
     clock = _Clock(received)
-    for kind, message, receipt in _messages(path, dataflash, kinds | {"PARM", "PARAM_VALUE", "HEARTBEAT"}):
+    for kind, message, receipt in _messages(
+        path, dataflash, kinds | {"PARM", "PARAM_VALUE", "HEARTBEAT"}, log.counts
+    ):
         if kind == "PARM":
             log.parameters[message["Name"]] = float(message["Value"])
         elif kind == "PARAM_VALUE":
@@ -164,11 +169,11 @@ def _stamp(message: dict[str, Any]) -> float:
 
 
 def _messages(
-    path: Path, dataflash: bool, kinds: frozenset[str]
+    path: Path, dataflash: bool, kinds: frozenset[str], counts: Counter[str]
 ) -> Iterator[tuple[str, dict[str, Any], float]]:
-    """Kind, fields and time of receipt [s] of each message of the autopilot."""
+    """Yield kind, fields and time of receipt [s] of each message of the autopilot, and count all kinds."""
     if path.suffix.lower() == ".mcap":
-        yield from _recorded(path, kinds)
+        yield from _recorded(path, kinds, counts)
         return
     from pymavlink import DFReader, mavutil
 
@@ -186,17 +191,26 @@ def _messages(
         try:
             while True:
                 try:
-                    message = log.recv_match(type=sorted(kinds))
+                    message = log.recv_match(type=sorted(kinds)) if dataflash else log.recv_msg()
                 except Exception:  # the same, at the cut of a log
                     break
                 if message is None:
                     break
-                kind, fields = message.get_type(), message.to_dict()
+                kind = message.get_type()
+                counts[kind] += 1
+                if kind not in kinds:
+                    continue
+                fields = message.to_dict()
                 if not dataflash:
                     sender = message.get_srcSystem(), message.get_srcComponent()
                     if not _of_autopilot(sender, kind, fields, systems):
                         continue
                 yield kind, fields, float(message._timestamp)
+            if dataflash:
+                names = {number: kind for number, kind in log.id_to_name.items() if log.counts[number]}
+                counts.update(
+                    {kind: log.counts[number] for number, kind in names.items() if kind not in kinds}
+                )
         finally:
             close = getattr(log, "close", None)
             if close is not None:
@@ -207,7 +221,9 @@ MAVLINK_TOPIC = re.compile(r"mavlink/(\d+)/(\d+)/([A-Z0-9_]+)")
 """Topic of a recording of BlueOS: system, component and kind of a message."""
 
 
-def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str, Any], float]]:
+def _recorded(
+    path: Path, kinds: frozenset[str], counts: Counter[str]
+) -> Iterator[tuple[str, dict[str, Any], float]]:
     """Yield the messages of an MCAP of BlueOS' recorder, which keeps messages of its MAVLink server as JSON."""
     from mcap.reader import NonSeekingReader
 
@@ -220,6 +236,7 @@ def _recorded(path: Path, kinds: frozenset[str]) -> Iterator[tuple[str, dict[str
             except Exception:  # at the end, or at the cut of a log in whatever layer reads it
                 return
             topic = MAVLINK_TOPIC.fullmatch(channel.topic)
+            counts[topic[3] if topic else channel.topic] += 1
             if topic is None or topic[3] not in kinds:
                 continue
             try:
@@ -377,21 +394,19 @@ ARMED_FLAG = 128
 """MAV_MODE_FLAG_SAFETY_ARMED"""
 
 
-def read_ardusub(
-    path: Path, requested: ArduSubMap, vehicle: Vehicle | None, *, pulses: bool = True
-) -> list[Stream]:
+def read(path: Path, request: Request) -> TrialStreams:
     """Return the content of an ArduSub log, one stream for each kind of message.
 
     Args:
         path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
-        requested: What is taken.
-        vehicle: Whose thrusters the outputs drive; without it the pulses keep the numbers of the outputs.
-        pulses: Whether the outputs are wanted; they are not of a passive trial.
+        request: Map, and the vehicle whose thrusters the outputs drive; without it the pulses keep the numbers of the
+            outputs. A passive trial has none.
 
     Raises:
         CalibrationError: Not a log, or outputs that cannot be told apart.
         ModuleNotFoundError: pymavlink is not installed.
     """
+    requested, pulses, vehicle = request.mapped.ardusub, not request.passive, request.vehicle
     log = read_log(path, KINDS, received=requested.stamps == "received")
     streams = [
         _attitude(log),
@@ -407,7 +422,12 @@ def read_ardusub(
         usable = _driven_by_sticks(log, requested, vehicle, usable)
     if not any(stream.channels for stream in usable):
         raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
-    return usable
+    used = {stream.source.removeprefix(f"{path.name} ") for stream in usable}
+    used |= {"PARM", "PARAM_VALUE", "HEARTBEAT", "MODE", "FMT"}
+    rest = [f"{kind} ({count})" for kind, count in sorted(log.counts.items()) if kind not in used]
+    if rest:
+        usable[0] = usable[0].noting(finding("not_read", items=f"messages {', '.join(rest)}"))
+    return TrialStreams(usable)
 
 
 def _attitude(log: ArduPilotLog) -> Stream | None:
@@ -425,9 +445,7 @@ def _attitude(log: ArduPilotLog) -> Stream | None:
     else:
         return None
     channels |= dict(zip(("roll", "pitch", "yaw"), angles, strict=True))
-    stream = in_our_axes(log.stream(kind, channels), FRD)
-    wrapped = {name: wrap_angle(stream.channels[name]) for name in ("roll", "yaw")}
-    return replace(stream, channels={**stream.channels, **wrapped})
+    return in_our_axes(log.stream(kind, channels), FRD)
 
 
 def _inertial(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
@@ -549,8 +567,6 @@ def _pulses(log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle | None) -
 
 MANUAL = 19
 """The mode in which the pilot's axes pass the mixer as they are."""
-STICK_CHANNELS = ("pitch", "roll", "throttle", "yaw", "forward", "lateral")
-"""Demands of channels 1 to 6 of an ArduSub."""
 USUAL_YAW = 3.375
 """ACRO_YAW_P at which the yaw axis is passed on as it is."""
 
@@ -636,3 +652,13 @@ def _armed(log: ArduPilotLog, t: Array) -> NDArray[np.bool_]:
         return np.ones(len(t), dtype=bool)
     held = np.searchsorted(arming.t, t, side="right") - 1
     return np.asarray(arming.words["arming"][np.maximum(held, 0)] == "armed")
+
+
+def _recognises(path: Path, head: bytes) -> bool:
+    """Return whether a file is a DataFlash log, telemetry, or an MCAP file without a profile, of BlueOS' recorder."""
+    return head.startswith(DATAFLASH) or path.suffix.lower() in (".bin", ".tlog") or without_profile(head)
+
+
+ARDUPILOT = LogImporter(
+    title="an ArduPilot log (.BIN, .tlog, .mcap of BlueOS)", recognises=_recognises, read=read
+)

@@ -19,6 +19,9 @@ __all__ = ["STICKS", "mixed_pulses", "outputs_of"]
 STICKS = tuple(f"stick_{name}" for name in DEMANDS)
 """Demands in the order of the mixer's factors."""
 
+STICK_CHANNELS = ("pitch", "roll", "throttle", "yaw", "forward", "lateral")
+"""Demands of channels 1 to 6 of an ArduSub."""
+
 MOTOR_1 = 33
 """SERVOn_FUNCTION of the first motor."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,12 +22,18 @@ from finssim.trials.conversion import (
     QUATERNION,
     SAME_ROW,
     TIME_UNITS,
+    constant,
     factor,
     in_our_frames,
     merged,
     ordered,
+    pressure_unit,
+    refuse_coarse,
+    spread,
     tidy_quaternions,
     upside_down,
+    without_dead,
+    wrapped,
 )
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import STICKS, mixed_pulses
@@ -45,6 +52,73 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import Part, did_you_mean, refuse_section, refuse_value, sentence_of
 
+TRUE = ("1", "true", "yes", "y", "t", "valid", "ok")
+FALSE = ("0", "false", "no", "n", "f", "invalid", "")
+
+
+def _token(cell: Any) -> str:
+    """Return a cell as a word in lower case: 1 and 0 for the words of truth, numbers without trailing zeros."""
+    if isinstance(cell, (bool, int, float, np.floating)):
+        return "" if cell != cell else f"{float(cell):g}"
+    word = str(cell).strip().lower()
+    return "1" if word in TRUE else "0" if word in FALSE and word else word
+
+
+class Validity(Part):
+    """Column that marks invalid samples: a flag, certain values, or limits."""
+
+    column: str
+    value: tuple[str | float, ...] | None = None
+    """Values of valid samples in the unit of the column; true, yes, valid, ok or 1 without `value` and limits."""
+    above: float | None = None
+    """Valid samples are above this number, in the unit of the column."""
+    below: float | None = None
+    """Valid samples are below this number, in the unit of the column."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"column": data}
+        if not isinstance(data, dict):
+            raise refuse_section(f"is {data!r}, expected a column, or column and value, above or below")
+        given = data.get("value")
+        # YAML's true is a number in Python.
+        values = given if isinstance(given, (list, tuple)) else [given]
+        return data if given is None else {**data, "value": [_token(value) for value in values]}
+
+    def valid(self, cells: Sequence[Any] | Array, label: str) -> NDArray[np.bool_]:
+        """Return which samples are valid, (n,).
+
+        Args:
+            cells: Cells of the column, words or numbers in its unit, (n,).
+            label: Name of the source in messages.
+
+        Raises:
+            CalibrationError: The cells are no flag and no numbers, whichever is needed.
+        """
+        if self.above is not None or self.below is not None:
+            try:
+                numbers = np.array([float(cell) for cell in cells])
+            except ValueError:
+                raise CalibrationError(
+                    f"{label}: column '{self.column}' contains no numbers, so it has no limits: give 'valid: {{column: "
+                    f"{self.column}, value: WORD}}'"
+                ) from None
+            high = math.inf if self.below is None else self.below
+            low = -math.inf if self.above is None else self.above
+            return ~((numbers >= high) | (numbers <= low))  # what has no number has no limit
+        tokens = [_token(cell) for cell in cells]
+        if self.value is not None:
+            return np.isin(tokens, [_token(value) for value in self.value])
+        other = next((token for token in tokens if token not in ("1", "0", "")), None)
+        if other is not None:
+            raise CalibrationError(
+                f"{label}: column '{self.column}' contains '{other}', expected 1 and 0 or true and false: give 'valid: "
+                f"{{column: {self.column}, value: {other}}}', or above or below with a number"
+            )
+        return np.array([token == "1" for token in tokens], dtype=bool)
+
 
 class ColumnSource(Part):
     """Source of one canonical column: sign (scale * column + offset) in `unit`."""
@@ -59,6 +133,8 @@ class ColumnSource(Part):
     sign: Literal[1, -1] = 1
     unit: str | None = None
     """Unit of scale * column + offset; the unit of the canonical column if None."""
+    valid: Validity | None = None
+    """Column that marks invalid samples of this column."""
 
     @model_validator(mode="before")
     @classmethod
@@ -85,6 +161,13 @@ class TimeColumn(Part):
 
     column: str
     unit: str = "s"
+    kind: Literal["stamp", "period", "counter", "coarse"] = "stamp"
+    """A clock; the time since the row before; a counter that begins again after `wrap`; or a clock of few steps, over
+    each of which its samples are spread."""
+    scale: float = Field(default=1.0, gt=0.0)
+    """Factor from the column to `unit`, such as 0.02 for a counter of samples of 50 Hz."""
+    wrap: float | None = Field(default=None, gt=0.0)
+    """Range of a counter, in counts of the column; the next of 2^8, 2^16, 2^24 and 2^32 if None."""
 
     @model_validator(mode="before")
     @classmethod
@@ -99,6 +182,38 @@ class TimeColumn(Part):
                 f"is '{unit}', expected one of {', '.join(TIME_UNITS)}, or date for written dates"
             )
         return unit
+
+    @model_validator(mode="after")
+    def _refuse_unused(self) -> TimeColumn:
+        if self.wrap is not None and self.kind != "counter":
+            raise refuse_section(f"wrap is of a counter, and kind is {self.kind}: add 'kind: counter'")
+        if self.unit == "date" and self.kind in ("period", "counter"):
+            raise refuse_section(f"dates are no {self.kind}: give another unit, or 'kind: stamp'")
+        return self
+
+    def seconds(self, raw: Array) -> Array:
+        """Return the times [s] of a column, (n,).
+
+        Args:
+            raw: The column as read; seconds if its unit is `date`, (n,).
+        """
+        unit = 1.0 if self.unit == "date" else TIME_UNITS[self.unit] * self.scale
+        if self.kind == "period":
+            return np.where(np.isfinite(raw), np.cumsum(np.nan_to_num(raw)), np.nan) * unit
+        if self.kind == "counter":
+            good = np.isfinite(raw)
+            largest = float(np.max(raw[good], initial=0.0))
+            wrap = self.wrap or next((2.0**bits for bits in (8, 16, 24, 32) if largest < 2.0**bits), math.inf)
+            turns = np.cumsum(np.diff(raw[good], prepend=raw[good][:1]) < -0.5 * wrap)
+            whole = raw.copy()
+            whole[good] += np.where(turns > 0, wrap * turns, 0.0)
+            return whole * unit
+        if self.kind == "coarse":
+            good = np.isfinite(raw)
+            out = np.full(len(raw), np.nan)
+            out[good] = spread(raw[good] * unit) if (np.diff(raw[good]) >= 0.0).all() else raw[good] * unit
+            return out
+        return raw * unit
 
 
 class PhaseColumn(Part):
@@ -168,6 +283,8 @@ class SourceMap(Part):
     """Lines before the line of names."""
     names: tuple[str, ...] | None = None
     """Names of the columns of a file that has no line of names."""
+    valid: tuple[Validity, ...] | None = None
+    """Columns that mark invalid samples, which are left out; an evident one if None, none if `false`."""
     stamps: Literal["header", "received"] = "header"
     """Times of a topic: the stamps in its messages, if it has them, or the times at which they were recorded."""
 
@@ -177,6 +294,13 @@ class SourceMap(Part):
         if isinstance(data, (list, tuple)):
             raise refuse_section("is a list, expected columns: {CANONICAL: FIELD}")
         return {} if data is None else data
+
+    @field_validator("valid", mode="before")
+    @classmethod
+    def _several(cls, valid: Any) -> Any:
+        if valid is False:
+            return ()
+        return valid if valid is None or isinstance(valid, (list, tuple)) else [valid]
 
     @field_validator("columns", mode="before")
     @classmethod
@@ -466,6 +590,8 @@ class Stream:
     """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
     findings: tuple[Finding, ...] = ()
     """Repairs, and data that was left out."""
+    rank: int = -1
+    """Place in the order of sources: of two that have a column the lower is used; -1 if the user chose it."""
 
     def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
         """Some of the samples, in that order; at times `t` where given. Times are in [s]."""
@@ -511,7 +637,11 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
     stream = stream.selected(timed)
     if len(stream.t) < 2:
         raise CalibrationError(f"{stream.source}: {len(stream.t)} samples, expected at least two")
-    t, rows, repaired = ordered(stream.t, stream.channels)
+    try:
+        t, rows, repaired = ordered(stream.t, stream.channels)
+        refuse_coarse(t, {name: values[rows] for name, values in stream.channels.items()})
+    except CalibrationError as error:
+        raise CalibrationError(str(error), stream.source) from None
     jumps = [item.values for item in repaired if item.code == "clock_jump"]
     if not alone and jumps:
         raise CalibrationError(
@@ -568,8 +698,7 @@ def merge(streams: Sequence[Stream]) -> MergedStreams:
     Raises:
         CalibrationError: A column in two streams, or streams that lie apart in time.
     """
-    each = [in_order(stream, alone=len(streams) == 1) for stream in streams]
-    _refuse_doubles(each)
+    each = [in_order(stream, alone=len(streams) == 1) for stream in without_doubles(streams)]
     _refuse_disjoint(each)
     start = min(float(stream.t[0]) for stream in each)
     # In integer microseconds, so that a written and read trial has the same times.
@@ -589,15 +718,74 @@ def merge(streams: Sequence[Stream]) -> MergedStreams:
     )
 
 
-def _refuse_doubles(streams: Sequence[Stream]) -> None:
-    sources: dict[str, str] = {}
-    for stream in streams:
-        for name in (*stream.channels, *stream.words):
-            if name in sources:
-                raise CalibrationError(
-                    f"{name} is in {sources[name]} and in {stream.source}: choose one of them in the map"
+def without_doubles(streams: Sequence[Stream]) -> list[Stream]:
+    """Return the streams with one source for each column: one that moves, then that of the lowest rank.
+
+    Raises:
+        CalibrationError: Two sources of one rank for a column, or of words.
+    """
+    out = list(streams)
+    units = [QUATERNION, *((name,) for stream in out for name in stream.channels if name not in QUATERNION)]
+    for names in dict.fromkeys(units):
+        holders = [i for i, stream in enumerate(out) if any(name in stream.channels for name in names)]
+        moving = [i for i in holders if not _dead(out[i], names)]
+        if 0 < len(moving) < len(holders):
+            for i in set(holders) - set(moving):
+                out[i] = _without(out[i], names, out[moving[0]], dead=True)
+            holders = moving
+        best = min(holders, key=lambda i: out[i].rank, default=-1)
+        for i in holders:
+            if out[i].rank > out[best].rank:
+                out[i] = _without(out[i], names, out[best], dead=False)
+            elif i != best:
+                _refuse_double(names[0], out[best], out[i])
+    depth = [stream for stream in out if "depth" in stream.channels]
+    for i, stream in enumerate(out):
+        if depth and "pressure" in stream.channels and stream.rank >= 0:
+            if _dead(depth[0], ("depth",)) and not _dead(stream, ("pressure",)):
+                j = next(k for k, other in enumerate(out) if other is depth[0])
+                out[j] = _without(depth[0], ("depth",), stream, dead=True)
+            else:
+                channels = {name: values for name, values in stream.channels.items() if name != "pressure"}
+                out[i] = replace(stream, channels=channels).noting(
+                    finding("pressure_left_out", topic=stream.source)
                 )
-            sources[name] = stream.source
+    worded: dict[str, Stream] = {}
+    for stream in out:
+        for name in stream.words:
+            if name in worded:
+                _refuse_double(name, worded[name], stream)
+            worded[name] = stream
+    return [stream for stream in out if stream.channels or stream.words or stream.findings]
+
+
+def _dead(stream: Stream, names: tuple[str, ...]) -> bool:
+    return all(constant(stream.channels[name]) for name in names if name in stream.channels)
+
+
+def _without(stream: Stream, names: tuple[str, ...], better: Stream, *, dead: bool) -> Stream:
+    """Return the stream without some columns, with one finding for all that were left out for one other stream."""
+    gone = tuple(name for name in names if name in stream.channels)
+    findings = []
+    for item in stream.findings:
+        if (
+            item.code == ("stream_dead" if dead else "columns_left_out")
+            and item.values["better"] == better.source
+        ):
+            gone = (*item.values["columns"], *gone)
+        else:
+            findings.append(item)
+    channels = {name: values for name, values in stream.channels.items() if name not in names}
+    note = (
+        finding("stream_dead", columns=gone, topic=stream.source, better=better.source)
+        if dead
+        else finding("columns_left_out", columns=gone, topic=stream.source, better=better.source)
+    )
+    return replace(stream, channels=channels, findings=(*findings, note))
+
+
+def _refuse_double(name: str, one: Stream, other: Stream) -> None:
+    raise CalibrationError(f"{name} is in {one.source} and in {other.source}: choose one of them in the map")
 
 
 def _refuse_disjoint(streams: Sequence[Stream]) -> None:
@@ -617,9 +805,15 @@ LONGEST_BRIDGE = 0.5
 """Between two attitudes that a velocity of the world is turned with [s]."""
 
 
-def in_our_axes(stream: Stream, frame: LogFrame) -> Stream:
-    """The stream in x forward, y left, z up and a world with z up."""
-    channels = in_our_frames(stream.channels, frame.body, frame.world)
+def in_our_axes(stream: Stream, frame: LogFrame, *, radians: bool = True) -> Stream:
+    """Return the stream in x forward, y left, z up and a world with z up, with angles in [-pi, pi).
+
+    Args:
+        stream: Of the log's axes.
+        frame: Axes of the log.
+        radians: False if the angles may be degrees without a unit; they are wrapped within one turn only.
+    """
+    channels = wrapped(in_our_frames(stream.channels, frame.body, frame.world), everything=radians)
     if frame.world == "NED":
         for name, sign in zip(WORLD_VELOCITY, FROM_FOSSEN.A.diagonal(), strict=True):
             if name in channels:
@@ -634,28 +828,37 @@ def trial_of(name: str, table: MergedStreams, header: Header, column_map: Column
         CalibrationError: World velocities without an attitude, or beside body velocities.
     """
     channels, findings = dict(table.channels), list(table.findings)
+    findings += _without_empty(channels)
     if any(c in channels for c in WORLD_VELOCITY):
         channels |= _body_velocity(name, table.t, channels)
         channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
+        findings += _without_empty(channels)
     if "pressure" in channels:
-        depth, assumed = _depth(channels.pop("pressure"), header, column_map)
+        depth, assumed = _depth(name, channels.pop("pressure"), header, column_map)
         findings += assumed
         channels["depth"] = depth
     if any(c in channels for c in STICKS):
         pulses, mixed = _pulses(name, channels, header, column_map.ardusub)
         channels = {c: v for c, v in channels.items() if c not in STICKS} | pulses
         findings += mixed
+    findings += without_dead(table.t, channels)
     findings += tidy_quaternions(channels)
     if upside_down(channels):
         findings.append(finding("upside_down"))
-    for column in [c for c, v in channels.items() if not np.isfinite(v).any()]:
-        findings.append(finding("column_empty", column=column))
-        del channels[column]
     if not channels:
         raise CalibrationError(f"{name}: no column of a trial holds a number")
+    findings.sort(key=lambda item: item.code == "not_read")  # the last of an import
     return Trial(
         name=name, t=table.t, channels=channels, phase=_phase(table), header=header, findings=tuple(findings)
     )
+
+
+def _without_empty(channels: dict[str, Array]) -> list[Finding]:
+    """Remove columns without a number, in place."""
+    empty = [column for column, values in channels.items() if not np.isfinite(values).any()]
+    for column in empty:
+        del channels[column]
+    return [finding("column_empty", column=column) for column in empty]
 
 
 def _phase(table: MergedStreams) -> np.ndarray | None:
@@ -691,6 +894,7 @@ def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str,
     times = t[valid]
     after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
     near = (t >= times[0]) & (t <= times[-1]) & (times[after] - times[after - 1] <= LONGEST_BRIDGE)
+    near |= np.isin(t, times)
     usable = near & np.isfinite(velocity).all(axis=-1)
     body = np.full_like(velocity, np.nan)
     if usable.any():
@@ -732,13 +936,24 @@ def _pulses(
     return findings, [finding("sticks_mixed", frame=requested.frame, gain=requested.gain), mapped]
 
 
-def _depth(pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:
+def _depth(name: str, pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:
     """Depth of the pressure sensor [m]: (p - p_surface) / (rho g)."""
     vehicle = load_vehicle(header.vehicle) if header.vehicle is not None else None
     density = header.water.density or (vehicle.water.density if vehicle else 1000.0)
     gravity = vehicle.water.gravity if vehicle else GRAVITY
     surface = column_map.surface_pressure
     findings = [finding("depth_of_pressure", density=density)]
+    if surface != 0.0:
+        unit, finite = pressure_unit(pressure), pressure[np.isfinite(pressure)]
+        low, high = float(finite.min()), float(finite.max())
+        if unit is None:
+            raise CalibrationError(
+                f"{name}: pressures of {low:.6g} to {high:.6g} are no absolute pressures in water in Pa, hPa or kPa: "
+                "give 'unit:' of the column in a map, and 'surface_pressure: 0' for a gauge"
+            )
+        if unit != "Pa":
+            findings.append(finding("pressure_unit", low=low, high=high, unit=unit))
+        pressure = pressure * factor(unit, "pressure")
     if surface is None:
         surface = STANDARD_ATMOSPHERE
         findings.append(finding("surface_pressure_assumed", pressure=surface))

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from finssim.core.files import plain_name
-from finssim.trials.findings import CalibrationError, finding
+from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.assemble import ColumnMap, SourceMap, merge, trial_of
-from finssim.trials.importers.dispatch import table_stream
+from finssim.trials.importers.table import memory_table, table_stream
 from finssim.trials.trial import Trial, column_of
 from finssim.trials.trial_files import ColumnTable
 from finssim.vehicles.part import did_you_mean, sentence_of
@@ -71,10 +71,6 @@ def trial_from_frame(
         mapped = ColumnMap.model_validate({"header": dict(header), "surface_pressure": surface_pressure})
     except ValidationError as error:
         raise CalibrationError(sentence_of(error.errors()[0], name, "add it")) from None
-    used = {time, "phase", *columns.values()}
-    table.findings += [
-        finding("unknown_column", column=column, hint="") for column in table.columns if column not in used
-    ]
     return trial_of(name, merge([table_stream(table, source, name)]), mapped.header_of(name, None), mapped)
 
 
@@ -101,12 +97,4 @@ def _table(frame: Any, time: str, name: str) -> ColumnTable:
         raise CalibrationError(
             f"{name}: columns {listed or 'none'}, expected one-dimensional ones of one length"
         )
-    table = ColumnTable()
-    for column, array in arrays.items():
-        if np.issubdtype(array.dtype, np.datetime64):
-            table.words[column] = np.datetime_as_string(array.astype("datetime64[us]")).tolist()
-        elif array.dtype.kind in "biuf":
-            table.numbers[column] = array.astype(np.float64)
-        else:
-            table.words[column] = ["" if word is None else str(word) for word in array.tolist()]
-    return table
+    return memory_table(arrays)

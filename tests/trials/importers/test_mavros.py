@@ -1,0 +1,364 @@
+"""Bags of MAVROS and of Doppler logs become trials without a map, and one unusable topic stops nothing."""
+
+import numpy as np
+import pytest
+
+from finssim.trials.findings import CalibrationError
+from finssim.trials.importers.dispatch import read_trials
+from finssim.vehicles import load_vehicle
+from finssim.vehicles.autopilot import FRAMES
+
+pytest.importorskip("rosbags")
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+HEADER = "std_msgs/Header header\n"
+BEAM = "int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid\n"
+TYPES = {
+    "mavros_msgs/msg/RCOut": HEADER + "uint16[] channels",
+    "mavros_msgs/msg/RCIn": HEADER + "uint8 rssi\nuint16[] channels",
+    "mavros_msgs/msg/OverrideRCIn": "uint16[18] channels",
+    "mavros_msgs/msg/State": HEADER
+    + "bool connected\nbool armed\nbool guided\nbool manual_input\nstring mode\nuint8 system_status",
+    "mavros_msgs/msg/VfrHud": HEADER + "float32 airspeed",
+    "waterlinked_a50_ros_driver/msg/DVLBeam": BEAM,
+    "waterlinked_a50_ros_driver/msg/DVL": HEADER
+    + "float64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\nfloat64 altitude\n"
+    "waterlinked_a50_ros_driver/DVLBeam[] beams\nbool velocity_valid\nint64 status\nstring form",
+}
+N, T0 = 100, 1_760_000_000
+TIMES = np.arange(N) * 0.1
+PULSES = np.stack([1500.0 + 20.0 * (i + 1) * np.sin(TIMES + i) for i in range(8)], axis=-1).round()
+
+
+def store(kind):
+    types = get_typestore(Stores.ROS2_HUMBLE if kind == 2 else Stores.ROS1_NOETIC)
+    for name, text in TYPES.items():
+        types.register(get_types_from_msg(text, name))
+    return types
+
+
+class Bag:
+    """Messages of one bag, in ROS 1 or ROS 2."""
+
+    def __init__(self, kind=2):
+        self.kind, self.types, self.queue = kind, store(kind), []
+
+    def __call__(self, name, **fields):
+        return self.types.types[name.replace("/", "/msg/", 1)](**fields)
+
+    def header(self, t, frame=""):
+        whole = int(T0 + t)
+        stamp = self("builtin_interfaces/Time", sec=whole, nanosec=round((T0 + t - whole) * 1e9))
+        more = {"seq": 0} if self.kind == 1 else {}
+        return self("std_msgs/Header", stamp=stamp, frame_id=frame, **more)
+
+    def vector(self, *values):
+        return self("geometry_msgs/Vector3", **dict(zip("xyz", values, strict=True)))
+
+    def add(self, topic, kind, make, rate=10.0, delay=0.003):
+        for i, t in enumerate(TIMES):
+            if i % round(10.0 / rate) == 0:
+                self.queue.append((round((T0 + t + delay) * 1e9), topic, kind, make(i, float(t))))
+        return self
+
+    def imu(self, topic="/mavros/imu/data", known=(True, True, True), scale=1.0):
+        covariances = [np.full(9, 0.0 if good else -1.0) for good in known]
+        names = ("orientation", "angular_velocity", "linear_acceleration")
+        return self.add(
+            topic,
+            "sensor_msgs/Imu",
+            lambda i, t: self(
+                "sensor_msgs/Imu",
+                header=self.header(t),
+                orientation=self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=np.sin(t / 2), w=np.cos(t / 2)),
+                angular_velocity=self.vector(
+                    *(scale * np.array([0.1 * np.sin(t), 0.2 * np.sin(t), 1.0 + 0.1 * t]))
+                ),
+                linear_acceleration=self.vector(*(scale * np.array([0.1 * t, 0.1 * np.sin(t), 9.8 + t]))),
+                **{f"{name}_covariance": c for name, c in zip(names, covariances, strict=True)},
+            ),
+        )
+
+    def odom(self, topic="/mavros/local_position/odom", turn=True, bad=lambda i: False):
+        def make(i, t):
+            six = np.zeros(36)
+            six[0] = -1.0 if bad(i) else 0.1
+            pose = self(
+                "geometry_msgs/Pose",
+                position=self("geometry_msgs/Point", x=np.sin(t), y=0.0, z=-1.0 - 0.1 * np.sin(t)),
+                orientation=self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            )
+            twist = self(
+                "geometry_msgs/Twist",
+                linear=self.vector(np.cos(t), 0.1 * t, 0.0),
+                angular=self.vector(9.0, 9.0, 9.0),
+            )
+            return self(
+                "nav_msgs/Odometry",
+                header=self.header(t, "map"),
+                child_frame_id="base_link",
+                pose=self("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+                twist=self("geometry_msgs/TwistWithCovariance", twist=twist, covariance=six),
+            )
+
+        return self.add(topic, "nav_msgs/Odometry", make)
+
+    def twist(self, topic, value=5.0):
+        return self.add(
+            topic,
+            "geometry_msgs/TwistStamped",
+            lambda i, t: self(
+                "geometry_msgs/TwistStamped",
+                header=self.header(t),
+                twist=self(
+                    "geometry_msgs/Twist", linear=self.vector(value, t, t), angular=self.vector(t, t, t)
+                ),
+            ),
+        )
+
+    def pressure(self, topic="/mavros/imu/static_pressure", scale=1.0):
+        return self.add(
+            topic,
+            "sensor_msgs/FluidPressure",
+            lambda i, t: self(
+                "sensor_msgs/FluidPressure",
+                header=self.header(t),
+                fluid_pressure=scale * (101325.0 + 9806.65 * (2.0 + np.sin(t))),
+                variance=0.0,
+            ),
+        )
+
+    def rel_alt(self, value=lambda t: -2.0 - np.sin(t)):
+        make = lambda i, t: self("std_msgs/Float64", data=float(value(t)))  # noqa: E731
+        return self.add("/mavros/global_position/rel_alt", "std_msgs/Float64", make)
+
+    def outputs(self):
+        make = lambda i, t: self(  # noqa: E731
+            "mavros_msgs/RCOut", header=self.header(t), channels=np.r_[PULSES[i], [0] * 8].astype(np.uint16)
+        )
+        return self.add("/mavros/rc/out", "mavros_msgs/RCOut", make, rate=5.0)
+
+    def pilot(self, sticks, kind="OverrideRCIn", topic="/mavros/rc/override"):
+        more = (lambda t: {}) if kind == "OverrideRCIn" else (lambda t: {"header": self.header(t), "rssi": 0})
+        make = lambda i, t: self(  # noqa: E731
+            f"mavros_msgs/{kind}", channels=np.r_[sticks(t), [65535] * 12].astype(np.uint16), **more(t)
+        )
+        return self.add(topic, f"mavros_msgs/{kind}", make)
+
+    def state(self, armed, mode=lambda t: "MANUAL"):
+        return self.add(
+            "/mavros/state",
+            "mavros_msgs/State",
+            lambda i, t: self(
+                "mavros_msgs/State",
+                header=self.header(t),
+                connected=True,
+                armed=bool(armed(t)),
+                guided=False,
+                manual_input=True,
+                mode=mode(t),
+                system_status=3,
+            ),
+        )
+
+    def dvl(self, topic="/dvl/data", valid=lambda i: True, package="waterlinked_a50_ros_driver"):
+        return self.add(
+            topic,
+            f"{package}/DVL",
+            lambda i, t: self(
+                f"{package}/DVL",
+                header=self.header(t),
+                time=100.0,
+                velocity=self.vector(np.sin(t), -np.cos(t), -0.1)
+                if valid(i)
+                else self.vector(0.56, 0.0, 0.0),
+                fom=0.002 if i % 10 else 2.0,
+                altitude=1.0,
+                beams=[],
+                velocity_valid=bool(valid(i)),
+                status=0,
+                form="json_v2",
+            ),
+        )
+
+    def write(self, path, broken=()):
+        """Write the bag; the messages of some topics are cut."""
+        path = path.with_suffix("" if self.kind == 2 else ".bag")
+        writer = (
+            Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) if self.kind == 2 else Writer1(path)
+        )
+        with writer:
+            names = {topic: kind.replace("/", "/msg/", 1) for _, topic, kind, _ in self.queue}
+            known = {t: writer.add_connection(t, kind, typestore=self.types) for t, kind in names.items()}
+            for ns, topic, _, message in sorted(self.queue, key=lambda item: item[0]):
+                pack = self.types.serialize_cdr if self.kind == 2 else self.types.serialize_ros1
+                raw = pack(message, names[topic])
+                writer.write(known[topic], ns, raw[:10] if topic in broken else raw)
+        return path
+
+
+@pytest.fixture(params=[1, 2], ids=["ROS 1", "ROS 2"])
+def bag(request):
+    return Bag(request.param)
+
+
+def one(path, **options):
+    (trial,) = read_trials([path], vehicle=options.pop("vehicle", "bluerov2_heavy"), **options)
+    return trial
+
+
+def codes(trial):
+    return [item.code for item in trial.findings]
+
+
+def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
+    """Outputs by the vehicle's frame, attitude and rates of the IMU, depth of rel_alt, velocity of the odometry; no
+    set-point and no velocity of the world is taken for a measurement, and what is not read is named with its count."""
+    bag.outputs().imu().odom().rel_alt().pressure().state(lambda t: 2.0 < t < 8.0)
+    bag.twist("/mavros/setpoint_velocity/cmd_vel").twist("/mavros/local_position/velocity_local").twist(
+        "/cmd_vel"
+    )
+    bag.add(
+        "/mavros/vfr_hud",
+        "mavros_msgs/VfrHud",
+        lambda i, t: bag("mavros_msgs/VfrHud", header=bag.header(t), airspeed=0.0),
+    )
+    path = bag.write(tmp_path / "dive")
+    trial = one(path)
+    for i in range(8):
+        np.testing.assert_array_equal(trial.series(f"pwm_T{i + 1}")[1], PULSES[::2, i])
+    np.testing.assert_allclose(trial.series("qz")[1], np.sin(TIMES / 2), atol=1e-12)
+    np.testing.assert_allclose(trial.series("p")[1], 0.1 * np.sin(TIMES), atol=1e-12)
+    np.testing.assert_allclose(trial.series("u")[1], np.cos(TIMES), atol=1e-12)
+    np.testing.assert_allclose(trial.series("x")[1], np.sin(TIMES), atol=1e-12)
+    np.testing.assert_allclose(trial.series("depth")[1], 2.0 + np.sin(TIMES), atol=1e-12)
+    assert "pressure_left_out" in codes(trial) and "directions_assumed" in codes(trial)
+    unread = str(trial.findings[-1])
+    for topic in (
+        "/cmd_vel",
+        "/mavros/local_position/velocity_local",
+        "/mavros/setpoint_velocity/cmd_vel",
+        "/mavros/vfr_hud",
+    ):
+        assert f"{topic} (" in unread
+    assert "/mavros/vfr_hud (mavros_msgs/VfrHud, 100 messages)" in unread
+    (armed,) = read_trials([path], vehicle="bluerov2_heavy", split="arming")
+    assert armed.duration == pytest.approx(5.8, abs=0.11)
+
+
+def test_without_a_vehicle_outputs_keep_their_numbers(tmp_path):
+    trial = one(Bag().outputs().imu().write(tmp_path / "a"), vehicle=None)
+    assert {f"pwm_C{i}" for i in range(1, 9)} <= set(trial.channels) and "pwm_C9" not in trial.channels
+
+
+def test_pressure_gives_the_depth_where_rel_alt_is_dead(tmp_path):
+    """A column that never changes loses to one that moves; kilopascals are told from their size."""
+    trial = one(Bag().imu().rel_alt(lambda t: 0.0).pressure(scale=1e-3).write(tmp_path / "a"))
+    density = load_vehicle("bluerov2_heavy").water.density
+    np.testing.assert_allclose(
+        trial.series("depth")[1],
+        (2.0 + np.sin(TIMES)) * 9806.65 / (density * load_vehicle("bluerov2_heavy").water.gravity),
+        rtol=1e-9,
+    )
+    assert {"stream_dead", "pressure_unit"} <= set(codes(trial))
+
+
+def test_a_dead_sensor_loses_to_one_that_moves(tmp_path):
+    """Two IMUs of one kind: the one whose rates are zero throughout is left out, with one sentence."""
+    trial = one(Bag().imu("/a/imu", scale=0.0).imu("/b/imu").write(tmp_path / "a"))
+    np.testing.assert_allclose(trial.series("p")[1], 0.1 * np.sin(TIMES), atol=1e-12)
+    (note,) = [item for item in trial.findings if item.code == "stream_dead"]
+    assert note.values["topic"] == "/a/imu" and set(note.values["columns"]) == {
+        "p",
+        "q",
+        "r",
+        "ax",
+        "ay",
+        "az",
+    }
+
+
+@pytest.mark.parametrize("kind", ["OverrideRCIn", "RCIn"])
+def test_pilots_channels_go_through_the_mixer_in_manual(tmp_path, kind):
+    """Forward at half: by ArduSub's own factors. Disarmed nothing turns, and other modes are left out and counted."""
+    forward, released = 1700.0, 65535.0
+    sticks = lambda t: [1500, 1500, 1500, 1500, forward if t != 5.0 else released, 1500]  # noqa: E731
+    bag = Bag().imu().pilot(sticks, kind, "/mavros/rc/in" if kind == "RCIn" else "/mavros/rc/override")
+    bag.state(lambda t: t >= 2.0, lambda t: "ALT_HOLD" if t >= 8.0 else "MANUAL")
+    trial = one(bag.write(tmp_path / "a"))
+    factors = np.array(dict(FRAMES.values())["VECTORED_6DOF"], float)[:, 4]
+    for i, factor in enumerate(factors):
+        t, pulse = trial.series(f"pwm_T{i + 1}")
+        np.testing.assert_allclose(pulse[(t > 2.2) & (t < 7.8)], 1500.0 + 400.0 * 0.5 * factor, atol=1.0)
+        np.testing.assert_allclose(pulse[t < 1.8], 1500.0)
+        assert t.max() < 8.1
+    assert "other_modes_left_out" in codes(trial) and "sticks_mixed" in codes(trial)
+
+
+def test_messages_that_say_they_know_nothing_are_left_out(bag, tmp_path):
+    """Covariances of -1: an IMU without rates, and velocities without a measurement."""
+    bag.imu(known=(True, False, True)).odom(bad=lambda i: i % 4 == 0)
+    trial = one(bag.write(tmp_path / "a"))
+    np.testing.assert_allclose(trial.series("u")[1], np.cos(TIMES)[np.arange(N) % 4 != 0], atol=1e-12)
+    assert trial.series("p")[1].max(initial=9.0) == 9.0  # those of the odometry, where it is valid
+    assert {item.values["column"] for item in trial.findings if item.code == "invalid_left_out"} >= {
+        "angular_velocity_covariance[0]",
+        "twist.covariance[0]",
+    }
+
+
+def test_a_doppler_log_is_read_in_its_own_axes(bag, tmp_path):
+    """Forward-right-down; without bottom lock, or with a figure of merit of 2 m/s, a velocity is none."""
+    trial = one(bag.dvl(valid=lambda i: i % 5 != 3).write(tmp_path / "a"))
+    good = (np.arange(N) % 5 != 3) & (np.arange(N) % 10 != 0)
+    t, u = trial.series("u")
+    np.testing.assert_allclose(u, np.sin(TIMES)[good], atol=1e-12)
+    np.testing.assert_allclose(trial.series("v")[1], np.cos(TIMES)[good], atol=1e-12)
+    np.testing.assert_allclose(trial.series("w")[1], 0.1)
+    invalid = {
+        item.values["column"]: item.values["samples"] for item in trial.findings if "column" in item.values
+    }
+    assert invalid == {"velocity_valid": 20, "fom": 10}
+
+
+def test_one_unusable_topic_does_not_refuse_a_bag(bag, tmp_path):
+    """Messages that are cut, and a topic whose samples are all invalid."""
+    bag.imu().dvl(valid=lambda i: False).odom()
+    bag.pressure("/other/pressure")
+    trial = one(bag.write(tmp_path / "a", broken=("/mavros/local_position/odom",)))
+    assert trial.has("p", "depth") and "u" not in trial.channels
+    texts = {item.values["topic"]: str(item) for item in trial.findings if item.code == "topic_unusable"}
+    assert texts["/mavros/local_position/odom"].startswith(
+        "100 messages of /mavros/local_position/odom cannot be read"
+    )
+    assert "no sample is valid" in texts["/dvl/data"]
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        one(Bag().odom().write(tmp_path / "b", broken=("/mavros/local_position/odom",)))
+
+
+def test_a_topic_with_the_clock_of_another_computer_is_timed_by_receipt(tmp_path):
+    """Stamps that count from the start of an autopilot beside Unix times."""
+    bag = Bag().imu().pressure()
+    header = bag.header
+    bag.header = lambda t, frame="": header(t - T0 + 100.0, frame)
+    bag.twist("/sensor/twist", 0.5)
+    bag.header = header
+    trial = one(bag.write(tmp_path / "a"))
+    assert trial.duration < 11.0 and "other_clock" in codes(trial)
+    np.testing.assert_allclose(trial.series("u")[0][0], 0.003, atol=1e-4)
+
+
+def test_a_bag_without_definitions_of_mavros_is_read(tmp_path):
+    """Recorders before ROS 2 Iron write none; those of an unknown type stop nothing."""
+    bag = Bag().outputs().imu()
+    bag.write(tmp_path / "full")
+    writer = Writer(tmp_path / "old", version=8, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        names = {topic: kind.replace("/", "/msg/", 1) for _, topic, kind, _ in bag.queue}
+        known = {t: writer.add_connection(t, kind, typestore=bag.types) for t, kind in names.items()}
+        for ns, topic, _, message in sorted(bag.queue, key=lambda item: item[0]):
+            writer.write(known[topic], ns, bag.types.serialize_cdr(message, names[topic]))
+    trial = one(tmp_path / "old")
+    np.testing.assert_array_equal(trial.series("pwm_T3")[1], PULSES[::2, 2])
