@@ -287,6 +287,7 @@ IMPORTERS = Family(
     "importer",
     {
         "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
+        "vehicle.urdf": "finssim.vehicles.importers.urdf:URDF",
         **{
             f"trial.{name}": f"finssim.trials.importers.{module}"
             for name, module in {
