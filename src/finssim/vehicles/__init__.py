@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
     from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
     from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
-    from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError
+    from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError, VehicleWarning
     from finssim.vehicles.thruster import Esc, Thruster
     from finssim.vehicles.vehicle import (
         AXES,
@@ -50,6 +50,7 @@ __all__ = [
     "Thruster",
     "Vehicle",
     "VehicleError",
+    "VehicleWarning",
     "ReferenceWater",
     "catalogue",
     "catalogue_vehicle",

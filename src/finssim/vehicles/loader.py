@@ -125,7 +125,7 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
 
 def importers() -> dict[str, Any]:
     """Return the importers of vehicles (`VehicleImporter`) by name."""
-    return {name: member for name, member in IMPORTERS.usable().items() if name.startswith(KIND)}
+    return {name: IMPORTERS[name] for name in IMPORTERS if name.startswith(KIND)}
 
 
 def importer_of(path: Path) -> Any:
@@ -143,10 +143,14 @@ def _meshes() -> TemporaryDirectory[str]:
     return TemporaryDirectory(prefix="finssim-")
 
 
-def _read_foreign(path: Path) -> tuple[Tree, Origins]:
-    """Values and origins of another program's model, with a warning that lists its guesses."""
+def _read_foreign(path: Path, extended: bool) -> tuple[Tree, Origins]:
+    """Values and origins of another program's model, with a warning that lists its guesses.
+
+    One that another file extends may lack what that file gives.
+    """
     draft = importer_of(path).read(path)
-    vehicle = draft.vehicle(Path(_meshes().name))
+    incomplete = extended and draft.missing
+    vehicle = None if incomplete else draft.vehicle(Path(_meshes().name))
     guessed = "; ".join(draft.guesses()) or "nothing"
     warnings.warn(
         f"{path}: guessed {guessed}. 'finssim vehicles import {path} --out {path.stem}.yaml' writes a file in which "
@@ -155,7 +159,9 @@ def _read_foreign(path: Path) -> tuple[Tree, Origins]:
         VehicleWarning,
         stacklevel=2,
     )
-    groups = {thruster.group: {} for thruster in vehicle.thrusters.values() if thruster.group}
+    if vehicle is None:
+        return dict(draft.values), dict(draft.origins)
+    groups: Tree = {thruster.group: {} for thruster in vehicle.thrusters.values() if thruster.group}
     return vehicle.values() | {"thruster_groups": groups}, dict(vehicle.provenance)
 
 
@@ -187,7 +193,9 @@ def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[T
     """Values and origins of a file merged onto the file it extends."""
     if path.resolve() in children:
         raise VehicleError(f"{label}: extends itself through {' -> '.join(child.stem for child in children)}")
-    values, origins = read_file(path, label) if importer_of(path) is None else _read_foreign(path)
+    values, origins = (
+        read_file(path, label) if importer_of(path) is None else _read_foreign(path, bool(children))
+    )
     hull = values.get("hull")
     if isinstance(hull, dict) and isinstance(hull.get("file"), str | Path):
         hull["file"] = path.parent.resolve() / hull["file"]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["IDENTITY", "LinkPose", "combined", "plain"]
+__all__ = ["IDENTITY", "LinkPose", "combined", "flu_of_frd", "plain"]
 
 Array = NDArray[np.float64]
 
@@ -57,3 +57,14 @@ def plain(value: Any) -> Any:
     array = np.asarray(value, dtype=np.float64)
     cleaned = np.where(np.abs(array) < 1e-12 * np.abs(array).max(initial=0.0), 0.0, array)
     return float(cleaned) if cleaned.ndim == 0 else cleaned
+
+
+def flu_of_frd(value: Any) -> Array:
+    """Return a vector (3,) or (6,), or a matrix (3, 3) or (6, 6), x forward, y left, z up, in its unit.
+
+    Args:
+        value: The same in axes x forward, y right, z down, in any unit.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    turn = np.tile([1.0, -1.0, -1.0], len(array) // 3)
+    return np.asarray((turn[:, None] if array.ndim == 2 else 1.0) * array * turn) + 0.0

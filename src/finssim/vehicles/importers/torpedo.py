@@ -1,0 +1,161 @@
+"""Hull drag and propeller of the torpedoes of PythonVehicleSimulator and HoloOcean.
+
+Their equations, x forward, y right, z down, b span, S area of the hull, alpha angle of attack, x_k places of 21 strips:
+
+    drag = rho/2 U² S (CD_0 + CL² / (pi e b²/S)),  lift = rho/2 U² S CL,  CL = CL_alpha alpha
+    Y = -rho/2 T Cd sum_k |v + x_k r| (v + x_k r) dx,  N = -rho/2 T Cd sum_k x_k |v + x_k r| (v + x_k r) dx
+    X = (1 - t) rho D⁴ (KT_0 n|n| + (KT_max - KT_0) / Ja_max (1 - w) U / D |n|)                n in 1/s
+
+A vehicle file holds these along each axis alone and, in heave, for small alpha at any forward speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.vehicles.importers.draft import Draft
+from finssim.vehicles.importers.rigid import flu_of_frd, plain
+
+__all__ = [
+    "PROPELLER",
+    "add_drag",
+    "cross_flow",
+    "guess_thruster",
+    "lift_drag",
+    "put_propeller",
+    "remove_munk",
+]
+
+Array = NDArray[np.float64]
+
+PROPELLER = ("D_prop", "t_prop", "KT_0", "KT_max", "Ja_max")
+"""Words of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
+RHO, WAKE, OSWALD = 1026.0, 0.056, 0.7
+"""Density [kg/m³] that the library's drag has, wake fraction and Oswald's efficiency of PythonVehicleSimulator [-]."""
+RPM, LAG = 3000.0, 0.1
+"""Guesses: shaft speed at the limit of a thruster [rpm], time constant [s]."""
+STRIPS = np.arange(21) / 20.0 - 0.5
+"""Places of the strips over the length [-]."""
+HOERNER = (
+    (0.0109, 0.1766, 0.3530, 0.4519, 0.4728, 0.4929, 0.4933, 0.5585, 0.6464, 0.8336, 0.9880, 1.3081, 1.6392, 1.8600,
+     2.3129, 2.6000, 3.0088, 3.4508, 3.7379, 4.0031),
+    (1.9661, 1.9657, 1.8976, 1.7872, 1.5837, 1.2786, 1.2108, 1.0836, 0.9986, 0.8796, 0.8284, 0.7599, 0.6914, 0.6571,
+     0.6307, 0.5962, 0.5868, 0.5859, 0.5599, 0.5593),
+)  # fmt: skip
+"""Beam by twice the draft [-], and cross-flow drag coefficient of Hoerner's curve [-]."""
+
+
+def lift_drag(span: float, area: float, drag: float, efficiency: float = OSWALD) -> tuple[Array, Array]:
+    """Return D2 [N s²/m²] and Du [N s²/m²] of lift and drag of a hull, (6, 6) each, x forward, y right, z down.
+
+    Args:
+        span: Of the hull as a wing [m].
+        area: Of the hull as a wing [m²].
+        drag: CD_0 [-].
+        efficiency: Oswald's [-].
+    """
+    D2, Du = np.zeros((6, 6)), np.zeros((6, 6))
+    ratio, q = span**2 / area, 0.5 * RHO * area
+    slope = math.pi * ratio / (1.0 + math.sqrt(1.0 + (ratio / 2.0) ** 2))
+    D2[0, 0] = q * drag
+    D2[2, 2] = q * (drag + (slope * math.pi / 2.0) ** 2 / (math.pi * efficiency * ratio))
+    Du[2, 2] = q * (slope + drag)
+    return D2, Du
+
+
+def cross_flow(length: float, beam: float, draught: float) -> Array:
+    """Return D2 of cross-flow drag in sway [N s²/m²] and yaw [N m s²], (6, 6).
+
+    Args:
+        length: Of the hull [m].
+        beam: Of the hull [m].
+        draught: Height of the hull [m].
+    """
+    D2, x = np.zeros((6, 6)), length * STRIPS
+    factor = 0.5 * RHO * draught * float(np.interp(beam / (2.0 * draught), *HOERNER)) * length / 20.0
+    D2[1, 1] = factor * len(x)
+    D2[5, 5] = factor * float(np.sum(np.abs(x) ** 3))
+    return D2
+
+
+def add_drag(draft: Draft, D2: Array, Du: Array) -> None:
+    """Add quadratic damping (6, 6) [N s²/m², N m s²] and surge damping (6, 6) [N s²/m², N s²/rad] of a hull.
+
+    Args:
+        draft: Draft with hydrodynamics.
+        D2: Along each axis alone [N s²/m², N m s²], x forward, y right, z down, (6, 6).
+        Du: At forward speed [N s²/m², N s²/rad], in the same axes, (6, 6).
+    """
+    chosen = draft.values["hydrodynamics"]["calibrated"]
+    for key, matrix in (("quadratic_damping", D2), ("surge_damping", Du)):
+        if np.any(matrix):
+            total = flu_of_frd(matrix) + np.array(chosen.get(key, np.zeros((6, 6))))
+            draft.put(
+                f"hydrodynamics.calibrated.{key}",
+                plain(total),
+                "derived",
+                "lift, drag and cross flow of the hull",
+            )
+    sentence = (
+        "drag of the hull is exact along each axis alone; where two velocities act, small angles are assumed"
+    )
+    if sentence not in draft.different:
+        draft.different.append(sentence)
+
+
+def remove_munk(draft: Draft) -> None:
+    """Cancel, at forward speed, the terms of C_A in pitch and yaw that these programs set to 0.
+
+    -C_A nu has (A33 - A11) u w in pitch and (A11 - A22) u v in yaw, A11 u q in heave and -A11 u r in sway.
+    """
+    A = np.diag(np.array(draft.values["hydrodynamics"]["calibrated"]["added_mass"]))
+    Du = np.zeros((6, 6))
+    Du[4, 2], Du[5, 1], Du[2, 4], Du[1, 5] = A[2] - A[0], A[0] - A[1], A[0], -A[0]
+    add_drag(draft, np.zeros((6, 6)), Du)
+    draft.different.append(
+        "the Munk moment, which the file sets to 0, is cancelled at forward speed; a real hull has it, and needs fins"
+    )
+
+
+def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
+    """Set the propeller at the stern: its thrust is that at its own top speed, as it has no curve of the speed here.
+
+    Args:
+        draft: Draft with water and hydrodynamics.
+        words: Numbers of `PROPELLER`, `nMax` [rpm], `T_n` [s], `L` [m] and, where given, `w` [-].
+    """
+    n, D = words["nMax"] / 60.0, words["D_prop"]
+    drag = draft.values["hydrodynamics"]["calibrated"]["quadratic_damping"][0][0]
+    scale = (1.0 - words["t_prop"]) * draft.values["water"]["density"] * D**4
+    fall = scale * (words["KT_0"] - words["KT_max"]) / words["Ja_max"] * (1.0 - words.get("w", WAKE)) / D * n
+    rest = scale * words["KT_0"] * n**2
+    top = 2.0 * rest / (fall + math.sqrt(fall**2 + 4.0 * drag * rest))  # drag u² = rest - fall u
+    forward, path = rest - fall * top, "thrusters.propeller"
+    how = f"at its top speed of {top:.3g} m/s; at rest it is {rest / forward:.3g} times as much"
+    for end, sign, force, note in (("max", 1.0, forward, how), ("min", -1.0, rest, "as at rest")):
+        draft.put(f"{path}.force_{end}", sign * force, "derived", note)
+        draft.put(f"{path}.rpm_{end}", sign * words["nMax"])
+        draft.put(
+            f"{path}.c_{'plus' if end == 'max' else 'minus'}",
+            force / (2.0 * math.pi * n) ** 2,
+            "derived",
+            note,
+        )
+    draft.put(f"{path}.time_constant", words["T_n"])
+    draft.put(f"{path}.axis", [1.0, 0.0, 0.0])
+    draft.guess(f"{path}.position", [-words["L"] / 2.0, 0.0, 0.0], "at the stern, on the axis")
+    draft.values["thrusters"]["propeller"]["domain"] = "speed"
+    draft.not_read["propeller torque and fins, which turn the vehicle"] += 1
+
+
+def guess_thruster(draft: Draft, section: str, name: str, limit: float) -> None:
+    """Guess the thrust curve and lag of a thruster of a section, of which the limit is known or guessed [N]."""
+    factor = limit / (RPM * math.pi / 30.0) ** 2
+    for key, value in (("force_min", -limit), ("force_max", limit), ("rpm_min", -RPM), ("rpm_max", RPM),
+                       ("c_plus", factor), ("c_minus", factor), ("time_constant", LAG)):  # fmt: skip
+        draft.guess(f"{section}.{name}.{key}", value, f"not in the file: {limit:.4g} N at {RPM:g} rpm")
+    draft.values[section][name]["domain"] = "force"
