@@ -286,8 +286,10 @@ WORLDS = Family("world", {})
 IMPORTERS = Family(
     "importer",
     {
+        "vehicle.coefficients": "finssim.vehicles.importers.coefficients:COEFFICIENTS",
+        "vehicle.holoocean": "finssim.vehicles.importers.holoocean:HOLOOCEAN",
+        "vehicle.marinegym": "finssim.vehicles.importers.marinegym:MARINEGYM",
         "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
-        "vehicle.urdf": "finssim.vehicles.importers.urdf:URDF",
         **{
             f"trial.{name}": f"finssim.trials.importers.{module}"
             for name, module in {

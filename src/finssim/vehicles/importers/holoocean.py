@@ -1,0 +1,128 @@
+"""Importer of scenarios of HoloOcean whose agent has Fossen's torpedo (`fossen_dynamics/torpedo.py` of HoloOcean 2).
+
+It is a spheroid with Lamb's added mass, and hull drag and propeller as in `torpedo`; x forward, y right, z down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finssim.core.yaml_file import read_mapping
+from finssim.vehicles.importers.assignments import Assignments, read_assignments
+from finssim.vehicles.importers.coefficients import draft_of
+from finssim.vehicles.importers.draft import Draft, VehicleImporter
+from finssim.vehicles.part import VehicleError, did_you_mean
+
+__all__ = ["HOLOOCEAN", "read_holoocean"]
+
+TORPEDO: dict[str, Any] = {
+    "rho": 1026.0, "mass": 31.03, "length": 1.6, "diam": 0.19, "r_bg": [0, 0, 0.02], "r_bb": [0, 0, 0],
+    "area_fraction": 0.7, "T_surge": 20.0, "T_sway": 20.0, "zeta_roll": 0.3, "zeta_pitch": 0.8, "T_yaw": 1.0,
+    "r44": 0.3, "Cd": 0.42, "e": 0.7, "nMax": 1525.0, "T_n": 1.0, "D_prop": 0.14, "t_prop": 0.1, "KT_0": 0.4566,
+    "KT_max": 0.1798, "Ja_max": 0.6632, "w": 0.056,
+}  # fmt: skip
+"""Word of `dynamics` or `actuator` -> HoloOcean's value where the scenario has none."""
+CONTROL = (
+    "K_nomoto sampleTime KQ_0 KQ_max fin_count fin_offset_deg fin_center fin_area x_fin CL_delta CL_delta_r CL_delta_s "
+    "deltaMax_fin_deg fin_speed_max T_delta"
+).split()
+"""Words of fins, torque and control, which are not read."""
+
+
+def _scenarios(tree: Any) -> Iterator[Mapping[str, Any]]:
+    """Yield the mappings with `agents` in a tree."""
+    if isinstance(tree, Mapping):
+        if "agents" in tree:
+            yield tree
+        for item in tree.values():
+            yield from _scenarios(item)
+
+
+def read_holoocean(path: Path) -> Draft:
+    """Read the main agent of a scenario.
+
+    Args:
+        path: JSON, YAML, or a Python program with the scenario as a mapping, which is not executed.
+
+    Raises:
+        VehicleError: It has no scenario, or its agent's numbers are elsewhere.
+    """
+    python = path.suffix.lower() == ".py"
+    tree = (
+        read_assignments(path).mappings if python else read_mapping(path, VehicleError, such_as="agents: []")
+    )
+    scenario: Mapping[str, Any] = next(_scenarios(tree), {"agents": {}})
+    agents = scenario["agents"]
+    agents = agents.values() if isinstance(agents, Mapping) else agents
+    agents = [agent for agent in agents if isinstance(agent, Mapping)]
+    agent = next(
+        (x for x in agents if x.get("agent_name") == scenario.get("main_agent")), (agents or [{}])[0]
+    )
+    if agent.get("fossen_model", "torpedo" if "dynamics" in agent else None) != "torpedo":
+        raise VehicleError(
+            f"{path}: the numbers of the main agent, a {agent.get('agent_type')}, are in HoloOcean's engine and not in "
+            "the file, expected an agent with fossen_model torpedo"
+        )
+    words: dict[str, Any] = {}
+    for section in ("dynamics", "actuator"):
+        for key, value in (agent.get(section) or {}).items():
+            count = 3 if key in ("r_bg", "r_bb") else 1
+            if key not in TORPEDO and key not in CONTROL:
+                raise VehicleError(
+                    f"{path}: {section}: unknown word '{key}'{did_you_mean(key, list(TORPEDO))} correct it"
+                )
+            if (
+                np.size(value) != count
+                or np.array(value).dtype.kind not in "if"
+                or not np.all(np.isfinite(value))
+            ):
+                raise VehicleError(f"{path}: {section}: {key} is {value!r}, expected {count} finite numbers")
+            words[key] = value
+    length, diam = (float(words.get(key, TORPEDO[key])) for key in ("length", "diam"))
+    if not length > diam > 0.0:
+        raise VehicleError(
+            f"{path}: length is {length:g} and diam is {diam:g}, expected a body longer than it is wide"
+        )
+    draft = draft_of(_torpedo(TORPEDO | words), path, f"{agent.get('agent_type')} of HoloOcean")
+    if defaults := sorted(TORPEDO.keys() - words.keys()):
+        draft.different.append(f"HoloOcean's torpedo gives what the scenario lacks: {', '.join(defaults)}")
+    draft.different.append("linear damping of surge and sway, which vanishes as exp(-3 U), is left out")
+    for key in (
+        *(words.keys() & set(CONTROL)),
+        *(agent.keys() - {"agent_name", "agent_type", "dynamics", "actuator"}),
+    ):
+        draft.not_read[f"agent: {key}"] += 1
+    return draft
+
+
+def _torpedo(n: Mapping[str, Any]) -> Assignments:
+    """Return the numbers that `torpedo.py` computes from its words, under the names of the field."""
+    m, a, b, W = n["mass"], n["length"] / 2.0, n["diam"] / 2.0, n["mass"] * 9.81
+    rg, rb = np.array(n["r_bg"], float), np.array(n["r_bb"], float)
+    moments = m * np.array([0.4 * b**2, 0.2 * (a**2 + b**2), 0.2 * (a**2 + b**2)])
+    e = math.sqrt(1.0 - (b / a) ** 2)
+    log = math.log((1.0 + e) / (1.0 - e))
+    alpha, beta = 2.0 * (1.0 - e**2) / e**3 * (0.5 * log - e), 1.0 / e**2 - (1.0 - e**2) / (2.0 * e**3) * log
+    k1, k2 = alpha / (2.0 - alpha), beta / (2.0 - beta)
+    k = e**4 * (beta - alpha) / ((2.0 - e**2) * (2.0 * e**2 - (2.0 - e**2) * (beta - alpha)))
+    added = np.array([m * k1, m * k2, m * k2, n["r44"] * moments[0], k * moments[1], k * moments[2]])
+    M = added + np.concatenate([[m] * 3, moments + m * (rg @ rg - rg**2)])
+    swing = np.sqrt(np.maximum(W * (rg[2] - rb[2]) / M[3:5], 0.0)) * [n["zeta_roll"], n["zeta_pitch"]]
+    values = dict(n) | {"g": 9.81, "W": W, "B": W, "I_g": moments, "MA": added, "r_bg": rg, "r_bb": rb}
+    values["D"] = np.array([0.0, 0.0, M[2] / n["T_sway"], *(2.0 * M[3:5] * swing), M[5] / n["T_yaw"]])
+    area = n["area_fraction"] * 4.0 * a * b
+    calls = {"forceLiftDrag": [2.0 * b, area, n["Cd"] * math.pi * b**2 / area, n["e"]],
+             "crossFlowDrag": [2.0 * a, 2.0 * b, 2.0 * b]}  # fmt: skip
+    return Assignments(values=values, calls=calls, cleared={"CA": {(4, 0), (4, 2), (5, 0), (5, 1)}})
+
+
+def _recognises(path: Path, head: bytes) -> bool:
+    return path.suffix.lower() in (".json", ".yaml", ".yml", ".py") and b"agent_type" in head
+
+
+HOLOOCEAN = VehicleImporter("scenario of HoloOcean (.json, .yaml, .py)", _recognises, read_holoocean)
