@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -186,17 +187,19 @@ def show_vehicle(
         typer.echo(f"thruster layout: {picture}", err=as_json)
 
 
-def import_vehicle(file: Path, *, out: Path, as_json: bool = False) -> None:
+def import_vehicle(file: Path, *, out: Path, folder: Sequence[Path] = (), as_json: bool = False) -> None:
     """Write a vehicle file from the model of another simulator, and list what was guessed and what was not read.
 
-    Read are SDF of gz-sim (plugins Hydrodynamics, Thruster and Buoyancy), coefficients of Fossen's equations in Python
-    or MATLAB, which are not executed, scenarios of HoloOcean and parameters of MarineGym.
+    Read are SDF of gz-sim (plugins Hydrodynamics, Thruster and Buoyancy), URDF and xacro with these or with the plugins
+    of uuv_simulator, coefficients of Fossen's equations in Python or MATLAB, which are not executed, scenarios of
+    HoloOcean and parameters of MarineGym.
 
     Example: finssim vehicles import model.sdf --out rov.yaml
 
     Args:
         file (FILE): Model of the other program; the files that it names are in its folder or below.
         out (FILE): Vehicle file to write (.yaml); the mesh of the hull goes beside it.
+        folder (FOLDER): Folder in which packages that the file names are sought, besides those around the file.
         as_json: Print one JSON object instead of text.
     """
     from tempfile import TemporaryDirectory
@@ -206,7 +209,7 @@ def import_vehicle(file: Path, *, out: Path, as_json: bool = False) -> None:
     from finssim.vehicles.importers.draft import read_foreign
 
     yaml_path(out, "vehicle")
-    draft = read_foreign(file)
+    draft = read_foreign(file, folder)
     with TemporaryDirectory() as folder:
         write_vehicle(draft.vehicle(Path(folder)), out)
     failed = [finding.sentence for finding in check_vehicle(load_vehicle(out)) if not finding.passed]

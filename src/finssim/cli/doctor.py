@@ -72,6 +72,7 @@ EXTRAS = {
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "place MJCF and URDF models in described worlds"),
     "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
+    "xacro": Extra({"xacro": "xacro"}, "import vehicles from xacro"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
     "perception": Extra(
         {"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.extensions.perception"

@@ -290,6 +290,7 @@ IMPORTERS = Family(
         "vehicle.holoocean": "finssim.vehicles.importers.holoocean:HOLOOCEAN",
         "vehicle.marinegym": "finssim.vehicles.importers.marinegym:MARINEGYM",
         "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
+        "vehicle.urdf": "finssim.vehicles.importers.urdf:URDF",
         **{
             f"trial.{name}": f"finssim.trials.importers.{module}"
             for name, module in {

@@ -6,7 +6,7 @@ An importer is one file with a `VehicleImporter`, registered as `vehicle.FORMAT`
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,21 @@ from numpy.typing import NDArray
 from finssim.core.mesh import Faces, MeshError, Vertices, write_stl
 from finssim.core.yaml_file import yaml_text
 from finssim.vehicles.importers.rigid import plain
+from finssim.vehicles.importers.xml_file import Element
 from finssim.vehicles.loader import KIND, checked, importer_of, importers
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Origin, Provenance, Vehicle
 
 __all__ = [
-    "Draft", "VehicleImporter", "check_registered", "put_controlled_axes", "put_envelope", "read_foreign",
+    "Draft", "VehicleImporter", "check_registered", "put_controlled_axes", "put_envelope", "read_foreign", "unread",
 ]  # fmt: skip
+
+GRAVITY = 9.8
+"""Gravity of Gazebo where a file gives none [m/s²]."""
+SHARE = 0.3
+"""Guessed limit of a thruster, as a share of the weight of the vehicle."""
+LAG = 0.05
+"""Guessed time constant of a thruster whose thrust follows at once [s]."""
 
 
 @dataclass
@@ -118,8 +126,10 @@ class VehicleImporter:
     """Name of the format."""
     recognises: Callable[[Path, bytes], bool]
     """Function of a path and the first bytes of its file: whether the file is of this format."""
-    read: Callable[[Path], Draft]
-    """Function that reads a file; it refuses by a `VehicleError` of one sentence."""
+    read: Callable[..., Draft]
+    """Function of a path, and of a list of folders if `folders`, that reads a file; it refuses by a `VehicleError`."""
+    folders: bool = False
+    """Whether its files name others by the name of a package or below a folder that is not in the file."""
 
 
 def check_registered(name: str, member: Any) -> None:
@@ -138,11 +148,12 @@ def check_registered(name: str, member: Any) -> None:
         )
 
 
-def read_foreign(path: Path) -> Draft:
+def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
     """Read the vehicle of another program, by the importer that recognises its file.
 
     Args:
         path: The file.
+        folders: Where the files that it names are sought besides its own folder.
 
     Raises:
         VehicleError: It cannot be read, or is of no known format.
@@ -150,10 +161,34 @@ def read_foreign(path: Path) -> Draft:
     if not path.is_file():
         raise VehicleError(f"{path}: no such file: give the file of a vehicle")
     importer: VehicleImporter | None = importer_of(path)
+    if importer is not None and folders and not importer.folders:
+        raise VehicleError(
+            f"{path}: {importer.title} names files below its own folder only: leave out --folder"
+        )
     if importer is not None:
-        return importer.read(path)
+        return importer.read(path, folders) if importer.folders else importer.read(path)
     known = ", ".join(sorted(member.title for member in importers().values()))
     raise VehicleError(f"{path}: is of no format that is read, expected one of {known}")
+
+
+NO_FORCE = {"visual", "sensor", "light", "surface", "laser_retro", "max_contacts", "self_collide"}
+"""Elements that say nothing about the motion in free water."""
+
+
+def unread(element: Element, known: Collection[str], where: str, draft: Draft) -> None:
+    """Note the children that are not read.
+
+    Args:
+        element: Their parent.
+        known: Those that are read.
+        where: What the note calls the parent.
+        draft: Draft to note them in.
+    """
+    for child in element:
+        if child.tag not in known:
+            kind = f" {child.get('type')}" if child.tag == "sensor" and child.get("type") else ""
+            idle = " (no force)" if child.tag in NO_FORCE else ""
+            draft.not_read[f"{where}: {child.tag}{kind}{idle}"] += 1
 
 
 # Numbers that no format gives.
@@ -168,7 +203,9 @@ def put_envelope(draft: Draft, corners: Sequence[NDArray[np.float64]]) -> None:
     """
     thrusters = draft.values.get("thrusters", {}).values()
     positions = [np.array(thruster["position"])[None] for thruster in thrusters if "position" in thruster]
-    points = np.concatenate([np.zeros((1, 3)), *corners, *positions])
+    points = np.concatenate([*corners, *positions] or [np.zeros((1, 3))])
+    if not corners:
+        points = np.concatenate([points, 2.0 * np.array(draft.values["body"]["center_of_gravity"]) - points])
     shortest = 0.5 * draft.values["body"]["displaced_volume"] ** (1.0 / 3.0)
     size = np.maximum(np.ptp(points, axis=0), shortest)
     size *= max(1.0, (1.01 * draft.values["body"]["displaced_volume"] / np.prod(size)) ** (1.0 / 3.0))

@@ -20,14 +20,45 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.mesh import MeshError, check_closed, load_stl, mesh_volume
-from finssim.core.rotations import quat_from_euler, quat_to_matrix
-from finssim.vehicles.importers.draft import Draft, VehicleImporter, put_controlled_axes, put_envelope
-from finssim.vehicles.importers.rigid import IDENTITY, LinkPose, combined, plain
-from finssim.vehicles.importers.xml_file import Element, file_of_model, flag, number, numbers, read_xml
+from finssim.vehicles.importers.draft import (
+    GRAVITY,
+    LAG,
+    SHARE,
+    Draft,
+    VehicleImporter,
+    put_controlled_axes,
+    put_envelope,
+)
+from finssim.vehicles.importers.model import (
+    Model,
+    note_rest,
+    put_body,
+    put_displacement,
+    put_hull,
+    put_physical_inertia,
+    shapes_of,
+)
+from finssim.vehicles.importers.rigid import LinkPose, plain
+from finssim.vehicles.importers.xml_file import (
+    Element,
+    flag,
+    number,
+    numbers,
+    read_xml,
+    refuse_unknown,
+)
 from finssim.vehicles.part import VehicleError, did_you_mean
 
-__all__ = ["SDF", "added_mass", "axis_of_joint", "damping", "read_sdf", "shape_volume", "thrust_factor"]
+__all__ = [
+    "SDF",
+    "added_mass",
+    "axis_of_joint",
+    "damping",
+    "kind_of",
+    "read_model",
+    "read_sdf",
+    "thrust_factor",
+]
 
 Array = NDArray[np.float64]
 
@@ -46,8 +77,6 @@ THRUSTER = {
     "power_load", "wake_fraction", "alpha_1", "alpha_2",
 }  # fmt: skip
 """Words of the plugin Thruster."""
-INERTIA = {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"}
-"""Words of an inertia."""
 CONTROL = {
     "jointName", "cmd_topic", "multiplier", "offset", "type", "servo_min", "servo_max", "useForce", "p_gain", "i_gain",
     "d_gain", "i_max", "i_min", "cmd_max", "cmd_min", "controlVelocitySlowdownSim", "frequencyCutoff",
@@ -55,14 +84,6 @@ CONTROL = {
 """Words of a control of the plugin ArduPilotPlugin."""
 BUOYANCY = {"uniform_fluid_density", "graded_buoyancy", "enable"}
 """Words of the plugin Buoyancy."""
-SHAPES = {
-    "box": ("size",), "ellipsoid": ("radii",), "sphere": ("radius",), "cylinder": ("radius", "length"),
-    "capsule": ("radius", "length"), "cone": ("radius", "length"), "mesh": ("uri", "scale"),
-    "plane": ("normal", "size"), "empty": (),
-}  # fmt: skip
-"""Shape -> its words."""
-NO_FORCE = {"visual", "sensor", "light", "surface", "laser_retro", "max_contacts", "self_collide"}
-"""Elements that say nothing about the motion in free water."""
 PROPELLER = {"thrust_coefficient": 1.0, "fluid_density": 1000.0, "propeller_diameter": 0.02}
 """Words that give the thrust -> gz-sim's number without them [-, kg/m³, m]."""
 CURVES = {"alpha_1", "alpha_2", "wake_fraction"}
@@ -70,39 +91,11 @@ CURVES = {"alpha_1", "alpha_2", "wake_fraction"}
 WRENCHES = ("LiftDrag", "BuoyancyEngine", "JointPositionController", "AddedMass", "Wind")
 """Plugins that act on a vehicle and are not read; others are named as well, without a warning."""
 
-GRAVITY = 9.8
-"""Gravity of a world that gives none [m/s²]."""
 DENSITY = 1000.0
 """Density of water where the plugins give none [kg/m³]."""
-SHARE = 0.3
-"""Guessed limit of a thruster, as a share of the weight of the vehicle."""
-LAG = 0.05
-"""Guessed time constant of a thruster [s]; gz-sim has none."""
 
 
 # The conversions: each from the words of gz-sim to those of a vehicle file.
-
-
-def pose_of(element: Element | None, where: str) -> LinkPose:
-    """Return the pose of an element `pose`: x y z, then roll pitch yaw, or a quaternion.
-
-    Args:
-        element: None: the identity.
-        where: What a message calls the element.
-    """
-    if element is None or not (element.text or "").strip():
-        return IDENTITY
-    if element.get("rotation_format", "euler_rpy") == "quat_xyzw":
-        values = numbers(element.text, 7, f"{where}: pose")
-        length = float(np.linalg.norm(values[3:]))
-        if length < 1e-6:
-            raise VehicleError(f"{where}: pose has a quaternion of length 0, expected 1")
-        return LinkPose(quat_to_matrix(values[3:] / length), values[:3])
-    values = numbers(element.text, 6, f"{where}: pose")
-    angles = (
-        np.radians(values[3:]) if element.get("degrees", "false").lower() in ("true", "1") else values[3:]
-    )
-    return LinkPose(quat_to_matrix(quat_from_euler(*angles)), values[:3])
 
 
 def added_mass(coefficients: Mapping[str, float], where: str) -> Array:
@@ -208,274 +201,6 @@ def axis_of_joint(joint: LinkPose, axis: Array) -> Array:
     return np.asarray(turned / np.linalg.norm(turned))
 
 
-def shape_volume(shape: Element, where: str) -> float:
-    """Return the volume of a shape other than a mesh [m³]."""
-
-    def of(tag: str) -> float:
-        length = number(shape, tag, where)
-        if length < 0.0:
-            raise VehicleError(f"{where}: {tag} is {length:g}, expected 0 or more")
-        return length
-
-    if shape.tag in ("box", "ellipsoid"):
-        tag, factor = ("size", 1.0) if shape.tag == "box" else ("radii", 4.0 / 3.0 * math.pi)
-        sides = numbers(shape.findtext(tag), 3, f"{where}: {tag}")
-        if sides.min() < 0.0:
-            raise VehicleError(f"{where}: {tag} is {sides.tolist()}, expected 3 numbers of 0 or more")
-        return factor * float(np.prod(sides))
-    if shape.tag in ("plane", "empty"):
-        return 0.0
-    ball = 4.0 / 3.0 * math.pi * of("radius") ** 3
-    if shape.tag == "sphere":
-        return ball
-    column = math.pi * of("radius") ** 2 * of("length")
-    return column / 3.0 if shape.tag == "cone" else column + (ball if shape.tag == "capsule" else 0.0)
-
-
-def _half_size(shape: Element) -> Array:
-    """Return half the box around a shape other than a mesh, in its frame [m], (3,)."""
-    if shape.tag == "box":
-        return numbers(shape.findtext("size"), 3, "size") / 2.0
-    if shape.tag == "ellipsoid":
-        return numbers(shape.findtext("radii"), 3, "radii")
-    radius, length = number(shape, "radius", shape.tag, 0.0), number(shape, "length", shape.tag, 0.0)
-    ends = radius if shape.tag in ("capsule", "sphere") else 0.0
-    return np.array([radius, radius, length / 2.0 + ends])
-
-
-# The model: its frames, and the rigid body that its links form.
-
-
-class Model:
-    """A model whose links and frames have poses in the body frame, which is that of the link with hydrodynamics."""
-
-    def __init__(self, element: Element, label: str, draft: Draft) -> None:
-        """
-        Args:
-            element: The element `model`.
-            label: What messages call it.
-            draft: Draft that notes what is not read.
-        """
-        self.element, self.label, self.draft = element, label, draft
-        self.links = self._named("link")
-        self.joints = self._named("joint")
-        self.frames = self._named("frame")
-        for tag in ("include", "model"):
-            if element.find(tag) is not None:
-                raise VehicleError(
-                    f"{label}: has a {tag} inside: write it as one model with 'gz sdf -p FILE'"
-                )
-        if flag(element, "static", label):
-            raise VehicleError(f"{label}: is static, expected a model that moves")
-        self._poses: dict[str, LinkPose] = {}
-        self.body = IDENTITY
-
-    def _named(self, tag: str) -> dict[str, Element]:
-        found: dict[str, Element] = {}
-        for element in self.element.findall(tag):
-            name = element.get("name", "")
-            if not name or name in found:
-                raise VehicleError(f"{self.label}: {tag} '{name}' is there twice or has no name: rename it")
-            found[name] = element
-        return found
-
-    def pose(self, name: str, above: tuple[str, ...] = ()) -> LinkPose:
-        """Return the pose of a link, joint or frame in the body frame."""
-        return self.body.inverse().after(self._in_model(name, above))
-
-    def _in_model(self, name: str, above: tuple[str, ...]) -> LinkPose:
-        if name == "__model__":
-            return IDENTITY
-        if name in above:
-            raise VehicleError(f"{self.label}: the pose of '{name}' depends on itself: {' -> '.join(above)}")
-        if name in self._poses:
-            return self._poses[name]
-        element = self.links.get(name, self.joints.get(name, self.frames.get(name)))
-        if element is None:
-            known = [*self.links, *self.joints, *self.frames]
-            raise VehicleError(f"{self.label}: no link, joint or frame '{name}'{did_you_mean(name, known)}")
-        pose, default = element.find("pose"), "__model__"
-        if name in self.joints:
-            default = self.text(element, "child")
-        elif name in self.frames:
-            default = element.get("attached_to") or "__model__"
-        reference = (None if pose is None else pose.get("relative_to")) or default
-        if len(above) > 50:
-            raise VehicleError(
-                f"{self.label}: the pose of '{name}' depends on more than 50 frames: make it fewer"
-            )
-        outer = self._in_model(reference, (*above, name))
-        self._poses[name] = outer.after(pose_of(pose, f"{self.label}: {element.tag} '{name}'"))
-        return self._poses[name]
-
-    def text(self, element: Element, tag: str) -> str:
-        """Return the text of a child element that must be there."""
-        text = (element.findtext(tag) or "").strip()
-        if not text:
-            raise VehicleError(
-                f"{self.label}: {element.tag} '{element.get('name', '')}': {tag} is missing: add it"
-            )
-        return text
-
-    def link_of(self, name: str) -> str:
-        """Return the link that a joint names: itself, or that a frame is attached to."""
-        for _ in range(50):
-            if name in self.links or name not in self.frames:
-                break
-            name = self.frames[name].get("attached_to", "")
-        if name not in self.links:
-            raise VehicleError(f"{self.label}: a joint names '{name}', expected a link of the model")
-        return name
-
-    def refuse_loose(self, base: str) -> None:
-        """Refuse links that no joints hold to the body."""
-        pairs = [
-            (self.link_of(self.text(j, "parent")), self.link_of(self.text(j, "child")))
-            for j in self.joints.values()
-        ]
-        held, before = {base}, 0
-        while len(held) > before:
-            before = len(held)
-            held |= {name for pair in pairs for name in pair if held & set(pair)}
-        for name in self.links.keys() - held:
-            raise VehicleError(f"{self.label}: link '{name}' is not joined to '{base}': join it or remove it")
-
-    def pose_in(self, link: str, element: Element, where: str) -> LinkPose:
-        """Return the pose in the body frame of what a link holds, such as a collision."""
-        pose = element.find("pose")
-        reference = (None if pose is None else pose.get("relative_to")) or link
-        return self.pose(reference).after(pose_of(pose, where))
-
-
-def _put_body(model: Model, draft: Draft) -> None:
-    """Set mass, centre of gravity and inertia: of all links together, fixed to one another."""
-    masses, centres, tensors = [], [], []
-    massless, momentless = [], []
-    for name, link in model.links.items():
-        where = f"{model.label}: link '{name}'"
-        inertial = link.find("inertial")
-        if not flag(link, "gravity", where, True) or flag(link, "kinematic", where):
-            raise VehicleError(
-                f"{where}: has no weight (gravity or kinematic), expected a link that falls: change it"
-            )
-        _unread(link, {"inertial", "collision", "pose", "gravity", "kinematic"}, "link", draft)
-        if inertial is None:
-            inertial = Element("inertial")
-        if inertial.find("mass") is None:
-            massless.append(name)
-        if any(inertial.find(f"inertia/{tag}") is None for tag in ("ixx", "iyy", "izz")):
-            momentless.append(name)
-        if inertial.get("auto", "false").lower() in ("true", "1"):
-            raise VehicleError(
-                f"{where}: its mass is computed from its shapes (auto): write the numbers of it instead"
-            )
-        _unread(inertial, {"mass", "pose", "inertia", "fluid_added_mass"}, "inertial", draft)
-        pose = model.pose_in(name, inertial, where)
-        tensor, inertia = np.zeros((3, 3)), inertial.find("inertia")
-        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-            tag = f"i{'xyz'[i]}{'xyz'[j]}"
-            usual = 1.0 if i == j else 0.0
-            tensor[i, j] = tensor[j, i] = usual if inertia is None else number(inertia, tag, where, usual)
-        if inertia is not None:
-            _refuse_unknown(inertia, INERTIA, where)
-        masses.append(number(inertial, "mass", where, 1.0))
-        centres.append(pose.place)
-        tensors.append(pose.turn @ tensor @ pose.turn.T)
-    if min(masses) < 0.0 or sum(masses) <= 0.0:
-        raise VehicleError(f"{model.label}: its links weigh {masses} kg, expected more than 0")
-    mass, centre, total = combined(masses, centres, tensors)
-    note = f"sum of {len(masses)} links" if len(masses) > 1 else ""
-    for path, value, without in (
-        ("mass", mass, massless),
-        ("center_of_gravity", centre, massless),
-        ("inertia", total, massless + momentless),
-    ):
-        if without:
-            links = f"link '{without[0]}'{' and others' if without[1:] else ''}"
-            draft.guess(
-                f"body.{path}", plain(value), f"the file lacks numbers of {links}: 1 kg, 1 kg m² as in SDF"
-            )
-        else:
-            draft.put(f"body.{path}", plain(value), "derived" if note else "published", note)
-
-
-def _put_displacement(model: Model, links: Collection[str], density: float, draft: Draft) -> list[Array]:
-    """Set volume, centre of buoyancy and, of a single closed mesh, the hull; return the corners of the shapes.
-
-    Args:
-        model: The model.
-        links: Those on which Buoyancy acts.
-        density: Of the water [kg/m³].
-        draft: Draft to set them in.
-    """
-    volumes, places, corners, meshes = [], [], [], []
-    for name in model.links:
-        for collision in model.links[name].findall("collision"):
-            where = f"{model.label}: link '{name}': collision '{collision.get('name', '')}'"
-            _unread(collision, {"pose", "geometry"}, "collision", draft)
-            shapes = list(collision.find("geometry") or ())
-            if len(shapes) != 1 or shapes[0].tag not in SHAPES:
-                found = ", ".join(shape.tag for shape in shapes) or "nothing"
-                raise VehicleError(
-                    f"{where}: its geometry is {found}, expected one of {', '.join(sorted(SHAPES))}"
-                )
-            _refuse_unknown(shapes[0], SHAPES[shapes[0].tag], where)
-            pose = model.pose_in(name, collision, where)
-            if shapes[0].tag == "mesh":
-                vertices, faces = _mesh(model, shapes[0], where)
-                placed = vertices @ pose.turn.T + pose.place
-                meshes.append((placed, faces))
-                volume = abs(mesh_volume(vertices, faces))
-                corners.append(placed)
-            else:
-                volume = shape_volume(shapes[0], where)
-                half = np.abs(pose.turn) @ _half_size(shapes[0])
-                corners.append(np.stack([pose.place - half, pose.place + half]))
-            if name in links:
-                volumes.append(volume)
-                places.append(pose.place)
-    if sum(volumes) <= 0.0:
-        mass, centre = draft.values["body"]["mass"], draft.values["body"]["center_of_gravity"]
-        draft.guess("body.displaced_volume", mass / density, "no shape displaces water: neutral buoyancy")
-        draft.guess("body.center_of_buoyancy", centre, "no shape displaces water: at the centre of gravity")
-        return corners
-    note = (
-        f"{len(volumes)} collision shape{'s' if len(volumes) > 1 else ''}, as the plugin Buoyancy takes them"
-    )
-    draft.put("body.displaced_volume", float(sum(volumes)), "derived", note)
-    draft.put("body.center_of_buoyancy", plain(np.average(places, axis=0, weights=volumes)), "derived", note)
-    if len(meshes) == len(volumes) == 1:
-        try:
-            check_closed(*meshes[0])
-            draft.hull = meshes[0]
-        except MeshError as error:
-            draft.different.append(f"the collision mesh is no hull: {error}")
-    return corners
-
-
-def _mesh(model: Model, shape: Element, where: str) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (n, 3) [m] and faces (m, 3) of a collision mesh in its own frame."""
-    uri = (shape.findtext("uri") or "").strip()
-    file = file_of_model(Path(model.label).parent, uri, where)
-    if file.suffix.lower() != ".stl":
-        raise VehicleError(
-            f"{where}: its mesh is a {file.suffix or 'file'}, expected .stl: export it so, or use a box"
-        )
-    try:
-        vertices, faces = load_stl(file)
-    except MeshError as error:
-        raise VehicleError(f"{where}: {error}") from None
-    scale = shape.find("scale")
-    factors = np.ones(3) if scale is None else numbers(scale.text, 3, f"{where}: scale")
-    if not np.all(factors > 0.0):
-        raise VehicleError(f"{where}: scale is {factors.tolist()}, expected 3 numbers > 0")
-    if not np.all(factors == 1.0):
-        model.draft.different.append(
-            f"{file.name}: its volume is taken with its scale, which Buoyancy leaves out"
-        )
-    return vertices * factors, faces
-
-
 def _put_hydrodynamics(model: Model, plugin: Element, base: str, draft: Draft) -> None:
     """Set added mass and damping of the plugin, or added mass of the link."""
     where = f"{model.label}: plugin Hydrodynamics"
@@ -543,7 +268,7 @@ def _put_thrusters(
     for plugin in plugins:
         name = model.text(plugin, "joint_name")
         where, path = f"{model.label}: Thruster of '{name}'", f"thrusters.{name}"
-        _refuse_unknown(plugin, THRUSTER, where)
+        refuse_unknown(plugin, THRUSTER, where)
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) or name in draft.values.get("thrusters", {}):
             raise VehicleError(
                 f"{where}: the name is there twice, or not of letters, digits, _ and -: rename the joint"
@@ -642,27 +367,9 @@ def _put_limits(
 # The file: its world or its model, its plugins, and what is not read.
 
 
-def _kind(plugin: Element) -> str:
+def kind_of(plugin: Element) -> str:
     """Return the last word of a plugin's name: `Thruster` of gz::sim::systems::Thruster."""
     return plugin.get("name", "").rpartition("::")[2]
-
-
-def _refuse_unknown(element: Element, known: Collection[str], where: str) -> None:
-    for child in element:
-        if child.tag not in known:
-            raise VehicleError(
-                f"{where}: unknown element '{child.tag}'{did_you_mean(child.tag, sorted(known))} "
-                f"expected one of {', '.join(sorted(known))}"
-            )
-
-
-def _unread(element: Element, known: Collection[str], where: str, draft: Draft) -> None:
-    """Note the children that are not read."""
-    for child in element:
-        if child.tag not in known:
-            kind = f" {child.get('type')}" if child.tag == "sensor" and child.get("type") else ""
-            idle = " (no force)" if child.tag in NO_FORCE else ""
-            draft.not_read[f"{where}: {child.tag}{kind}{idle}"] += 1
 
 
 def _model_of(root: Element, path: Path) -> tuple[Element, Element | None]:
@@ -672,7 +379,7 @@ def _model_of(root: Element, path: Path) -> tuple[Element, Element | None]:
     worlds = root.findall("world")
     around = worlds[0] if len(worlds) == 1 else root
     models = around.findall("model")
-    wet = [m for m in models if any(_kind(p) == "Hydrodynamics" for p in m.findall("plugin"))]
+    wet = [m for m in models if any(kind_of(p) == "Hydrodynamics" for p in m.findall("plugin"))]
     if len(worlds) > 1 or len(wet) != 1:
         names = ", ".join(m.get("name", "") for m in wet) or "none"
         hint = (
@@ -700,9 +407,9 @@ def _put_water(
         draft.put("water.gravity", -float(vector[2]))
     given = {}
     links: Collection[str] = model.links
-    for plugin in [] if world is None else [p for p in world.findall("plugin") if _kind(p) == "Buoyancy"]:
+    for plugin in [] if world is None else [p for p in world.findall("plugin") if kind_of(p) == "Buoyancy"]:
         where = f"{model.label}: plugin Buoyancy"
-        _refuse_unknown(plugin, BUOYANCY, where)
+        refuse_unknown(plugin, BUOYANCY, where)
         given["Buoyancy"] = _density(plugin, where)
         names = {(element.text or "").strip() for element in plugin.findall("enable")}
         own = model.element.get("name", "")
@@ -734,7 +441,7 @@ def _density(plugin: Element, where: str) -> float:
     graded = plugin.find("graded_buoyancy")
     if graded is None or plugin.find("uniform_fluid_density") is not None:
         return number(plugin, "uniform_fluid_density", where, DENSITY)
-    _refuse_unknown(graded, {"default_density", "density_change"}, where)
+    refuse_unknown(graded, {"default_density", "density_change"}, where)
     changes = graded.findall("density_change")
     if any(number(change, "above_depth", where, 0.0) != 0.0 for change in changes):
         raise VehicleError(
@@ -751,7 +458,7 @@ def _ranges(plugins: list[Element], label: str) -> dict[str, tuple[float, float]
         topic = (control.findtext("cmd_topic") or "").strip()
         if topic.endswith((f"/{joint}/cmd_thrust", f"/{joint}/cmd_vel")):
             where = f"{label}: control of '{joint}'"
-            _refuse_unknown(control, CONTROL, where)
+            refuse_unknown(control, CONTROL, where)
             factor, offset = number(control, "multiplier", where, 1.0), number(control, "offset", where, 0.0)
             low, high = sorted((factor * offset, factor * (1.0 + offset)))
             ranges[joint] = (low, high)
@@ -768,24 +475,37 @@ def read_sdf(path: Path) -> Draft:
         VehicleError: It cannot be read; the message says where, what was expected and what to do.
     """
     element, world = _model_of(read_xml(path), path)
+    return read_model(element, world, path, "SDF of gz-sim")
+
+
+def read_model(
+    element: Element, world: Element | None, path: Path, form: str, packages: Mapping[str, Path] | None = None
+) -> Draft:
+    """Read a model with the plugin Hydrodynamics of gz-sim.
+
+    Args:
+        element: The element `model`.
+        world: The world around it; None: there is none.
+        path: Its file.
+        form: Name of the file's format.
+        packages: Name -> folder of the packages in which its meshes may be.
+
+    Raises:
+        VehicleError: It cannot be read.
+    """
     name = element.get("name", "")
-    draft = Draft(str(path), f"{path.name}, model {name} (SDF of gz-sim)")
-    model = Model(element, str(path), draft)
+    draft = Draft(str(path), f"{path.name}, model {name} ({form})")
+    model = Model(element, str(path), draft, packages)
     plugins: dict[str, list[Element]] = {}
     for plugin in element.findall("plugin"):
-        plugins.setdefault(_kind(plugin), []).append(plugin)
+        plugins.setdefault(kind_of(plugin), []).append(plugin)
     hydrodynamics = plugins["Hydrodynamics"]
     if len(hydrodynamics) > 1:
         raise VehicleError(
             f"{path}: {len(hydrodynamics)} plugins Hydrodynamics, expected one: a vehicle is one body"
         )
     base = model.text(hydrodynamics[0], "link_name")
-    if base not in model.links:
-        raise VehicleError(
-            f"{path}: plugin Hydrodynamics: no link '{base}'{did_you_mean(base, list(model.links))} correct it"
-        )
-    model.body = model.pose(base)
-    model.refuse_loose(base)
+    model.set_body(base, "plugin Hydrodynamics")
     thrusters = plugins.get("Thruster", [])
     if not thrusters:
         raise VehicleError(f"{path}: has no plugin Thruster, expected one or more: add them")
@@ -795,40 +515,32 @@ def read_sdf(path: Path) -> Draft:
         "description": f"Read by FinsSim from {path.name}, a model of gz-sim.",
     }
     links = _put_water(model, world, plugins, draft)
-    _put_body(model, draft)
-    corners = _put_displacement(model, links, draft.values["water"]["density"], draft)
+    put_body(model, draft)
+    shapes = shapes_of(model)
+    for mesh in element.findall("link/collision/geometry/mesh"):
+        if (mesh.findtext("scale") or "1 1 1").split() != ["1", "1", "1"]:
+            file = (mesh.findtext("uri") or "").rpartition("/")[2]
+            draft.different.append(f"{file}: its volume is taken with its scale, which Buoyancy leaves out")
+    wet = [shape for shape in shapes if shape.link in links]
+    note = f"{len(wet)} collision shape{'s' if len(wet) > 1 else ''}, as the plugin Buoyancy takes them"
+    lifts = [(shape.volume, shape.pose.place) for shape in wet]
+    put_displacement(lifts, draft.values["water"]["density"], note, draft)
+    if lifts and draft.values["body"]["displaced_volume"] > 0.0:
+        put_hull(wet, draft)
     _put_hydrodynamics(model, hydrodynamics[0], base, draft)
+    put_physical_inertia(draft)
     _put_thrusters(model, thrusters, _ranges(plugins.get("ArduPilotPlugin", []), str(path)), draft)
-    put_envelope(draft, corners)
+    put_envelope(draft, [shape.corners for shape in shapes])
     put_controlled_axes(draft)
-    _note_rest(model, world, plugins, {model.text(plugin, "joint_name") for plugin in thrusters})
+    turned = {model.text(plugin, "joint_name") for plugin in thrusters}
+    acting = dict.fromkeys(WRENCHES, " (its forces are left out)")
+    acting["ArduPilotPlugin"] = " but for the ranges of its commands"
+    note_rest(model, plugins, {"Hydrodynamics", "Thruster"}, acting, turned)
+    for child in () if world is None else world:
+        kind = f" {kind_of(child)}" if child.tag == "plugin" else ""
+        if child is not element and child.tag != "gravity" and kind != " Buoyancy":
+            draft.not_read[f"world: {child.tag}{kind}"] += 1
     return draft
-
-
-def _note_rest(
-    model: Model, world: Element | None, plugins: Mapping[str, list[Element]], turned: Collection[str]
-) -> None:
-    """Note plugins, joints and elements around the model that are not read."""
-    draft = model.draft
-    _unread(model.element, {"link", "joint", "frame", "plugin", "pose", "static"}, "model", draft)
-    for kind, found in plugins.items():
-        if kind not in ("Hydrodynamics", "Thruster"):
-            acts = " (its forces are left out)" if kind in WRENCHES else ""
-            partly = " but for the ranges of its commands" if kind == "ArduPilotPlugin" else ""
-            draft.not_read[f"plugin {kind or 'without a name'}{partly}{acts}"] += len(found)
-    for frame in model.frames.values():
-        _unread(frame, {"pose"}, "frame", draft)
-    for name, joint in model.joints.items():
-        _unread(joint, {"pose", "parent", "child", "axis"}, "joint", draft)
-        for axis in joint.findall("axis"):
-            _unread(axis, {"xyz"}, "axis", draft)
-        if joint.get("type") != "fixed" and name not in turned:
-            draft.different.append(f"joint '{name}' ({joint.get('type')}) is held where the file puts it")
-    if world is not None:
-        for child in world:
-            kind = f" {_kind(child)}" if child.tag == "plugin" else ""
-            if child is not model.element and child.tag != "gravity" and kind != " Buoyancy":
-                draft.not_read[f"world: {child.tag}{kind}"] += 1
 
 
 def _recognises(path: Path, head: bytes) -> bool:

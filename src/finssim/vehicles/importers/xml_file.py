@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from finssim.core.budget import NODES, read_bytes
 from finssim.vehicles.loader import GREATEST
-from finssim.vehicles.part import VehicleError
+from finssim.vehicles.part import VehicleError, did_you_mean
 
-__all__ = ["Element", "file_of_model", "flag", "number", "numbers", "read_xml"]
+__all__ = ["Element", "file_of_model", "flag", "number", "numbers", "parse_xml", "read_xml", "refuse_unknown"]
 
 LARGEST = 32 << 20
 """Greatest size of an XML file [bytes]."""
@@ -28,7 +29,11 @@ def read_xml(path: Path) -> Element:
     Raises:
         VehicleError: It is no XML, too large, or defines words of its own.
     """
-    data = read_bytes(path, VehicleError, limit=LARGEST)
+    return parse_xml(read_bytes(path, VehicleError, limit=LARGEST), path)
+
+
+def parse_xml(data: bytes, path: Path) -> Element:
+    """Return the root of the content of a file; see `read_xml`."""
 
     def refuse_doctype(*_: object) -> None:
         raise VehicleError(f"{path}: has a DOCTYPE, which may name other files: remove it")
@@ -98,19 +103,43 @@ def flag(parent: Element, tag: str, where: str, default: bool = False) -> bool:
     return word in ("true", "1")
 
 
-def file_of_model(folder: Path, uri: str, where: str) -> Path:
-    """Return a file that a model names: in the folder of the model or below.
+def refuse_unknown(element: Element, known: Collection[str], where: str) -> None:
+    """Refuse children that are not known.
+
+    Args:
+        element: Their parent.
+        known: Their names.
+        where: What the message calls the parent.
+    """
+    for child in element:
+        if child.tag not in known:
+            raise VehicleError(
+                f"{where}: unknown element '{child.tag}'{did_you_mean(child.tag, sorted(known))} "
+                f"expected one of {', '.join(sorted(known))}"
+            )
+
+
+def file_of_model(folder: Path, uri: str, where: str, packages: Mapping[str, Path] | None = None) -> Path:
+    """Return a file that a model names: in the folder of the model, in that of a package, or below.
 
     Args:
         folder: Folder of the model.
-        uri: `model://NAME/PATH`, `package://NAME/PATH`, or a path below the folder; NAME is that of the model.
+        uri: `model://NAME/PATH`, `package://NAME/PATH`, or a path below the folder; NAME is that of the model or of a
+            package. Within a package, `file://PATH` too.
         where: What the message calls the element.
+        packages: Name -> folder of packages of ROS.
 
     Raises:
         VehicleError: It lies elsewhere, or there is none.
     """
     kind, scheme, below = uri.partition("://")
-    name = below.partition("/")[2] if scheme else uri
+    package, _, rest = below.partition("/")
+    name = rest if scheme else uri
+    if kind == "package" and package in (packages or {}):
+        folder = (packages or {})[package]
+    elif kind == "file":
+        for inside in (x for x in (packages or {}).values() if Path(below).is_relative_to(x)):
+            folder, kind, name = inside, "package", str(Path(below).relative_to(inside))
     strange = re.search(r"^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|[\0\n]", name)
     foreign = bool(scheme) and kind not in ("model", "package")
     outside = foreign or name.startswith(("/", "\\", "~")) or strange is not None

@@ -1,0 +1,496 @@
+"""Reader of uuv_simulator's plugins: UnderwaterObject with its hydrodynamic models, and Thruster.
+
+Equations as of commit bfb40cb, about the centre of gravity c of the base link and all links fixed to it, in which
+Gazebo applies wrenches, while it takes the velocity at the link's origin; v is in axes forward, right, down:
+
+    force = (DLin + u DLinForward + diag(DQuad |v|)) v - Ma v_dot - C_A(Ma v) v     D is negative
+    buoyancy = density g volume at c + center_of_buoyancy;  mass g where neutrally_buoyant
+    thrust = thrust_efficiency f(propeller_efficiency w), w from gain times the command, along the axis of the joint
+
+The factors and offsets of these (`scaling_damping`, `offset_volume`, ...) are set while it runs, not in files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.yaml_file import read_mapping
+from finssim.vehicles.importers.draft import GRAVITY, LAG, SHARE, Draft, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.model import (
+    Model,
+    note_rest,
+    put_body,
+    put_displacement,
+    put_hull,
+    put_physical_inertia,
+    shapes_of,
+)
+from finssim.vehicles.importers.rigid import combined, plain
+from finssim.vehicles.importers.sdf import axis_of_joint
+from finssim.vehicles.importers.xml_file import Element, flag, number, numbers, refuse_unknown
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.vehicle import moved_to_origin, skew
+
+__all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv", "to_left_up"]
+
+Array = NDArray[np.float64]
+
+OBJECT, THRUSTER = "uuv_underwater_object", "uuv_thruster"
+PLUGINS = tuple(f"lib{name}{ros}_plugin.so" for name in (OBJECT, THRUSTER) for ros in ("_ros", ""))
+"""File names of the plugins that are read."""
+FACTORS = {
+    f"{word}_{what}"
+    for word in ("scaling", "offset")
+    for what in (
+        "volume",
+        "added_mass",
+        "damping",
+        "linear_damping",
+        "lin_forward_speed_damping",
+        "nonlin_damping",
+    )
+}
+"""Words that uuv_simulator takes from its services, and not from a file."""
+WORDS = {
+    "plugin": {"fluid_density", "flow_velocity_topic", "debug", "link", "use_global_current", "robotNamespace"},
+    "link": {"neutrally_buoyant", "volume", "box", "center_of_buoyancy", "hydrodynamic_model"},
+    "box": {"width", "length", "height"},
+    "hydrodynamic_model": {
+        "type", "added_mass", "linear_damping", "linear_damping_forward_speed", "quadratic_damping", "radius",
+        "length", "axis", *FACTORS,
+    },
+    "thruster": {
+        "linkName", "jointName", "thrusterID", "gain", "clampMin", "clampMax", "thrustMin", "thrustMax",
+        "thrust_efficiency", "propeller_efficiency", "dynamics", "conversion", "robotNamespace",
+    },
+}  # fmt: skip
+"""Element -> its words."""
+SURFACE = ("metacentric_width", "metacentric_length", "submerged_height")
+"""Words of a vessel that floats."""
+DENSITY = 1028.0
+"""Density of a plugin that gives none, and of the models of a sphere and a cylinder [kg/m³]."""
+
+
+def to_left_up(matrix: Array) -> Array:
+    """Return a 6x6 matrix of axes forward, right, down in axes forward, left, up; the units are kept."""
+    signs = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+    return signs[:, None] * matrix * signs
+
+
+def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str) -> dict[str, Array]:
+    """Return added mass, linear, forward-speed and quadratic damping, positive, in axes forward, right, down.
+
+    Args:
+        hydrodynamics: The element `hydrodynamic_model`.
+        box: Width, length and height of the link [m]; None: they are not given.
+        where: What a message calls it.
+
+    Returns:
+        `added_mass` [kg, kg m, kg m²], `linear_damping` [N s/m, ...], `surge_damping` and `quadratic_damping`
+        [N s²/m², ...], (6, 6) each.
+    """
+    words = {
+        "added_mass": 1.0, "linear_damping": -1.0, "linear_damping_forward_speed": -1.0, "quadratic_damping": -1.0
+    }  # fmt: skip
+    out = {}
+    for word, sign in words.items():
+        text = hydrodynamics.findtext(word) or "0 0 0 0 0 0"
+        full = len(text.split()) == 36 or word == "added_mass" and hydrodynamics.find(word) is not None
+        values = numbers(text, 36 if full else 6, f"{where}: {word}")
+        matrix = values.reshape(6, 6) if full else np.diag(values)
+        out["surge_damping" if word.endswith("speed") else word] = sign * matrix
+    out["quadratic_damping"] = np.diag(np.diag(out["quadratic_damping"]))
+
+    def size(word: str, choose: Callable[[Sequence[float]], float]) -> float:
+        if hydrodynamics.find(word) is None and box is not None:
+            return choose(box)
+        return number(hydrodynamics, word, where)
+
+    kind = (hydrodynamics.findtext("type") or "").strip()
+    M, D = out["added_mass"], out["quadratic_damping"]
+    linear = range(3)
+    if kind == "sphere":
+        r = size("radius", min)
+        M[linear, linear] = 2.0 / 3.0 * DENSITY * math.pi * r**3
+        D[linear, linear] = 0.5 * DENSITY * 0.5 * math.pi * r**2
+    elif kind == "cylinder":
+        r, length = size("radius", min), size("length", max)
+        along = (hydrodynamics.findtext("axis") or "").strip()
+        if along not in ("i", "j", "k"):
+            raise VehicleError(f"{where}: axis is '{along}', expected i, j or k: add it")
+        ratio, disc = length / (2.0 * r), math.pi * r**2
+        ends = ((1, 0.91), (2, 0.85), (4, 0.87), (math.inf, 0.99))
+        sides = ((1, 0.63), (2, 0.68), (5, 0.74), (10, 0.82), (math.inf, 0.98))
+        end, side = (next(c for limit, c in pairs if ratio <= limit) for pairs in (ends, sides))
+        for i in linear:
+            ahead = i == "ijk".index(along)
+            M[i, i] = DENSITY * disc * (1.0 if ahead else length)
+            D[i, i] = 0.5 * DENSITY * (end * disc if ahead else side * r * length)
+            if not ahead:
+                M[3 + i, 3 + i] = DENSITY * disc * length**3 / 12.0
+    elif kind != "fossen":
+        unfinished = ", which uuv_simulator itself leaves unfinished" if kind in ("spheroid", "box") else ""
+        raise VehicleError(
+            f"{where}: type is '{kind}'{unfinished}, expected one of fossen, sphere, cylinder: change it"
+        )
+    for word, matrix in out.items():
+        if np.diag(matrix).min() < 0.0:
+            raise VehicleError(
+                f"{where}: {word} has a diagonal number of the wrong sign, expected added mass >= 0 and damping "
+                "<= 0: change its sign"
+            )
+    if not np.allclose(M, M.T, rtol=1e-2, atol=1e-9):
+        raise VehicleError(f"{where}: added_mass is not symmetric: give each coupling in both places")
+    return out
+
+
+class Conversion(NamedTuple):
+    """Thrust of a thruster over the speed of its rotor, and back."""
+
+    thrust: Callable[[float], float]
+    """Function of the speed [rad/s] that returns the thrust [N]."""
+    speed: Callable[[float], float]
+    """Function of the thrust [N] that returns the least speed for it [rad/s]."""
+    ends: tuple[float, float] = (-math.inf, math.inf)
+    """Least and greatest thrust [N]."""
+
+
+def conversion(element: Element, where: str) -> Conversion:
+    """Return what an element `conversion` says.
+
+    Args:
+        element: The element.
+        where: What a message calls it.
+    """
+    kind = (element.findtext("type") or "").strip()
+    if kind == "Basic":
+        refuse_unknown(element, {"type", "rotorConstant"}, where)
+        k = abs(number(element, "rotorConstant", where))  # its sign only says which way the propeller turns
+        if k == 0.0:
+            raise VehicleError(f"{where}: rotorConstant is 0, expected another")
+        return Conversion(lambda w: k * w * abs(w), lambda f: math.copysign(math.sqrt(abs(f) / k), f))
+    if kind == "Bessa":
+        refuse_unknown(element, {"type", "rotorConstantL", "rotorConstantR", "deltaL", "deltaR"}, where)
+        left, right = number(element, "rotorConstantL", where), number(element, "rotorConstantR", where)
+        low, high = number(element, "deltaL", where), number(element, "deltaR", where)
+        if min(left, right) <= 0.0 or low > 0.0 or high < 0.0:
+            raise VehicleError(
+                f"{where}: expected rotorConstantL, rotorConstantR > 0 and deltaL <= 0 <= deltaR"
+            )
+
+        def speed(force: float) -> float:
+            square = force / right + high if force > 0.0 else force / left + low
+            return math.copysign(math.sqrt(abs(square)), force)
+
+        return Conversion(
+            lambda w: right * max(w * abs(w) - high, 0.0) + left * min(w * abs(w) - low, 0.0), speed
+        )
+    if kind == "LinearInterp":
+        refuse_unknown(element, {"type", "inputValues", "outputValues"}, where)
+        count = len((element.findtext("inputValues") or "").split())
+        texts = [(word, element.findtext(word)) for word in ("inputValues", "outputValues")]
+        columns = [numbers(text, count, f"{where}: {word}") for word, text in texts]
+        inputs, outputs = (column[np.argsort(columns[0])] for column in columns)
+        rises = count > 1 and np.all(np.diff(outputs) >= 0.0)
+        if not (rises and inputs[0] < 0.0 < inputs[-1] and outputs[0] < 0.0 < outputs[-1]):
+            raise VehicleError(
+                f"{where}: expected inputs and outputs that rise together from below 0 to above 0"
+            )
+        rising = np.r_[True, np.diff(outputs) > 0.0]
+        return Conversion(
+            lambda w: float(np.interp(w, inputs, outputs)),
+            lambda f: float(np.interp(f, outputs[rising], inputs[rising])),
+            (float(outputs[0]), float(outputs[-1])),
+        )
+    raise VehicleError(f"{where}: type is '{kind}', expected one of Basic, Bessa, LinearInterp: correct it")
+
+
+def _response(element: Element, where: str) -> tuple[float | None, Callable[[float], float], str]:
+    """Return time constant [s], steady rotor speed [rad/s] of an input, and how the time constant comes about."""
+    kind = (element.findtext("type") or "").strip()
+    if kind == "FirstOrder":
+        return number(element, "timeConstant", where), lambda u: u, "timeConstant"
+    if kind == "ZeroOrder":
+        return None, lambda u: u, "thrust of the dynamics ZeroOrder follows at once"
+    if kind == "Yoerger":
+        loss, gain, lin = number(element, "alpha", where), number(element, "beta", where), 0.0
+    elif kind == "Bessa":
+        inertia = number(element, "Jmsp", where)
+        lin, loss = number(element, "Kv1", where) / inertia, number(element, "Kv2", where) / inertia
+        gain = number(element, "Kt", where) / number(element, "Rm", where) / inertia
+    else:
+        raise VehicleError(
+            f"{where}: type is '{kind}', expected one of ZeroOrder, FirstOrder, Yoerger, Bessa: correct it"
+        )
+    if loss <= 0.0 or lin < 0.0:
+        raise VehicleError(f"{where}: its losses are {lin:g} and {loss:g}, expected more than 0")
+
+    def steady(u: float) -> float:
+        return math.copysign((math.sqrt(lin**2 + 4.0 * loss * abs(gain * u)) - lin) / (2.0 * loss), gain * u)
+
+    return None, steady, f"the dynamics {kind} have none"
+
+
+def _put_thruster(model: Model, plugin: Element, name: str, managed: float | None, draft: Draft) -> str:
+    """Set a thruster, and return the name of its joint."""
+    where, path = f"{model.label}: thruster {name}", f"thrusters.{name}"
+    refuse_unknown(plugin, WORDS["thruster"], where)
+    parts = {word: plugin.find(word) for word in ("dynamics", "conversion")}
+    for word, part in parts.items():
+        if part is None:
+            raise VehicleError(f"{where}: {word} is missing: add it")
+    joint, link = model.text(plugin, "jointName"), model.link_of(model.text(plugin, "linkName"))
+    if joint not in model.joints:
+        raise VehicleError(f"{where}: no joint '{joint}': correct it")
+    curve = conversion(parts["conversion"], f"{where}: conversion")
+    lag, steady, how = _response(parts["dynamics"], f"{where}: dynamics")
+    push, turn = (number(plugin, f"{word}_efficiency", where, 1.0) for word in ("thrust", "propeller"))
+    gain = number(plugin, "gain", where, 1.0)
+    if not (0.0 < push <= 1.0 and 0.0 < turn <= 1.0) or gain == 0.0:
+        raise VehicleError(f"{where}: expected a gain other than 0 and efficiencies above 0 and up to 1")
+
+    inertial = model.links[link].find("inertial")
+    place = (model.pose(link) if inertial is None else model.pose_in(link, inertial, where)).place
+    axis = numbers(model.joints[joint].findtext("axis/xyz"), 3, f"{where}: axis of '{joint}'")
+    if np.linalg.norm(axis) < 1e-6:
+        raise VehicleError(f"{where}: axis of '{joint}' is {axis.tolist()}, expected a direction")
+    draft.put(f"{path}.position", plain(place), "derived", "centre of gravity of the thruster's link")
+    draft.put(f"{path}.axis", plain(axis_of_joint(model.pose(joint), axis)), "derived", "axis of the joint")
+
+    ends = {}
+    for kind in ("clamp", "thrust"):
+        low, high = (
+            number(plugin, f"{kind}Min", where, -math.inf),
+            number(plugin, f"{kind}Max", where, math.inf),
+        )
+        ends[kind] = (
+            (low, high) if low < high else (-math.inf, math.inf)
+        )  # uuv_simulator leaves out reversed limits
+    forces = [push * curve.thrust(turn * steady(gain * u)) for u in ends["clamp"] if math.isfinite(u)]
+    if len(forces) == 1:
+        forces.append(-math.copysign(math.inf, forces[0]))
+    limits = [
+        tuple(sorted(forces or (-math.inf, math.inf))),
+        ends["thrust"],
+        tuple(push * end for end in curve.ends),
+    ]
+    low, high = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
+    origin = "thruster" if managed is None else "thruster and of the thruster manager"
+    if managed is not None:
+        low, high = max(low, -managed), min(high, managed)
+    if low >= 0.0 or high <= 0.0:
+        raise VehicleError(
+            f"{where}: its thrust is {low:g} to {high:g} N, expected one that reverses: change its limits"
+        )
+    greatest = 0.0
+    for side, force, sign in (("min", low, -1.0), ("max", high, 1.0)):
+        guessed = not math.isfinite(force)
+        note = (
+            f"no limit in the file: {SHARE:g} of the vehicle's weight"
+            if guessed
+            else f"limits of the {origin}"
+        )
+        force = sign * SHARE * draft.values["body"]["mass"] * GRAVITY if guessed else force
+        speed = curve.speed(force / push) / turn
+        greatest = max(greatest, abs(speed))
+        for key, value in (
+            (f"force_{side}", force),
+            (f"rpm_{side}", speed * 30.0 / math.pi),
+            ("c_plus" if sign > 0.0 else "c_minus", abs(force) / speed**2),
+        ):
+            if guessed and key[0] != "c":
+                draft.guess(f"{path}.{key}", value, note)
+            else:
+                draft.put(f"{path}.{key}", value, "derived", note)
+        dead = curve.speed(sign * 1e-9) / turn * 30.0 / math.pi
+        if abs(dead) > 1e-3 * abs(speed):
+            draft.put(f"{path}.dead_rpm_{'plus' if sign > 0.0 else 'minus'}", dead, "derived", "dead zone")
+        off = max(
+            abs(push * curve.thrust(turn * speed * x) / force - x**2) for x in np.linspace(0.1, 1.0, 10)
+        )
+        if off > 1e-6:
+            draft.different.append(
+                f"thruster {name}: its curve is taken as a parabola through {force:.4g} N, which is up to "
+                f"{100.0 * off:.2g} % of that from it; commands in newtons are not affected"
+            )
+    draft.values["thrusters"][name] |= {"domain": "speed", "group": "propeller"}
+    if lag is not None:
+        draft.put(f"{path}.time_constant", lag, "published", how)
+    else:
+        draft.guess(f"{path}.time_constant", LAG, how)
+    return joint
+
+
+def _managed(model: Model, base: str) -> float | None:
+    """Return the greatest thrust in the thruster manager's file of this robot, near it [N]; None: there is none."""
+    robot = base.rpartition("/")[0] or model.element.get("name", "")
+    for folder in model.packages.values():
+        for pattern in ("config/thruster_manager.yaml", "config/*/thruster_manager.yaml"):
+            for file in sorted(folder.glob(pattern)) if folder.name else ():
+                try:
+                    manager = read_mapping(file, VehicleError, such_as="max_thrust: 20").get(
+                        "thruster_manager", {}
+                    )
+                except VehicleError:
+                    continue
+                if isinstance(manager, dict) and manager.get("tf_prefix") == robot:
+                    greatest = manager.get("max_thrust")
+                    if isinstance(greatest, int | float) and greatest > 0.0:
+                        return float(greatest)
+    return None
+
+
+def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draft:
+    """Read a model with the plugins of uuv_simulator.
+
+    Args:
+        element: The element `model`.
+        path: Its file.
+        packages: Name -> folder of the packages in which its meshes may be.
+
+    Raises:
+        VehicleError: It cannot be read.
+    """
+    name = element.get("name", "")
+    draft = Draft(str(path), f"{path.name}, robot {name} (uuv_simulator)")
+    model = Model(element, str(path), draft, packages)
+    plugins: dict[str, list[Element]] = {}
+    for plugin in element.findall("plugin"):
+        kind = plugin.get("filename", "").removeprefix("lib").removesuffix(".so").removesuffix("_plugin")
+        plugins.setdefault(kind.removesuffix("_ros"), []).append(plugin)
+    objects, thrusters = plugins.get(OBJECT, []), plugins.get(THRUSTER, [])
+    if len(objects) != 1 or not thrusters:
+        raise VehicleError(
+            f"{path}: {len(objects)} plugins of underwater objects and {len(thrusters)} thrusters, expected 1 and more"
+        )
+    refuse_unknown(objects[0], WORDS["plugin"], f"{path}: underwater object")
+    links = {link.get("name", ""): link for link in objects[0].findall("link")}
+    base = next((link for link in links if "base_link" in link), next(iter(links), ""))
+    model.set_body(base, "underwater object")
+    draft.values |= {
+        "title": f"{name} (uuv_simulator)",
+        "description": f"Read by FinsSim from {path.name}, a robot of uuv_simulator.",
+    }
+    draft.guess("water.gravity", GRAVITY, "it is in the file of a world: that of Gazebo")
+    if objects[0].find("fluid_density") is None:
+        draft.guess("water.density", DENSITY, "the file gives none: that of uuv_simulator")
+    else:
+        draft.put("water.density", number(objects[0], "fluid_density", f"{path}: underwater object"))
+    density = draft.values["water"]["density"]
+    put_body(model, draft)
+
+    lifts, boxes = [], {}
+    for link, words in links.items():
+        where = f"{path}: underwater object, link '{link}'"
+        if any(words.find(word) is not None for word in SURFACE):
+            raise VehicleError(
+                f"{where}: floats as a ship does ({SURFACE[0]}), expected a vehicle under water"
+            )
+        refuse_unknown(words, WORDS["link"], where)
+        if link not in model.links:
+            raise VehicleError(f"{where}: the robot has no such link: correct it")
+        mass, centre = _fixed(model, link)
+        neutral = flag(words, "neutrally_buoyant", where)
+        share = mass / density if neutral else number(words, "volume", where, 0.0)
+        offset = numbers(words.findtext("center_of_buoyancy") or "0 0 0", 3, f"{where}: center_of_buoyancy")
+        lifts.append((share, centre + model.pose(link).turn @ offset))
+        box = words.find("box")
+        if box is not None:
+            refuse_unknown(box, WORDS["box"], where)
+            boxes[link] = [number(box, side, where) for side in ("width", "length", "height")]
+        if link != base:
+            draft.not_read[f"hydrodynamics of link {link} (its buoyancy is read)"] += 1
+    put_displacement(
+        lifts, density, "volume, or mass where neutrally_buoyant; from the centre of gravity", draft
+    )
+
+    _, centre = _fixed(model, base)
+    where = f"{path}: hydrodynamic_model of '{base}'"
+    hydrodynamics = links[base].find("hydrodynamic_model")
+    if hydrodynamics is None:
+        raise VehicleError(f"{where} is missing: add it")
+    refuse_unknown(hydrodynamics, WORDS["hydrodynamic_model"], where)
+    arm = np.eye(6)
+    arm[3:, :3] = skew(centre)
+    for word, matrix in coefficients(hydrodynamics, boxes.get(base), where).items():
+        turned = to_left_up(matrix)
+        if word == "added_mass":
+            turned = moved_to_origin((turned + turned.T) / 2.0, centre)
+        elif word != "surge_damping" or np.any(matrix):
+            turned = arm @ turned
+        else:
+            continue
+        draft.put(f"hydrodynamics.calibrated.{word}", plain(turned))
+    _note_differences(hydrodynamics, centre, draft)
+
+    managed = _managed(model, base)
+    names = [f"thruster_{(plugin.findtext('thrusterID') or '').strip()}" for plugin in thrusters]
+    if len(set(names)) < len(names) or not all(n[9:].isdigit() and len(n) < 20 for n in names):
+        raise VehicleError(
+            f"{path}: thrusterID are {', '.join(n[9:] for n in names)}, expected different whole numbers"
+        )
+    turning = {_put_thruster(model, p, n, managed, draft) for p, n in zip(thrusters, names, strict=True)}
+    try:
+        shapes = shapes_of(model)
+    except VehicleError as error:
+        shapes = []
+        draft.not_read[f"collision shapes ({str(error).removeprefix(f'{path}: ')})"] += 1
+    put_hull([shape for shape in shapes if shape.link == base], draft)
+    put_physical_inertia(draft)
+    if base in boxes:
+        width, length, height = boxes[base]
+        draft.put("body.size", [length, width, height], "published", "box")
+        draft.put("body.surface_half_height", height / 2.0, "published", "box")
+    else:
+        put_envelope(draft, [shape.corners for shape in shapes])
+    put_controlled_axes(draft)
+    remarks = {"uuv_fin": " (steering by fins comes with actuators)"}
+    note_rest(model, plugins, {OBJECT, THRUSTER}, remarks, turning)
+    return draft
+
+
+def _fixed(model: Model, link: str) -> tuple[float, Array]:
+    """Return mass [kg] and centre of gravity in the body frame [m], (3,), of a link and all that are fixed to it."""
+    joined = [
+        {model.text(joint, "parent"), model.text(joint, "child")}
+        for joint in model.joints.values()
+        if joint.get("type") == "fixed"
+    ]
+    held, before = {link}, 0
+    while len(held) > before:
+        before = len(held)
+        held |= {name for pair in joined if held & pair for name in pair}
+    masses, centres = [], []
+    for name in held:
+        inertial = model.links[name].find("inertial")
+        if inertial is not None:
+            masses.append(number(inertial, "mass", f"{model.label}: link '{name}'"))
+            centres.append(model.pose_in(name, inertial, f"{model.label}: link '{name}'").place)
+    if sum(masses) <= 0.0:
+        raise VehicleError(f"{model.label}: link '{link}' has no mass: add it")
+    mass, centre, _ = combined(masses, centres, [np.zeros((3, 3))] * len(masses))
+    return mass, centre
+
+
+def _note_differences(hydrodynamics: Element, centre: Array, draft: Draft) -> None:
+    """Note what uuv_simulator computes otherwise."""
+    for word in FACTORS & {child.tag for child in hydrodynamics}:
+        draft.not_read[f"{word} (uuv_simulator does not read it from a file either)"] += 1
+    if len((hydrodynamics.findtext("quadratic_damping") or "").split()) == 36:
+        draft.different.append("of quadratic_damping only the diagonal acts, as in uuv_simulator")
+    if hydrodynamics.find("linear_damping_forward_speed") is not None:
+        draft.different.append(
+            "linear_damping_forward_speed: astern uuv_simulator changes its sign, which drives the vehicle"
+        )
+    if np.abs(centre).max() > 1e-3:
+        draft.different.append(
+            "the added mass acts on the centre of gravity; uuv_simulator takes the acceleration of the link's origin"
+        )
+    if not np.any(draft.values["hydrodynamics"]["calibrated"]["added_mass"]):
+        draft.different.append("the added mass is 0 on every axis: a real vehicle accelerates more slowly")
