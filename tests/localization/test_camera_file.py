@@ -151,7 +151,7 @@ REFUSED = {
         "unknown lens model 'eucm'",
     ),
     "unknown key with numbers": (ros("plumb_bob", FIVE) + "xi: 1.2\n", "unknown key 'xi' holds numbers"),
-    "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "unknown key 'cam1' holds numbers"),
+    "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "holds cam0, cam1, expected one camera"),
     "binned": (ros("plumb_bob", FIVE) + "binning_x: 2\n", "binning_x is 2"),
     "part of the picture": (ros("plumb_bob", FIVE) + "roi: {x_offset: 8, width: 9}\n", "roi is {"),
     "transposed": (
@@ -169,15 +169,17 @@ REFUSED = {
     ),
     "radial coefficients of MATLAB": (matlab(RadialDistortion=[0.1]), "RadialDistortion of 2 or 3 numbers"),
     "tangential coefficients of MATLAB": (matlab(TangentialDistortion=[0.1]), "TangentialDistortion of 2"),
+    "width and height, or rows and columns": (
+        json.dumps({"mtx": K, "dist": FIVE, "image_size": [640, 480]}),
+        "give image_width and image_height",
+    ),
     **{
         name: (
             text,
-            "expected a camera file of FinsSim (lens), ROS (camera_info), OpenCV (FileStorage), Kalibr",
+            "no camera in a known format; expected FinsSim (lens), ROS (camera_info, ost.txt), Kalibr",
         )
         for name, text in {
             "plain numbers": "width: 640\nheight: 480\nfx: 535.9\nfy: 536.2\ncx: 342.3\ncy: 235.6\nk1: 0.1\n",
-            "own json": json.dumps({"mtx": K, "dist": FIVE, "image_size": [640, 480]}),
-            "orb-slam": "Camera.fx: 535.9\nCamera.fy: 536.2\nCamera.cx: 342.3\nCamera.cy: 235.6\n",
             "no camera at all": "image_width: 640\nimage_height: 480\n",
         }.items()
     },

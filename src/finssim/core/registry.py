@@ -210,6 +210,7 @@ def check_importer(name: str, member: Any) -> None:
     checks = {
         "vehicle": "finssim.vehicles.importers.draft:check_registered",
         "trial": "finssim.trials.importers.log:check_registered",
+        "lens": "finssim.localization.camera_file:check_registered",
     }
     if kind not in checks or "." not in name:
         raise RegistryError(
@@ -303,10 +304,18 @@ IMPORTERS = Family(
                 "csv": "table:TABLE",
             }.items()
         },
+        "lens.ros": "finssim.localization.importers.calibration:ROS",
+        "lens.kalibr": "finssim.localization.importers.calibration:KALIBR",
+        "lens.matlab": "finssim.localization.importers.calibration:MATLAB",
+        "lens.nerfstudio": "finssim.localization.importers.reconstruction:NERFSTUDIO",
+        "lens.orb_slam": "finssim.localization.importers.reconstruction:ORB_SLAM",
+        "lens.colmap": "finssim.localization.importers.reconstruction:COLMAP",
+        "lens.opencv": "finssim.localization.importers.calibration:OPENCV",
     },
     check="finssim.core.registry:check_importer",
 )
-"""What is imported, a dot, and the format -> the importer: of vehicles a `VehicleImporter`, of logs a `LogImporter`."""
+"""What is imported, a dot, and the format -> the importer: of vehicles a `VehicleImporter`, of logs a `LogImporter`, of
+lenses a `LensImporter`."""
 
 FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS, IMPORTERS)
 """All families."""

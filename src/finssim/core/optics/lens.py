@@ -327,12 +327,16 @@ _WORDS = {
     "rational_polynomial": "rational",
     "fisheye": "fisheye",
     "equidistant": "fisheye",
+    "kannala_brandt": "fisheye",
+    "opencv_fisheye": "fisheye",
+    "opencv": "plumb_bob",
+    "brown_conrady": "plumb_bob",
 }
-"""Words of our files, of ROS and of Kalibr -> model."""
+"""Words of our files and of other programs -> model."""
 
 
 def lens_model(word: str) -> str:
-    """Return the lens model of a word in a camera file: ours, or one of ROS or Kalibr.
+    """Return the lens model of a word in a camera file: ours, or one of another program.
 
     Args:
         word: Word such as `plumb_bob`, `radtan` or `equidistant`, which is `fisheye`.

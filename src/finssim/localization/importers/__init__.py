@@ -1,0 +1,1 @@
+"""Importers of lenses: a file for each kind of calibration program. See `finssim.localization.camera_file`."""
