@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from threading import Lock
@@ -19,6 +20,8 @@ from finssim.vehicles.equipment import Tags
 
 Image = npt.NDArray[np.uint8]
 
+MANY = 10_000
+"""Tags of a family from which one wrong bit is corrected, not two."""
 EDGES = {"edges": 1, "none": 0}
 """Name -> the library's `refine_edges`."""
 
@@ -76,13 +79,27 @@ def _library(family: str, refine: str) -> Any:
     It is never destroyed: pupil-apriltags frees the family before the detector that still refers to it, which
     corrupts memory.
     """
+    import ctypes
+
     import pupil_apriltags
 
     class Kept(pupil_apriltags.Detector):  # type: ignore[misc]
         def __del__(self) -> None:
             pass
 
-    return Kept(families=family, nthreads=1, quad_decimate=1.0, refine_edges=EDGES[refine])
+    options = {"nthreads": 1, "quad_decimate": 1.0, "refine_edges": EDGES[refine]}
+    if FAMILIES[family].count < MANY:
+        return Kept(families=family, **options)
+    # Of a family with so many tags, a table of two wrong bits has 3 GB and takes half a minute: of one, 100 MB.
+    detector = Kept(families="tag16h5", **options)
+    library, pointer = detector.libc, detector.tag_detector_ptr
+    library.apriltag_detector_remove_family.restype = None
+    library.apriltag_detector_remove_family(pointer, detector.tag_families.pop("tag16h5"))
+    create = getattr(library, f"{family}_create")
+    create.restype = library.tag16h5_create.restype
+    detector.tag_families[family] = create()
+    library.apriltag_detector_add_family_bits(pointer, detector.tag_families[family], ctypes.c_int(1))
+    return detector
 
 
 Cells = npt.NDArray[np.uint8]
@@ -116,6 +133,10 @@ FAMILIES = {
         TagFamily("tag25h9", 7, 7, 35, 9),
         TagFamily("tag36h11", 8, 8, 587, 11),
         TagFamily("tagStandard41h12", 9, 5, 2115, 12),
+        TagFamily("tagStandard52h13", 10, 6, 48714, 13),
+        TagFamily("tagCustom48h12", 10, 6, 42211, 12),
+        TagFamily("tagCircle21h7", 9, 5, 38, 7),
+        TagFamily("tagCircle49h12", 11, 5, 65535, 12),
     )
 }
 """Name -> family."""
@@ -127,11 +148,16 @@ def family_named(name: str) -> TagFamily:
     Raises:
         LocalizationError: There is none.
     """
-    plain = name.lower().removeprefix("dict_apriltag_").removeprefix("tag").removeprefix("standard")
+    plain = _bare(name.lower().removeprefix("dict_apriltag_"))
     for family in FAMILIES.values():
-        if family.name.lower().removeprefix("tag").removeprefix("standard") == plain:
+        if _bare(family.name.lower()) == plain:
             return family
     raise LocalizationError(f"unknown tag family '{name}'; available: {', '.join(FAMILIES)}")
+
+
+def _bare(name: str) -> str:
+    """Return a family's name in small letters without its first words: `41h12` of `tagstandard41h12`."""
+    return re.sub(r"^(tag)?(standard|custom|circle)?", "", name)
 
 
 @cache
