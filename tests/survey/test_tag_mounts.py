@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
-from finssim.localization.detection.families import corners
 from finssim.survey.mounts import (
     Moment,
     MountNoise,
@@ -24,7 +23,7 @@ from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError
 from survey.moving_vehicle import EDGE, MOUNTS, POOL, PORT, moments, motion
 
-RIG = Rig(pool=POOL, corners_t=corners(EDGE), port=PORT, reference=15)
+RIG = Rig(pool=POOL, edge=EDGE, port=PORT, reference=15)
 TRUTH = MountState(reference=MOUNTS[15], others={16: MOUNTS[15].inverse.then(MOUNTS[16])}, poses=[])
 LEVEL = quat_to_matrix(quat_from_euler(0.0, 0.0, np.pi / 2))
 FILE = {15: Pose(LEVEL, np.array([0.07, 0.0, 0.10])), 16: Pose(LEVEL, np.array([-0.07, 0.0, 0.10]))}

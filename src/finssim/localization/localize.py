@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from finssim.core.optics import Lens
 from finssim.core.provenance import provenance
 from finssim.core.text_table import write_csv
 from finssim.localization import LocalizationError
-from finssim.localization.detection.detections import Frame, read_detections
+from finssim.localization.detection.detections import Frame, in_our_order, read_detections
 from finssim.localization.detection.detector import Detector, RegionTracker, detector
 from finssim.localization.detection.families import family_named
 from finssim.localization.fusion.attitude import roll_pitch, up_of
@@ -226,8 +226,8 @@ class Locator:
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
                 "port; --method refractive-6dof does without"
             )
-        self.known, self.tags = prior, tuple(self._locate.tags_b)
-        """Ids of the vehicle's tags."""
+        self.known, self.tags_b = prior, self._locate.tags_b
+        """Corners of the vehicle's tags, body frame [m]: tag id -> (4, 3)."""
         self.family = family_named(self._locate.family).name
 
     def locate(self, frame: Frame) -> PoseMeasurement:
@@ -347,7 +347,7 @@ def frames_of(
     inputs: Sequence[Path],
     lens: Lens,
     find: Detector,
-    tags: tuple[int, ...],
+    corners: Mapping[int, Array],
     times: Path | None,
     notes: list[str],
 ) -> tuple[Iterator[Frame], int | None]:
@@ -357,7 +357,8 @@ def frames_of(
         inputs: Pictures, folders of them, videos or detection files.
         lens: Of the camera: pictures of another size are refused.
         find: Finds tags in pictures.
-        tags: Those looked for in videos, near where they were a picture before.
+        corners: Tag id -> its corners on the vehicle [m], (4, 3). In videos these tags are looked for near where they
+            were a picture before.
         times: File with the time stamps of the pictures.
         notes: Takes one sentence on each thing that was left out.
 
@@ -372,9 +373,13 @@ def frames_of(
     if tables and len(tables) < len(inputs):
         raise LocalizationError("detection files and pictures are mixed: give the ones or the others")
     if tables:
-        frames = [frame for path in tables for frame in read_detections(path, notes)]
+        frames = []
+        for path in tables:
+            ordered, remark = in_our_order(read_detections(path, notes), corners)
+            frames += ordered
+            notes += [f"{path}: {remark}"] if remark else []
         return iter(frames), len(frames)
-    return _seen(inputs, lens, find, tags, times, notes), _count(inputs)
+    return _seen(inputs, lens, find, tuple(corners), times, notes), _count(inputs)
 
 
 def _seen(
@@ -485,7 +490,7 @@ def run(
     find = detector(locator.family, refine=refine, gamma=gamma)
     stamps = None if times is None else Path(times)
     notes: list[str] = []
-    frames, count = frames_of(paths, site.camera.lens, find, locator.tags, stamps, notes)
+    frames, count = frames_of(paths, site.camera.lens, find, locator.tags_b, stamps, notes)
     result = _measure(frames, count, locator)
     write_rows(result.rows, out)
     result.summary = {

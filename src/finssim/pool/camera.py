@@ -22,7 +22,7 @@ from finssim.sim.overhead_camera import Ripples
 from finssim.sim.overhead_camera.scene import surface_frame
 from finssim.sim.overhead_camera.surface import waves_of
 from finssim.vehicles import Vehicle
-from finssim.vehicles.equipment import Mount, Tags
+from finssim.vehicles.equipment import TagMount, Tags
 
 __all__ = [
     "CameraSettings", "CornerCamera", "CornerFit", "PictureCamera", "PoolCamera", "RippledView", "camera_of",
@@ -51,20 +51,19 @@ _UNITY = np.eye(3)
 class CornerFit:
     """The tags of a vehicle: where to look at each, and which corners the fit reports."""
 
-    def __init__(self, family: str, tags: Sequence[int], edge: float) -> None:
+    def __init__(self, family: str, tags: Sequence[int]) -> None:
         """
         Args:
             family: Name of the tags' family.
             tags: Their ids.
-            edge: Of the black border [m].
         """
         along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev's, the ends included
         self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
         self._at_corner = [0, NODES - 1, NODES * NODES - 1, NODES * (NODES - 1)]
         self.nodes = np.zeros((NODES * NODES, 3))
-        """Points of a tag whose pixels `corners` wants, tag frame [m], (N, 3)."""
-        self.nodes[:, 0] = edge * (self._square[:, 0] - 0.5)
-        self.nodes[:, 1] = edge * (0.5 - self._square[:, 1])
+        """Points of a tag whose pixels `corners` wants, tag frame, in edges of its black border, (N, 3)."""
+        self.nodes[:, 0] = self._square[:, 0] - 0.5
+        self.nodes[:, 1] = 0.5 - self._square[:, 1]
         self._matrix = np.stack([_fit_matrix(family, tag, along, self._square) for tag in tags])
 
     def corners(self, pixels: Array) -> tuple[Array, Array]:
@@ -335,11 +334,11 @@ class CornerCamera:
         self._inside = site.camera.lens.inside
         self._view = RippledView(site.camera, site.interface, ripples)
         self._ids = list(tags.mounts)
-        self._fit = CornerFit(tags.family, self._ids, tags.edge)
+        self._fit = CornerFit(tags.family, self._ids)
         self._nodes_b = np.concatenate(
             [
-                np.asarray(m.position) + self._fit.nodes @ quat_to_matrix(m.orientation).T
-                for m in tags.mounts.values()
+                np.asarray(m.position) + tags.edge_of(tag) * self._fit.nodes @ quat_to_matrix(m.orientation).T
+                for tag, m in tags.mounts.items()
             ]
         )
 
@@ -417,7 +416,7 @@ class CameraSettings:
     pixel_noise: float = 0.03
     """Noise of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their
     pixels."""
-    mounts: Mapping[int, Mount] = field(default_factory=dict)
+    mounts: Mapping[int, TagMount] = field(default_factory=dict)
     """True mounts of tags, by id; the others are as in the vehicle file."""
 
     def shutter(self, seed: int) -> Shutter:
@@ -544,12 +543,11 @@ def _calibrated(true: Pool, errors: _Errors, random: np.random.Generator, severi
     )
 
 
-def _moved(mount: Mount, errors: _Errors, random: np.random.Generator) -> Mount:
+def _moved(mount: TagMount, errors: _Errors, random: np.random.Generator) -> TagMount:
     turn = quat_from_rotvec(random.normal(0.0, errors.mount_turn, 3))
-    return Mount(
-        position=np.asarray(mount.position) + random.normal(0.0, errors.mount_position, 3),
-        orientation=np.asarray(quat_multiply(turn, mount.orientation)),
-    )
+    position = np.asarray(mount.position) + random.normal(0.0, errors.mount_position, 3)
+    orientation = np.asarray(quat_multiply(turn, mount.orientation))
+    return mount.model_copy(update={"position": position, "orientation": orientation})
 
 
 # Pictures of a vehicle's tags under water, drawn by the overhead camera's renderer; its hull is left out.
@@ -629,14 +627,14 @@ class PictureCamera:
         return self._per_metre * (float(np.linalg.norm(end[0] - start[0])) + REACH * turn)
 
     def _tag(
-        self, tag: int, mount: Mount, start: tuple[Array, Array], end: tuple[Array, Array] | None
+        self, tag: int, mount: TagMount, start: tuple[Array, Array], end: tuple[Array, Array] | None
     ) -> oc.TagInScene:
         family = family_named(self._tags.family)
         return oc.TagInScene(
             bitmap=self._bitmaps[tag],
-            edge=self._tags.edge,
+            edge=self._tags.edge_of(tag),
             border_cells=family.border,
-            margin=MARGIN * self._tags.edge,
+            margin=MARGIN * self._tags.edge_of(tag),
             pose=_placed(start, mount.position, mount.orientation),
             end=None if end is None else _placed(end, mount.position, mount.orientation),
         )

@@ -34,7 +34,8 @@ from finssim.sim.overhead_camera import ObjectPose, OverheadCamera, Ripples, Sce
 from finssim.survey.points import Observations, observe, read_survey
 from finssim.survey.pool_fit import PoolFit, calibrate_pool, pool_record
 from finssim.survey.pool_model import PoolFitSettings
-from finssim.vehicles import Mount, Tags
+from finssim.vehicles import Tags
+from finssim.vehicles.equipment import TagMount
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ REACH = (1.84, 0.84)
 WATER_HEIGHT = 1.0
 """Height of the surface over the floor, where z = 0 [m]."""
 
-TAG = Tags(family="tag25h9", edge=0.098, mounts={1: Mount(position=np.zeros(3))})
+TAG = Tags(family="tag25h9", edge=0.098, mounts={1: TagMount(position=np.zeros(3))})
 """The tag of the published test; its own frame is the body."""
 
 

@@ -82,18 +82,19 @@ class Rig:
     """Known values."""
 
     pool: Pool
-    corners_t: Array
-    """Corners of a tag in its own frame [m], (4, 3)."""
+    edge: float
+    """Edge of a tag [m]."""
     port: Array
     """Pressure port, body frame [m], (3,)."""
     reference: int
     """The reference tag."""
     noise: MountNoise = field(default_factory=MountNoise)
+    edges: Mapping[int, float] = field(default_factory=dict)
+    """Edges of tags of another size, by id [m]."""
 
-    @property
-    def edge(self) -> float:
-        """Return the edge of a tag [m]."""
-        return float(np.linalg.norm(self.corners_t[0] - self.corners_t[1]))
+    def corners_t(self, tag: int) -> Array:
+        """Return the corners of a tag in its own frame [m], (4, 3)."""
+        return corners(self.edges.get(tag, self.edge))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +137,7 @@ def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> Moun
 def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Array:
     """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3) [m]."""
     mounts = {
-        tag: state.mount(tag, rig.reference).at(rig.corners_t) for tag in (rig.reference, *state.others)
+        tag: state.mount(tag, rig.reference).at(rig.corners_t(tag)) for tag in (rig.reference, *state.others)
     }
     return np.array(
         [pose.at(mounts[tag]) for pose, m in zip(state.poses, moments, strict=True) for tag in m.corners]
@@ -178,7 +179,8 @@ def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment]) -> lis
 def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) -> tuple[Array, Array]:
     """Derivatives of a tag's pixels with respect to the shared unknowns (4, 2, P) and the pose (4, 2, 6), from those
     with respect to its corners in the pool, J (4, 2, 3)."""
-    in_reference = rig.corners_t if tag == rig.reference else state.others[tag].at(rig.corners_t)
+    corners_t = rig.corners_t(tag)
+    in_reference = corners_t if tag == rig.reference else state.others[tag].at(corners_t)
     in_body = state.reference.at(in_reference)
     of_pose = np.concatenate([-J @ skew(in_body @ pose.R.T), J], axis=-1)
     A = np.zeros((4, 2, len(state.names)))
@@ -187,7 +189,7 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
     A[..., 3:6] = J_b
     if tag != rig.reference:
         J_r, start = J_b @ state.reference.R, 6 + 6 * list(state.others).index(tag)
-        A[..., start : start + 3] = -J_r @ skew(rig.corners_t @ state.others[tag].R.T)
+        A[..., start : start + 3] = -J_r @ skew(corners_t @ state.others[tag].R.T)
         A[..., start + 3 : start + 6] = J_r
     return A, of_pose
 
@@ -254,7 +256,7 @@ def start_state(
 def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | None:
     """Body in the pool: position and heading of a tag seen as if it were parallel to the surface, tilt by the IMU."""
     for tag in sorted(moment.corners, key=lambda tag: tag != rig.reference):
-        level = level_tag(rig, moment.corners[tag]) if tag in mounts else None
+        level = level_tag(rig, tag, moment.corners[tag]) if tag in mounts else None
         if level is None:
             continue
         R = level.R @ mounts[tag].R.T  # of a body whose tag is level
@@ -264,7 +266,7 @@ def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | N
     return None
 
 
-def level_tag(rig: Rig, pixels: Array) -> Pose | None:
+def level_tag(rig: Rig, tag: int, pixels: Array) -> Pose | None:
     """Tag in the pool as if it lay parallel to the surface, at the depth at which its edges have their length."""
     rays = back_project(rig.pool.camera, rig.pool.interface, pixels)
     if not np.isfinite(rays.direction).all():
@@ -279,10 +281,10 @@ def level_tag(rig: Rig, pixels: Array) -> Pose | None:
         points = at(depth)
         return float(np.mean(np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1)))
 
-    low, high = 0.0, DEEPEST
+    low, high, edge = 0.0, DEEPEST, rig.edges.get(tag, rig.edge)
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if size(middle) < rig.edge else (low, middle)
+        low, high = (middle, high) if size(middle) < edge else (low, middle)
     points = at(0.5 * (low + high))
     right = points[1] + points[2] - points[0] - points[3]
     x = right - (right @ n) * n
@@ -297,7 +299,7 @@ def _locate_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment]
             beside = [other for other in moment.corners if other in mounts]
             if tag not in moment.corners or not beside:
                 continue
-            reference, new = level_tag(rig, moment.corners[beside[0]]), level_tag(rig, moment.corners[tag])
+            reference, new = (level_tag(rig, one, moment.corners[one]) for one in (beside[0], tag))
             if reference is not None and new is not None:
                 mounts[tag] = mounts[beside[0]].then(reference.inverse.then(new))
                 break
@@ -853,7 +855,8 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
     depth = vehicle.sensors.depth
     rig = Rig(
         pool=pool,
-        corners_t=corners(tags.edge),
+        edge=tags.edge,
+        edges={tag: mount.edge for tag, mount in tags.mounts.items() if mount.edge is not None},
         port=np.zeros(3) if depth is None else np.asarray(depth.position, float),
         reference=reference_tag(log.moments(), mounts),
     )

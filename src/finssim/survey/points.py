@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.core.text_table import TextTable, read_text, read_text_table, text_table
 from finssim.core.text_table import number as _number
-from finssim.localization.detection.detections import Frame, best_detections, read_detections
+from finssim.localization.detection.detections import Frame, best_detections, in_our_order, read_detections
 from finssim.localization.detection.families import corners
 from finssim.trials.conversion import UNITS
 from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.tag_layout import read_tag_layout
 
 Array = NDArray[np.float64]
 
@@ -262,7 +264,12 @@ class Survey:
 
 
 def read_survey(
-    path: str | Path, *, unit: str | None = None, edge: float | None = None, z: float | None = None
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    edge: float | None = None,
+    edges: Mapping[int, float] | None = None,
+    z: float | None = None,
 ) -> Survey:
     """Read a survey.
 
@@ -270,15 +277,20 @@ def read_survey(
     of the tag frame); `image,x,y,z,yaw_deg[,tag],edge` for one tag that was moved from picture to picture. `sigma`
     gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
 
+    A tag file of apriltag_ros (.yaml) gives the tags of its bundle, in the bundle's frame.
+
     Args:
-        path: CSV file.
+        path: CSV file, or the YAML file of a bundle.
         unit: Of lengths where the file says none.
         edge: Of all tags [m] where the table has no such column.
+        edges: Of tags by id [m], before `edge`.
         z: Height of all points [m] where the table has no such column.
 
     Raises:
         CalibrationError: A column or number is missing, or an id has two positions; names the line.
     """
+    if Path(path).suffix.lower() in (".yaml", ".yml"):
+        return _bundle(Path(path))
     table = read_table(path, unit=unit)
     for name in ("x", "y"):
         if name not in table.columns:
@@ -297,7 +309,7 @@ def read_survey(
         if missing := row.missing("x", "y", *(["z"] if z is None else [])):
             findings.append(finding("row_incomplete", table.path, line=row.line, missing=tuple(missing)))
             continue
-        name, tag, here = _surveyed(table, row, edge, z)
+        name, tag, here = _surveyed(table, row, (edge, edges or {}), z)
         every.append(here.points)
         if "image" in row.words:
             survey.locations.setdefault(name, []).append((tag, here))
@@ -320,10 +332,12 @@ def read_survey(
 
 
 def _surveyed(
-    table: SurveyTable, row: TableRow, edge: float | None, z: float | None
+    table: SurveyTable, row: TableRow, edges: tuple[float | None, Mapping[int, float]], z: float | None
 ) -> tuple[str, int | None, Placed]:
     """Return the name of a row, the number of its tag (None: a point, or any tag), and its points."""
-    edge = row.numbers.get("edge", edge)
+    of_any, of_tags = edges
+    named = row.words.get("tag", "").removesuffix(".0")
+    edge = row.numbers.get("edge", of_tags.get(int(named), of_any) if named.isdecimal() else of_any)
     word = row.words.get("tag") or (row.words.get("id") if edge is not None else None)
     if "image" not in row.words and word is None:
         name = row.words.get("id", "")
@@ -340,6 +354,27 @@ def _surveyed(
     name = row.words.get("image") or f"tag {tag}"
     turn = quat_from_euler(*(row.numbers.get(n, 0.0) for n in ("roll", "pitch", "yaw")))
     return name, tag, row.placed(name, row.position(z) + quat_rotate(turn, corners(edge)))
+
+
+def _bundle(path: Path) -> Survey:
+    """Return the tags of a bundle of apriltag_ros."""
+    try:
+        layout = read_tag_layout(path)
+    except VehicleError as error:
+        raise CalibrationError(str(error)) from None
+    if not layout.poses:
+        raise CalibrationError(
+            f"{path}: gives sizes of tags without poses: give a table of tag,x,y,z,yaw_deg as points, and this file as "
+            "sizes of tags"
+        )
+    placed = {
+        tag: Placed(
+            f"tag {tag}", pose.position + quat_rotate(pose.orientation, corners(layout.sizes[tag])), math.nan
+        )
+        for tag, pose in layout.poses.items()
+    }
+    remarks = tuple(finding("as_read", remark=remark) for remark in layout.remarks)
+    return Survey(str(path), tags=placed, findings=remarks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,7 +432,10 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
     for path in tables:
         if _is_detections(path):
             remarks: list[str] = []
-            _match_frames(rows, read_detections(path, remarks), survey)
+            tags = {tag: placed.points for tag, placed in survey.tags.items()}
+            frames, remark = in_our_order(read_detections(path, remarks), tags)
+            remarks += [f"{path}: {remark}"] if remark else []
+            _match_frames(rows, frames, survey)
             rows.findings += [finding("as_read", remark=remark) for remark in remarks]
         else:
             _match_table(rows, read_table(path), survey)

@@ -27,6 +27,8 @@ from finssim.survey.points import (
 )
 from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.tag_layout import TagLayout, read_tag_layout
 
 PRINTED = 0.0005
 """Standard error of a tag on a board where the file gives none [m]; printers and glue do no better."""
@@ -49,6 +51,8 @@ class SurveyFile:
     """Height of points in tables without z [m]."""
     edge: float | None = None
     """Edge of tags in a table without that column [m]."""
+    edges: Mapping[int, float] = field(default_factory=dict)
+    """Edges of tags by id [m], which come before `edge`."""
     family: str | None = None
     """Family of the tags in images."""
     latency: float = 0.0
@@ -87,7 +91,7 @@ class SurveyFile:
             return observe(inputs, Survey(str(self.path), tags=dict(self.grid)), family=self.family)
         if self.points is None:
             return observe_combined(inputs, unit=self.unit, z=self.z)
-        survey = read_survey(self.points, unit=self.unit, edge=self.edge, z=self.z)
+        survey = read_survey(self.points, unit=self.unit, edge=self.edge, edges=self.edges, z=self.z)
         return observe(inputs, survey, family=self.family)
 
 
@@ -132,6 +136,11 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
         count = "both surface and window are" if kinds else "neither surface nor window is"
         raise top.error(
             f"{count} given, expected one: what the camera looks through (surface: {{}} is enough)"
+            + (
+                f"; give this file as points: {path.name} of a survey file"
+                if top.given("tag_bundles")
+                else ""
+            )
         )
     sections = {"": top, **{name: top.section(name) for name in ("tags", "water", "camera", *kinds)}}
     tags, interface = sections["tags"], sections[kinds[0]]
@@ -168,6 +177,9 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
             )
         options["fit"] = tuple(names)
     words = {"points": _word(top, "points"), "unit": _word(top, "unit"), "family": _word(tags, "family")}
+    sizes = _word(tags, "sizes")
+    layout = TagLayout({}) if sizes is None else _layout(path.parent / sizes)
+    words["family"] = words["family"] or layout.family or None
     if words["unit"] is not None and words["unit"] not in METRES:
         raise top.error(f"unknown unit '{words['unit']}'; available: {', '.join(METRES)}")
     if words["family"] is not None:
@@ -183,12 +195,20 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
         unit=words["unit"],
         z=_number(top, "z"),
         edge=_number(tags, "edge"),
+        edges=layout.sizes,
         family=words["family"],
         latency=sections["camera"].number("latency", 0.0),
     )
     for section in sections.values():
         section.finish()
     return file
+
+
+def _layout(path: Path) -> TagLayout:
+    try:
+        return read_tag_layout(path)
+    except VehicleError as error:
+        raise CalibrationError(str(error)) from None
 
 
 def _number(fields: Fields, key: str) -> float | None:

@@ -18,10 +18,10 @@ from finssim.vehicles.equipment import (
     Dvl,
     Imu,
     Mcu,
-    Mount,
     RaySensor,
     Safety,
     Sensors,
+    TagMount,
     Tags,
 )
 from finssim.vehicles.part import VehicleError
@@ -124,7 +124,9 @@ def default_tags(values: Mapping[str, Any]) -> Tags:
     x, y, z = values["body"].center_of_buoyancy
     top = float(z + 0.5 * height)
     mounts = {
-        tag: Mount(position=np.array([x + side * APART * length, y, top]), orientation=np.array(QUARTER_TURN))
+        tag: TagMount(
+            position=np.array([x + side * APART * length, y, top]), orientation=np.array(QUARTER_TURN)
+        )
         for tag, side in ((15, 1.0), (16, -1.0))
     }
     return Tags(family="tag25h9", edge=float(min(EDGE[0] * length, EDGE[1] * width)), mounts=mounts)

@@ -220,6 +220,13 @@ class RaySensor(Sensor):
     """Range cells of a sonar's pictures; the device's own where not given."""
 
 
+class TagMount(Mount):
+    """Pose of a tag."""
+
+    edge: Positive | None = None
+    """Edge of this tag's black border, where it is not that of the others [m]."""
+
+
 class Tags(Part):
     """Fiducial tags on the vehicle, seen by an overhead camera.
 
@@ -230,8 +237,12 @@ class Tags(Part):
     """AprilTag family, such as `tag25h9`."""
     edge: Positive
     """Edge of the black border [m]."""
-    mounts: dict[Annotated[int, Field(ge=0)], Mount]
+    mounts: dict[Annotated[int, Field(ge=0)], TagMount]
     """Pose of each tag, by tag id."""
+
+    def edge_of(self, tag: int) -> float:
+        """Return the edge of a tag's black border [m]."""
+        return self.mounts[tag].edge or self.edge
 
 
 class Mcu(Part):

@@ -21,6 +21,7 @@ from finssim.core.registry import IMPORTERS, VEHICLES, RegistryError
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.importers.rigid import combined
 from finssim.vehicles.part import VehicleError, VehicleWarning, did_you_mean, sentence_of
+from finssim.vehicles.tag_layout import with_layout
 from finssim.vehicles.vehicle import ORIGINS, Origin, Provenance, Vehicle
 
 GREATEST = 1e12
@@ -199,6 +200,9 @@ def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[T
     hull = values.get("hull")
     if isinstance(hull, dict) and isinstance(hull.get("file"), str | Path):
         hull["file"] = path.parent.resolve() / hull["file"]
+    tags = values.get("tags")
+    if isinstance(tags, dict) and isinstance(tags.get("layout"), str):
+        values["tags"] = _Replacing(with_layout(tags, path.parent, label))
     perception = values.get("perception")
     for name, entry in perception.items() if isinstance(perception, dict) else ():
         device = entry.get("device") if isinstance(entry, dict) else None
@@ -221,9 +225,13 @@ def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[T
     return _merged(base_values, values, (), base_origins), base_origins | origins
 
 
+class _Replacing(dict[str, Any]):
+    """A section that replaces the inherited one instead of changing some of its keys."""
+
+
 def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> Any:
     """`change` laid over `base`: sections merge, everything else replaces, null removes."""
-    if isinstance(base, dict) and isinstance(change, dict):
+    if isinstance(base, dict) and isinstance(change, dict) and not isinstance(change, _Replacing):
         result = dict(base)
         for key in _replaced_hull(change) if path == ("hull",) else ():
             result.pop(key, None)

@@ -57,8 +57,10 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
         return None
     return tuple(  # type: ignore[return-value]
         _squares(
-            [(m.position, quat_to_matrix(m.orientation)) for m in tags.mounts.values()],
-            size * tags.edge,
+            [
+                (m.position, quat_to_matrix(m.orientation), size * tags.edge_of(i))
+                for i, m in tags.mounts.items()
+            ],
             lift,
         )
         for size, lift in ((1.3, 0.0), (0.9, 0.002))
@@ -179,10 +181,9 @@ def _box(lower: Array, upper: Array) -> Mesh:
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))
 
 
-def _squares(places: list[tuple[Array, Array]], edge: float, lift: float) -> Mesh:
-    """Squares about the z axes of mounts, seen from both sides."""
-    half = 0.5 * edge
-    corners = np.array([[-half, -half, lift], [half, -half, lift], [half, half, lift], [-half, half, lift]])
-    vertices = [corners @ R.T + np.asarray(position) for position, R in places]
+def _squares(places: list[tuple[Array, Array, float]], lift: float) -> Mesh:
+    """Squares about the z axes of mounts, each with its edge, seen from both sides."""
+    flat = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    vertices = [(edge * flat + [0.0, 0.0, lift]) @ R.T + np.asarray(position) for position, R, edge in places]
     faces = [np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(len(places))]
     return Mesh(np.concatenate(vertices), np.concatenate(faces))

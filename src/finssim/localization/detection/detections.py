@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +78,83 @@ def best_detections(detections: Iterable[Detection]) -> list[Detection]:
         if (detection.hamming, -_comparable(detection.margin)) < (rival.hamming, -_comparable(rival.margin)):
             best[detection.family, detection.tag] = detection
     return list(best.values())
+
+
+def in_our_order(frames: Sequence[Frame], corners: Mapping[int, Array]) -> tuple[list[Frame], str]:
+    """Return pictures whose corners are in our order, and a sentence if the file had them in another one.
+
+    Other programs begin at another corner or go round the other way. A printed tag is seen from its front, which shows
+    the direction. The first corner is the one with which each tag, as a ruler of the plane around it, best gives the
+    places of the others: so it takes two tags in a picture.
+
+    Args:
+        frames: As they were read.
+        corners: Tag id -> its corners in the order of `families.corners` in any common frame [m], (4, 3).
+    """
+    seen = [
+        [(corners[d.tag], np.asarray(d.corners, float)) for d in frame.detections if d.tag in corners]
+        for frame in frames
+    ]
+    tags = [pixels for frame in seen for _, pixels in frame if np.isfinite(pixels).all()]
+    backwards = bool(tags) and float(np.median([_area(pixels) for pixels in tags])) < 0.0
+    orders = [np.roll(np.arange(4)[:: -1 if backwards else 1], shift) for shift in range(4)]
+    misses = [
+        [
+            miss
+            for frame in seen
+            for X, x in frame
+            for Y, y in frame
+            if (miss := _miss(X, x[order], Y, y[order])) is not None
+        ]
+        for order in orders
+    ]
+    if not misses[0]:
+        return list(frames), ""
+    scores = [float(np.median(of_order)) for of_order in misses]
+    best = int(np.argmin(scores))
+    order = orders[best]
+    if (best == 0 and not backwards) or scores[best] > UNCLEAR * min(scores[:best] + scores[best + 1 :]):
+        return list(frames), ""
+    ordered = [
+        replace(f, detections=tuple(replace(d, corners=np.asarray(d.corners)[order]) for d in f.detections))
+        for f in frames
+    ]
+    names = ("top-left", "top-right", "bottom-right", "bottom-left")
+    first, second = (names[int(np.flatnonzero(order == i)[0])] for i in (0, 1))
+    return (
+        ordered,
+        f"corners are read as {first}, {second}, ..., the order in which the surveyed tags fit together",
+    )
+
+
+UNCLEAR = 0.5
+"""Share of the miss of the second best order below which the best one is believed."""
+
+
+def _area(pixels: Array) -> float:
+    """Signed area of a ring of corners [px²]; above 0 where it goes round clockwise on the screen."""
+    x, y = pixels.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+def _miss(X: Array, x: Array, Y: Array, y: Array) -> float | None:
+    """Return by how much a tag misses the place of another one in the picture, as a share of their distance.
+
+    Args:
+        X: Corners of the tag [m], (4, 3).
+        x: Its corners in the picture [px], (4, 2).
+        Y: Corners of the other one [m].
+        y: Its corners in the picture [px].
+    """
+    there, seen = Y.mean(axis=0) - X.mean(axis=0), y.mean(axis=0) - x.mean(axis=0)
+    flat = X - X.mean(axis=0)
+    _, _, axes = np.linalg.svd(flat)
+    distance, along = float(np.linalg.norm(there)), float(np.linalg.norm(axes[:2] @ there))
+    if not np.isfinite(seen).all() or along < 0.7 * distance or distance == 0.0:
+        return None
+    linear = np.linalg.lstsq(flat, x - x.mean(axis=0), rcond=None)[0]
+    miss, length = float(np.linalg.norm(there @ linear - seen)), float(np.linalg.norm(seen))
+    return miss / max(length, 1e-9)
 
 
 def write_detections(frames: Iterable[Frame], path: str | Path) -> None:

@@ -224,8 +224,10 @@ def corners(edge: float) -> Array:
 
 def tag_corners_b(tags: Tags) -> dict[int, Array]:
     """Corners of a vehicle's tags in the body frame [m]: tag id -> (4, 3), in the order of `corners`."""
-    flat = corners(tags.edge)
     return {
-        tag: np.asarray(np.asarray(mount.position) + quat_rotate(np.asarray(mount.orientation), flat))
+        tag: np.asarray(
+            np.asarray(mount.position)
+            + quat_rotate(np.asarray(mount.orientation), corners(tags.edge_of(tag)))
+        )
         for tag, mount in tags.mounts.items()
     }
