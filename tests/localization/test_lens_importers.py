@@ -186,6 +186,9 @@ READ = {
                          "dist": [[K1, K2, P1, P2, K3]]})),
         brown(),
     ),
+    "OpenCV with the word of a model": (
+        "c.yaml", text(ros("equidistant", (T1, T2, T3, T4)).replace("distortion_model", "camera_model")), kannala(),
+    ),
     "COLMAP OPENCV": ("cameras.txt", colmap("OPENCV", *FOCAL, K1, K2, P1, P2), brown((K1, K2))),
     "COLMAP OPENCV_FISHEYE": ("cameras.txt", colmap("OPENCV_FISHEYE", *FOCAL, T1, T2, T3, T4), kannala()),
     "COLMAP FULL_OPENCV": (
@@ -237,6 +240,12 @@ def test_small_models_of_colmap_have_no_further_coefficients(model, numbers, wor
 
 REFUSED = {
     "ost.txt without a model": ("ost.txt", text(OST.replace(f" {K3}\n", "\n")), "give ost.yaml, which names it"),
+    "OpenCV with 4 coefficients": (
+        "c.yaml", text(ros("x", (T1,) * 4).replace("distortion_model: x\n", "")), "add distortion_model: plumb_bob",
+    ),
+    "OpenCV with an unknown model": (
+        "c.yaml", text(ros("mei", (T1,) * 4).replace("distortion_model", "lens_model")), "unknown lens model 'mei'",
+    ),
     "COLMAP with two cameras": (
         "cameras.txt", text("1 PINHOLE 9 9 5 5 6 6\n2 PINHOLE 9 9 5 5 6 6\n"), "its cameras are 1, 2, expected one",
     ),

@@ -12,7 +12,7 @@ from finssim.vehicles.part import VehicleError
 from finssim.vehicles.tag_layout import read_tag_layout
 
 BUNDLE = """
-standalone_tags: [{id: 3, size: 0.2, name: gate}]
+standalone_tags: [{id: 03, size: 0.2, name: gate}]
 tag_bundles:
   [
     {
@@ -100,6 +100,7 @@ REFUSED = {
     "two bundles": (BUNDLE.replace("bundles:\n  [", "bundles:\n  [{name: b, layout: []},"), "the bundles b, rov_top"),
     "twice": (BUNDLE.replace("id: 11", "id: 10"), "tag 10 is there twice"),
     "no size": (BUNDLE.replace("id: 11, size: 0.08", "id: 11"), "size is [None], expected 1 finite number"),
+    "no number": (BUNDLE.replace("id: 11", "id: eleven"), "id is 'eleven', expected an integer from 0"),
     "a size of 0": (BUNDLE.replace("id: 11, size: 0.08", "id: 11, size: 0.0"), "size is 0 m, expected above 0"),
     "no rotation": (BUNDLE.replace("qw: 0.9659258", "qw: 0.1"), "has length 0.2775, expected 1"),
     "sizes of too few": (SETTINGS.replace("[0.162, 0.1]", "[0.162]"), "2 ids and 1 sizes"),

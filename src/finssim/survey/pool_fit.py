@@ -1507,7 +1507,7 @@ def run(
     Args:
         inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
         survey (FILE): Survey file (.yaml): the points, what the camera looks through, and what is known of it.
-        camera (FILE): Camera file: ours, or one of OpenCV, ROS, Kalibr or MATLAB.
+        camera (FILE): Camera file: ours, or that of another program (see the page Bring what you have).
         out (FILE): Pool file to write (.yaml).
         report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.

@@ -217,9 +217,9 @@ def _list(value: Any, where: str) -> list[Any]:
 
 def _id(values: Mapping[Any, Any], where: str) -> int:
     tag = values.get("id")
-    if type(tag) is not int or tag < 0:
+    if type(tag) not in (int, float) or not tag >= 0 or tag % 1 != 0:  # 00 is read as 0.0
         raise VehicleError(f"{where}: id is {str(tag)[:40]!r}, expected an integer from 0")
-    return tag
+    return int(tag)
 
 
 def _size(values: Mapping[Any, Any], where: str) -> float:

@@ -45,7 +45,8 @@ OF_OPENCV = {
 OPENCV_WORDS = {
     "width": ("imagewidth", "width"), "height": ("imageheight", "height"),
     "matrix": ("cameramatrix", "k", "mtx", "intrinsicmatrix"),
-    "distortion": ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d"), "fisheye": ("fisheyemodel",),
+    "distortion": ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d"),
+    "model": ("distortionmodel", "cameramodel", "lensmodel", "model"), "fisheye": ("fisheyemodel",),
 }  # fmt: skip
 """Part of a lens -> keys of files that programs write with OpenCV, as `_plain` writes them."""
 OF_MATLAB = {
@@ -293,16 +294,30 @@ def read_opencv(path: Path) -> Lens:
         )
     refuse_strange(plain, {*found.values(), *OF_OPENCV}, label)
     size = (plain.get(found["width"]), plain.get(found["height"]))
-    fisheye = plain.get(found["fisheye"]) in (True, 1)
+    model = _model_of_opencv(plain, given, label)
     return lens_of(
         {
             **_size(size, "image_width and image_height", label),
             **_pinhole(_flat(plain[found["matrix"]], label), "camera_matrix", label),
-            "model": "fisheye" if fisheye else _perspective(given),
+            "model": model,
             "distortion": given,
         },
         label,
     )
+
+
+def _model_of_opencv(plain: Mapping[str, Any], distortion: Sequence[float], label: str) -> str:
+    """Return the lens model by its word or its flag; the number of the coefficients alone shows those of 5 and 8."""
+    word = next((plain[key] for key in OPENCV_WORDS["model"] if isinstance(plain.get(key), str)), None)
+    if word is not None:
+        model = model_of(word.lower(), label)
+        return _perspective(distortion) if model == "plumb_bob" else model
+    flag = next((plain[key] for key in OPENCV_WORDS["fisheye"] if key in plain), None)
+    if flag is None and len(distortion) == 4:
+        raise LocalizationError(
+            f"{label}: has 4 coefficients and no name of their model: add distortion_model: plumb_bob or equidistant"
+        )
+    return "fisheye" if flag in (True, 1) else _perspective(distortion)
 
 
 def _plain(key: Any) -> str:

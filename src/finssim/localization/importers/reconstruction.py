@@ -235,7 +235,7 @@ def read_orb_slam(path: Path) -> Lens:
 COLMAP = LensImporter(
     "COLMAP (cameras.txt, .bin)",
     lambda path, head: (
-        path.name.lower() == "cameras.bin"
+        path.name.lower().endswith("cameras.bin")
         or re.search(rb"(?m)^\s*\d+\s+(" + "|".join(MODELS).encode() + rb")\s+\d+\s+\d+\s", head) is not None
         or b"CAMERA_ID, MODEL" in head
     ),
