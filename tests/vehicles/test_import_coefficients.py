@@ -8,8 +8,8 @@ from finssim.vehicles.importers.assignments import read_assignments
 from finssim.vehicles.importers.coefficients import one_sign, symbol_of
 from finssim.vehicles.importers.draft import read_foreign
 from finssim.vehicles.importers.rigid import flu_of_frd
-from reference.alike import assert_moves_alike, simulated
 from reference.fossen import F, Fossen, Torpedo
+from reference.imported import assert_moves_alike, simulated
 
 HEAVY = """
 clc; clear;                 % BlueROV2 Heavy of von Benzon et al. 2022

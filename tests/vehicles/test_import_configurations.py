@@ -9,8 +9,8 @@ import pytest
 from finssim.vehicles import VehicleError, VehicleWarning, load_vehicle
 from finssim.vehicles.importers.draft import read_foreign
 from finssim.vehicles.importers.marinegym import thrust
-from reference.alike import assert_moves_alike, simulated
 from reference.fossen import F, Fossen, Torpedo
+from reference.imported import assert_moves_alike, simulated
 
 COUGUV = {
     "rho": 1026, "mass": 31.03, "length": 1.6, "diam": 0.19, "r_bg": [0, 0, 0.02], "r_bb": [0, 0, 0],

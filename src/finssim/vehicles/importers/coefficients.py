@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from finssim.vehicles.importers import torpedo
 from finssim.vehicles.importers.assignments import Assignments, read_assignments
-from finssim.vehicles.importers.draft import Draft, VehicleImporter, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.draft import SHARE, Draft, VehicleImporter, put_controlled_axes, put_envelope
 from finssim.vehicles.importers.rigid import flu_of_frd, plain
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, skew
@@ -42,8 +42,6 @@ NAMES = {
     "thrust": "T TAM T_alloc T_matrix B B_matrix Thrust_alloc Thurst_alloc thrust_matrix thruster_matrix",
 }  # fmt: skip
 """Quantity -> its names. Matrices may be 6 numbers of a diagonal, an inertia 3; centres may be xg, x_g or xG."""
-SHARE = 0.3
-"""Guessed limit of a thruster, as a share of the weight [-]."""
 
 
 def one_sign(matrix: Array, what: str, where: str) -> Array:

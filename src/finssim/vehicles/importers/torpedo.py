@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.vehicles.importers.draft import Draft
+from finssim.vehicles.importers.draft import LAG, Draft
 from finssim.vehicles.importers.rigid import flu_of_frd, plain
 
 __all__ = [
@@ -36,8 +36,8 @@ PROPELLER = ("D_prop", "t_prop", "KT_0", "KT_max", "Ja_max")
 """Words of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
 RHO, WAKE, OSWALD = 1026.0, 0.056, 0.7
 """Density [kg/m³] that the library's drag has, wake fraction and Oswald's efficiency of PythonVehicleSimulator [-]."""
-RPM, LAG = 3000.0, 0.1
-"""Guesses: shaft speed at the limit of a thruster [rpm], time constant [s]."""
+RPM = 3000.0
+"""Guessed shaft speed at the limit of a thruster [rpm]."""
 STRIPS = np.arange(21) / 20.0 - 0.5
 """Places of the strips over the length [-]."""
 HOERNER = (
