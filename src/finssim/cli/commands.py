@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -26,6 +26,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "vehicles": "finssim.cli.commands:vehicles",
         "vehicles show": "finssim.cli.commands:show_vehicle",
         "vehicles import": "finssim.cli.commands:import_vehicle",
+        "vehicles export": "finssim.cli.commands:export",
         "simulate": "finssim.cli.simulate:simulate",
     },
     "Identify a vehicle": {
@@ -226,3 +227,35 @@ def import_vehicle(file: Path, *, out: Path, folder: Sequence[Path] = (), as_jso
     for kind, sentences in lists.items():
         for sentence in sentences:
             print(f"{kind}: {sentence}")
+
+
+def export(
+    name: str,
+    *,
+    format: Literal["sdf", "urdf"] | None = None,
+    out: Path | None = None,
+    hydrodynamics: str = "calibrated",
+    as_json: bool = False,
+) -> None:
+    """Write a vehicle as SDF or URDF with the plugins of gz-sim, and list what the format does not hold.
+
+    Example: finssim vehicles export bluerov2_heavy --format sdf
+
+    Args:
+        name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
+        format: SDF is a world that runs by itself; that of the suffix of the file, or sdf, if not given.
+        out (FILE): File to write; NAME.sdf or NAME.urdf if not given.
+        hydrodynamics (SET): Set of coefficients of the vehicle file.
+        as_json: Print one JSON object instead of text.
+    """
+    from finssim.vehicles import load_vehicle
+    from finssim.vehicles.export import export_vehicle
+
+    kind = format or ("urdf" if out is not None and out.suffix == ".urdf" else "sdf")
+    vehicle = load_vehicle(name)
+    file = out or Path(f"{vehicle.name}.{kind}")
+    if file.suffix != f".{kind}":
+        raise ValueError(f"{file} ends in '{file.suffix}', expected .{kind}, as the format")
+    lost = export_vehicle(vehicle, file, kind, hydrodynamics)
+    lines = [str(file), *(f"not held: {sentence}" for sentence in lost)]
+    print(json.dumps({"file": str(file), "not held": lost}) if as_json else "\n".join(lines))

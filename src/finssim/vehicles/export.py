@@ -1,0 +1,181 @@
+"""Export of vehicles: SDF and URDF with the plugins Hydrodynamics, Thruster and Buoyancy of gz-sim.
+
+The link of the body has its frame at the reference point of the hydrodynamic coefficients, x forward, y left, z up. Its
+only collision shape is a box of the displaced volume at the centre of buoyancy. SDF has the added mass in
+`fluid_added_mass`, with which gz-sim's Coriolis wrench has the right sign, and is a world that runs by itself.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree.ElementTree import Element, ElementTree, indent
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.files import atomic_write
+from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.importers.rigid import combined
+from finssim.vehicles.part import VehicleError
+from finssim.vehicles.vehicle import Vehicle
+
+__all__ = ["export_vehicle"]
+
+DIAMETER = 0.1
+"""Diameter of every propeller [m]; only its product with the thrust coefficient acts."""
+PROPELLER = 1e-4
+"""Mass of a propeller as a share of the vehicle's, from whose body it is taken."""
+SECTIONS = ("sensors", "perception", "tags", "mcu", "autopilot", "safety", "calibrations")
+"""Sections of a vehicle file that these formats do not hold."""
+
+
+def export_vehicle(
+    vehicle: Vehicle, out: Path, kind: Literal["sdf", "urdf"], hydrodynamics: str = "calibrated"
+) -> list[str]:
+    """Write a vehicle for gz-sim and return what the format does not hold, one sentence for each.
+
+    Args:
+        vehicle: The vehicle.
+        out: File to write.
+        kind: Format.
+        hydrodynamics: Set with coefficients.
+
+    Raises:
+        VehicleError: There is no such set with coefficients.
+    """
+    chosen = vehicle.hydrodynamic_set(hydrodynamics)
+    if not isinstance(chosen, HydrodynamicSet):
+        raise VehicleError(
+            f"{vehicle.name}: the set '{hydrodynamics}' is of a mesh: name one with coefficients"
+        )
+    lost = [f"section {name}" for name in SECTIONS if name in vehicle.model_fields_set]
+    lost += [f"hydrodynamic set {name}" for name in vehicle.hydrodynamics if name != hydrodynamics]
+    lost += [f"hydrodynamic term {name}" for name in chosen.terms]
+    lost += ["lag, delay and rate limit of thrusters: the thrust of gz-sim follows at once"]
+    lost += [
+        "shape of the hull, which is a box of the displaced volume, and the layer in which buoyancy fades"
+    ]
+    if any(t.c_plus != t.c_minus for t in vehicle.thrusters.values()):
+        lost += ["thrust coefficient of reverse rotation (c_minus): gz-sim has one for both directions"]
+    if np.any(chosen.reference_point):
+        lost += [f"body origin: the link's frame is at the reference point {chosen.reference_point.tolist()}"]
+    if kind == "urdf":
+        lost += ["gravity and the plugin Buoyancy, which are a world's"]
+        lost += [
+            "sign of the Coriolis wrench of the added mass, which gz-sim inverts for a plugin's coefficients"
+        ]
+    root = _sdf(vehicle, chosen) if kind == "sdf" else _urdf(vehicle, chosen)
+    indent(root)
+    with atomic_write(out) as temporary:
+        ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+    return lost
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(values))
+
+
+def _x(tag: str, *content: Any, **attributes: Any) -> Element:
+    """Return an element of children, a text, or numbers; attributes are texts or numbers."""
+    made = Element(tag, {k: x if isinstance(x, str) else _numbers(x) for k, x in attributes.items()})
+    for part in content:
+        if isinstance(part, Element):
+            made.append(part)
+        else:
+            made.text = part if isinstance(part, str) else _numbers(part)
+    return made
+
+
+def _links(
+    vehicle: Vehicle, origin: NDArray[np.float64]
+) -> dict[str, tuple[float, Any, Any, dict[str, float]]]:
+    """Return link -> mass [kg], place in the body [m], centre of gravity in the link [m], inertia by word [kg m²].
+
+    The body's mass is less by those of the propellers, so that all together have that of the vehicle.
+    """
+    body, mass = vehicle.body, vehicle.body.mass * PROPELLER
+    places = {f"{name}_propeller": thruster.position - origin for name, thruster in vehicle.thrusters.items()}
+    tensor, count = mass * 1e-4 * np.eye(3), len(places)
+    centres = [body.center_of_gravity - origin, *places.values()]
+    base = combined([body.mass, *[-mass] * count], centres, [body.inertia, *[-tensor] * count])
+
+    def words(matrix: NDArray[np.float64]) -> dict[str, float]:
+        return {f"i{'xyz'[i]}{'xyz'[j]}": float(matrix[i, j]) for i in range(3) for j in range(i, 3)}
+
+    links = {"base_link": (base[0], np.zeros(3), base[1], words(base[2]))}
+    return links | {name: (mass, place, np.zeros(3), words(tensor)) for name, place in places.items()}
+
+
+def _plugin(kind: str, **words: Any) -> Element:
+    file = "".join(f"-{letter.lower()}" if letter.isupper() else letter for letter in kind)
+    children = (_x(word, value) for word, value in words.items())
+    return _x("plugin", *children, filename=f"gz-sim{file}-system", name=f"gz::sim::systems::{kind}")
+
+
+def _plugins(vehicle: Vehicle, chosen: HydrodynamicSet, *, added: bool) -> list[Element]:
+    """Return Hydrodynamics, with added mass or without it, and a Thruster for each propeller."""
+    density, words = vehicle.water.density, {}
+    matrices = {"Dot": chosen.added_mass} if added else {}
+    for infix, matrix in (matrices | {"": chosen.linear_damping, "abs": chosen.quadratic_damping}).items():
+        for i, j in zip(*np.nonzero(matrix), strict=True):
+            velocity = "UVWPQR"[j]
+            word = f"{velocity}abs{velocity}" if infix == "abs" else f"{infix}{velocity}"
+            words["xyzkmn"[i] + word] = -matrix[i, j]
+    plugins = [_plugin("Hydrodynamics", link_name="base_link", water_density=density, **words)]
+    for name, thruster in vehicle.thrusters.items():
+        dead = thruster.thrust(thruster.dead_rpm_plus * np.pi / 30.0)
+        plugins.append(_plugin(
+            "Thruster", joint_name=name, thrust_coefficient=thruster.c_plus / (density * DIAMETER**4),
+            fluid_density=density, propeller_diameter=DIAMETER, velocity_control="true",
+            max_thrust_cmd=thruster.force_max, min_thrust_cmd=thruster.force_min,
+            **({"deadband": dead} if dead > 0.0 else {}),
+        ))  # fmt: skip
+    return plugins
+
+
+def _geometry(vehicle: Vehicle) -> Any:
+    """Return the sides of a box of the displaced volume, in the proportions of the size [m], (3,)."""
+    return vehicle.body.size * (vehicle.body.displaced_volume / np.prod(vehicle.body.size)) ** (1.0 / 3.0)
+
+
+def _sdf(vehicle: Vehicle, chosen: HydrodynamicSet) -> Element:
+    origin, parts = chosen.reference_point, []
+    level, buoyant = [0.0, 0.0, 0.0], vehicle.body.center_of_buoyancy - origin
+    box = _x("geometry", _x("box", _x("size", _geometry(vehicle))))
+    pairs = zip(*np.triu_indices(6), strict=True)
+    added = _x(
+        "fluid_added_mass", *(_x("xyzpqr"[i] + "xyzpqr"[j], chosen.added_mass[i, j]) for i, j in pairs)
+    )
+    hull = [_x(kind, _x("pose", [*buoyant, *level]), box, name="hull") for kind in ("collision", "visual")]
+    for name, (mass, place, centre, words) in _links(vehicle, origin).items():
+        inertia = _x("inertia", *(_x(word, x) for word, x in words.items()))
+        fluid, shapes = ([added], hull) if name == "base_link" else ([], [])
+        inertial = _x("inertial", _x("pose", [*centre, *level]), _x("mass", mass), inertia, *fluid)
+        parts.append(_x("link", _x("pose", [*place, *level]), inertial, *shapes, name=name))
+    for name, thruster in vehicle.thrusters.items():
+        ends = _x("parent", "base_link"), _x("child", f"{name}_propeller")
+        parts.append(_x("joint", *ends, _x("axis", _x("xyz", thruster.axis)), name=name, type="revolute"))
+    model = _x("model", *parts, *_plugins(vehicle, chosen, added=False), name=vehicle.name)
+    gravity = _x("gravity", [0.0, 0.0, -vehicle.water.gravity])
+    engine = [_plugin(kind) for kind in ("Physics", "UserCommands", "SceneBroadcaster")]
+    buoyancy = _plugin("Buoyancy", uniform_fluid_density=vehicle.water.density)
+    return _x("sdf", _x("world", gravity, *engine, buoyancy, model, name="water"), version="1.10")
+
+
+def _urdf(vehicle: Vehicle, chosen: HydrodynamicSet) -> Element:
+    origin, parts = chosen.reference_point, []
+    box = _x("geometry", _x("box", size=_geometry(vehicle)))
+    buoyant = _x("origin", xyz=vehicle.body.center_of_buoyancy - origin, rpy="0 0 0")
+    links = _links(vehicle, origin)
+    for name, (mass, _, centre, words) in links.items():
+        inertial = _x(
+            "inertial", _x("origin", xyz=centre, rpy="0 0 0"), _x("mass", value=mass), _x("inertia", **words)
+        )
+        shapes = [_x(kind, buoyant, box) for kind in ("collision", "visual")] if name == "base_link" else []
+        parts.append(_x("link", inertial, *shapes, name=name))
+    for name, thruster in vehicle.thrusters.items():
+        ends = _x("parent", link="base_link"), _x("child", link=f"{name}_propeller")
+        place = _x("origin", xyz=links[f"{name}_propeller"][1], rpy="0 0 0")
+        parts.append(_x("joint", *ends, place, _x("axis", xyz=thruster.axis), name=name, type="continuous"))
+    return _x("robot", *parts, _x("gazebo", *_plugins(vehicle, chosen, added=True)), name=vehicle.name)
