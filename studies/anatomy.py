@@ -19,6 +19,7 @@ from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, 
 from finssim.evaluation.plants import PlantChanges, load_plant
 from finssim.evaluation.statistics import with_interval
 from finssim.evaluation.tables import Columns, Table, cells
+from finssim.learning.train import TrainingSettings
 from finssim.studies.transfer import T1, controllers_of
 from finssim.vehicles import load_vehicle
 
@@ -132,8 +133,8 @@ def anatomy(
     check_choices(names, ROWS, "row", ValueError)
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
-        "t1", {name: T1.rows[name] for name in names}, run_seeds, folder, vehicle, steps,
-        progress=lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
+        "t1", {name: T1.rows[name] for name in names}, run_seeds, folder,
+        TrainingSettings(vehicle=vehicle, steps=steps), progress=lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
     plants = {
         (name, k): PlantChanges(name=f"{name}-{k}", **CAUSES[name].plant(amount))

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from finssim.evaluation.tables import html_of, markdown_of
+from finssim.learning.train import TrainingSettings
 from finssim.studies.transfer import T1, T2, controllers_of, row_figures, scores, transfer_experiment
 
 pytestmark = pytest.mark.slow
@@ -71,14 +72,14 @@ def test_what_is_unknown_is_refused_before_anything_is_trained(tmp_path, wrong, 
 def test_a_finished_policy_is_not_trained_again(tmp_path):
     """An unfinished one is."""
     rows = {name: T1.rows[name] for name in ("pid", "calibrated-pool")}
-    controllers = controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    controllers = controllers_of("t1", rows, [5], tmp_path, TrainingSettings(steps=4096))
     network = Path(controllers["calibrated-pool", 5]) / "policy.onnx"
     assert controllers["pid", 5] == "pid" and network.parent.parent == tmp_path / "policies"
     first = network.stat().st_mtime_ns
-    controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    controllers_of("t1", rows, [5], tmp_path, TrainingSettings(steps=4096))
     assert network.stat().st_mtime_ns == first
     network.write_bytes(b"cut short")
-    controllers_of("t1", rows, [5], tmp_path, "finsrov", 4096)
+    controllers_of("t1", rows, [5], tmp_path, TrainingSettings(steps=4096))
     assert network.stat().st_size > 1000
 
 
