@@ -134,7 +134,8 @@ def anatomy(
     folder, run_seeds = Path(out), range(seed, seed + seeds)
     controllers = controllers_of(
         "t1", {name: T1.rows[name] for name in names}, run_seeds, folder,
-        TrainingSettings(vehicle=vehicle, steps=steps), progress=lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
+        TrainingSettings(vehicle=vehicle, steps=steps), lambda part, text: progress(TRAINING_SHARE * part, text),
+        processes=processes, address=address,
     )  # fmt: skip
     plants = {
         (name, k): PlantChanges(name=f"{name}-{k}", **CAUSES[name].plant(amount))
