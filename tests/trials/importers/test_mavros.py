@@ -234,7 +234,7 @@ def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
     np.testing.assert_allclose(trial.series("u")[1], np.cos(TIMES), atol=1e-12)
     np.testing.assert_allclose(trial.series("x")[1], np.sin(TIMES), atol=1e-12)
     np.testing.assert_allclose(trial.series("depth")[1], 2.0 + np.sin(TIMES), atol=1e-12)
-    assert "pressure_left_out" in codes(trial) and "directions_assumed" in codes(trial)
+    assert "columns_left_out" in codes(trial) and "directions_assumed" in codes(trial)
     unread = str(trial.findings[-1])
     for topic in (
         "/cmd_vel",

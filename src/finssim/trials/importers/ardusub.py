@@ -406,7 +406,7 @@ def read(path: Path, request: Request) -> TrialStreams:
         CalibrationError: Not a log, or outputs that cannot be told apart.
         ModuleNotFoundError: pymavlink is not installed.
     """
-    requested, pulses, vehicle = request.mapped.ardusub, not request.passive, request.vehicle
+    requested = request.mapped.ardusub
     log = read_log(path, KINDS, received=requested.stamps == "received")
     streams = [
         _attitude(log),
@@ -415,11 +415,8 @@ def read(path: Path, request: Request) -> TrialStreams:
         _voltage(log),
         _arming(log),
         velocity_stream(log, requested.velocity),
-        *(_pulses(log, requested, vehicle) if pulses else ()),
     ]
-    usable = [stream for stream in streams if stream is not None and len(stream.t) >= 2]
-    if pulses and vehicle is not None and not any("pwm_" in name for s in usable for name in s.channels):
-        usable = _driven_by_sticks(log, requested, vehicle, usable)
+    usable = with_inputs(log, request, [s for s in streams if s is not None and len(s.t) >= 2])
     if not any(stream.channels for stream in usable):
         raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
     used = {stream.source.removeprefix(f"{path.name} ") for stream in usable}
@@ -428,6 +425,20 @@ def read(path: Path, request: Request) -> TrialStreams:
     if rest:
         usable[0] = usable[0].noting(finding("not_read", items=f"messages {', '.join(rest)}"))
     return TrialStreams(usable)
+
+
+def with_inputs(log: ArduPilotLog, request: Request, streams: list[Stream]) -> list[Stream]:
+    """Return streams of a log with the pulses of its outputs, or those that the mixer makes of the pilot's axes.
+
+    Raises:
+        CalibrationError: The outputs do not fit the vehicle's thrusters.
+    """
+    if request.passive:
+        return streams
+    streams = [*streams, *_pulses(log, request.mapped.ardusub, request.vehicle)]
+    if request.vehicle is None or any("pwm_" in name for stream in streams for name in stream.channels):
+        return streams
+    return _driven_by_sticks(log, request.mapped.ardusub, request.vehicle, streams)
 
 
 def _attitude(log: ArduPilotLog) -> Stream | None:

@@ -285,6 +285,8 @@ class SourceMap(Part):
     """Names of the columns of a file that has no line of names."""
     valid: tuple[Validity, ...] | None = None
     """Columns that mark invalid samples, which are left out; an evident one if None, none if `false`."""
+    arming: Validity | None = None
+    """Column that is valid while the vehicle is armed, for `split: arming`."""
     stamps: Literal["header", "received"] = "header"
     """Times of a topic: the stamps in its messages, if it has them, or the times at which they were recorded."""
 
@@ -725,67 +727,42 @@ def without_doubles(streams: Sequence[Stream]) -> list[Stream]:
         CalibrationError: Two sources of one rank for a column, or of words.
     """
     out = list(streams)
-    units = [QUATERNION, *((name,) for stream in out for name in stream.channels if name not in QUATERNION)]
-    for names in dict.fromkeys(units):
+    names_of = [name for stream in out for name in (*stream.channels, *stream.words)]
+    groups = {name: group for group in (QUATERNION, ("depth", "pressure")) for name in group}
+    for names in dict.fromkeys(groups.get(name, (name,)) for name in names_of):
         holders = [i for i, stream in enumerate(out) if any(name in stream.channels for name in names)]
-        moving = [i for i in holders if not _dead(out[i], names)]
-        if 0 < len(moving) < len(holders):
-            for i in set(holders) - set(moving):
-                out[i] = _without(out[i], names, out[moving[0]], dead=True)
-            holders = moving
-        best = min(holders, key=lambda i: out[i].rank, default=-1)
-        for i in holders:
-            if out[i].rank > out[best].rank:
-                out[i] = _without(out[i], names, out[best], dead=False)
-            elif i != best:
-                _refuse_double(names[0], out[best], out[i])
-    depth = [stream for stream in out if "depth" in stream.channels]
-    for i, stream in enumerate(out):
-        if depth and "pressure" in stream.channels and stream.rank >= 0:
-            if _dead(depth[0], ("depth",)) and not _dead(stream, ("pressure",)):
-                j = next(k for k, other in enumerate(out) if other is depth[0])
-                out[j] = _without(depth[0], ("depth",), stream, dead=True)
-            else:
-                channels = {name: values for name, values in stream.channels.items() if name != "pressure"}
-                out[i] = replace(stream, channels=channels).noting(
-                    finding("pressure_left_out", topic=stream.source)
+        holders += [i for i, stream in enumerate(out) if names[0] in stream.words]
+        moving = [i for i in holders if not _dead(out[i], names)] or holders
+        best = min(moving, key=lambda i: out[i].rank)
+        for i in set(holders) - {best}:
+            if i in moving and out[i].rank == out[best].rank:
+                one, other = (out[k].source for k in sorted((i, best)))
+                raise CalibrationError(
+                    f"{names[0]} is in {one} and in {other}: choose one of them in the map"
                 )
-    worded: dict[str, Stream] = {}
-    for stream in out:
-        for name in stream.words:
-            if name in worded:
-                _refuse_double(name, worded[name], stream)
-            worded[name] = stream
+            out[i] = _without(out[i], names, out[best].source, dead=i not in moving)
     return [stream for stream in out if stream.channels or stream.words or stream.findings]
 
 
 def _dead(stream: Stream, names: tuple[str, ...]) -> bool:
-    return all(constant(stream.channels[name]) for name in names if name in stream.channels)
+    values = [stream.channels[name] for name in names if name in stream.channels]
+    return bool(values) and all(constant(column) for column in values)
 
 
-def _without(stream: Stream, names: tuple[str, ...], better: Stream, *, dead: bool) -> Stream:
+def _without(stream: Stream, names: tuple[str, ...], better: str, *, dead: bool) -> Stream:
     """Return the stream without some columns, with one finding for all that were left out for one other stream."""
-    gone = tuple(name for name in names if name in stream.channels)
-    findings = []
+    gone, findings = tuple(name for name in names if name in stream.channels), []
     for item in stream.findings:
-        if (
-            item.code == ("stream_dead" if dead else "columns_left_out")
-            and item.values["better"] == better.source
-        ):
+        if item.code in ("stream_dead", "columns_left_out") and item.values["better"] == better:
             gone = (*item.values["columns"], *gone)
+            dead &= item.code == "stream_dead"
         else:
             findings.append(item)
     channels = {name: values for name, values in stream.channels.items() if name not in names}
-    note = (
-        finding("stream_dead", columns=gone, topic=stream.source, better=better.source)
-        if dead
-        else finding("columns_left_out", columns=gone, topic=stream.source, better=better.source)
-    )
-    return replace(stream, channels=channels, findings=(*findings, note))
-
-
-def _refuse_double(name: str, one: Stream, other: Stream) -> None:
-    raise CalibrationError(f"{name} is in {one.source} and in {other.source}: choose one of them in the map")
+    words = {name: texts for name, texts in stream.words.items() if name not in names}
+    about = {"columns": gone, "topic": stream.source, "better": better}
+    note = finding("stream_dead", **about) if dead else finding("columns_left_out", **about)
+    return replace(stream, channels=channels, words=words, findings=(*findings, note))
 
 
 def _refuse_disjoint(streams: Sequence[Stream]) -> None:

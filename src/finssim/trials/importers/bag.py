@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from finssim.control.ardusub import FULL, NEUTRAL
 from finssim.core.budget import check_unpacked, limited_memory, packed_with_zstd
 from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.importers.ardusub_outputs import STICK_CHANNELS, STICKS, mixed_pulses, outputs_of
+from finssim.trials.importers.ardusub import ARMED_FLAG, MANUAL, ArduPilotLog, with_inputs
 from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream
 from finssim.trials.importers.finssim_record import (
     THRUSTERS,
@@ -28,18 +24,15 @@ from finssim.trials.importers.finssim_record import (
     thruster_columns,
 )
 from finssim.trials.importers.log import LogImporter, Request, TrialStreams
-from finssim.trials.importers.table import WORST_FOM, stream_of, used_columns
-from finssim.trials.trial_files import ColumnTable
-from finssim.vehicles import Vehicle
+from finssim.trials.importers.table import WORST_FOM, used_columns
+from finssim.trials.importers.topics import Topic, log_of, times_of
+from finssim.trials.trial import Array
 from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import did_you_mean
 
 BAGS = (".mcap", ".db3", ".bag")
 
 TEXT = "std_msgs/msg/String"
-
-OTHER_CLOCK = 5.0
-"""Stamps that are farther from the times of receipt than those of other topics are of another clock [s]."""
 
 # Fields of ROS messages by dotted path, and the columns that messages of usual types contain.
 
@@ -78,17 +71,6 @@ FORCE = _axes("ax ay az", "linear_acceleration", "linear_acceleration_covariance
 TURN = _axes("qx qy qz qw", "orientation", "orientation_covariance")
 ODOMETRY = _pose("pose.pose", "pose.covariance") | _twist("twist.twist", "twist.covariance")
 PRESSURE, VOLTAGE = _fields({"pressure": "fluid_pressure"}), _fields({"voltage": "voltage"})
-PILOT = {
-    f"stick_{name}": {
-        "column": f"channels[{i}]",
-        "scale": 1.0 / FULL,
-        "offset": -NEUTRAL / FULL,
-        "valid": {"column": f"channels[{i}]", "above": 800.0, "below": 2200.0},  # 0 and 65535 are no pulse
-    }
-    for i, name in enumerate(STICK_CHANNELS)
-}
-"""Demands of the pilot in channels of pulses [µs], in ArduSub's order."""
-
 USUAL: tuple[tuple[str, SourceMap], ...] = (
     ("sensor_msgs/msg/Imu", _map(RATES | FORCE)),
     ("nav_msgs/msg/Odometry", _map(ODOMETRY)),
@@ -98,18 +80,18 @@ USUAL: tuple[tuple[str, SourceMap], ...] = (
     ("geometry_msgs/msg/PoseWithCovarianceStamped", _map(_pose("pose.pose", "pose.covariance"))),
     ("geometry_msgs/msg/TwistStamped", _map(_twist("twist"))),
     ("geometry_msgs/msg/TwistWithCovarianceStamped", _map(_twist("twist.twist", "twist.covariance"))),
+    ("finssim_msgs/msg/HardwareTelemetry", _map(_fields({"depth": "depth"}))),
     ("sensor_msgs/msg/FluidPressure", _map(PRESSURE)),
     ("sensor_msgs/msg/BatteryState", _map(VOLTAGE)),
-    ("finssim_msgs/msg/HardwareTelemetry", _map(_fields({"depth": "depth"}))),
 )
 """Type -> columns. An Imu's attitude is used only if a map names it, for many leave it unset. If two types contain one
 column and no map chooses, the first type here is used."""
 
 MAVROS: tuple[tuple[str, str, SourceMap], ...] = (
     ("rc/out", "mavros_msgs/msg/RCOut", SourceMap()),
-    ("rc/in", "mavros_msgs/msg/RCIn", _map(PILOT)),
-    ("rc/override", "mavros_msgs/msg/OverrideRCIn", _map(PILOT)),
-    ("state", "mavros_msgs/msg/State", SourceMap(split="armed")),
+    ("rc/in", "mavros_msgs/msg/RCIn", SourceMap()),
+    ("rc/override", "mavros_msgs/msg/OverrideRCIn", SourceMap()),
+    ("state", "mavros_msgs/msg/State", _map({}, arming="armed")),
     ("imu/data", "sensor_msgs/msg/Imu", _map(RATES | FORCE | TURN)),
     ("local_position/odom", "nav_msgs/msg/Odometry", _map(ODOMETRY)),
     ("local_position/pose", "geometry_msgs/msg/PoseStamped", _map(_pose("pose"))),
@@ -125,6 +107,13 @@ MAVROS: tuple[tuple[str, str, SourceMap], ...] = (
 )
 """End of a topic of MAVROS, its type and columns, the preferred first. No other topic of MAVROS is read: many of the
 usual types are commands, or velocities in the world."""
+
+INPUTS = {
+    "mavros_msgs/msg/RCOut": ("SERVO_OUTPUT_RAW", "servo{}_raw"),
+    "mavros_msgs/msg/RCIn": ("RC_CHANNELS", "chan{}_raw"),
+    "mavros_msgs/msg/OverrideRCIn": ("RC_CHANNELS", "chan{}_raw"),
+}
+"""Types whose channels are those of a message of the autopilot, and its fields; the first of one message is used."""
 
 DVL = _map(
     _axes("u v w", "velocity"),
@@ -166,12 +155,6 @@ def number_at(message: Any, path: str, topic: str) -> float:
     raise CalibrationError(
         f"{topic}: field '{path}' is a {type(value).__name__}, expected a number{_inside(value)}"
     )
-
-
-def word_at(message: Any, path: str, topic: str) -> str:
-    """The text at a dotted path; numbers become text."""
-    value = _value_at(message, path, topic)
-    return value if isinstance(value, str) else f"{number_at(message, path, topic):g}"
 
 
 def stamp_of(message: Any) -> int | None:
@@ -237,7 +220,7 @@ def read(path: Path, request: Request) -> TrialStreams:
         types = {c.topic: c.msgtype for c in reader.connections}
         given = request.mapped.topics
         native = {} if given else native_topics(types)
-        sources: dict[str, TopicData] = {}
+        sources: dict[str, Topic] = {}
         for topic, source in (given or native).items():
             if topic not in types:
                 raise CalibrationError(
@@ -253,54 +236,28 @@ def read(path: Path, request: Request) -> TrialStreams:
         _collect(reader, sources, findings)
         events = _events(reader) if native else []
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
-    streams = _streams(sources, request, findings)
-    usable = [stream for stream in streams if len(stream.t) >= 2 and (stream.channels or stream.words)]
-    if not usable:
-        reasons = "".join(f"; {item}" for item in findings if item.code == "topic_unusable")
-        raise CalibrationError(
-            f"{path.name}: {', '.join(sources)} hold fewer than two messages each{reasons}"
-        )
-    unread = {**{t: counts.get(t, 0) for t in types if t not in sources}}
-    if native and events:
-        unread = {topic: count for topic, count in unread.items() if not topic.endswith("/events")}
-    if unread:
-        items = (f"{t} ({types[t].replace('/msg/', '/')}, {n} messages)" for t, n in sorted(unread.items()))
-        findings.append(finding("not_read", items="topics " + ", ".join(items)))
-    return TrialStreams([usable[0].noting(*findings), *usable[1:], *events], recorded)
+    times = times_of(sources, findings)
+    events += _inputs(path.name, sources, times, request, findings)
+    sources = {
+        topic: source for topic, source in sources.items() if source.rank < 0 or source.kind not in INPUTS
+    }
+    used = {
+        *sources,
+        *(stream.source for stream in events),
+        *(t for t in types if native and t.endswith("/events")),
+    }
+    unread = [
+        f"{topic} ({types[topic].replace('/msg/', '/')}, {counts.get(topic, 0)} messages)"
+        for topic in sorted(set(types) - used)
+    ]
+    unread[:1] = [f"topics {topic}" for topic in unread[:1]]
+    return log_of(path.name, sources, times, findings, unread, events, recorded)
 
 
-@dataclass
-class TopicData:
-    """A topic that is read."""
-
-    map: SourceMap
-    rank: int
-    """Place in the order of sources of a column; -1 if a map names its columns."""
-    kind: str
-    received: list[float] = field(default_factory=list)
-    """Times of receipt [s]."""
-    stamps: list[float] = field(default_factory=list)
-    """Stamps of the headers [s]; NaN for messages without one."""
-    cells: dict[str, list[Any]] = field(default_factory=dict)
-    """Field -> numbers or words."""
-    broken: Counter[str] = field(default_factory=Counter)
-    """Reasons for which messages cannot be read."""
-
-    def table(self) -> ColumnTable:
-        """Return the fields as columns."""
-        table = ColumnTable()
-        for name, cells in self.cells.items():
-            if any(isinstance(cell, str) for cell in cells):
-                table.words[name] = [str(cell) for cell in cells]
-            else:
-                table.numbers[name] = np.array(cells, dtype=float)
-        return table
-
-
-def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> TopicData:
+def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> Topic:
     """Return a topic of a map, with the usual columns of its type where the map names none."""
     if source.columns or source.phase is not None or source.split is not None:
-        return TopicData(source, -1, kind)
+        return Topic(source, -1, kind)
     order = [*THRUSTERS, *(known for known, _ in USUAL)]
     if kind in THRUSTERS:
         columns, usual = _thruster_columns(reader, topic, kind), SourceMap()
@@ -312,7 +269,7 @@ def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> TopicData:
             f"{topic} is of type {kind}, for which no columns are usual: give 'columns: {{u: FIELD, ...}}'"
         )
     keys = {name: getattr(source, name) for name in source.model_fields_set - {"columns"}}
-    return TopicData(
+    return Topic(
         usual.model_copy(update={**keys, "columns": columns}),
         order.index(kind) if kind in order else len(order),
         kind,
@@ -321,13 +278,13 @@ def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> TopicData:
 
 def _known(
     reader: Any, types: Mapping[str, str], request: Request, findings: list[Finding]
-) -> dict[str, TopicData]:
+) -> dict[str, Topic]:
     """Return the topics of a bag that are read without a map."""
     ends = tuple("/" + end for end, kind, _ in MAVROS if kind.startswith("mavros_msgs"))
     roots = {
         t[: -len(e)] for t, k in types.items() for e in ends if k.startswith("mavros_msgs") and t.endswith(e)
     }
-    out: dict[str, TopicData] = {}
+    out: dict[str, Topic] = {}
     for topic, kind in sorted(types.items()):
         of_mavros = "mavros" in topic.split("/") or any(
             root and topic.startswith(f"{root}/") for root in roots
@@ -336,31 +293,15 @@ def _known(
             (i for i, (end, of, _) in enumerate(MAVROS) if kind == of and topic.endswith(f"/{end}")), None
         )
         if end is not None and (of_mavros or kind.startswith("mavros_msgs") or "" in roots):
-            out[topic] = TopicData(MAVROS[end][2], end, kind)
+            out[topic] = Topic(MAVROS[end][2], end, kind)
         elif of_mavros:
             continue
         elif _is_dvl(reader, kind):
-            out[topic] = TopicData(DVL, 0, kind)
+            out[topic] = Topic(DVL, 0, kind)
         elif kind in dict(USUAL) and not (COMMANDS.search(topic) and re.search("Pose|Twist|Odometry", kind)):
             out[topic] = _mapped(reader, topic, kind, SourceMap())
             out[topic].rank += len(MAVROS)
-    outputs = [topic for topic in out if out[topic].kind == "mavros_msgs/msg/RCOut"]
-    for topic in outputs if not request.passive else ():
-        try:
-            out[topic].map = _outputs(reader, topic, request, findings)
-        except CalibrationError as error:
-            if request.mapped.ardusub.outputs:
-                raise
-            findings.append(finding("topic_unusable", topic=topic, messages="all", reason=str(error)))
-            outputs = []
-    framed = request.vehicle is not None and request.vehicle.autopilot is not None and not request.passive
-    pilot = framed and not outputs
-    return {
-        t: s
-        for t, s in out.items()
-        if s.map.columns or s.map.split
-        if pilot or "stick_yaw" not in s.map.columns
-    }
+    return out
 
 
 def _is_dvl(reader: Any, kind: str) -> bool:
@@ -369,46 +310,53 @@ def _is_dvl(reader: Any, kind: str) -> bool:
     return {"velocity", "velocity_valid", "fom"} <= set(fields)
 
 
-def _parameters(vehicle: Vehicle) -> dict[str, float]:
-    """Return the autopilot's parameters of frame and motors that a vehicle file gives."""
-    if vehicle.autopilot is None:
-        return {}
-    signs = enumerate(vehicle.autopilot.signs(len(vehicle.thrusters)), start=1)
-    frame = next((n for n, (name, _) in FRAMES.items() if name == vehicle.autopilot.name), -1)
-    return {"FRAME_CONFIG": float(frame), **{f"MOT_{i}_DIRECTION": float(sign) for i, sign in signs}}
+def _inputs(
+    label: str,
+    sources: Mapping[str, Topic],
+    times: Mapping[str, Array],
+    request: Request,
+    findings: list[Finding],
+) -> list[Stream]:
+    """Return the streams of the outputs of an ArduSub autopilot, or of the pilot's channels through its mixer."""
+    log, vehicle, named = ArduPilotLog(label, telemetry=True), request.vehicle, {}
+    for topic, source in sorted(sources.items(), key=lambda item: item[1].rank):
+        kind, name = INPUTS.get(source.kind, ("", ""))
+        if kind and source.rank >= 0 and len(times[topic]) >= 2 and kind not in log.messages:
+            rows = [enumerate(cells, start=1) for cells in source.cells["channels"]]
+            log.messages[kind] = [{name.format(i): int(pulse) for i, pulse in row} for row in rows]
+            log.times[kind], named[f"{label} {kind}"] = times[topic], topic
+        elif "mode" in source.cells and source.rank >= 0 and len(times[topic]) >= 2:
+            states = zip(source.cells["armed"], source.cells["mode"], strict=True)
+            log.messages["HEARTBEAT"] = [
+                {"base_mode": ARMED_FLAG * int(armed), "custom_mode": MANUAL if mode == "MANUAL" else -1}
+                for armed, mode in states
+            ]
+            log.times["HEARTBEAT"] = times[topic]
+    if vehicle is not None and vehicle.autopilot is not None:
+        signs = enumerate(vehicle.autopilot.signs(len(vehicle.thrusters)), start=1)
+        frame = next((n for n, (name, _) in FRAMES.items() if name == vehicle.autopilot.name), -1)
+        log.parameters.update({"FRAME_CONFIG": frame, **{f"MOT_{i}_DIRECTION": sign for i, sign in signs}})
+    try:
+        streams = with_inputs(log, request, [])
+    except CalibrationError as error:
+        if request.mapped.ardusub.outputs:
+            raise
+        findings.append(
+            finding("topic_unusable", topic=", ".join(named.values()), messages="all", reason=str(error))
+        )
+        return []
+    assumed = vehicle is not None and streams and not request.mapped.ardusub.outputs
+    findings += [finding("directions_assumed")] if assumed else []
+    return [replace(stream, source=named[stream.source], rank=0) for stream in streams]
 
 
-def _outputs(reader: Any, topic: str, request: Request, findings: list[Finding]) -> SourceMap:
-    """Return the columns of the outputs of an ArduSub autopilot, by the vehicle's frame where no map assigns them."""
-    connections = [c for c in reader.connections if c.topic == topic]
-    first = next((message for _, message in _messages(reader, connections)), None)
-    width = 0 if first is None else len(first.channels)
-    stated = request.mapped.ardusub.outputs
-    if request.vehicle is None:
-        outputs = {i + 1: (f"C{i + 1}", 1) for i in range(width) if first.channels[i]}
-        findings.append(finding("pulses_unnamed"))
-    else:
-        outputs, mapped = outputs_of(request.vehicle, _parameters(request.vehicle), stated)
-        findings += [mapped, *([] if stated else [finding("directions_assumed")])]
-    columns = {}
-    for number, (name, sign) in outputs.items():
-        if number <= width:
-            at = f"channels[{number - 1}]"
-            turned = {"sign": -1, "offset": -2.0 * NEUTRAL} if sign < 0 else {}
-            columns[f"pwm_{name}"] = {
-                "column": at,
-                "valid": {"column": at, "above": 0.0, "below": 65535.0},
-                **turned,
-            }
-    return _map(columns)
-
-
-def _collect(reader: Any, sources: dict[str, TopicData], findings: list[Finding]) -> None:
+def _collect(reader: Any, sources: dict[str, Topic], findings: list[Finding]) -> None:
     """Read the messages of the topics; a message that cannot be read is counted."""
     needed = {topic: used_columns(source.map) for topic, source in sources.items()}
     for topic, names in needed.items():
-        if sources[topic].kind == "mavros_msgs/msg/State":
-            names.append("mode")
+        if sources[topic].rank >= 0:
+            names += {"mavros_msgs/msg/State": ["mode"]}.get(sources[topic].kind, [])
+            names += ["channels"] if sources[topic].kind in INPUTS else []
         sources[topic].cells = {name: [] for name in names}
     connections = [c for c in reader.connections if c.topic in sources]
     try:
@@ -442,63 +390,9 @@ def _collect(reader: Any, sources: dict[str, TopicData], findings: list[Finding]
         )
 
 
-def _cell(message: Any, path: str, topic: str) -> float | str:
+def _cell(message: Any, path: str, topic: str) -> Any:
     value = _value_at(message, path, topic)
-    return value if isinstance(value, str) else number_at(message, path, topic)
-
-
-def _streams(sources: dict[str, TopicData], request: Request, findings: list[Finding]) -> list[Stream]:
-    """Return the streams of the topics that can be used, on one clock; the others are findings."""
-    stamped = {topic: source for topic, source in sources.items() if np.isfinite(source.stamps).any()}
-    delays = {t: float(np.nanmedian(np.subtract(s.received, s.stamps))) for t, s in stamped.items()}
-    usual = float(np.median(list(delays.values()))) if delays else 0.0
-    streams = []
-    for topic, source in sources.items():
-        if source.broken:
-            reason, total = source.broken.most_common(1)[0][0], source.broken.total()
-            findings.append(finding("topic_unusable", topic=topic, messages=total, reason=reason))
-        if len(source.received) < 2:
-            findings += [] if source.broken else [finding("topic_short", topic=topic)]
-            continue
-        received, stamps = np.array(source.received), np.array(source.stamps)
-        on_clock = abs(delays.get(topic, usual) - usual) <= OTHER_CLOCK
-        if not on_clock:
-            findings.append(finding("other_clock", topic=topic, seconds=delays[topic] - usual))
-        shift = usual if abs(usual) > OTHER_CLOCK else 0.0
-        t = np.where(np.isfinite(stamps) & on_clock, stamps, received - shift)
-        table = source.table()
-        try:
-            if source.kind == "mavros_msgs/msg/State" and source.rank >= 0:
-                labels = np.where(table.numbers["armed"] > 0.0, "armed", "disarmed")
-                streams.append(
-                    Stream(source=topic, t=t, words={"arming": labels.astype(np.str_)}, rank=source.rank)
-                )
-            else:
-                streams.append(replace(stream_of(table, source.map, t, topic), rank=source.rank))
-        except CalibrationError as error:
-            if source.rank < 0:
-                raise
-            reason = str(error).removeprefix(f"{topic}: ")
-            findings.append(finding("topic_unusable", topic=topic, messages=len(t), reason=reason))
-    return [_mixed(stream, sources, request) for stream in streams]
-
-
-def _mixed(stream: Stream, sources: dict[str, TopicData], request: Request) -> Stream:
-    """Return a stream with the pulses that ArduSub's mixer makes of the pilot's demands, in MANUAL and while armed."""
-    vehicle = request.vehicle
-    if stream.rank < 0 or vehicle is None or not all(name in stream.channels for name in STICKS):
-        return stream
-    demands = np.stack([stream.channels[name] for name in STICKS], axis=-1)
-    state = next((s for s in sources.values() if s.kind == "mavros_msgs/msg/State" and s.received), None)
-    notes = [finding("sticks_mixed", frame=vehicle.autopilot.name, gain=1.0), finding("directions_assumed")]
-    if state is not None:
-        held = np.maximum(np.searchsorted(state.received, stream.t, side="right") - 1, 0)
-        armed = np.array([bool(cell) for cell in state.cells["armed"]])[held]
-        other = armed & (np.array(state.cells["mode"], dtype=np.str_)[held] != "MANUAL")
-        demands = np.where(other[:, None], np.nan, np.where(armed[:, None], demands, 0.0))
-        notes += [finding("other_modes_left_out", share=other.mean())] if other.any() else []
-    pulses, mapped = mixed_pulses(vehicle, demands, _parameters(vehicle), (), request.mapped.ardusub.outputs)
-    return replace(stream, channels=pulses).noting(*notes, mapped)
+    return value if isinstance(value, str) or path == "channels" else number_at(message, path, topic)
 
 
 def bag_files(path: Path) -> list[Path]:

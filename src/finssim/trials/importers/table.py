@@ -135,7 +135,7 @@ def table_stream(table: ColumnTable, source: SourceMap | None, label: str) -> St
     source = _by_names(table, label) if source is None else source
     if source.time is None:
         raise CalibrationError(f"{label}: no time: give 'time: COLUMN' of its columns {_column_list(table)}")
-    if not source.columns and source.phase is None:
+    if not source.columns and source.phase is None and source.arming is None:
         raise CalibrationError(
             f"{label}: no columns: give 'columns: {{u: NAME, ...}}' of its columns {_column_list(table)}"
         )
@@ -149,8 +149,12 @@ def table_stream(table: ColumnTable, source: SourceMap | None, label: str) -> St
 def used_columns(source: SourceMap) -> list[str]:
     """Return the columns or fields that a map names, without that of the time."""
     specs = source.columns.values()
-    flags = [*(spec.valid for spec in specs if spec.valid), *(source.valid or ())]
-    names = [*(spec.column for spec in specs), *worded(source).values(), *(flag.column for flag in flags)]
+    flags = [*(spec.valid for spec in specs), source.arming, *(source.valid or ())]
+    names = [
+        *(spec.column for spec in specs),
+        *worded(source).values(),
+        *(flag.column for flag in flags if flag),
+    ]
     return [name for name in dict.fromkeys(names) if name is not None]
 
 
@@ -196,6 +200,8 @@ def stream_of(table: ColumnTable, source: SourceMap, t: Array, label: str) -> St
         texts = _text(table, name, label)
         known = source.phase.words if key == "phase" and source.phase is not None else {}
         words[key] = np.array([known.get(word, "") for word in texts] if known else texts, dtype=np.str_)
+    if source.arming is not None:
+        words["arming"] = np.where(_valid(table, source.arming, label), "armed", "disarmed").astype(np.str_)
     stream = Stream(source=label, t=t + source.time_offset, channels=channels, words=words)
     if marked.any() and not words:
         stream = stream.selected(
