@@ -292,18 +292,13 @@ IMPORTERS = Family(
         "vehicle.marinegym": "finssim.vehicles.importers.marinegym:MARINEGYM",
         "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
         "vehicle.urdf": "finssim.vehicles.importers.urdf:URDF",
-        **{
-            f"trial.{name}": f"finssim.trials.importers.{module}"
-            for name, module in {
-                "qgroundcontrol": "qgroundcontrol:QGROUNDCONTROL",
-                "acoustic": "acoustic:ACOUSTIC",
-                "waterlinked": "water_linked:WATER_LINKED",
-                "ulog": "ulog:ULOG",
-                "ardupilot": "ardusub:ARDUPILOT",
-                "rosbag": "bag:ROSBAG",
-                "csv": "table:TABLE",
-            }.items()
-        },
+        "trial.qgroundcontrol": "finssim.trials.importers.table:QGROUNDCONTROL",
+        "trial.acoustic": "finssim.trials.importers.table:ACOUSTIC",
+        "trial.waterlinked": "finssim.trials.importers.water_linked:WATER_LINKED",
+        "trial.ulog": "finssim.trials.importers.ulog:ULOG",
+        "trial.ardupilot": "finssim.trials.importers.ardusub:ARDUPILOT",
+        "trial.rosbag": "finssim.trials.importers.bag:ROSBAG",
+        "trial.csv": "finssim.trials.importers.table:TABLE",
         "lens.ros": "finssim.localization.importers.calibration:ROS",
         "lens.kalibr": "finssim.localization.importers.calibration:KALIBR",
         "lens.matlab": "finssim.localization.importers.calibration:MATLAB",

@@ -232,13 +232,12 @@ def _wraps(t: Array, back: NDArray[np.intp]) -> str:
     """Return the cause if every step back is from the end of a counter's range to its beginning, else nothing."""
     step = 3.0 * float(np.median(np.abs(np.diff(t))))
     ranges = [2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-6, 1e-3, 1e-2, 1.0)]
-    for full in (*ranges, float(t[back - 1].max())):
+    if len(back) > 1:
+        ranges.append(float(t[back - 1].max()))
+    for full in ranges:
         if full > 20.0 * step and (full - t[back - 1] <= step).all() and (np.abs(t[back]) <= step).all():
-            if full in ranges or len(back) > 1:
-                return (
-                    f"probably a counter that begins again after {full:.6g} s: give 'time: {{column: NAME, kind: "
-                    "counter}' in a map"
-                )
+            advice = "give 'time: {column: NAME, kind: counter}' in a map"
+            return f"probably a counter that begins again after {full:.6g} s: {advice}"
     return ""
 
 
@@ -270,9 +269,8 @@ def refuse_coarse(t: Array, columns: Mapping[str, Array]) -> None:
     if len(t) >= 10 and np.sum(same & other) > REPEATED * len(t):
         step = np.median(np.diff(np.unique(t))) if t[-1] > t[0] else math.inf
         raise CalibrationError(
-            f"{np.sum(same & other)} of {len(t)} samples have the time of the one before, for the clock counts steps "
-            f"of {step:.3g} s: give 'time: {{column: NAME, kind: coarse}}' in a map to spread them over the steps, or "
-            "name a finer column"
+            f"{np.sum(same & other)} of {len(t)} samples have the time of the one before, as the clock counts steps of "
+            f"{step:.3g} s: name a finer column, or spread them by 'time: {{column: NAME, kind: coarse}}' in a map"
         )
 
 
@@ -361,12 +359,13 @@ def without_dead(t: Array, channels: Channels) -> list[Finding]:
             del channels[rate]
         findings.append(finding("never_changes", columns=tuple(rates), moving=tuple(against)))
     for names, others, least in DEAD:
-        present = [name for name in names if name in channels and np.isfinite(channels[name]).any()]
+        present = [name for name in names if name in channels]
         moving = [name for name in others if name in channels and least < _range(channels[name]) < math.inf]
-        dead = all(constant(channels[name]) for name in present)
         # A constant speed is possible while the position moves.
-        still = names not in DEAD_AT_ZERO or not any(np.nanmax(np.abs(channels[name])) for name in present)
-        if present and moving and dead and still:
+        at_zero = names not in DEAD_AT_ZERO or not any(
+            np.nanmax(np.abs(channels[name]), initial=0.0) for name in present
+        )
+        if present and moving and at_zero and all(constant(channels[name]) for name in present):
             for name in present:
                 del channels[name]
             findings.append(finding("never_changes", columns=tuple(present), moving=tuple(moving)))

@@ -91,7 +91,7 @@ def test_evident_flags_need_no_map(tmp_path, name, bad, column):
     [
         (["maybe"] * N, "valid: f", "contains 'maybe', expected 1 and 0 or true and false"),
         ([5] * N, "valid: f", "contains '5'"),
-        (["A"] * N, "valid: {column: f, below: 3}", "contains no numbers"),
+        (["A"] * N, "valid: {column: f, below: 3}", "contains words, which have no limits"),
         ([0] * N, "valid: f", "no sample is valid: 200 of 200"),
         ([1] * N, "valid: g", "no column 'g'"),
         ([1] * N, "valid: {column: f, belov: 3}", "unknown key 'belov', did you mean 'below'?"),
@@ -144,7 +144,7 @@ def test_whole_seconds_are_spread_and_never_dropped(tmp_path):
     """A clock of seconds with 10 samples each, begun within a second: refused, or spread within 0.1 s of the truth."""
     true = 17.37 + np.arange(N) * 0.1
     columns = {"t": np.floor(true).astype(int), "u": np.arange(N)}
-    with pytest.raises(CalibrationError, match=r"clock counts steps of 1 s: give 'time: .*kind: coarse"):
+    with pytest.raises(CalibrationError, match=r"clock counts steps of 1 s: .*kind: coarse"):
         read(tmp_path, columns)
     trial = read(tmp_path, columns, "time: {column: t, kind: coarse}\ncolumns: [u]")
     assert len(trial.series("u")[1]) == N

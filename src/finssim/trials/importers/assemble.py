@@ -102,22 +102,21 @@ class Validity(Part):
                 numbers = np.array([float(cell) for cell in cells])
             except ValueError:
                 raise CalibrationError(
-                    f"{label}: column '{self.column}' contains no numbers, so it has no limits: give 'valid: {{column: "
-                    f"{self.column}, value: WORD}}'"
+                    f"{label}: column '{self.column}' contains words, which have no limits: give its value in the map"
                 ) from None
             high = math.inf if self.below is None else self.below
             low = -math.inf if self.above is None else self.above
             return ~((numbers >= high) | (numbers <= low))  # what has no number has no limit
-        tokens = [_token(cell) for cell in cells]
+        tokens = np.array([_token(cell) for cell in cells], dtype=np.str_)
         if self.value is not None:
             return np.isin(tokens, [_token(value) for value in self.value])
-        other = next((token for token in tokens if token not in ("1", "0", "")), None)
-        if other is not None:
+        other = tokens[~np.isin(tokens, ("1", "0", ""))]
+        if len(other):
             raise CalibrationError(
-                f"{label}: column '{self.column}' contains '{other}', expected 1 and 0 or true and false: give 'valid: "
-                f"{{column: {self.column}, value: {other}}}', or above or below with a number"
+                f"{label}: column '{self.column}' contains '{other[0]}', expected 1 and 0 or true and false: give "
+                f"'valid: {{column: {self.column}, value: {other[0]}}}', or above or below with a number"
             )
-        return np.array([token == "1" for token in tokens], dtype=bool)
+        return tokens == "1"
 
 
 class ColumnSource(Part):
@@ -185,10 +184,11 @@ class TimeColumn(Part):
 
     @model_validator(mode="after")
     def _refuse_unused(self) -> TimeColumn:
-        if self.wrap is not None and self.kind != "counter":
-            raise refuse_section(f"wrap is of a counter, and kind is {self.kind}: add 'kind: counter'")
-        if self.unit == "date" and self.kind in ("period", "counter"):
-            raise refuse_section(f"dates are no {self.kind}: give another unit, or 'kind: stamp'")
+        dates = self.unit == "date" and self.kind in ("period", "counter")
+        if dates or (self.wrap is not None and self.kind != "counter"):
+            raise refuse_section(
+                f"kind is {self.kind}: wrap is for a counter, unit: date for no period or counter"
+            )
         return self
 
     def seconds(self, raw: Array) -> Array:
@@ -198,22 +198,16 @@ class TimeColumn(Part):
             raw: The column as read; seconds if its unit is `date`, (n,).
         """
         unit = 1.0 if self.unit == "date" else TIME_UNITS[self.unit] * self.scale
+        good, out = np.isfinite(raw), unit * raw
         if self.kind == "period":
-            return np.where(np.isfinite(raw), np.cumsum(np.nan_to_num(raw)), np.nan) * unit
-        if self.kind == "counter":
-            good = np.isfinite(raw)
+            out[good] = np.cumsum(out[good])
+        elif self.kind == "counter":
             largest = float(np.max(raw[good], initial=0.0))
-            wrap = self.wrap or next((2.0**bits for bits in (8, 16, 24, 32) if largest < 2.0**bits), math.inf)
-            turns = np.cumsum(np.diff(raw[good], prepend=raw[good][:1]) < -0.5 * wrap)
-            whole = raw.copy()
-            whole[good] += np.where(turns > 0, wrap * turns, 0.0)
-            return whole * unit
-        if self.kind == "coarse":
-            good = np.isfinite(raw)
-            out = np.full(len(raw), np.nan)
-            out[good] = spread(raw[good] * unit) if (np.diff(raw[good]) >= 0.0).all() else raw[good] * unit
-            return out
-        return raw * unit
+            wrap = self.wrap or next((2.0**bits for bits in (8, 16, 24, 32) if largest < 2.0**bits), 2.0**64)
+            out[good] += unit * wrap * np.cumsum(np.diff(raw[good], prepend=raw[good][:1]) < -0.5 * wrap)
+        elif self.kind == "coarse" and (np.diff(out[good]) >= 0.0).all():
+            out[good] = spread(out[good])
+        return out
 
 
 class PhaseColumn(Part):
@@ -295,14 +289,10 @@ class SourceMap(Part):
     def _short(cls, data: Any) -> Any:
         if isinstance(data, (list, tuple)):
             raise refuse_section("is a list, expected columns: {CANONICAL: FIELD}")
+        valid = data.get("valid") if isinstance(data, dict) else None
+        if valid is False or (valid is not None and not isinstance(valid, (list, tuple))):
+            return {**data, "valid": [valid] if valid else []}
         return {} if data is None else data
-
-    @field_validator("valid", mode="before")
-    @classmethod
-    def _several(cls, valid: Any) -> Any:
-        if valid is False:
-            return ()
-        return valid if valid is None or isinstance(valid, (list, tuple)) else [valid]
 
     @field_validator("columns", mode="before")
     @classmethod
@@ -474,6 +464,35 @@ def read_map(path: Path) -> ColumnMap:
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
     return column_map
+
+
+def shipped_maps(file: str) -> dict[str, dict[str, Any]]:
+    """Return the sections of a shipped file: name -> map of a topic, report or table that needs no map of the user's.
+
+    Args:
+        file: Name of the YAML file beside this module; sections of texts are returned as they are.
+    """
+    tree = read_mapping(Path(__file__).with_name(file), CalibrationError, such_as="topics: {}")
+    return {
+        section: {
+            name: keys if isinstance(keys, str) else SourceMap.model_validate({"valid": False, **keys})
+            for name, keys in content.items()
+        }
+        for section, content in tree.items()
+    }
+
+
+def present(source: SourceMap, names: Sequence[str]) -> SourceMap:
+    """Return a map of those of its columns that a log has; velocities in the world only if it has all three.
+
+    Args:
+        source: Map of all columns that the format may have.
+        names: Columns or fields of the log.
+    """
+    there = {name: spec for name, spec in source.columns.items() if spec.column in names}
+    if not {"vx", "vy", "vz"} <= set(there):
+        there = {name: spec for name, spec in there.items() if name not in ("vx", "vy", "vz")}
+    return source.model_copy(update={"columns": there})
 
 
 def split_rule(text: str) -> SplitRule:

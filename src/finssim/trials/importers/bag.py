@@ -13,19 +13,12 @@ from typing import Any
 from finssim.core.budget import check_unpacked, limited_memory, packed_with_zstd
 from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.importers import finssim_record
 from finssim.trials.importers.ardusub import ARMED_FLAG, MANUAL, ArduPilotLog, with_inputs
-from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream
-from finssim.trials.importers.finssim_record import (
-    THRUSTERS,
-    names_of,
-    native_topics,
-    recorded_header,
-    spoken_events,
-    thruster_columns,
-)
+from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream, shipped_maps
 from finssim.trials.importers.log import LogImporter, Request, TrialStreams
-from finssim.trials.importers.table import WORST_FOM, used_columns
-from finssim.trials.importers.topics import Topic, log_of, times_of
+from finssim.trials.importers.table import used_columns
+from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array
 from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import did_you_mean
@@ -34,79 +27,8 @@ BAGS = (".mcap", ".db3", ".bag")
 
 TEXT = "std_msgs/msg/String"
 
-# Fields of ROS messages by dotted path, and the columns that messages of usual types contain.
-
-
-def _fields(columns: Mapping[str, str], covariance: str = "") -> dict[str, ColumnSource]:
-    """Return columns of fields, invalid where the first element of a covariance is -1."""
-    valid = {"column": f"{covariance}[0]", "above": -0.5} if covariance else None
-    return {name: ColumnSource.model_validate({"column": at, "valid": valid}) for name, at in columns.items()}
-
-
-def _axes(names: str, at: str, covariance: str = "") -> dict[str, ColumnSource]:
-    """Return three columns of a vector, and a fourth of a quaternion."""
-    return _fields({n: f"{at}.{c}" for n, c in zip(names.split(), "xyzw", strict=False)}, covariance)
-
-
-def _pose(at: str, covariance: str = "") -> dict[str, ColumnSource]:
-    position, turn = f"{at}.position", f"{at}.orientation"
-    return _axes("x y z", position, covariance) | _axes("qx qy qz qw", turn, covariance)
-
-
-def _twist(at: str, covariance: str = "") -> dict[str, ColumnSource]:
-    return _axes("u v w", f"{at}.linear", covariance) | _axes("p q r", f"{at}.angular", covariance)
-
-
-def _wrench(at: str) -> dict[str, ColumnSource]:
-    dot = f"{at}." if at else ""
-    return _axes("tau_x tau_y tau_z", f"{dot}force") | _axes("tau_k tau_m tau_n", f"{dot}torque")
-
-
-def _map(columns: Mapping[str, ColumnSource], **keys: Any) -> SourceMap:
-    return SourceMap.model_validate({"columns": dict(columns), "valid": False, **keys})
-
-
-RATES = _axes("p q r", "angular_velocity", "angular_velocity_covariance")
-FORCE = _axes("ax ay az", "linear_acceleration", "linear_acceleration_covariance")
-TURN = _axes("qx qy qz qw", "orientation", "orientation_covariance")
-ODOMETRY = _pose("pose.pose", "pose.covariance") | _twist("twist.twist", "twist.covariance")
-PRESSURE, VOLTAGE = _fields({"pressure": "fluid_pressure"}), _fields({"voltage": "voltage"})
-USUAL: tuple[tuple[str, SourceMap], ...] = (
-    ("sensor_msgs/msg/Imu", _map(RATES | FORCE)),
-    ("nav_msgs/msg/Odometry", _map(ODOMETRY)),
-    ("geometry_msgs/msg/WrenchStamped", _map(_wrench("wrench"))),
-    ("geometry_msgs/msg/Wrench", _map(_wrench(""))),
-    ("geometry_msgs/msg/PoseStamped", _map(_pose("pose"))),
-    ("geometry_msgs/msg/PoseWithCovarianceStamped", _map(_pose("pose.pose", "pose.covariance"))),
-    ("geometry_msgs/msg/TwistStamped", _map(_twist("twist"))),
-    ("geometry_msgs/msg/TwistWithCovarianceStamped", _map(_twist("twist.twist", "twist.covariance"))),
-    ("finssim_msgs/msg/HardwareTelemetry", _map(_fields({"depth": "depth"}))),
-    ("sensor_msgs/msg/FluidPressure", _map(PRESSURE)),
-    ("sensor_msgs/msg/BatteryState", _map(VOLTAGE)),
-)
-"""Type -> columns. An Imu's attitude is used only if a map names it, for many leave it unset. If two types contain one
-column and no map chooses, the first type here is used."""
-
-MAVROS: tuple[tuple[str, str, SourceMap], ...] = (
-    ("rc/out", "mavros_msgs/msg/RCOut", SourceMap()),
-    ("rc/in", "mavros_msgs/msg/RCIn", SourceMap()),
-    ("rc/override", "mavros_msgs/msg/OverrideRCIn", SourceMap()),
-    ("state", "mavros_msgs/msg/State", _map({}, arming="armed")),
-    ("imu/data", "sensor_msgs/msg/Imu", _map(RATES | FORCE | TURN)),
-    ("local_position/odom", "nav_msgs/msg/Odometry", _map(ODOMETRY)),
-    ("local_position/pose", "geometry_msgs/msg/PoseStamped", _map(_pose("pose"))),
-    ("local_position/velocity_body", "geometry_msgs/msg/TwistStamped", _map(_twist("twist"))),
-    ("imu/data_raw", "sensor_msgs/msg/Imu", _map(RATES | FORCE)),
-    (
-        "global_position/rel_alt",
-        "std_msgs/msg/Float64",
-        _map({"depth": ColumnSource(column="data", sign=-1)}),
-    ),
-    ("imu/static_pressure", "sensor_msgs/msg/FluidPressure", _map(PRESSURE)),
-    ("battery", "sensor_msgs/msg/BatteryState", _map(VOLTAGE)),
-)
-"""End of a topic of MAVROS, its type and columns, the preferred first. No other topic of MAVROS is read: many of the
-usual types are commands, or velocities in the world."""
+KNOWN = shipped_maps("rosbag.yaml")
+"""Topics and types that need no map, and definitions of messages."""
 
 INPUTS = {
     "mavros_msgs/msg/RCOut": ("SERVO_OUTPUT_RAW", "servo{}_raw"),
@@ -115,28 +37,8 @@ INPUTS = {
 }
 """Types whose channels are those of a message of the autopilot, and its fields; the first of one message is used."""
 
-DVL = _map(
-    _axes("u v w", "velocity"),
-    frame="FRD",
-    valid=["velocity_valid", {"column": "fom", "below": WORST_FOM}],
-)
-"""Messages of the drivers of Water Linked's logs, whatever their package is called: the log's own axes."""
-
 COMMANDS = re.compile(r"cmd|command|setpoint|goal|target|desired|reference")
 """Parts of the names of topics whose poses and velocities are no measurements."""
-
-DEFINITIONS = {
-    "mavros_msgs/msg/RCOut": "std_msgs/Header header\nuint16[] channels",
-    "mavros_msgs/msg/RCIn": "std_msgs/Header header\nuint8 rssi\nuint16[] channels",
-    "mavros_msgs/msg/OverrideRCIn": "uint16[18] channels",
-    "mavros_msgs/msg/State": "std_msgs/Header header\nbool connected\nbool armed\nbool guided\nbool manual_input\n"
-    "string mode\nuint8 system_status",
-    "dvl_msgs/msg/DVLBeam": "int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid",
-    "dvl_msgs/msg/DVL": "std_msgs/Header header\nfloat64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\n"
-    "float64[9] covariance\nfloat64 altitude\ndvl_msgs/DVLBeam[4] beams\nbool velocity_valid\nint64 status\n"
-    "int64 time_of_validity\nint64 time_of_transmission\nstring form",
-}
-"""Definitions of messages for ROS 2 bags without definitions, as recorders before ROS 2 Iron write them."""
 
 _PART = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 
@@ -179,7 +81,7 @@ def _value_at(message: Any, path: str, topic: str) -> Any:
                 )
             continue
         key = index or name
-        names = names_of(message)
+        names = finssim_record.names_of(message)
         position = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
         if position is None:
             raise CalibrationError(
@@ -214,13 +116,13 @@ def read(path: Path, request: Request) -> TrialStreams:
         CalibrationError: Not a bag, or topics, types or fields that it lacks.
         ModuleNotFoundError: rosbags is not installed.
     """
-    recorded, remarks = recorded_header(path)
+    recorded, remarks = finssim_record.recorded_header(path)
     with _opened(path) as (reader, findings):
         findings += [] if request.vehicle else remarks
         types = {c.topic: c.msgtype for c in reader.connections}
         given = request.mapped.topics
-        native = {} if given else native_topics(types)
-        sources: dict[str, Topic] = {}
+        native = {} if given else finssim_record.native_topics(types)
+        sources: dict[str, LogTopic] = {}
         for topic, source in (given or native).items():
             if topic not in types:
                 raise CalibrationError(
@@ -228,7 +130,7 @@ def read(path: Path, request: Request) -> TrialStreams:
                 )
             sources[topic] = _mapped(reader, topic, types[topic], source)
         if not given and not native:
-            sources = _known(reader, types, request, findings)
+            sources = _known(reader, types)
         if not sources:
             raise CalibrationError(
                 f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(types)}"
@@ -237,70 +139,60 @@ def read(path: Path, request: Request) -> TrialStreams:
         events = _events(reader) if native else []
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
     times = times_of(sources, findings)
-    events += _inputs(path.name, sources, times, request, findings)
-    sources = {
-        topic: source for topic, source in sources.items() if source.rank < 0 or source.kind not in INPUTS
-    }
-    used = {
-        *sources,
-        *(stream.source for stream in events),
-        *(t for t in types if native and t.endswith("/events")),
-    }
+    try:
+        events += _inputs(path.name, sources, times, request)
+    except CalibrationError as error:
+        if request.mapped.ardusub.outputs:
+            raise
+        findings.append(finding("topic_unusable", topic="the outputs", messages="all", reason=str(error)))
+    used = {*sources, *(stream.source for stream in events)}
     unread = [
         f"{topic} ({types[topic].replace('/msg/', '/')}, {counts.get(topic, 0)} messages)"
-        for topic in sorted(set(types) - used)
+        for topic in sorted(types)
+        if topic not in used and not (native and topic.endswith("/events"))
     ]
     unread[:1] = [f"topics {topic}" for topic in unread[:1]]
     return log_of(path.name, sources, times, findings, unread, events, recorded)
 
 
-def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> Topic:
+def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> LogTopic:
     """Return a topic of a map, with the usual columns of its type where the map names none."""
     if source.columns or source.phase is not None or source.split is not None:
-        return Topic(source, -1, kind)
-    order = [*THRUSTERS, *(known for known, _ in USUAL)]
-    if kind in THRUSTERS:
-        columns, usual = _thruster_columns(reader, topic, kind), SourceMap()
-    elif kind in order or _is_dvl(reader, kind):
-        usual = dict(USUAL).get(kind, DVL)
-        columns = usual.columns
-    else:
+        return LogTopic(source, -1, kind)
+    usual = KNOWN["usual"] | KNOWN["dvl"]
+    name = next(iter(KNOWN["dvl"])) if _is_dvl(reader, kind) else kind
+    if kind in finssim_record.THRUSTERS:
+        usual = {kind: SourceMap(columns=_thruster_columns(reader, topic, kind))}
+    if name not in usual:
         raise CalibrationError(
             f"{topic} is of type {kind}, for which no columns are usual: give 'columns: {{u: FIELD, ...}}'"
         )
+    rank = [*KNOWN["mavros"], *finssim_record.THRUSTERS, *KNOWN["usual"], *KNOWN["dvl"]].index(name)
     keys = {name: getattr(source, name) for name in source.model_fields_set - {"columns"}}
-    return Topic(
-        usual.model_copy(update={**keys, "columns": columns}),
-        order.index(kind) if kind in order else len(order),
-        kind,
-    )
+    return LogTopic(usual[name].model_copy(update=keys), rank, kind)
 
 
-def _known(
-    reader: Any, types: Mapping[str, str], request: Request, findings: list[Finding]
-) -> dict[str, Topic]:
+def _known(reader: Any, types: Mapping[str, str]) -> dict[str, LogTopic]:
     """Return the topics of a bag that are read without a map."""
-    ends = tuple("/" + end for end, kind, _ in MAVROS if kind.startswith("mavros_msgs"))
-    roots = {
-        t[: -len(e)] for t, k in types.items() for e in ends if k.startswith("mavros_msgs") and t.endswith(e)
-    }
-    out: dict[str, Topic] = {}
+    known = [(f"/{key.split()[0]}", key.split()[1], source) for key, source in KNOWN["mavros"].items()]
+    own = [
+        (topic, end)
+        for topic, kind in types.items()
+        for end, of, _ in known
+        if kind == of and topic.endswith(end)
+    ]
+    roots = tuple({f"{topic.removesuffix(end)}/" for topic, end in own if "mavros" in types[topic]})
+    out: dict[str, LogTopic] = {}
     for topic, kind in sorted(types.items()):
-        of_mavros = "mavros" in topic.split("/") or any(
-            root and topic.startswith(f"{root}/") for root in roots
+        inside = "mavros" in topic.split("/") or topic.startswith(
+            tuple(root for root in roots if root != "/")
         )
-        end = next(
-            (i for i, (end, of, _) in enumerate(MAVROS) if kind == of and topic.endswith(f"/{end}")), None
-        )
-        if end is not None and (of_mavros or kind.startswith("mavros_msgs") or "" in roots):
-            out[topic] = Topic(MAVROS[end][2], end, kind)
-        elif of_mavros:
-            continue
-        elif _is_dvl(reader, kind):
-            out[topic] = Topic(DVL, 0, kind)
-        elif kind in dict(USUAL) and not (COMMANDS.search(topic) and re.search("Pose|Twist|Odometry", kind)):
+        for rank, (end, of, source) in enumerate(known):
+            if (topic, end) in own and kind == of and (inside or "/" in roots):
+                out[topic] = LogTopic(source, rank, kind)
+        command = COMMANDS.search(topic) and re.search("Pose|Twist|Odometry", kind)
+        if not (inside or topic in out or command) and (kind in KNOWN["usual"] or _is_dvl(reader, kind)):
             out[topic] = _mapped(reader, topic, kind, SourceMap())
-            out[topic].rank += len(MAVROS)
     return out
 
 
@@ -311,52 +203,45 @@ def _is_dvl(reader: Any, kind: str) -> bool:
 
 
 def _inputs(
-    label: str,
-    sources: Mapping[str, Topic],
-    times: Mapping[str, Array],
-    request: Request,
-    findings: list[Finding],
+    label: str, sources: dict[str, LogTopic], times: Mapping[str, Array], request: Request
 ) -> list[Stream]:
-    """Return the streams of the outputs of an ArduSub autopilot, or of the pilot's channels through its mixer."""
+    """Return the streams of the outputs of an ArduSub autopilot, or of the pilot's channels through its mixer.
+
+    The topics of outputs and channels are removed from the sources.
+
+    Raises:
+        CalibrationError: The outputs do not fit the vehicle.
+    """
     log, vehicle, named = ArduPilotLog(label, telemetry=True), request.vehicle, {}
     for topic, source in sorted(sources.items(), key=lambda item: item[1].rank):
-        kind, name = INPUTS.get(source.kind, ("", ""))
-        if kind and source.rank >= 0 and len(times[topic]) >= 2 and kind not in log.messages:
+        if source.rank < 0 or len(times[topic]) < 2:
+            continue
+        kind, name = INPUTS.get(source.kind, ("HEARTBEAT" if "mode" in source.cells else "", ""))
+        if name:
+            del sources[topic]
             rows = [enumerate(cells, start=1) for cells in source.cells["channels"]]
-            log.messages[kind] = [{name.format(i): int(pulse) for i, pulse in row} for row in rows]
-            log.times[kind], named[f"{label} {kind}"] = times[topic], topic
-        elif "mode" in source.cells and source.rank >= 0 and len(times[topic]) >= 2:
-            states = zip(source.cells["armed"], source.cells["mode"], strict=True)
-            log.messages["HEARTBEAT"] = [
-                {"base_mode": ARMED_FLAG * int(armed), "custom_mode": MANUAL if mode == "MANUAL" else -1}
-                for armed, mode in states
-            ]
-            log.times["HEARTBEAT"] = times[topic]
+            messages = [{name.format(i): int(pulse) for i, pulse in row} for row in rows]
+        elif kind:
+            modes = [MANUAL if mode == "MANUAL" else -1 for mode in source.cells["mode"]]
+            arming = [ARMED_FLAG * int(armed) for armed in source.cells["armed"]]
+            messages = [{"base_mode": a, "custom_mode": m} for a, m in zip(arming, modes, strict=True)]
+        if kind and kind not in log.messages:
+            log.messages[kind], log.times[kind], named[f"{label} {kind}"] = messages, times[topic], topic
     if vehicle is not None and vehicle.autopilot is not None:
         signs = enumerate(vehicle.autopilot.signs(len(vehicle.thrusters)), start=1)
         frame = next((n for n, (name, _) in FRAMES.items() if name == vehicle.autopilot.name), -1)
         log.parameters.update({"FRAME_CONFIG": frame, **{f"MOT_{i}_DIRECTION": sign for i, sign in signs}})
-    try:
-        streams = with_inputs(log, request, [])
-    except CalibrationError as error:
-        if request.mapped.ardusub.outputs:
-            raise
-        findings.append(
-            finding("topic_unusable", topic=", ".join(named.values()), messages="all", reason=str(error))
-        )
-        return []
-    assumed = vehicle is not None and streams and not request.mapped.ardusub.outputs
-    findings += [finding("directions_assumed")] if assumed else []
+    streams = with_inputs(log, request, [])
+    if streams and vehicle is not None and not request.mapped.ardusub.outputs:
+        streams[0] = streams[0].noting(finding("directions_assumed"))
     return [replace(stream, source=named[stream.source], rank=0) for stream in streams]
 
 
-def _collect(reader: Any, sources: dict[str, Topic], findings: list[Finding]) -> None:
+def _collect(reader: Any, sources: dict[str, LogTopic], findings: list[Finding]) -> None:
     """Read the messages of the topics; a message that cannot be read is counted."""
     needed = {topic: used_columns(source.map) for topic, source in sources.items()}
     for topic, names in needed.items():
-        if sources[topic].rank >= 0:
-            names += {"mavros_msgs/msg/State": ["mode"]}.get(sources[topic].kind, [])
-            names += ["channels"] if sources[topic].kind in INPUTS else []
+        names += ["channels"] if sources[topic].rank >= 0 and sources[topic].kind in INPUTS else []
         sources[topic].cells = {name: [] for name in names}
     connections = [c for c in reader.connections if c.topic in sources]
     try:
@@ -437,7 +322,7 @@ def _typestore() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    for name, text in DEFINITIONS.items():
+    for name, text in KNOWN["definitions"].items():
         store.register(get_types_from_msg(text, name))
     return store
 
@@ -446,7 +331,7 @@ def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSou
     """Columns that the first message of a topic names."""
     connections = [c for c in reader.connections if c.topic == topic]
     for _, message in _messages(reader, connections):
-        return thruster_columns(kind, message)
+        return finssim_record.thruster_columns(kind, message)
     return {}
 
 
@@ -468,7 +353,7 @@ def _events(reader: Any) -> list[Stream]:
     """Return the streams of the events of our own records."""
     connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == TEXT]
     texts = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
-    stream = spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
+    stream = finssim_record.spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
     return [] if stream is None else [stream]
 
 

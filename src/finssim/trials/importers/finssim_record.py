@@ -39,7 +39,7 @@ def native_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
     """Topics of ours that make a trial; none of a bag without a type of ours.
 
     Args:
-        types: Topic -> type, all that the bag has.
+        types: LogTopic -> type, all that the bag has.
     """
     if not any(kind.startswith(NATIVE) for kind in types.values()):
         return {}

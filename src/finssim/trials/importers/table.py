@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 
 from finssim.core.budget import CELLS
 from finssim.core.text_table import text_table
+from finssim.core.yaml_file import read_mapping
 from finssim.trials.conversion import EULER, factor
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
-from finssim.trials.importers.assemble import SourceMap, Stream, TimeColumn, Validity, in_our_axes
-from finssim.trials.importers.log import LogImporter, TrialStreams
+from finssim.trials.importers.assemble import SourceMap, Stream, TimeColumn, Validity, in_our_axes, present
+from finssim.trials.importers.log import LogImporter, Request, TrialStreams
 from finssim.trials.trial import Array, column_of
 from finssim.trials.trial_files import ColumnTable, read_table
 from finssim.vehicles.part import did_you_mean
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".pq", ".npz")
+TEXTS = (".csv", ".tsv", ".txt", ".dat")
+SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
 """Names of the time column without a map; seconds."""
 
@@ -307,14 +309,35 @@ def _column_list(table: ColumnTable) -> str:
     return listed(table.columns, 40)
 
 
-def names_of(path: Path, head: bytes) -> set[str]:
+def _names(path: Path, head: bytes) -> list[str]:
     """Return the names of the columns of a text table, from its first bytes; none of other files."""
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt", ".dat"):
-        return set()
+    if path.suffix.lower() not in TEXTS:
+        return []
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    return set(text_table(head.decode(encoding, errors="replace")).names)
+    return text_table(head.decode(encoding, errors="replace")).names
 
 
+def known_table(file: str) -> LogImporter:
+    """Return the importer of tables that a shipped file describes: its title, the columns it needs, and its map.
+
+    Args:
+        file: Name of the YAML file beside this module.
+    """
+    known = read_mapping(Path(__file__).with_name(file), CalibrationError, such_as="map: {}")
+    source, needs = SourceMap.model_validate(known["map"]), set(known["needs"])
+
+    def read(path: Path, request: Request) -> TrialStreams:
+        table = read_table(path)
+        written = source.time is not None and source.time.column in table.words
+        time = source.time.model_copy(update={"unit": "date"}) if written and source.time else source.time
+        used = present(source, table.columns).model_copy(update={"time": time})
+        return TrialStreams([table_stream(table, used, path.name)])
+
+    return LogImporter(known["title"], lambda path, head: needs <= set(_names(path, head)), read)
+
+
+ACOUSTIC = known_table("acoustic.yaml")
+QGROUNDCONTROL = known_table("qgroundcontrol.yaml")
 TABLE = LogImporter(
     title="a table (.csv, .txt, .parquet, .npz)",
     recognises=lambda path, head: path.is_file() and path.suffix.lower() in SUFFIXES,

@@ -12,16 +12,15 @@ import numpy as np
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.assemble import SourceMap, Stream
 from finssim.trials.importers.log import TrialStreams
-from finssim.trials.importers.table import stream_of
+from finssim.trials.importers.table import memory_table, stream_of
 from finssim.trials.trial import Array
-from finssim.trials.trial_files import ColumnTable
 
 OTHER_CLOCK = 5.0
 """Stamps that are farther from the times of receipt than those of other topics are of another clock [s]."""
 
 
 @dataclass
-class Topic:
+class LogTopic:
     """A topic that is read."""
 
     map: SourceMap
@@ -38,18 +37,8 @@ class Topic:
     broken: Counter[str] = field(default_factory=Counter)
     """Reasons for which messages cannot be read -> their number."""
 
-    def table(self) -> ColumnTable:
-        """Return the fields as columns."""
-        table = ColumnTable()
-        for name, cells in self.cells.items():
-            if any(isinstance(cell, str) for cell in cells):
-                table.words[name] = [str(cell) for cell in cells]
-            else:
-                table.numbers[name] = np.array(cells, dtype=float)
-        return table
 
-
-def times_of(topics: Mapping[str, Topic], findings: list[Finding]) -> dict[str, Array]:
+def times_of(topics: Mapping[str, LogTopic], findings: list[Finding]) -> dict[str, Array]:
     """Return the times [s] of each topic's messages on one clock: stamps where they are of that of the others.
 
     Args:
@@ -75,7 +64,7 @@ def times_of(topics: Mapping[str, Topic], findings: list[Finding]) -> dict[str, 
 
 def log_of(
     label: str,
-    topics: Mapping[str, Topic],
+    topics: Mapping[str, LogTopic],
     times: Mapping[str, Array],
     findings: list[Finding],
     unread: Sequence[str],
@@ -87,7 +76,7 @@ def log_of(
     Args:
         label: Name of the log in messages.
         topics: Topics by name.
-        times: Topic -> times of its messages [s].
+        times: LogTopic -> times of its messages [s].
         findings: Findings about the log.
         unread: What the log contains beside the topics.
         others: Further streams of the log.
@@ -106,7 +95,8 @@ def log_of(
             findings += [] if total else [finding("topic_short", topic=name)]
             continue
         try:
-            streams.append(replace(stream_of(topic.table(), topic.map, times[name], name), rank=topic.rank))
+            table = memory_table({name: np.asarray(cells) for name, cells in topic.cells.items()})
+            streams.append(replace(stream_of(table, topic.map, times[name], name), rank=topic.rank))
         except CalibrationError as error:
             if topic.rank < 0:
                 raise

@@ -13,43 +13,15 @@ from finssim.control.ardusub import NEUTRAL
 from finssim.core.budget import limited_memory
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.ardusub_outputs import outputs_of
-from finssim.trials.importers.assemble import SourceMap, Stream
+from finssim.trials.importers.assemble import Stream, present, shipped_maps
 from finssim.trials.importers.log import LogImporter, Request, TrialStreams
-from finssim.trials.importers.topics import Topic, log_of, times_of
+from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array
 
 MAGIC = b"ULog\x01\x12\x35"
 
-ARMED = 2
-"""vehicle_status.arming_state of an armed vehicle."""
-
-
-def _map(columns: dict[str, Any], **keys: Any) -> SourceMap:
-    return SourceMap.model_validate({"frame": "NED", "valid": False, "columns": columns, **keys})
-
-
-def _flagged(columns: str, flag: str) -> dict[str, Any]:
-    return {name: {"column": name, "valid": flag} for name in columns.split()}
-
-
-TOPICS: dict[str, SourceMap] = {
-    "vehicle_attitude": _map({"qw": "q[0]", "qx": "q[1]", "qy": "q[2]", "qz": "q[3]"}),
-    "vehicle_angular_velocity": _map({"p": "xyz[0]", "q": "xyz[1]", "r": "xyz[2]"}),
-    "sensor_combined": _map(
-        {name: f"gyro_rad[{i}]" for i, name in enumerate("pqr")}
-        | {f"a{axis}": f"accelerometer_m_s2[{i}]" for i, axis in enumerate("xyz")}
-    ),
-    "vehicle_local_position": _map(
-        _flagged("x y", "xy_valid")
-        | _flagged("z", "z_valid")
-        | _flagged("vx vy", "v_xy_valid")
-        | _flagged("vz", "v_z_valid")
-    ),
-    "battery_status": _map(
-        {"voltage": {"column": "voltage_v", "valid": {"column": "voltage_v", "above": 1.0}}}
-    ),
-}
-"""Topic -> columns in forward-right-down axes of the body and north-east-down of the world; the preferred first."""
+TOPICS = shipped_maps("ulog.yaml")["topics"]
+"""Topic -> map of its fields."""
 
 
 def read(path: Path, request: Request) -> TrialStreams:
@@ -71,20 +43,15 @@ def read(path: Path, request: Request) -> TrialStreams:
     except Exception as error:  # what is damaged shows in whatever layer of pyulog meets it
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise CalibrationError(f"{path}: cannot be read as a PX4 log: {reason}") from None
-    topics: dict[str, Topic] = {}
+    topics: dict[str, LogTopic] = {}
     unread, outputs = [], []
-    findings = (
-        [finding("as_read", remark="the log is damaged: the intact part was read")]
-        if log.file_corruption
-        else []
-    )
+    damaged = finding("as_read", remark="the log is damaged: the intact part was read")
+    findings = [damaged] if log.file_corruption else []
     for data in sorted(log.data_list, key=lambda data: (data.name, data.multi_id)):
         name, t = data.name + (f" {data.multi_id}" if data.multi_id else ""), 1e-6 * data.data["timestamp"]
         if name in TOPICS:
-            topic = Topic(TOPICS[name], list(TOPICS).index(name), received=t, cells=data.data)
-            columns = {column: spec for column, spec in topic.map.columns.items() if spec.column in data.data}
-            topic.map = topic.map.model_copy(update={"columns": columns})  # those of this version of PX4
-            topics[name] = topic
+            source = present(TOPICS[name], list(data.data))  # versions of PX4 differ
+            topics[name] = LogTopic(source, list(TOPICS).index(name), received=t, cells=data.data)
         elif name == "actuator_outputs" and not request.passive and len(t) >= 2:
             outputs.append(_outputs(data.data, t, request))
         else:

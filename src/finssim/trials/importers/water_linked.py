@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,45 +12,16 @@ import numpy as np
 
 from finssim.core.text_table import read_text
 from finssim.trials.findings import CalibrationError, finding
-from finssim.trials.importers.assemble import SourceMap, TimeColumn
+from finssim.trials.importers.assemble import TimeColumn, shipped_maps
 from finssim.trials.importers.log import LogImporter, Request, TrialStreams
-from finssim.trials.importers.table import WORST_FOM, stream_of
-from finssim.trials.trial_files import ColumnTable
+from finssim.trials.importers.table import used_columns
+from finssim.trials.importers.topics import LogTopic, log_of
 
-FIELDS = (
-    "vx",
-    "vy",
-    "vz",
-    "velocity_valid",
-    "fom",
-    "time",
-    "time_of_validity",
-    "x",
-    "y",
-    "roll",
-    "pitch",
-    "yaw",
-)
+REPORTS = shipped_maps("water_linked.yaml")["reports"]
+"""Type of a report -> map of its fields."""
 
-VELOCITY = SourceMap.model_validate(
-    {
-        "frame": "FRD",
-        "columns": {"u": "vx", "v": "vy", "w": "vz"},
-        "valid": ["velocity_valid", {"column": "fom", "below": WORST_FOM}],
-    }
-)
-POSITION = SourceMap.model_validate(
-    {
-        "frame": "NED",
-        "columns": {
-            "x": "x",
-            "y": "y",
-            **{name: {"column": name, "unit": "deg"} for name in ("roll", "pitch", "yaw")},
-        },
-        "valid": {"column": "status", "value": 0},
-    }
-)
-"""Dead reckoning; its z counts from its start, not from the surface."""
+LABELS = {"type", "format", "ts", "status", "time", "time_of_transmission", "time_of_validity"}
+"""Fields that tell what a report is."""
 
 
 def read(path: Path, request: Request) -> TrialStreams:
@@ -64,17 +36,17 @@ def read(path: Path, request: Request) -> TrialStreams:
         CalibrationError: Unreadable, or without a valid velocity.
     """
     text, _ = read_text(path, CalibrationError)
-    reports: dict[str, list[dict[str, Any]]] = {"velocity": [], "position_local": []}
+    reports: dict[str, list[dict[str, Any]]] = {kind: [] for kind in REPORTS}
     others: Counter[str] = Counter()
-    for line in text.splitlines():
+    for line in filter(str.strip, text.splitlines()):
         try:
-            report = json.loads(line) if line.strip() else None
-        except (ValueError, RecursionError):
-            report = line
-        if not isinstance(report, dict):
-            others["lines that are no JSON object"] += report is not None
+            report = json.loads(line)
+            kind = str(
+                report.get("type", "velocity" if "velocity_valid" in report else "reports without a type")
+            )
+        except (ValueError, RecursionError, AttributeError):
+            others["lines that are no JSON object"] += 1
             continue
-        kind = str(report.get("type", "velocity" if "velocity_valid" in report else "reports without a type"))
         if kind == "velocity" and report.get("tracking_mode", "bottom") != "bottom":
             kind = "velocity_water"
         if kind in reports:
@@ -86,41 +58,38 @@ def read(path: Path, request: Request) -> TrialStreams:
         raise CalibrationError(
             f"{path}: no velocity of a Water Linked log in it, expected one JSON object a line"
         )
-    table, unread = _table(velocity)
-    clock = table.numbers.get("time_of_validity")
-    stamped = clock is not None and bool((clock > 0.0).all())
+    stamped = all(_number(report.get("time_of_validity")) > 0.0 for report in velocity)
     time = TimeColumn(column="time", unit="ms", kind="period")
     time = TimeColumn(column="time_of_validity", unit="us") if stamped else time
-    if time.column not in table.numbers:
+    t = time.seconds(np.array([_number(report.get(time.column)) for report in velocity]))
+    if not np.isfinite(t).any():
         raise CalibrationError(f"{path}: the velocities have no '{time.column}' with numbers")
-    t = time.seconds(table.numbers[time.column])
-    notes = [finding("velocity_at_sensor", kind="the Doppler log")]
+    findings = [finding("velocity_at_sensor", kind="the Doppler log")]
+    topics, times = {"velocity": _topic("velocity", velocity)}, {"velocity": t}
     if not stamped:
-        notes.append(
-            finding("periods_summed", name=str(velocity[0].get("format", "this format")), count=len(t))
-        )
-    streams = [stream_of(table, VELOCITY, t, f"{path.name} velocity").noting(*notes)]
-    if position and stamped:
-        table, more = _table(position)
-        streams.append(stream_of(table, POSITION, table.numbers["ts"], f"{path.name} position_local"))
-        unread |= more
+        version = str(velocity[0].get("format", "this format"))
+        findings.append(finding("periods_summed", name=version, count=len(t)))
+        others["position_local, which has another clock"] += len(position)
     elif position:
-        others["position_local, which has another clock"] = len(position)
-    unread -= {"type", "format", "ts", "status", "time", "time_of_transmission", "time_of_validity"}
-    items = [f"{kind} ({count} lines)" for kind, count in others.items() if count]
-    items += [f"fields {', '.join(sorted(unread))}"] if unread else []
-    return TrialStreams([streams[0].noting(finding("not_read", items="; ".join(items))), *streams[1:]])
+        topics["position_local"] = _topic("position_local", position)
+        times["position_local"] = np.array([_number(report.get("ts")) for report in position])
+    used = {field for topic in topics.values() for field in topic.cells} | LABELS
+    fields = {field for kind in topics for report in reports[kind] for field in report} - used
+    unread = [f"{kind} ({count} lines)" for kind, count in others.items() if count]
+    unread += [f"fields {', '.join(sorted(fields))}"] if fields else []
+    return log_of(path.name, topics, times, findings, unread)
 
 
-def _table(reports: list[dict[str, Any]]) -> tuple[ColumnTable, set[str]]:
-    """Return the numbers of reports as columns, and the names of the fields that are not read."""
-    table = ColumnTable()
-    names = dict.fromkeys(name for report in reports for name in report)
-    for name in names:
-        cells = [report.get(name) for report in reports]
-        if all(cell is None or isinstance(cell, (int, float)) for cell in cells):
-            table.numbers[name] = np.array([np.nan if cell is None else float(cell) for cell in cells])
-    return table, {name for name in names if name not in FIELDS}
+def _topic(kind: str, reports: list[dict[str, Any]]) -> LogTopic:
+    """Return reports as a topic; a number that a report lacks is NaN."""
+    names = [name for name in used_columns(REPORTS[kind]) if any(name in report for report in reports)]
+    return LogTopic(
+        REPORTS[kind], cells={name: [_number(report.get(name)) for report in reports] for name in names}
+    )
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, (int, float)) else math.nan
 
 
 def _recognises(path: Path, head: bytes) -> bool:
