@@ -62,6 +62,7 @@ EXTRAS = {
             "pandas": "pandas",
             "pyarrow": "pyarrow",
             "pymavlink": "pymavlink",
+            "pyulog": "pyulog",
             "rosbags": "rosbags",
         },
         "read Parquet, ArduSub logs and ROS 2 bags, draw the report of a calibration and the figures of a replay",
