@@ -153,7 +153,7 @@ def show_vehicle(
     picture: Path | None = None,
     as_json: bool = False,
 ) -> None:
-    """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s] and thrusters.
+    """Print mass [kg], trim, terminal speeds, wrench capability [N, N m], time constants [s], thrusters and stability.
 
     Example: finssim vehicles show finsrov --picture finsrov.png
 
@@ -164,8 +164,9 @@ def show_vehicle(
     """
     from rich.console import Console
 
+    from finssim.sim.stability import stability
     from finssim.vehicles import load_vehicle
-    from finssim.vehicles.show import print_vehicle, vehicle_data
+    from finssim.vehicles.show import print_motions, print_vehicle, vehicle_data
 
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"{picture} ends in '{picture.suffix}', expected one of {' '.join(PICTURES)}")
@@ -175,10 +176,14 @@ def show_vehicle(
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)
+    model = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
+    top, found = stability(vehicle, model)
+    motions = {n: (m.words(m.at_rest), m.words(m.at_top_speed), m.unstable_above) for n, m in found.items()}
     if as_json:
-        print(json.dumps(vehicle_data(vehicle)))
+        print(json.dumps(vehicle_data(vehicle) | {"top_speed": top, "without_control": motions}))
     else:
         print_vehicle(vehicle, Console())
+        print_motions(top, motions, Console())
     if picture is not None:
         from finssim.core.files import atomic_write
         from finssim.vehicles.show import draw_vehicle

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from rich.console import Console
 
-__all__ = ["draw_vehicle", "print_catalogue", "print_vehicle", "vehicle_data"]
+__all__ = ["draw_vehicle", "print_catalogue", "print_motions", "print_vehicle", "vehicle_data"]
 
 
 _MARK = {"measured": "", "published": "", "derived": " ·", "guessed": " ?"}
@@ -74,6 +74,20 @@ def print_vehicle(vehicle: Vehicle, console: Console) -> None:
         console.print(f"calibrated: {record.sentence()}", highlight=False, markup=False)
     for table in _tables(vehicle):
         console.print(table)
+
+
+def print_motions(top: float, motions: Mapping[str, tuple[str, str, float | None]], console: Console) -> None:
+    """Print what a vehicle does without control.
+
+    Args:
+        top: Its top speed [m/s].
+        motions: Motion -> what it does at rest and at top speed, and the speed from which it grows [m/s].
+        console: Where to print.
+    """
+    heads = ("", "at rest", f"at {top:.2f} m/s", "unstable above [m/s]")
+    items = motions.items()
+    rows = ((n, rest, fast, "-" if above is None else f"{above:.2f}") for n, (rest, fast, above) in items)
+    console.print(_table("Without control (level, actuators and fins held)", heads, rows, words=True))
 
 
 def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
