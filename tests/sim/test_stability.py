@@ -8,7 +8,7 @@ import pytest
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.sim.stability import Motion, stability
+from finssim.sim.stability import FreeMotion, stability
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import restoring
 from reference.imported import simulated
@@ -58,9 +58,9 @@ def test_a_disturbance_grows_in_the_simulation_as_it_is_reported():
 
 
 def test_an_eigenvalue_in_words():
-    assert Motion.words(complex(-0.5, 0.0)) == "dies out in 2 s"
-    assert Motion.words(complex(0.25, math.pi)) == "grows e-fold in 4 s, period 2 s"
-    assert Motion.words(complex(0.0, 2 * math.pi)) == "neutral, period 1 s"
+    assert FreeMotion.words(complex(-0.5, 0.0)) == "dies out in 2 s"
+    assert FreeMotion.words(complex(0.25, math.pi)) == "grows e-fold in 4 s, period 2 s"
+    assert FreeMotion.words(complex(0.0, 2 * math.pi)) == "neutral, period 1 s"
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from finssim.sim.model import acceleration
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 
-__all__ = ["MOTIONS", "Motion", "stability"]
+__all__ = ["MOTIONS", "FreeMotion", "stability"]
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ SLOW = 5e-3
 """Rate below which a motion neither grows nor dies out [1/s]; differences over a step of v|v| are smaller."""
 
 
-class Motion(NamedTuple):
+class FreeMotion(NamedTuple):
     """One motion without control: the eigenvalue with the greatest real part at rest and at top speed [1/s]."""
 
     at_rest: complex
@@ -69,7 +69,7 @@ def _system_matrices(vehicle: Vehicle, speeds: Array, hydrodynamics: str) -> Arr
     return A
 
 
-def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[float, dict[str, Motion]]:
+def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[float, dict[str, FreeMotion]]:
     """Return top speed [m/s] and what each motion of `MOTIONS` does without control up to it.
 
     An eigenvalue belongs to the motion whose states take the greatest part in it.
@@ -94,5 +94,5 @@ def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[floa
         first = np.take_along_axis(values, own.argmax(axis=1)[:, None], axis=1)[:, 0]
         growing = np.flatnonzero((first.real > SLOW) & np.isfinite(own.max(axis=1)))
         above = float(speeds[growing[0]]) if len(growing) else None
-        motions[name] = Motion(complex(first[0]), complex(first[-1]), above)
+        motions[name] = FreeMotion(complex(first[0]), complex(first[-1]), above)
     return top, motions
