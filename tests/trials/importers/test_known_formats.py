@@ -99,6 +99,14 @@ def test_dead_reckoning_is_read_on_the_same_clock_only(tmp_path):
     assert f"position_local, which has another clock ({N} lines)" in str(
         one(tmp_path / "old.json").findings[-1]
     )
+    boot = [
+        json.dumps(line)
+        for i in range(N)
+        for line in (report(i, "3.3"), dead_reckoning(i) | {"ts": CLOCK[i]})
+    ]
+    (tmp_path / "boot.json").write_text("\n".join(boot))
+    trial = one(tmp_path / "boot.json")
+    assert "x" not in trial.channels and "position_local, which has another clock" in str(trial.findings[-1])
 
 
 @pytest.mark.parametrize(
@@ -238,7 +246,7 @@ def message(kind, content):
     return struct.pack("<HB", len(content), ord(kind)) + content
 
 
-def ulog(path, topics=tuple(FORMATS)):
+def ulog(path, topics=tuple(FORMATS), valid=None):
     """A log of 20 s: our own attitude and motion, turned into forward-right-down and north-east-down."""
     half = np.array([1.0, 0.0, 0.0, 0.0])
     x, y, z, w = quat_multiply(quat_multiply(half, TILT), half)
@@ -246,23 +254,13 @@ def ulog(path, topics=tuple(FORMATS)):
     out += b"".join(message("F", f"{name}:{FORMATS[name][0]}".encode()) for name in topics)
     out += b"".join(message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(topics))
     for k, t in enumerate(T):
+        flags = valid or (k % 10 != 0, True, k % 5 != 0, True)
         outputs = [1500.0 + 10.0 * k % 300.0, 1500.0, *[0.0] * 14]
         values = {
             "vehicle_attitude": (w, x, y, z),
             "vehicle_angular_velocity": (np.sin(t), -np.cos(t), -0.3 * t),
             "sensor_combined": (9.0, 9.0, 9.0, 0.1, -0.2, -9.8),
-            "vehicle_local_position": (
-                t,
-                -2.0 * t,
-                3.0,
-                0.5,
-                -0.25,
-                0.1 * t,
-                k % 10 != 0,
-                True,
-                k % 5 != 0,
-                True,
-            ),
+            "vehicle_local_position": (t, -2.0 * t, 3.0, 0.5, -0.25, 0.1 * t, *flags),
             "actuator_outputs": (2, *outputs),
             "battery_status": (15.5,),
             "vehicle_status": (2 if 50 <= k < 150 else 1,),
@@ -309,6 +307,16 @@ def test_px4_logs_split_by_arming_with_outputs_of_a_map(tmp_path):
     np.testing.assert_allclose(
         trial.series("pwm_T1")[1], (1500.0 - 10.0 * np.arange(50, 150) % 300.0), rtol=1e-6
     )
+
+
+def test_px4_logs_without_a_horizontal_velocity(tmp_path):
+    """As without positioning: the valid vertical velocity alone becomes no velocity of the body, and this is noted."""
+    pytest.importorskip("pyulog")
+    trial = one(ulog(tmp_path / "dive.ulg", valid=(False, True, False, True)))
+    assert "z" in trial.channels and not {"x", "u", "v", "w"} & set(trial.channels)
+    assert "vz left out: a velocity in the world needs all of vx, vy and vz" in [
+        str(i) for i in trial.findings
+    ]
 
 
 @pytest.mark.parametrize("part", [0.7, 0.3])

@@ -825,7 +825,11 @@ def trial_of(name: str, table: MergedStreams, header: Header, column_map: Column
     """
     channels, findings = dict(table.channels), list(table.findings)
     findings += _without_empty(channels)
-    if any(c in channels for c in WORLD_VELOCITY):
+    world = [c for c in WORLD_VELOCITY if c in channels]
+    if 0 < len(world) < len([c for c in WORLD_VELOCITY if c in table.channels]):  # others of them are empty
+        findings.append(finding("world_velocity_incomplete", columns=tuple(world)))
+        channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
+    elif world:
         channels |= _body_velocity(name, table.t, channels)
         channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
         findings += _without_empty(channels)

@@ -69,10 +69,12 @@ def read(path: Path, request: Request) -> TrialStreams:
     if not stamped:
         version = str(velocity[0].get("format", "this format"))
         findings.append(finding("periods_summed", name=version, count=len(t)))
-        others["position_local, which has another clock"] += len(position)
     elif position:
-        topics["position_local"] = _topic("position_local", position)
         times["position_local"] = np.array([_number(report.get("ts")) for report in position])
+        if np.nanmin(t) <= np.nanmedian(times["position_local"]) <= np.nanmax(t):
+            topics["position_local"] = _topic("position_local", position)
+    if "position_local" not in topics:
+        others["position_local, which has another clock"] = len(position)
     used = {field for topic in topics.values() for field in topic.cells} | LABELS
     fields = {field for kind in topics for report in reports[kind] for field in report} - used
     unread = [f"{kind} ({count} lines)" for kind, count in others.items() if count]
