@@ -138,7 +138,7 @@ def test_a_trial_is_made_of_a_frame_with_its_units_and_axes():
     np.testing.assert_allclose(trial.channels["v"], -np.sin(trial.t), atol=1e-12)  # left, not right
     np.testing.assert_allclose(trial.channels["depth"], 1.5 + 0.1 * trial.t)
     assert trial.name == "dive" and trial.header.vehicle == "bluerov2"
-    assert [(one.code, one.values["column"]) for one in trial.findings] == [("unknown_column", "note")]
+    assert [(one.code, one.values["items"]) for one in trial.findings] == [("not_read", "columns note")]
     assert fs.Trial.from_frame(frame(), columns=columns, **options).sha256 == trial.sha256
 
 

@@ -117,11 +117,9 @@ def _logs(paths: list[Path], request: Request, format: str, has_map: bool) -> li
     logs: list[tuple[str, TrialStreams]] = []
     tables = []
     for path in paths:
-        if not path.exists():
-            raise CalibrationError(f"{path}: no such file")
+        name = importer_of(path, format)
         mapped = any(_trial_name(pattern, path) is not None for pattern in request.mapped.files)
-        name = "csv" if mapped and path.suffix.lower() in SUFFIXES else importer_of(path, format)
-        if name == "csv":
+        if name == "csv" or (mapped and path.suffix.lower() in SUFFIXES):
             tables.append(path)
         else:
             logs.append((path.stem, importers()[name].read(path, request)))

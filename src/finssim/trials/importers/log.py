@@ -93,12 +93,12 @@ def importer_of(path: Path, format: str = "auto") -> str:
         CalibrationError: No importer of that name, or none recognises it.
     """
     known = importers()
-    if format in known:
-        return format
-    if format != "auto":
+    if format not in ("auto", *known):
         raise CalibrationError(f"format is '{format}', expected one of auto, {', '.join(known)}")
     if not path.exists():
         raise CalibrationError(f"{path}: no such file")
+    if format in known:
+        return format
     head = b""
     if path.is_file():
         with path.open("rb") as file:
