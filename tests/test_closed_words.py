@@ -48,7 +48,7 @@ FREE = {"about", "source", "note", "description", "name", "title", "license", "l
 RECORDS = {"calibration", "calibrations", "training", "provenance"}
 """Sections in which a program notes how a file came about."""
 LATER = {
-    "map": {"vehicle", "column", "p"},
+    "map": {"vehicle", "column", "p", "value"},
     "trial": {"vehicle"},
     "plant of the pool": {"vehicle"},
     "vehicle": {"family"},
@@ -86,8 +86,10 @@ READERS = {
     "altimeter": (load_device, DEVICES / "ping.yaml", "own.yaml"),
     "map": (
         read_map,
-        "vehicle: bluerov2_heavy\nsplit: {gaps: 2.0}\nfiles:\n  a.csv:\n    time: {column: t, unit: s}\n"
-        "    frame: {body: FRD, world: NED}\n    columns: {p: x, ax: {column: y, unit: g}}\n"
+        "vehicle: bluerov2_heavy\nsplit: {gaps: 2.0}\nfiles:\n  a.csv:\n    time: {column: t, unit: s, "
+        "kind: counter, wrap: 256}\n    valid: [{column: status, value: OK}, {column: fom, below: 0.4}]\n"
+        "    frame: {body: FRD, world: NED}\n"
+        "    columns: {p: x, ax: {column: y, unit: g, valid: {column: z, above: 1}}}\n"
         "    phase: {column: mode, words: {run: excitation}}\nardusub: {velocity: ekf, imu: 0}\n"
         "trials: {one: {role: fit}}\n",
         "map.yaml",

@@ -42,6 +42,32 @@ def test_the_published_report_becomes_a_velocity_in_our_axes_with_the_logs_own_a
 
 
 @pytest.mark.parametrize(
+    ("version", "without"),
+    [
+        ("json_v1", ("type", "time_of_validity", "time_of_transmission", "covariance")),
+        (None, ("type", "format", "time_of_validity", "time_of_transmission", "covariance")),
+        ("json_v2", ("time_of_validity", "time_of_transmission", "covariance")),
+    ],
+)
+def test_reports_of_old_firmware_are_velocities_without_an_age(version, without):
+    """Before json_v3 a report has no times, in json_v1 no type; without bottom lock it is none either way."""
+    old = {key: value for key, value in REPORT.items() if key not in without}
+    old |= {} if version is None else {"format": version}
+    counts = Counter()
+    aid = decode_line(json.dumps(old).encode(), counts)
+    assert (aid.values, aid.age, aid.fom) == ((0.5, -0.25, 0.125), 0.0, 1.6e-4)
+    assert decode_line(json.dumps(old | {"velocity_valid": False}).encode(), counts) is None
+    assert counts == {"velocity without times": 1, "no bottom lock": 1}
+
+
+@pytest.mark.parametrize("missing", ["time_of_validity", "time_of_transmission"])
+def test_a_report_of_new_firmware_needs_its_times(missing):
+    counts = Counter()
+    assert decode_line(json.dumps({k: v for k, v in REPORT.items() if k != missing}).encode(), counts) is None
+    assert counts == {"implausible": 1}
+
+
+@pytest.mark.parametrize(
     ("changes", "counted"),
     [
         ({"velocity_valid": False}, "no bottom lock"),

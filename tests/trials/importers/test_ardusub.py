@@ -1,6 +1,7 @@
 """ArduSub logs become trials: real DataFlash and telemetry logs, their axes, their clocks, their outputs, cut files."""
 
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,22 @@ def test_pulses_of_a_thruster_wired_the_other_way_are_left_to_the_vehicle_file()
         outputs, _ = outputs_of(one, {}, given)
         name, sign = outputs[1]
         assert one.thrusters[name].shaft_speed(1500.0 + sign * 200.0) > 0.0
+
+
+def test_kinds_of_messages_that_are_not_read_are_named_with_their_numbers(dataflash, telemetry):
+    """As counted by pymavlink's own iteration of both logs."""
+    from pymavlink import mavutil
+
+    for path, trial in ((BIN, dataflash), (TLOG, telemetry)):
+        log, counts = mavutil.mavlink_connection(str(path)), Counter()
+        while (message := log.recv_msg()) is not None:
+            counts[message.get_type()] += 1
+        unread = str(trial.findings[-1])
+        assert trial.findings[-1].code == "not_read"
+        kind, number = max(
+            ((k, n) for k, n in counts.items() if f" {k} (" in unread), key=lambda item: item[1]
+        )
+        assert f"{kind} ({number})" in unread and "ATT" not in unread.replace("ATTITUDE_TARGET", "").split()
 
 
 def test_an_explicit_map_of_outputs_comes_first(tmp_path):

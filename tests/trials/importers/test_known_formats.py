@@ -359,3 +359,62 @@ def test_known_formats_take_the_keys_of_a_map(tmp_path):
     )
     first, second = read_trials([tmp_path / "dvl.jsonl"], column_map=tmp_path / "map.yaml")
     assert first.header.passive and all(low < high for low, high in pairwise(second.t))
+
+
+# Closed words: what a log has and a trial has not is named, in every format; and so is what is invalid or dead.
+
+
+def csv(path, **columns):
+    cells = [[str(value) for value in values] for values in columns.values()]
+    path.write_text(
+        "\n".join([",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]) + "\n"
+    )
+    return path
+
+
+def npz(path, **columns):
+    np.savez(path, **columns)
+    return path
+
+
+def with_type(path):
+    lines = [json.dumps(report(i, "3.1") | {"turboness": 1.5}) for i in range(N)]
+    path.write_text("\n".join([*lines, *['{"type": "turbo_model"}'] * 7]))
+    return path
+
+
+FIX = {"timestamp": T, "position_valid": GOOD, "x": T, "y": T, "z": T}
+UNKNOWN = {
+    "csv": ("a.csv", lambda path: csv(path, t=T, u=T, turboness=T)),
+    "npz": ("a.npz", lambda path: npz(path, t=T, u=T, turboness=np.arange(3))),
+    "qgroundcontrol": ("a.csv", lambda path: path.write_text(ground_station(turboness=T)) and path),
+    "acoustic": ("a.csv", lambda path: csv(path, **FIX, turboness=T)),
+    "waterlinked": ("a.json", with_type),
+    "ulog": ("a.ulg", lambda path: ulog(path, (*list(FORMATS)[:3], "cpuload"))),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_a_trial_has_not_is_named(tmp_path, name):
+    """An unknown column, field, array or topic, and the count of an unknown kind of message."""
+    if name == "ulog":
+        pytest.importorskip("pyulog")
+    file, write = UNKNOWN[name]
+    unread = " ".join(str(item) for item in one(write(tmp_path / file)).findings if item.code == "not_read")
+    assert ("cpuload (200)" if name == "ulog" else "turboness") in unread
+    assert name != "waterlinked" or "turbo_model (7 lines)" in unread
+
+
+def test_every_importer_of_logs_has_such_a_test():
+    """Bags in `test_mavros.py`, ArduSub logs in `test_ardusub.py`; a new format joins the table above."""
+    assert set(importers()) == {*UNKNOWN, "rosbag", "ardupilot"} - {"npz"}
+
+
+@pytest.mark.parametrize("name", ["csv", "npz"])
+def test_a_dead_column_and_a_stale_flag_are_reported_in_tables(tmp_path, name):
+    """The rates are zero, the last velocities are stale: neither becomes a measurement in silence."""
+    flags = np.where(GOOD, 1.0, 0.0)
+    columns = {"t": T, "yaw": np.sin(T), "r": 0.0 * T, "u": np.where(GOOD, T, 77.0), "velocity_valid": flags}
+    trial = one((csv if name == "csv" else npz)(tmp_path / f"a.{name}", **columns))
+    assert "r" not in trial.channels and trial.series("u")[1].max() < 77.0
+    assert {"never_changes", "invalid_left_out"} <= {item.code for item in trial.findings}

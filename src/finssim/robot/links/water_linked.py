@@ -1,4 +1,4 @@
-"""Water Linked A50 and A125 Doppler logs: JSON lines over TCP, as their makers publish them (json_v3.1).
+"""Water Linked A50 and A125 Doppler logs: JSON lines over TCP, as their makers publish them (json_v1 to json_v3.1).
 
 `DvlClient` brings lines from a log and `decode_line` reads them; `encode_velocity` writes a report and `DvlServer`
 sends it, for a log that is simulated. The log's axes on the wire are x forward, y right, z down.
@@ -26,7 +26,7 @@ __all__ = ["PORT", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "enco
 PORT = 16171
 """TCP port of a log."""
 
-_FORMAT = "json_v3.1"
+_FORMAT, _UNTIMED = "json_v3.1", ("json_v1", "json_v2")
 _FASTEST, _OLDEST, _HIGHEST = 10.0, 5.0, 300.0
 """Speed [m/s], age [s] and altitude [m] beyond what either log can report."""
 _MICROSECONDS = 1e17
@@ -50,16 +50,18 @@ def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity 
 
     Args:
         line: One JSON object.
-        counts: Counts what comes: `velocity` for those returned; `no bottom lock`, `implausible`, `not a report`; other
-            reports, such as `position_local` and `response`, under their type.
+        counts: Counts what comes: `velocity` for those returned, and `velocity without times` for those of firmware
+            before json_v3; `no bottom lock`, `implausible`, `not a report`; other reports, such as `position_local` and
+            `response`, under their type.
 
     Returns:
         Velocity over the floor in our axes of the log (x forward, y left, z up), with the age that the log's own clock
-        gives it; None for everything else, and for a velocity through the water.
+        gives it, 0 s where the firmware sends no times; None for everything else, and for a velocity through the water.
     """
     counts = Counter() if counts is None else counts
     report = _object(line)
-    kind = report.get("type")
+    # The first firmware has no types, and neither it nor json_v2 has times.
+    kind = report.get("type", "velocity" if "velocity_valid" in report else None)
     if kind != "velocity" or report.get("tracking_mode", "bottom") != "bottom":
         recognised = kind in ("velocity", "velocity_water", "position_local", "response")
         counts["velocity_water" if kind == "velocity" else kind if recognised else "not a report"] += 1
@@ -68,13 +70,14 @@ def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity 
         counts["no bottom lock"] += 1
         return None
     v = [_number(report.get(axis), -_FASTEST, _FASTEST) for axis in ("vx", "vy", "vz")]
-    measured = _number(report.get("time_of_validity"), 0.0, _MICROSECONDS)
-    sent = _number(report.get("time_of_transmission"), 0.0, _MICROSECONDS)
-    age = 1e-6 * (sent - measured)
+    times = [report.get(f"time_of_{event}") for event in ("validity", "transmission")]
+    measured, sent = (_number(time, 0.0, _MICROSECONDS) for time in times)
+    untimed = times == [None, None] and report.get("format", "json_v1") in _UNTIMED
+    age = 0.0 if untimed else 1e-6 * (sent - measured)
     if not (all(math.isfinite(value) for value in v) and 0.0 <= age <= _OLDEST):
         counts["implausible"] += 1
         return None
-    counts["velocity"] += 1
+    counts["velocity without times" if untimed else "velocity"] += 1
     x, y, z = FROM_FOSSEN.vector(v).tolist()
     altitude = _number(report.get("altitude"), 0.0, _HIGHEST)
     fom = _number(report.get("fom"), 0.0, _FASTEST)

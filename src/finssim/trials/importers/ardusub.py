@@ -420,7 +420,7 @@ def read(path: Path, request: Request) -> TrialStreams:
     if not any(stream.channels for stream in usable):
         raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
     used = {stream.source.removeprefix(f"{path.name} ") for stream in usable}
-    used |= {"PARM", "PARAM_VALUE", "HEARTBEAT", "MODE", "FMT"}
+    used |= {"PARM", "PARAM_VALUE", "HEARTBEAT", "MODE", "FMT", "EV", "XKF4", "NKF4", "EKF_STATUS_REPORT"}
     rest = [f"{kind} ({count})" for kind, count in sorted(log.counts.items()) if kind not in used]
     if rest:
         usable[0] = usable[0].noting(finding("not_read", items=f"messages {', '.join(rest)}"))
