@@ -73,15 +73,6 @@ def test_terminal_speeds_and_the_speed_of_floating_up(tmp_path):
 # Conversions, one by one
 
 
-def test_axes_change_from_forward_right_down_to_forward_left_up():
-    """A force to the right by a turn to the right is one to the left by a turn to the left."""
-    found = uuv.to_left_up(np.arange(36.0).reshape(6, 6))
-    assert found[1, 5] == 11.0 and found[0, 5] == -5.0 and found[3, 4] == -22.0 and found[0, 3] == 3.0
-    vehicle_axes = np.diag([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
-    matrix, v = np.arange(36.0).reshape(6, 6) % 7, np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    assert uuv.to_left_up(matrix) @ (vehicle_axes @ v) == pytest.approx(vehicle_axes @ (matrix @ v))
-
-
 def hydrodynamic_model(**words):
     inner = "".join(f"<{word}>{value}</{word}>" for word, value in words.items())
     return fromstring(f"<hydrodynamic_model>{inner}</hydrodynamic_model>")

@@ -198,7 +198,7 @@ def import_vehicle(file: Path, *, out: Path, folder: Sequence[Path] = (), as_jso
 
     Read are SDF of gz-sim (plugins Hydrodynamics, Thruster and Buoyancy), URDF and xacro with these or with the plugins
     of uuv_simulator, coefficients of Fossen's equations in Python or MATLAB, which are not executed, scenarios of
-    HoloOcean and parameters of MarineGym.
+    Stonefish and HoloOcean and parameters of MarineGym.
 
     Example: finssim vehicles import model.sdf --out rov.yaml
 

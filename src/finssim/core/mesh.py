@@ -171,6 +171,44 @@ def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
     return vertices, index.reshape(-1, 3).astype(np.int64)
 
 
+def load_obj(path: str | Path) -> tuple[Vertices, Faces]:
+    """Read the polygons of a Wavefront OBJ file, all its objects together.
+
+    Args:
+        path: The file; its lengths are taken to be metres.
+
+    Returns:
+        Vertices (n, 3) [m] and faces (m, 3): a polygon becomes a fan.
+
+    Raises:
+        MeshError: It has no polygon, one of vertices that are not there, or a number beyond reason.
+    """
+    corners: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    try:
+        for line in read_bytes(Path(path), MeshError).decode("utf-8", "replace").splitlines():
+            words = line.split()
+            if words[:1] == ["v"]:
+                corners.append([float(word) for word in words[1:4]])
+            elif words[:1] == ["f"]:
+                numbers = [int(word.partition("/")[0]) for word in words[1:]]
+                corner = [number - 1 if number > 0 else len(corners) + number for number in numbers]
+                faces += [(corner[0], b, c) for b, c in zip(corner[1:-1], corner[2:], strict=True)]
+        vertices, index = (
+            np.array(corners, np.float64).reshape(-1, 3),
+            np.array(faces, np.int64).reshape(-1, 3),
+        )
+    except ValueError as error:
+        raise MeshError(f"{path}: cannot be read as OBJ: {error}") from None
+    if index.size == 0 or index.min() < 0 or index.max() >= len(vertices):
+        raise MeshError(f"{path}: has no polygon, or one of vertices that it does not have: export it again")
+    if not np.abs(vertices).max() <= FARTHEST:
+        raise MeshError(
+            f"{path}: a coordinate is not a number up to {FARTHEST:g} m: save the mesh again, in metres"
+        )
+    return vertices, index
+
+
 def write_stl(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     """Write a binary STL file (float32).
 

@@ -292,6 +292,7 @@ IMPORTERS = Family(
         "vehicle.marinegym": "finssim.vehicles.importers.marinegym:MARINEGYM",
         "vehicle.sdf": "finssim.vehicles.importers.sdf:SDF",
         "vehicle.urdf": "finssim.vehicles.importers.urdf:URDF",
+        "vehicle.stonefish": "finssim.vehicles.importers.stonefish:STONEFISH",
         "trial.qgroundcontrol": "finssim.trials.importers.table:QGROUNDCONTROL",
         "trial.acoustic": "finssim.trials.importers.table:ACOUSTIC",
         "trial.waterlinked": "finssim.trials.importers.water_linked:WATER_LINKED",

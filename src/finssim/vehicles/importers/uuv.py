@@ -15,13 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.yaml_file import read_mapping
-from finssim.vehicles.importers.draft import GRAVITY, LAG, SHARE, Draft, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.draft import GRAVITY, LAG, Draft, put_controlled_axes, put_envelope
 from finssim.vehicles.importers.model import (
     Model,
     note_rest,
@@ -31,13 +30,22 @@ from finssim.vehicles.importers.model import (
     put_physical_inertia,
     shapes_of,
 )
-from finssim.vehicles.importers.rigid import combined, plain
+from finssim.vehicles.importers.rigid import combined, flu_of_frd, plain
 from finssim.vehicles.importers.sdf import axis_of_joint
+from finssim.vehicles.importers.thrust_curve import (
+    ThrustCurve,
+    dead_zone,
+    interpolated,
+    put_curve,
+    quadratic,
+    scaled,
+    steady_speed,
+)
 from finssim.vehicles.importers.xml_file import Element, flag, number, numbers, refuse_unknown
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import moved_to_origin, skew
 
-__all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv", "to_left_up"]
+__all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv"]
 
 Array = NDArray[np.float64]
 
@@ -75,12 +83,6 @@ SURFACE = ("metacentric_width", "metacentric_length", "submerged_height")
 """Words of a vessel that floats."""
 DENSITY = 1028.0
 """Density of a plugin that gives none, and of the models of a sphere and a cylinder [kg/m³]."""
-
-
-def to_left_up(matrix: Array) -> Array:
-    """Return a 6x6 matrix of axes forward, right, down in axes forward, left, up; the units are kept."""
-    signs = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
-    return signs[:, None] * matrix * signs
 
 
 def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str) -> dict[str, Array]:
@@ -150,110 +152,64 @@ def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str
     return out
 
 
-class Conversion(NamedTuple):
-    """Thrust of a thruster over the speed of its rotor, and back."""
-
-    thrust: Callable[[float], float]
-    """Function of the speed [rad/s] that returns the thrust [N]."""
-    speed: Callable[[float], float]
-    """Function of the thrust [N] that returns the least speed for it [rad/s]."""
-    ends: tuple[float, float] = (-math.inf, math.inf)
-    """Least and greatest thrust [N]."""
-
-
-def conversion(element: Element, where: str) -> Conversion:
-    """Return what an element `conversion` says.
-
-    Args:
-        element: The element.
-        where: What a message calls it.
-    """
+def conversion(element: Element, where: str) -> ThrustCurve:
+    """Return the thrust curve of an element `conversion`; `where` is what a message calls it."""
     kind = (element.findtext("type") or "").strip()
-    if kind == "Basic":
-        refuse_unknown(element, {"type", "rotorConstant"}, where)
-        k = abs(number(element, "rotorConstant", where))  # its sign only says which way the propeller turns
-        if k == 0.0:
-            raise VehicleError(f"{where}: rotorConstant is 0, expected another")
-        return Conversion(lambda w: k * w * abs(w), lambda f: math.copysign(math.sqrt(abs(f) / k), f))
-    if kind == "Bessa":
-        refuse_unknown(element, {"type", "rotorConstantL", "rotorConstantR", "deltaL", "deltaR"}, where)
-        left, right = number(element, "rotorConstantL", where), number(element, "rotorConstantR", where)
-        low, high = number(element, "deltaL", where), number(element, "deltaR", where)
-        if min(left, right) <= 0.0 or low > 0.0 or high < 0.0:
-            raise VehicleError(
-                f"{where}: expected rotorConstantL, rotorConstantR > 0 and deltaL <= 0 <= deltaR"
-            )
-
-        def speed(force: float) -> float:
-            square = force / right + high if force > 0.0 else force / left + low
-            return math.copysign(math.sqrt(abs(square)), force)
-
-        return Conversion(
-            lambda w: right * max(w * abs(w) - high, 0.0) + left * min(w * abs(w) - low, 0.0), speed
-        )
+    words = {
+        "Basic": ("rotorConstant",),
+        "Bessa": ("rotorConstantL", "rotorConstantR", "deltaL", "deltaR"),
+        "LinearInterp": ("inputValues", "outputValues"),
+    }
+    if kind not in words:
+        raise VehicleError(f"{where}: type is '{kind}', expected one of {', '.join(words)}: correct it")
+    refuse_unknown(element, {"type", *words[kind]}, where)
     if kind == "LinearInterp":
-        refuse_unknown(element, {"type", "inputValues", "outputValues"}, where)
         count = len((element.findtext("inputValues") or "").split())
-        texts = [(word, element.findtext(word)) for word in ("inputValues", "outputValues")]
-        columns = [numbers(text, count, f"{where}: {word}") for word, text in texts]
-        inputs, outputs = (column[np.argsort(columns[0])] for column in columns)
-        rises = count > 1 and np.all(np.diff(outputs) >= 0.0)
-        if not (rises and inputs[0] < 0.0 < inputs[-1] and outputs[0] < 0.0 < outputs[-1]):
-            raise VehicleError(
-                f"{where}: expected inputs and outputs that rise together from below 0 to above 0"
-            )
-        rising = np.r_[True, np.diff(outputs) > 0.0]
-        return Conversion(
-            lambda w: float(np.interp(w, inputs, outputs)),
-            lambda f: float(np.interp(f, outputs[rising], inputs[rising])),
-            (float(outputs[0]), float(outputs[-1])),
-        )
-    raise VehicleError(f"{where}: type is '{kind}', expected one of Basic, Bessa, LinearInterp: correct it")
+        columns = [numbers(element.findtext(word), count, f"{where}: {word}") for word in words[kind]]
+        return interpolated(columns[0], columns[1], where)
+    values = [number(element, word, where) for word in words[kind]]
+    if kind == "Basic":  # the sign of rotorConstant only says which way the propeller turns
+        return quadratic(abs(values[0]), abs(values[0]), where)
+    return dead_zone(*values, where)
 
 
 def _response(element: Element, where: str) -> tuple[float | None, Callable[[float], float], str]:
     """Return time constant [s], steady rotor speed [rad/s] of an input, and how the time constant comes about."""
     kind = (element.findtext("type") or "").strip()
+
+    def of(word: str) -> float:
+        return number(element, word, where)
+
     if kind == "FirstOrder":
-        return number(element, "timeConstant", where), lambda u: u, "timeConstant"
+        return of("timeConstant"), lambda u: u, "timeConstant"
     if kind == "ZeroOrder":
         return None, lambda u: u, "thrust of the dynamics ZeroOrder follows at once"
     if kind == "Yoerger":
-        loss, gain, lin = number(element, "alpha", where), number(element, "beta", where), 0.0
-    elif kind == "Bessa":
-        inertia = number(element, "Jmsp", where)
-        lin, loss = number(element, "Kv1", where) / inertia, number(element, "Kv2", where) / inertia
-        gain = number(element, "Kt", where) / number(element, "Rm", where) / inertia
-    else:
-        raise VehicleError(
-            f"{where}: type is '{kind}', expected one of ZeroOrder, FirstOrder, Yoerger, Bessa: correct it"
-        )
-    if loss <= 0.0 or lin < 0.0:
-        raise VehicleError(f"{where}: its losses are {lin:g} and {loss:g}, expected more than 0")
-
-    def steady(u: float) -> float:
-        return math.copysign((math.sqrt(lin**2 + 4.0 * loss * abs(gain * u)) - lin) / (2.0 * loss), gain * u)
-
-    return None, steady, f"the dynamics {kind} have none"
+        return None, steady_speed(of("beta"), 0.0, of("alpha"), where), "the dynamics Yoerger have none"
+    if kind == "Bessa":
+        steady = steady_speed(of("Kt") / of("Rm"), of("Kv1"), of("Kv2"), where)
+        return None, steady, "the dynamics Bessa have none"
+    raise VehicleError(
+        f"{where}: type is '{kind}', expected one of ZeroOrder, FirstOrder, Yoerger, Bessa: correct it"
+    )
 
 
 def _put_thruster(model: Model, plugin: Element, name: str, managed: float | None, draft: Draft) -> str:
     """Set a thruster, and return the name of its joint."""
     where, path = f"{model.label}: thruster {name}", f"thrusters.{name}"
     refuse_unknown(plugin, WORDS["thruster"], where)
-    parts = {word: plugin.find(word) for word in ("dynamics", "conversion")}
-    for word, part in parts.items():
-        if part is None:
-            raise VehicleError(f"{where}: {word} is missing: add it")
+    parts = [plugin.find(word) for word in ("dynamics", "conversion")]
+    if None in parts:
+        raise VehicleError(f"{where}: dynamics or conversion is missing: add it")
     joint, link = model.text(plugin, "jointName"), model.link_of(model.text(plugin, "linkName"))
     if joint not in model.joints:
         raise VehicleError(f"{where}: no joint '{joint}': correct it")
-    curve = conversion(parts["conversion"], f"{where}: conversion")
-    lag, steady, how = _response(parts["dynamics"], f"{where}: dynamics")
+    lag, steady, how = _response(parts[0], f"{where}: dynamics")
     push, turn = (number(plugin, f"{word}_efficiency", where, 1.0) for word in ("thrust", "propeller"))
     gain = number(plugin, "gain", where, 1.0)
     if not (0.0 < push <= 1.0 and 0.0 < turn <= 1.0) or gain == 0.0:
         raise VehicleError(f"{where}: expected a gain other than 0 and efficiencies above 0 and up to 1")
+    curve = scaled(conversion(parts[1], f"{where}: conversion"), push, turn)
 
     inertial = model.links[link].find("inertial")
     place = (model.pose(link) if inertial is None else model.pose_in(link, inertial, where)).place
@@ -263,63 +219,20 @@ def _put_thruster(model: Model, plugin: Element, name: str, managed: float | Non
     draft.put(f"{path}.position", plain(place), "derived", "centre of gravity of the thruster's link")
     draft.put(f"{path}.axis", plain(axis_of_joint(model.pose(joint), axis)), "derived", "axis of the joint")
 
+    none = (-math.inf, math.inf)
     ends = {}
     for kind in ("clamp", "thrust"):
-        low, high = (
-            number(plugin, f"{kind}Min", where, -math.inf),
-            number(plugin, f"{kind}Max", where, math.inf),
+        pair = tuple(
+            number(plugin, f"{kind}{end}", where, x) for end, x in zip(("Min", "Max"), none, strict=True)
         )
-        ends[kind] = (
-            (low, high) if low < high else (-math.inf, math.inf)
-        )  # uuv_simulator leaves out reversed limits
-    forces = [push * curve.thrust(turn * steady(gain * u)) for u in ends["clamp"] if math.isfinite(u)]
-    if len(forces) == 1:
-        forces.append(-math.copysign(math.inf, forces[0]))
-    limits = [
-        tuple(sorted(forces or (-math.inf, math.inf))),
-        ends["thrust"],
-        tuple(push * end for end in curve.ends),
-    ]
-    low, high = max(pair[0] for pair in limits), min(pair[1] for pair in limits)
+        ends[kind] = pair if pair[0] < pair[1] else none  # uuv_simulator leaves out reversed limits
+    low, high = sorted(
+        curve.thrust(steady(gain * u)) if math.isfinite(u) else gain * u for u in ends["clamp"]
+    )
+    greatest = math.inf if managed is None else managed
+    low, high = max(low, ends["thrust"][0], -greatest), min(high, ends["thrust"][1], greatest)
     origin = "thruster" if managed is None else "thruster and of the thruster manager"
-    if managed is not None:
-        low, high = max(low, -managed), min(high, managed)
-    if low >= 0.0 or high <= 0.0:
-        raise VehicleError(
-            f"{where}: its thrust is {low:g} to {high:g} N, expected one that reverses: change its limits"
-        )
-    greatest = 0.0
-    for side, force, sign in (("min", low, -1.0), ("max", high, 1.0)):
-        guessed = not math.isfinite(force)
-        note = (
-            f"no limit in the file: {SHARE:g} of the vehicle's weight"
-            if guessed
-            else f"limits of the {origin}"
-        )
-        force = sign * SHARE * draft.values["body"]["mass"] * GRAVITY if guessed else force
-        speed = curve.speed(force / push) / turn
-        greatest = max(greatest, abs(speed))
-        for key, value in (
-            (f"force_{side}", force),
-            (f"rpm_{side}", speed * 30.0 / math.pi),
-            ("c_plus" if sign > 0.0 else "c_minus", abs(force) / speed**2),
-        ):
-            if guessed and key[0] != "c":
-                draft.guess(f"{path}.{key}", value, note)
-            else:
-                draft.put(f"{path}.{key}", value, "derived", note)
-        dead = curve.speed(sign * 1e-9) / turn * 30.0 / math.pi
-        if abs(dead) > 1e-3 * abs(speed):
-            draft.put(f"{path}.dead_rpm_{'plus' if sign > 0.0 else 'minus'}", dead, "derived", "dead zone")
-        off = max(
-            abs(push * curve.thrust(turn * speed * x) / force - x**2) for x in np.linspace(0.1, 1.0, 10)
-        )
-        if off > 1e-6:
-            draft.different.append(
-                f"thruster {name}: its curve is taken as a parabola through {force:.4g} N, which is up to "
-                f"{100.0 * off:.2g} % of that from it; commands in newtons are not affected"
-            )
-    draft.values["thrusters"][name] |= {"domain": "speed", "group": "propeller"}
+    put_curve(draft, name, curve, low, high, f"limits of the {origin}")
     if lag is not None:
         draft.put(f"{path}.time_constant", lag, "published", how)
     else:
@@ -419,7 +332,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     arm = np.eye(6)
     arm[3:, :3] = skew(centre)
     for word, matrix in coefficients(hydrodynamics, boxes.get(base), where).items():
-        turned = to_left_up(matrix)
+        turned = flu_of_frd(matrix)
         if word == "added_mass":
             turned = moved_to_origin((turned + turned.T) / 2.0, centre)
         elif word != "surge_damping" or np.any(matrix):
