@@ -268,6 +268,13 @@ def test_python_is_not_executed(tmp_path):
     )
     values = read_assignments(tmp_path / "a.py").values
     assert values == {"d.m": 2.5, "n": 8.0} and not (tmp_path / "made").exists()
+    grow = "x = [1, 2]\n" + "x = np.array([x, x])\n" * 60
+    (tmp_path / "a.py").write_text(grow + "y = [" + "x, " * 100_000 + "x]\nz = np.eye(30)\n")
+    assert read_assignments(tmp_path / "a.py").values.keys() == {"z"}
+    (tmp_path / "a.m").write_text(
+        "x = [1 2];\n" + "x = [x x; x x];\n" * 60 + "y = [" + "x " * 100_000 + "];\nz = 1;\n"
+    )
+    assert read_assignments(tmp_path / "a.m").values.keys() == {"z"}
     (tmp_path / "a.py").write_text("x = (" * 3000)
     with pytest.raises(VehicleError, match="cannot be read as Python"):
         read_assignments(tmp_path / "a.py")
@@ -324,6 +331,7 @@ def test_what_is_not_read_is_named(tmp_path):
         ("m = 13.5", "n = 13.5", "no mass is read"),
         ("Iz = 0.37", "", "no inertia is read"),
         ("m = 13.5;", "m = 13.5; W = 500;", "the weight W is 500 N, and m g is 132.57 N"),
+        ("m = 13.5;", "m = 13.5; B = 1.08;", "the buoyancy B is 1.08 N and the weight 132.57 N"),
         ("m = 13.5;", "m = 13.5; mass = 0.07;", "m is 13.5 and mass is 0.07, which should be the same"),
         ("Xu_l = 13.7", "Xu_l = -13.7", "linear damping has both signs"),
         ("diag([6.36", "diag([-6.36", "added mass has both signs"),

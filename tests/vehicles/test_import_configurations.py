@@ -122,9 +122,10 @@ def test_what_a_scenario_lacks_or_has_besides_is_named(tmp_path):
     [
         (scenario(agent_type="BlueROV2", fossen_model=None, dynamics=None), "a BlueROV2, are in HoloOcean's engine"),
         (scenario(fossen_model="otter"), "expected an agent with fossen_model torpedo"),
-        (scenario(COUGUV | {"diamm": 0.2}), "dynamics: unknown word 'diamm', did you mean 'diam'"),
-        (scenario(COUGUV | {"mass": "16"}), "dynamics: mass is '16', expected 1 finite numbers"),
-        (scenario(COUGUV | {"r_bg": [0, 0]}), "r_bg is [0, 0], expected 3 finite numbers"),
+        (scenario(COUGUV | {"diamm": 0.2}), "unknown word 'diamm', did you mean 'diam'"),
+        (scenario(COUGUV | {"mass": "16"}), "mass is '16', expected a number > 0"),
+        (scenario(COUGUV | {"T_sway": 0}), "T_sway is 0, expected a number > 0"),
+        (scenario(COUGUV | {"r_bg": [0, 0]}), "r_bg is [0, 0], expected 3 numbers"),
         (scenario(COUGUV | {"diam": 2.0}), "length is 1.6 and diam is 2, expected a body longer than it is wide"),
     ],
 )  # fmt: skip

@@ -25,8 +25,8 @@ __all__ = ["Assignments", "read_assignments"]
 
 LARGEST = 1 << 20
 """Greatest size of a file [bytes]."""
-GREATEST_SIDE = 100
-"""Greatest side of a matrix."""
+GREATEST_SIZE = 1000
+"""Greatest number of entries of a matrix."""
 UNREAD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, np.linalg.LinAlgError)
 """Errors of an expression that is not read."""
 Names = dict[str, Any]
@@ -35,7 +35,7 @@ Names = dict[str, Any]
 def _filled(make: Callable[[Any], Any]) -> Callable[..., Any]:
     def of(*sides: Any) -> Any:
         shape = [int(x) for side in sides for x in np.ravel(side)]
-        if len(shape) > 2 or max(shape) > GREATEST_SIDE:
+        if len(shape) > 2 or max(shape) ** 2 > GREATEST_SIZE:
             raise ValueError
         return make(shape)
 
@@ -147,7 +147,7 @@ class Assignments:
             array = np.array(value, dtype=np.float64)
         except (ValueError, TypeError):
             return False
-        if array.size and np.all(np.isfinite(array)):
+        if 0 < array.size <= GREATEST_SIZE and np.all(np.isfinite(array)):
             names[name] = float(array) if array.ndim == 0 else array
             return True
         return False
@@ -201,6 +201,8 @@ class Assignments:
             return left @ right if matrices else OPERATORS[type(node.op)](left, right)
         if isinstance(node, ast.List | ast.Tuple):
             items = [self.value(item, names) for item in node.elts]
+            if _count(items) > GREATEST_SIZE:
+                raise ValueError
             mappings = any(isinstance(x, dict) for x in items)
             return {str(k): x for k, x in enumerate(items)} if mappings else items
         if isinstance(node, ast.Dict):
@@ -232,6 +234,10 @@ def _dotted(node: Any) -> str:
     if isinstance(node, ast.Attribute):
         return f"{_dotted(node.value)}.{node.attr}"
     return node.id if isinstance(node, ast.Name) else ""
+
+
+def _count(value: Any) -> int:
+    return sum(map(_count, value)) if isinstance(value, list) else int(np.size(value))
 
 
 def _last(node: Any) -> str:
@@ -271,6 +277,8 @@ TOKEN = re.compile(
     re.DOTALL,
 )
 """Token of MATLAB; a quote behind a word or a bracket is an operator."""
+PART = re.compile(r"[-+](?!\s)|[\w(\[\"'@.~](?![*/^'])")
+"""Beginning of an operand that begins an element of a matrix."""
 CONTROL = {"if", "for", "while", "switch", "try", "parfor"}
 
 
@@ -283,7 +291,8 @@ def _statements(text: str) -> Iterator[str]:
     while k < len(text) + 1:
         match = TOKEN.match(text, k)
         kind, token = ("operator", "\n") if match is None else (str(match.lastgroup), match[0])
-        behind = bool(re.search(r"[\w)\].]$", line)) and text[k - 1 : k] not in (" ", "\t")
+        operand = line[-1:].isalnum() or line[-1:] in ("_", ")", "]", ".")
+        behind = operand and text[k - 1 : k] not in (" ", "\t")
         if kind == "text" and behind:
             kind, token = "operator", "'"
         k += len(token)
@@ -291,9 +300,7 @@ def _statements(text: str) -> Iterator[str]:
             line += " " if kind == "space" else ""
             continue
         if kind == "space":
-            signed = re.match(r"[-+](?!\s)", text[k:])
-            part = re.search(r"[\w)\]]$", line) and (signed or re.match(r"[\w(\[\"'@.~](?![*/^'])", text[k:]))
-            line += "," if part else " "
+            line += "," if operand and PART.match(text, k) else " "
         elif kind == "operator" and not brackets and token in ";,\n":
             word = (re.match(r"\w+", line.strip()) or [""])[0]
             depth += (word in CONTROL) - (word in ("end", "endif", "endfor") and depth > 0)

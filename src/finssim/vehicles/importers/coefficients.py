@@ -194,8 +194,13 @@ def draft_of(found: Assignments, path: Path, title: str) -> Draft:
             f"{path}: has a restoring matrix G: a vessel that floats, expected a submerged vehicle"
         )
     draft.different.append("axes are taken as Fossen's: x forward, y right, z down, turned here to z up")
-    _put_body(names, draft)
-    _put_hydrodynamics(names, draft)
+    try:
+        _put_body(names, draft)
+        _put_hydrodynamics(names, draft)
+    except ArithmeticError as error:
+        raise VehicleError(
+            f"{path}: its mass, drag or thrust is not finite ({error}): correct its numbers"
+        ) from None
     _put_thrusters(names, draft)
     sides = np.array([names.first(key) or 0.0 for key in ("length", "width", "height")])
     put_envelope(draft, [np.stack([-sides / 2.0, sides / 2.0])])
@@ -240,6 +245,10 @@ def _put_body(names: _Names, draft: Draft) -> None:
         else:
             draft.put(f"body.center_of_{key}", plain(flu_of_frd(point)))
     buoyancy, volume = names.first("buoyancy"), names.first("volume")
+    if buoyancy is not None and not 0.2 < buoyancy / (mass * g) < 5.0:
+        raise VehicleError(
+            f"{names.label}: the buoyancy B is {buoyancy:g} N and the weight {mass * g:g} N: correct one"
+        )
     if buoyancy is None and volume is None:
         draft.guess("body.displaced_volume", mass / rho, "no B and no volume in the file: neutral buoyancy")
     else:

@@ -58,7 +58,9 @@ def read_holoocean(path: Path) -> Draft:
     )
     scenario: Mapping[str, Any] = next(_scenarios(tree), {"agents": {}})
     agents = scenario["agents"]
-    agents = agents.values() if isinstance(agents, Mapping) else agents
+    agents = (
+        list(agents.values()) if isinstance(agents, Mapping) else agents if isinstance(agents, list) else []
+    )
     agents = [agent for agent in agents if isinstance(agent, Mapping)]
     agent = next(
         (x for x in agents if x.get("agent_name") == scenario.get("main_agent")), (agents or [{}])[0]
@@ -69,22 +71,22 @@ def read_holoocean(path: Path) -> Draft:
             "the file, expected an agent with fossen_model torpedo"
         )
     words: dict[str, Any] = {}
-    for section in ("dynamics", "actuator"):
-        for key, value in (agent.get(section) or {}).items():
-            count = 3 if key in ("r_bg", "r_bb") else 1
-            if key not in TORPEDO and key not in CONTROL:
-                raise VehicleError(
-                    f"{path}: {section}: unknown word '{key}'{did_you_mean(key, list(TORPEDO))} correct it"
-                )
-            if (
-                np.size(value) != count
-                or np.array(value).dtype.kind not in "if"
-                or not np.all(np.isfinite(value))
-            ):
-                raise VehicleError(f"{path}: {section}: {key} is {value!r}, expected {count} finite numbers")
-            words[key] = value
+    sections = [section for section in ("dynamics", "actuator") if isinstance(agent.get(section), Mapping)]
+    for key, value in ((key, value) for section in sections for key, value in agent[section].items()):
+        if key not in TORPEDO and key not in CONTROL:
+            raise VehicleError(
+                f"{path}: unknown word '{key}'{did_you_mean(str(key), list(TORPEDO))} correct it"
+            )
+        count = 3 if key in ("r_bg", "r_bb") else 1
+        least = -np.inf if count == 3 or key in CONTROL else -1e-12 if key in ("w", "t_prop") else 0.0
+        plain = np.size(value) == count and np.array(value).dtype.kind in "if" and np.all(np.isfinite(value))
+        if not plain or np.min(value) <= least:
+            raise VehicleError(
+                f"{path}: {key} is {value!r}, expected {'3 numbers' if count == 3 else 'a number > 0'}"
+            )
+        words[key] = value
     length, diam = (float(words.get(key, TORPEDO[key])) for key in ("length", "diam"))
-    if not length > diam > 0.0:
+    if not length > diam:
         raise VehicleError(
             f"{path}: length is {length:g} and diam is {diam:g}, expected a body longer than it is wide"
         )

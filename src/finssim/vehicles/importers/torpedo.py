@@ -133,7 +133,7 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
     scale = (1.0 - words["t_prop"]) * draft.values["water"]["density"] * D**4
     fall = scale * (words["KT_0"] - words["KT_max"]) / words["Ja_max"] * (1.0 - words.get("w", WAKE)) / D * n
     rest = scale * words["KT_0"] * n**2
-    top = 2.0 * rest / (fall + math.sqrt(fall**2 + 4.0 * drag * rest))  # drag u² = rest - fall u
+    top = 2.0 * rest / (fall + math.sqrt(max(fall**2 + 4.0 * drag * rest, 0.0)))  # drag u² = rest - fall u
     forward, path = rest - fall * top, "thrusters.propeller"
     how = f"at its top speed of {top:.3g} m/s; at rest it is {rest / forward:.3g} times as much"
     for end, sign, force, note in (("max", 1.0, forward, how), ("min", -1.0, rest, "as at rest")):
