@@ -212,6 +212,7 @@ def test_an_archive_runs_no_code(tmp_path):
     """Python objects in it are refused, and so is what is no archive."""
     np.savez(tmp_path / "objects.npz", t=np.array([{}, {}], dtype=object))
     (tmp_path / "text.npz").write_text("t,u\n")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "objects.npz").read_bytes()[:-30])
     np.savez(tmp_path / "empty.npz", u=T)
     for name, sentence in (
         ("objects", "archive of numbers"),
@@ -335,6 +336,13 @@ def test_a_px4_log_without_motion_is_refused(tmp_path):
     (tmp_path / "broken.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(3))
     with pytest.raises(CalibrationError, match="cannot be read as a PX4 log"):
         read_trials([tmp_path / "broken.ulg"])
+    # In this one pyulog goes back and forth for ever.
+    about = message("I", b"\x05char[2] aab" + bytes(20)) * 15
+    (tmp_path / "endless.ulg").write_bytes(
+        b"ULog\x01\x12\x35\x01" + bytes(8) + about + b"\x2c\x01\0" + bytes(97)
+    )
+    with pytest.raises(CalibrationError, match="is damaged, and no part of it can be read"):
+        read_trials([tmp_path / "endless.ulg"])
 
 
 def test_formats_are_recognised_by_content(tmp_path):

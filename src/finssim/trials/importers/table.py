@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -87,9 +88,9 @@ def read_npz(path: Path, time: str | None) -> ColumnTable:
                     columns |= {f"{name}[{i}]": array[:, i] for i in range(array.shape[1])}
                 else:
                     columns[name] = array
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        if isinstance(error, CalibrationError):
-            raise
+    except CalibrationError:
+        raise
+    except Exception as error:  # what is damaged shows in whatever layer of zipfile and NumPy meets it
         reason = " ".join(str(error).split())[:120]
         raise CalibrationError(f"{path}: cannot be read as a NumPy archive of numbers: {reason}") from None
     time = time or next((name for name in TIME_NAMES if name in columns), None)
@@ -285,11 +286,11 @@ def _time(table: ColumnTable, time: TimeColumn, label: str) -> Array:
     _require_column(table, time.column, label)
     if time.unit != "date" and time.column in table.numbers:
         return time.seconds(table.numbers[time.column])
+    words = [_date(word) for word in _text(table, time.column, label)]
     try:
-        dates = np.array(
-            [_date(word) for word in _text(table, time.column, label)],
-            dtype="datetime64[us]",
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an offset from universal time, which is applied
+            dates = np.array(words, dtype="datetime64[us]")
     except ValueError:
         raise CalibrationError(
             f"{label}: column '{time.column}' holds neither numbers nor dates such as 2026-05-31 12:30:00.25: "

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from finssim.control.ardusub import NEUTRAL
-from finssim.core.budget import limited_memory
+from finssim.core.budget import TEXT, limited_memory, read_bytes
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.ardusub_outputs import outputs_of
 from finssim.trials.importers.assemble import Stream, present, shipped_maps
@@ -22,6 +22,16 @@ MAGIC = b"ULog\x01\x12\x35"
 
 TOPICS = shipped_maps("ulog.yaml")["topics"]
 """Topic -> map of its fields."""
+
+
+class _BoundedFile(io.BytesIO):
+    """Content of a file that is read a bounded number of times, for pyulog does not leave some damaged files."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        self.reads = getattr(self, "reads", 0) + 1
+        if self.reads > 10_000 + len(self.getbuffer()) // 2:
+            raise CalibrationError("it is damaged, and no part of it can be read")
+        return super().read(size)
 
 
 def read(path: Path, request: Request) -> TrialStreams:
@@ -37,9 +47,10 @@ def read(path: Path, request: Request) -> TrialStreams:
     """
     from pyulog import ULog
 
+    data = read_bytes(path, CalibrationError, limit=TEXT)
     try:
         with limited_memory(), contextlib.redirect_stdout(io.StringIO()):  # pyulog prints what it skips
-            log = ULog(str(path))
+            log = ULog(_BoundedFile(data))
     except Exception as error:  # what is damaged shows in whatever layer of pyulog meets it
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise CalibrationError(f"{path}: cannot be read as a PX4 log: {reason}") from None
