@@ -19,6 +19,9 @@ from finssim.core.files import atomic_write
 EMPTY = re.compile(r"nan|none|null|n/?a|[-.:]*")
 """Words for "no value", in lower case: `--.--` is how ground stations write it."""
 
+QUOTED_COMMA = re.compile(r'"-?\d+,(?!\d{3}")\d+"')
+"""Number with a decimal comma among cells that commas separate; with three decimals it may be thousands."""
+
 COMMENT = ("#",)
 """Beginnings of lines that are no rows."""
 
@@ -75,9 +78,13 @@ def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str
         path: The file.
         error: What is raised where it cannot be read.
     """
-    raw = read_bytes(Path(path), error, limit=TEXT)
-    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or (len(raw) > 8 and not any(raw[1:9:2])):
-        marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return decoded(read_bytes(Path(path), error, limit=TEXT))
+
+
+def decoded(raw: bytes) -> tuple[str, bool]:
+    """Return the text of some bytes up to the zero bytes that a crash may leave, and whether there were any."""
+    marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if marked or (len(raw) > 8 and not any(raw[1:9:2])):
         text, _, rest = raw.decode("utf-16" if marked else "utf-16-le", errors="replace").partition("\0")
         return text, bool(rest)
     intact = raw.split(b"\0", 1)[0]
@@ -156,7 +163,7 @@ def text_table(
         texts=[line for _, line in below],
         lines=[i for i, _ in below],
         split=split,
-        decimal_comma=not blank and mark != ",",
+        decimal_comma=not blank and (mark != "," or any(QUOTED_COMMA.search(line) for _, line in below[:20])),
         comments=[line.strip() for _, line in every if line.lstrip().startswith(comment)],
         unfinished=not text.endswith(("\n", "\r")),
     )

@@ -49,47 +49,27 @@ EXTRA_COLUMNS = {
 UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3, "cdeg": math.pi / 18000.0},
     "rate": {
-        "rad/s": 1.0,
-        "deg/s": math.pi / 180.0,
-        "mrad/s": 1e-3,
-        "rpm": math.pi / 30.0,
-        "rps": 2.0 * math.pi,
+        "rad/s": 1.0, "deg/s": math.pi / 180.0, "mrad/s": 1e-3, "rpm": math.pi / 30.0, "rps": 2.0 * math.pi,
         "Hz": 2.0 * math.pi,
     },
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254},
     "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "kn": 1852.0 / 3600.0},
     "acceleration": {"m/s²": 1.0, "m/s^2": 1.0, "m/s2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
     "force": {
-        "N": 1.0,
-        "mN": 1e-3,
-        "kN": 1e3,
-        "kgf": GRAVITY,
-        "gf": 1e-3 * GRAVITY,
-        "lbf": POUND * GRAVITY,
+        "N": 1.0, "mN": 1e-3, "kN": 1e3, "kgf": GRAVITY, "gf": 1e-3 * GRAVITY, "lbf": POUND * GRAVITY,
         "ozf": POUND / 16.0 * GRAVITY,
     },
     "moment": {
-        "N m": 1.0,
-        "Nm": 1.0,
-        "N mm": 1e-3,
-        "kgf m": GRAVITY,
-        "kgf cm": 1e-2 * GRAVITY,
+        "N m": 1.0, "Nm": 1.0, "N mm": 1e-3, "kgf m": GRAVITY, "kgf cm": 1e-2 * GRAVITY,
         "lbf ft": POUND * GRAVITY * 0.3048,
     },
     "voltage": {"V": 1.0, "mV": 1e-3, "cV": 1e-2},
     "pulse": {"µs": 1.0, "us": 1.0, "ms": 1e3, "s": 1e6, "ns": 1e-3},
     "pressure": {
-        "Pa": 1.0,
-        "hPa": 1e2,
-        "mbar": 1e2,
-        "kPa": 1e3,
-        "bar": 1e5,
-        "dbar": 1e4,
-        "atm": 101325.0,
-        "psi": 6894.757293168,
+        "Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "dbar": 1e4, "atm": 101325.0, "psi": 6894.757293168,
     },
     "number": {"-": 1.0},
-}
+}  # fmt: skip
 """Dimension -> unit -> how many of our units it is."""
 
 _DIMENSION = {unit: dimension for dimension, units in UNITS.items() for unit in units}
@@ -358,6 +338,16 @@ def without_dead(t: Array, channels: Channels) -> list[Finding]:
         for rate in rates:
             del channels[rate]
         findings.append(finding("never_changes", columns=tuple(rates), moving=tuple(against)))
+    swinging = {
+        name: rate
+        for rate, name in zip("pqr", EULER, strict=True)
+        if rate in channels and name in angles and constant(angles[name]) and _swing(t, channels[rate]) > 0.2
+    }
+    dead = tuple(swinging) if any(name in channels for name in EULER) else QUATERNION
+    if swinging and all(constant(channels[name]) for name in dead):
+        for name in dead:
+            del channels[name]
+        findings.append(finding("never_changes", columns=dead, moving=tuple(swinging.values())))
     for names, others, least in DEAD:
         present = [name for name in names if name in channels]
         moving = [name for name in others if name in channels and least < _range(channels[name]) < math.inf]
@@ -370,6 +360,15 @@ def without_dead(t: Array, channels: Channels) -> list[Finding]:
                 del channels[name]
             findings.append(finding("never_changes", columns=tuple(present), moving=tuple(moving)))
     return findings
+
+
+def _swing(t: Array, rate: Array) -> float:
+    """Return the range of the angle [rad] of a rate [rad/s] without its mean, for gyroscopes have a bias, (n,) each."""
+    good = np.isfinite(rate)
+    steps = np.minimum(np.diff(t[good], prepend=t[good][:1]), 0.5)
+    return (
+        float(np.ptp(np.cumsum((rate[good] - np.mean(rate[good])) * steps))) if good.sum() >= ALIVE else 0.0
+    )
 
 
 def _range(values: Array) -> float:

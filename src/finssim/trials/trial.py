@@ -263,16 +263,7 @@ class Trial:
         """
         from finssim.trials.importers.frame import trial_from_frame
 
-        return trial_from_frame(
-            frame,
-            columns=columns,
-            units=units,
-            time=time,
-            axes=axes,
-            name=name,
-            surface_pressure=surface_pressure,
-            header=header,
-        )
+        return trial_from_frame(frame, columns, units, time, axes, name, surface_pressure, header)
 
     def has(self, *columns: str) -> bool:
         """Return whether every one of these columns holds at least two finite samples."""

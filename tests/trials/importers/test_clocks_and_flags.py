@@ -262,11 +262,26 @@ def test_rates_that_never_change_lose_to_an_attitude_that_moves(tmp_path):
         ({"x": 0.0, "y": 0.0}, {"u": np.sin(T), "v": np.cos(T)}),
         ({"depth": 0.0}, {"z": -1.0 - 0.5 * np.sin(T)}),
         ({"z": 0.0}, {"depth": 1.0 + 0.5 * np.sin(T)}),
+        ({"roll": 0.0, "pitch": 0.0}, {"p": 0.01 + 0.3 * np.cos(T), "q": 0.3 * np.sin(T)}),
+        ({"qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}, {"r": 0.3 * np.cos(T)}),
     ],
 )
 def test_other_dead_columns_lose_as_well(tmp_path, dead, moving):
     trial = read(tmp_path, {"t": T} | {k: v + 0.0 * T for k, v in dead.items()} | moving)
     assert set(trial.channels) == set(moving)
+
+
+def test_a_biased_gyroscope_does_not_kill_a_heading_that_rests(tmp_path):
+    """A compass of whole degrees on the bench, beside rates with a bias of 0.02 rad/s and noise."""
+    rate = 0.02 + 0.005 * np.random.default_rng(0).normal(size=N)
+    assert set(read(tmp_path, {"t": T, "yaw": 0.5 + 0.0 * T, "r": rate}).channels) == {"yaw", "r"}
+
+
+def test_a_dead_pressure_loses_to_a_depth_that_moves(tmp_path):
+    columns = {"t": T, "depth": 1.0 + 0.5 * np.sin(T), "p": 101325.0 + 0.0 * T}
+    trial = read(tmp_path, columns, "time: t\ncolumns: {depth: depth, pressure: p}")
+    np.testing.assert_allclose(trial.channels["depth"], columns["depth"])
+    assert "never_changes" in codes(trial)
 
 
 def test_an_empty_optional_column_is_left_out_with_a_note(tmp_path):
@@ -289,6 +304,8 @@ def test_an_import_ends_with_what_it_did_not_read(tmp_path):
         "t,u\n0,0.5\n0.1,0.25\n".encode("utf-16-le"),
         b"sep=;\r\nt;u\r\n0,0;0,5\r\n0,1;0,25\r\n",
         b"\xef\xbb\xbfsep=,\nt,u\n0,0.5\n0.1,0.25\n",
+        b't,u\n0,"0,5"\n"0,1","0,25"\n',
+        b"t\tu\n0\t0,5\n0,1\t0,25\n",
         "t;u;T [\u20ac\u00b0]\n0;0,5;1\n0,1;0,25;2\n".encode("cp1252"),
     ],
 )

@@ -259,7 +259,7 @@ def ulog(path, topics=tuple(FORMATS), valid=None):
         outputs = [1500.0 + 10.0 * k % 300.0, 1500.0, *[0.0] * 14]
         values = {
             "vehicle_attitude": (w, x, y, z),
-            "vehicle_angular_velocity": (np.sin(t), -np.cos(t), -0.3 * t),
+            "vehicle_angular_velocity": (0.01 * np.sin(t), -0.01 * np.cos(t), -3e-3 * t),
             "sensor_combined": (9.0, 9.0, 9.0, 0.1, -0.2, -9.8),
             "vehicle_local_position": (t, -2.0 * t, 3.0, 0.5, -0.25, 0.1 * t, *flags),
             "actuator_outputs": (2, *outputs),
@@ -284,7 +284,8 @@ def test_px4_logs(tmp_path):
             quat_rotate(q, v), np.broadcast_to(quat_rotate(TILT, v), (N, 3)), atol=1e-6
         )
     for name, expected in {
-        "p": np.sin(T), "q": np.cos(T), "r": 0.3 * T, "ax": 0.1 + 0 * T, "ay": 0.2 + 0 * T, "az": 9.8 + 0 * T,
+        "p": 0.01 * np.sin(T), "q": 0.01 * np.cos(T), "r": 3e-3 * T, "ax": 0.1 + 0 * T, "ay": 0.2 + 0 * T,
+        "az": 9.8 + 0 * T,
         "z": -3.0 + 0 * T, "voltage": 15.5 + 0 * T, "pwm_C1": 1500.0 + 10.0 * np.arange(N) % 300.0,
     }.items():  # fmt: skip
         np.testing.assert_allclose(trial.series(name)[1], expected, rtol=1e-6, atol=1e-6, err_msg=name)

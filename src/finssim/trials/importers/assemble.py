@@ -245,12 +245,8 @@ class LogFrame(Part):
     def _short(cls, data: Any) -> Any:
         if not isinstance(data, str):
             return data
-        forms = {
-            "FLU": {},
-            "z_up": {},
-            "FRD": {"body": "FRD", "world": "NED"},
-            "NED": {"body": "FRD", "world": "NED"},
-        }
+        fossen = {"body": "FRD", "world": "NED"}
+        forms: dict[str, Any] = {"FLU": {}, "z_up": {}, "FRD": fossen, "NED": fossen}
         if data not in forms:
             raise refuse_section(
                 f"is '{data}', expected FLU, FRD, or {{body: FLU or FRD, world: z_up or NED}}"
@@ -367,11 +363,8 @@ class SplitRule(Part):
             if "windows" in data:
                 return {"by": "windows", **data}
             if "gaps" in data:
-                return {
-                    "by": "gaps",
-                    "longest_gap": data["gaps"],
-                    **{k: v for k, v in data.items() if k != "gaps"},
-                }
+                others = {key: value for key, value in data.items() if key != "gaps"}
+                return {"by": "gaps", "longest_gap": data["gaps"], **others}
         return data
 
     @model_validator(mode="after")
@@ -833,6 +826,13 @@ def trial_of(name: str, table: MergedStreams, header: Header, column_map: Column
         channels |= _body_velocity(name, table.t, channels)
         channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
         findings += _without_empty(channels)
+    if (
+        {"pressure", "depth"} <= set(channels)
+        and constant(channels["pressure"])
+        and not constant(channels["depth"])
+    ):
+        del channels["pressure"]
+        findings.append(finding("never_changes", columns=("pressure",), moving=("depth",)))
     if "pressure" in channels:
         depth, assumed = _depth(name, channels.pop("pressure"), header, column_map)
         findings += assumed

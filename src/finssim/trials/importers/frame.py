@@ -19,7 +19,6 @@ from finssim.vehicles.part import did_you_mean, sentence_of
 
 def trial_from_frame(
     frame: Any,
-    *,
     columns: Mapping[str, str] | None,
     units: Mapping[str, str] | None,
     time: str,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.budget import CELLS
-from finssim.core.text_table import text_table
+from finssim.core.text_table import decoded, text_table
 from finssim.core.yaml_file import read_mapping
 from finssim.trials.conversion import EULER, factor
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
@@ -314,8 +314,7 @@ def _names(path: Path, head: bytes) -> list[str]:
     """Return the names of the columns of a text table, from its first bytes; none of other files."""
     if path.suffix.lower() not in TEXTS:
         return []
-    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    return text_table(head.decode(encoding, errors="replace")).names
+    return text_table(decoded(head)[0]).names
 
 
 def known_table(file: str) -> LogImporter:
