@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from finssim.core.text_table import number, write_csv
 from finssim.evaluation.tables import Table, print_tables
 from finssim.sim import Simulator
 from finssim.sim.recorder import STATE_COLUMNS
+from finssim.sim.water import load_water
 from finssim.vehicles import AXES, load_vehicle
 
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
@@ -75,6 +77,7 @@ def simulate(
     out: Path,
     hydrodynamics: str = "calibrated",
     depth: float = 5.0,
+    water: Path | None = None,
     device: str = "cpu",
     as_json: bool = False,
 ) -> None:
@@ -93,6 +96,8 @@ def simulate(
         out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json records its origin.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         depth: Depth of the body origin at the start [m].
+        water (FILE): Water file (.yaml): currents, a profile over depth and time, waves or a sea state; still water if
+            not given.
         device (DEVICE): Compute device: cpu or cuda.
         as_json: Print one JSON object instead of a table.
 
@@ -109,7 +114,10 @@ def simulate(
     tau, chosen = parse_wrench(command), load_vehicle(vehicle)
     allocator, names = Allocator.from_vehicle(chosen), chosen.thruster_names
     thrust = allocator.allocate(tau)
-    simulator = Simulator(chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, device=device)
+    flow = None if water is None else load_water(water)
+    simulator = Simulator(
+        chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, water=flow, device=device
+    )
     with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
         rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))
         columns = ["t", *(name for state in STATE_COLUMNS.values() for name in state)]
@@ -121,6 +129,7 @@ def simulate(
             "command": dict(zip(AXES, tau.tolist(), strict=True)),
             "thrust": dict(zip(names, thrust.tolist(), strict=True)),
             "depth": depth,
+            "water": None if flow is None else asdict(flow),
             "control_step": CONTROL_STEP,
             "provenance": provenance(),
         }

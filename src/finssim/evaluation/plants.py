@@ -14,6 +14,7 @@ from finssim.core.yaml_file import first_problem, read_mapping
 from finssim.sim import Water
 from finssim.sim.randomize import Randomization
 from finssim.sim.ranges_file import Ranges, load_ranges
+from finssim.sim.water import beside
 from finssim.tasks import Environment, MeasurementNoise, Task
 from finssim.tasks.catalogue import observed
 from finssim.tasks.sensing import seen_with
@@ -41,7 +42,8 @@ class PlantChanges(BaseModel):
     ranges: Ranges | None = None
     """Ranges drawn for every trial: a mapping, or the name or file of ranges."""
     water: Water | None = None
-    """Current, shear, drift_std, drift_time, depth, waves; still if None."""
+    """Current (or the table of a profile, beside the file), shear, drift_std, drift_time, depth, waves (or those of a
+    spectrum); still if None."""
     noise: MeasurementNoise | None = None
     """Errors of what the controller observes [m, rad, m/s, rad/s]."""
     observe: str | None = None
@@ -160,6 +162,7 @@ def load_plant(name_or_path: str | Path) -> PlantChanges:
         available = ", ".join(available_plants())
         raise PlantError(f"no plant '{name_or_path}': give a YAML file or one of {available}{hint}")
     data = read_mapping(path, PlantError, such_as="hydrodynamics: mesh")
+    data["water"] = beside(data.get("water"), path.parent)
     try:
         return PlantChanges.model_validate({"name": path.stem, **data})
     except ValidationError as error:

@@ -14,7 +14,7 @@ from finssim.core.rotations import quat_from_euler, quat_rotate, quat_to_euler
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.sim.simulator import Simulator
-from finssim.sim.site import Water
+from finssim.sim.water import Water
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
 from finssim.trials.inputs import InputForces, drive

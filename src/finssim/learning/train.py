@@ -18,6 +18,7 @@ from finssim.core.files import atomic_directory, refuse_unwritable
 from finssim.core.quiet import start_warp
 from finssim.learning.learners import learner_named
 from finssim.sim.randomize import Randomization
+from finssim.sim.water import load_water
 from finssim.tasks import Environment, Task, make, task_named
 from finssim.tasks.fitting import authority
 from finssim.vehicles import Vehicle, load_vehicle
@@ -47,6 +48,9 @@ class TrainingSettings:
     observe: str = "training"
     """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, through a
     filter), a file of other fixes, estimator (about what localization is off by) or truth."""
+    water: Path | None = None
+    """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state, beside what
+    --randomize draws."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
     worlds: Annotated[int | None, (1, 10_000_000)] = None
@@ -99,7 +103,8 @@ class TrainingSettings:
         scale = authority(body) if (self.action or task.action).startswith("wrench") else 1.0
         return make(
             task, worlds=worlds, vehicle=body, hydrodynamics=self.hydrodynamics, action=self.action,
-            randomize=randomization, observe=self.observe, device=self.device, seed=seed, wrench_scale=scale, **options,
+            randomize=randomization, observe=self.observe, device=self.device, seed=seed, wrench_scale=scale,
+            water=None if self.water is None else load_water(self.water), **options,
         )  # fmt: skip
 
 
@@ -174,6 +179,7 @@ def train(
     description = description_of(
         environment, learner=learner, algorithm=kind.what, **asdict(values), device=device,
         observe={"name": settings.observe}, until=until,
+        **({} if settings.water is None else {"water": asdict(load_water(settings.water))}),
     )  # fmt: skip
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from

@@ -24,6 +24,12 @@ class WaterArrays:
     drift_rate: wp.array(dtype=wp.vec3)  # its rate during the step [m/s²]
     drift_std: wp.array(dtype=wp.vec3)  # standard deviation of the drift, world frame [m/s]
     drift_time: wp.array(dtype=float)  # correlation time [s]
+    profile_depth: wp.array(
+        dtype=float
+    )  # depths of the current profile, ascending [m]; none without a profile
+    profile_time: wp.array(dtype=float)  # its times since the reset, ascending [s]
+    profile: wp.array2d(dtype=wp.vec3)  # current by time and depth, world frame [m/s]
+    profile_turn: wp.array(dtype=wp.vec2)  # factor on it and turn of it, as factor (cos, sin), by world [-]
     wave_amplitude: wp.array2d(dtype=float)  # [m]
     wave_number: wp.array2d(dtype=float)  # k [rad/m]
     wave_frequency: wp.array2d(dtype=float)  # omega [rad/s], from the dispersion relation
@@ -77,6 +83,64 @@ def wave_number(frequency: ArrayLike, depth: float, gravity: float = 9.81) -> ND
     return k
 
 
+@wp.struct
+class ProfileFlow:
+    """Current of a profile at a point."""
+
+    velocity: wp.vec3  # world frame [m/s]
+    slope: wp.vec3  # change with height [1/s]
+    rate: wp.vec3  # change with time [m/s²]
+
+
+@wp.func
+def segment(grid: wp.array(dtype=float), x: float) -> int:
+    """Return the index of the segment of an ascending grid of two points or more that holds x, in the grid's unit."""
+    i = int(0)
+    for r in range(1, grid.shape[0] - 1):
+        if x >= grid[r]:
+            i = r
+    return i
+
+
+@wp.func
+def profile_at(water: WaterArrays, world: int, depth: float, t: float) -> ProfileFlow:
+    """Current of the profile, linear between its depths [m] and times [s], and constant beyond them."""
+    out = ProfileFlow()
+    i = int(0)
+    j = int(0)
+    di = int(0)
+    dj = int(0)
+    f = float(0.0)
+    g = float(0.0)
+    height = float(1.0)
+    span = float(1.0)
+    if water.profile_depth.shape[0] > 1:
+        i = segment(water.profile_depth, depth)
+        di = 1
+        height = water.profile_depth[i + 1] - water.profile_depth[i]
+        f = (depth - water.profile_depth[i]) / height
+    if water.profile_time.shape[0] > 1:
+        j = segment(water.profile_time, t)
+        dj = 1
+        span = water.profile_time[j + 1] - water.profile_time[j]
+        g = (t - water.profile_time[j]) / span
+    u = wp.clamp(f, 0.0, 1.0)
+    s = wp.clamp(g, 0.0, 1.0)
+    a = water.profile[j, i]
+    b = water.profile[j, i + di]
+    c = water.profile[j + dj, i]
+    d = water.profile[j + dj, i + di]
+    turn = water.profile_turn[world]
+    factor = wp.length(turn)
+    R = wp.mat33(turn[0], -turn[1], 0.0, turn[1], turn[0], 0.0, 0.0, 0.0, factor)
+    out.velocity = R * ((1.0 - s) * ((1.0 - u) * a + u * b) + s * ((1.0 - u) * c + u * d))
+    if u == f:
+        out.slope = -(R * ((1.0 - s) * (b - a) + s * (d - c))) / height
+    if s == g:
+        out.rate = R * ((1.0 - u) * (c - a) + u * (d - b)) / span
+    return out
+
+
 @wp.func
 def flow_at(water: WaterArrays, world: int, position: wp.vec3, t: float, t_step: float) -> Flow:
     """Water velocity, acceleration, gradient and surface at a point.
@@ -105,6 +169,11 @@ def flow_at(water: WaterArrays, world: int, position: wp.vec3, t: float, t_step:
     rate = water.drift_rate[world]
     v = water.current[world] + depth_z * shear + water.drift[world] + t_step * rate
     a = rate
+    if water.profile_depth.shape[0] > 0:
+        profile = profile_at(water, world, -depth_z, t)
+        v += profile.velocity
+        a += profile.rate
+        shear += profile.slope
     eta = float(0.0)
     slope_x = float(0.0)
     slope_y = float(0.0)

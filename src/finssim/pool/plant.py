@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,8 @@ def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
     modes = circulation.eddies
     out.count = len(modes)
     out.length, out.width, out.depth = basin.length, basin.width, basin.depth
-    out.floor_share, out.stream = circulation.floor_share, wp.vec3(*circulation.stream)
+    uniform = circulation.water.uniform if circulation.water else (0.0, 0.0, 0.0)
+    out.floor_share, out.stream = circulation.floor_share, wp.vec3(*np.add(circulation.stream, uniform))
     return with_arrays(
         out,
         device,
@@ -595,6 +597,7 @@ class Plant:
         self, position: ArrayLike, quaternion: ArrayLike, world: Any | None, dock: Dock | None
     ) -> Simulator:
         spec, hull = self.spec, self.spec.hull
+        water = replace(spec.circulation.water or Water(), depth=spec.basin.depth)
         basin = RectangularPool(length=spec.basin.length, width=spec.basin.width, depth=spec.basin.depth)
         meshed = hull.form_drag > 0.0 or hull.skin_drag > 0.0
         vehicle = self.vehicle
@@ -606,16 +609,17 @@ class Plant:
             hydrodynamics="mesh" if meshed else "calibrated",
             control_step=self.step,
             substeps=1,
-            water=Water(
+            water=replace(
+                water,
                 depth=spec.basin.depth,
-                waves=[Wave(**wave.model_dump()) for wave in spec.circulation.waves],
+                waves=[*water.components, *(Wave(**wave.model_dump()) for wave in spec.circulation.waves)],
             ),
             pool=basin if world is None else None,
             world=world,
             dock=dock,
             tether=dragged_line(spec.tether),
             threads=1,
-            water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream)),
+            water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream) or water.moving),
         )
         none = {slot.path: 0.0 for slot in layout(simulator.plant.terms)}
         for name, value in (_engine_fields(vehicle, spec) | none).items():

@@ -13,7 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from finssim.core.files import atomic_write
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.core.yaml_file import first_problem, read_mapping, yaml_text
+from finssim.sim import Water
 from finssim.sim.plant_arrays import twist_shift
+from finssim.sim.water import beside
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import POOL, room
 
@@ -220,6 +222,8 @@ class Circulation(Section):
     stream: Three = (0.0, 0.0, 0.0)
     """Uniform current, world frame [m/s]."""
     waves: tuple[Swell, ...] = ()
+    water: Water | None = None
+    """Further current, profile, shear, drift and waves, as of a water file; its depth is that of the basin."""
     eddies: tuple[Eddy, ...] = ()
     floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
     """Speed at the floor over that at the surface [-]."""
@@ -423,6 +427,8 @@ def load_plant_spec(path: str | Path) -> PlantSpec:
         PlantSpecError: The file cannot be used; names file, key and expectation.
     """
     data = read_mapping(Path(path), PlantSpecError, such_as="severity: realistic")
+    if isinstance(data.get("circulation"), dict) and "water" in data["circulation"]:
+        data["circulation"]["water"] = beside(data["circulation"]["water"], Path(path).parent)
     try:
         return PlantSpec.model_validate(data)
     except ValidationError as error:

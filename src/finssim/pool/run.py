@@ -45,6 +45,7 @@ from finssim.robot.lockstep import LockstepError, decode_request, encode_deliver
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
 from finssim.sim.site import described_world
+from finssim.sim.water import load_water
 from finssim.tasks.observer import fitted_task
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
@@ -535,6 +536,9 @@ class SiteChoice:
     world: str | None = None
     """(SITE|FILE) World for the vehicle's own cameras, sonars and altimeters, drawn from --seed: a site of finssim
     worlds, or a world file. Readings are sent like images."""
+    water: Path | None = None
+    """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state, which add to the site's
+    own."""
     start: str | None = None
     """(X,Y,Z,YAW) Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint of a world,
     if not given."""
@@ -548,6 +552,17 @@ class SiteChoice:
     as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
+
+    def wet(self, spec: PlantSpec) -> PlantSpec:
+        """Return a plant in the water of the water file.
+
+        Raises:
+            SurroundingsError: The file is refused.
+        """
+        if self.water is None:
+            return spec
+        circulation = spec.circulation.model_copy(update={"water": load_water(self.water)})
+        return spec.model_copy(update={"circulation": circulation})
 
     def plan(self) -> tuple[PoolPlan, Station]:
         """Return the pool of one vehicle, and where the vehicle starts.
@@ -568,6 +583,7 @@ class SiteChoice:
             firmware=self.firmware,
             world=self.world,
         )
+        plan = replace(plan, spec=self.wet(plan.spec))
         start = self.start
         if start is None and self.world is not None and self.site is None:
             view = described_world(self.world).viewpoint
@@ -737,7 +753,7 @@ def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[
     site = TaskSite(
         task,
         [*agents, *[bodies[0]] * len(fitted.others)],
-        lambda v: site_of("open-water", draw_plant(v, int(choice.plant), choice.severity)),
+        lambda v: choice.wet(site_of("open-water", draw_plant(v, int(choice.plant), choice.severity))),
         None,
         None,
         seed=choice.seed,
@@ -765,7 +781,7 @@ def swimming(bodies: Sequence[Vehicle], choice: SiteChoice, truth: Path | None) 
     if site == "open-water" and camera != "none":
         raise PlantSpecError("no camera hangs over open water: give --camera none, and a positioning")
     ours = [numbered(vehicle_at(site, body), i) for i, body in enumerate(bodies)]
-    specs = [site_of(site, draw_plant(v, plant + i, severity)) for i, v in enumerate(ours)]
+    specs = [choice.wet(site_of(site, draw_plant(v, plant + i, severity))) for i, v in enumerate(ours)]
     basin = specs[0].basin
     spacing = ROOM * max(max(v.body.size) for v in ours)
     if spacing * len(ours) > basin.length:

@@ -11,12 +11,15 @@ if TYPE_CHECKING:
     from finssim.sim.sensors.sampling import WHITE, SampledState, normal, parameters_of, sampling_kernel
     from finssim.sim.sensors.suite import SensorSuite, add_sensor
     from finssim.sim.simulator import Simulator
-    from finssim.sim.site import Dock, RectangularPool, SurroundingsError, TetherLine, Water, Wave
+    from finssim.sim.site import Dock, RectangularPool, SurroundingsError, TetherLine
     from finssim.sim.state import State
+    from finssim.sim.water import CurrentProfile, SeaState, Water, Wave, load_water
 
 __all__ = [
+    "CurrentProfile",
     "Dock",
     "RectangularPool",
+    "SeaState",
     "StateRecorder",
     "SensorBatch",
     "SensorSuite",
@@ -30,6 +33,7 @@ __all__ = [
     "Water",
     "Wave",
     "add_sensor",
+    "load_water",
     "normal",
     "parameters_of",
     "read_run",

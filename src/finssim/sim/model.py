@@ -20,8 +20,8 @@ from finssim.physics.types import vec6, vec8
 from finssim.physics.water import WaterArrays
 from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.simulator import checked_choice, find_device
-from finssim.sim.site import Water
 from finssim.sim.step import motion_function
+from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
 
 __all__ = ["acceleration"]

@@ -19,10 +19,11 @@ from finssim.sim.launch import KernelSequence
 from finssim.sim.measured import SENSORS, MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import build_plant, twist_shift, vehicle_parameters
-from finssim.sim.ranges_file import MAX_WAVES, Ranges, load_ranges
+from finssim.sim.ranges_file import MAX_WAVES, Ranges, RangesError, SeaRanges, WaveRanges, load_ranges
 from finssim.sim.ranges_table import ENTRIES, INDEX, TETHER, WORLD, WORLD_END, added_entry, drawn_entries
 from finssim.sim.site import TetherLine
 from finssim.sim.state import State
+from finssim.sim.water import sea_bands
 
 # The table of distributions that the kernel draws from, and one draw.
 
@@ -201,6 +202,10 @@ class Nominal:
     H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin [-, m]
     current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
     waves: int  # waves of the given water stay in the first slots
+    sea_ratio: wp.array(
+        dtype=float
+    )  # frequencies of a drawn sea's waves, parts of the peak's; none without a sea
+    sea_turn: wp.array(dtype=float)  # their directions from the sea's [rad]
     extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units, one world
     factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
     added: wp.array(dtype=int)  # entry that is added to it
@@ -314,6 +319,17 @@ def write_thrusters(
 
 
 @wp.func
+def number_of(omega: float, depth: float, gravity: float) -> float:
+    """Wave number [rad/m] of an angular frequency [rad/s] at a depth [m], as `finssim.physics.water.wave_number`."""
+    deep = omega * omega / gravity
+    k = deep / wp.sqrt(wp.tanh(deep * depth))
+    for _ in range(5):
+        t = wp.tanh(k * depth)
+        k = k - (gravity * k * t - omega * omega) / (gravity * t + gravity * k * depth * (1.0 - t * t))
+    return k
+
+
+@wp.func
 def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: int, drift: int):
     """Write current, drift and waves of a world from the drawn entries x, each in its unit."""
     water.current[w] = n.current + wp.vec3(
@@ -327,13 +343,23 @@ def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: i
         water.drift_time[w] = x[w, 0, wp.static(COLUMN["current_drift.time"])]
         water.drift[w] = wp.vec3()
         water.drift_rate[w] = wp.vec3()
+    scale = x[w, 0, wp.static(COLUMN["current_profile.scale"])]
+    turn = x[w, 0, wp.static(COLUMN["current_profile.turn"])]
+    water.profile_turn[w] = wp.vec2(scale * wp.cos(turn), scale * wp.sin(turn))
     for i in range(n.waves, water.n_waves):
         column = wp.static(COLUMN["waves.0.amplitude"]) + 4 * (i - n.waves)
         k = 6.2831853 / wp.max(x[w, 0, column + 1], 0.1)
-        water.wave_amplitude[w, i] = x[w, 0, column]
+        amplitude = x[w, 0, column]
+        heading = x[w, 0, column + 2]
+        if n.sea_ratio.shape[0] > 0:
+            period = x[w, 0, wp.static(COLUMN["sea.period"])]
+            k = number_of(n.sea_ratio[i - n.waves] * 6.2831853 / period, water.depth, water.gravity)
+            amplitude = x[w, 0, wp.static(COLUMN["sea.height"])] / wp.sqrt(8.0 * float(n.sea_ratio.shape[0]))
+            heading = x[w, 0, wp.static(COLUMN["sea.heading"])] + n.sea_turn[i - n.waves]
+        water.wave_amplitude[w, i] = amplitude
         water.wave_number[w, i] = k
         water.wave_frequency[w, i] = wp.sqrt(water.gravity * k * wp.tanh(k * water.depth))
-        water.wave_heading[w, i] = x[w, 0, column + 2]
+        water.wave_heading[w, i] = heading
         water.wave_phase[w, i] = x[w, 0, column + 3]
 
 
@@ -522,7 +548,7 @@ class Randomization:
     @property
     def moves_water(self) -> bool:
         """True if currents or waves are drawn."""
-        return self._draws("current", "vertical_current", "waves.")
+        return self._draws("current", "vertical_current", "waves.", "sea.")
 
     @property
     def changes_sensors(self) -> bool:
@@ -545,7 +571,7 @@ class Randomization:
         factor, added, jitter = (bounds_of(x)[1] for x in (r.delay, r.added_delay, r.command_jitter))
         return {
             "max_delay": vehicle_delay * max(factor, 1.0) + added + jitter,
-            "max_waves": r.waves.count[1] if r.waves else 0,
+            "max_waves": r.most_waves,
             "water_moves": self.moves_water,
             "water_drifts": self._draws("current_drift."),
             "tether": TetherLine() if tether is None and self._draws("tether.") else tether,
@@ -611,7 +637,12 @@ class Draws:
         self._seen = (
             measurement.array if measurement else wp.zeros((1, 1), dtype=MeasurementErrors, device=device)
         )
-        self._nominal = _nominal_vehicles(simulator)
+        profile = simulator.surroundings[0].profile
+        if profile is None and any(name.startswith("current_profile.") for name in self.names):
+            raise RangesError(
+                "the ranges draw current_profile, and the water has none: give water with a profile"
+            )
+        self._nominal = _nominal_vehicles(simulator, randomization.ranges.waves)
         self._arrays = self._drawn_arrays(agents, privileged)
 
     def _drawn_arrays(self, agents: int, privileged: tuple[wp.array, wp.array] | None) -> DrawnArrays:
@@ -688,7 +719,7 @@ def _nominal_values(simulator: "Simulator", measurement: Packed | None) -> NDArr
     return out
 
 
-def _nominal_vehicles(simulator: "Simulator") -> Nominal:
+def _nominal_vehicles(simulator: "Simulator", waves: WaveRanges | SeaRanges | None) -> Nominal:
     device, vehicles = simulator.device, simulator.vehicles
     out = Nominal()
     plant = build_plant(vehicles, simulator.hydrodynamics, 1, [0] * len(vehicles), device)
@@ -707,5 +738,11 @@ def _nominal_vehicles(simulator: "Simulator") -> Nominal:
     out.H = wp.array(np.array(H), dtype=mat66, device=device)
     out.M_A = wp.array(np.array(M_A), dtype=mat66, device=device)
     nominal = simulator.surroundings[0]
-    out.current, out.waves = wp.vec3(*nominal.current), len(nominal.waves)
+    out.current, out.waves = wp.vec3(*nominal.uniform), len(nominal.components)
+    ratios, turns = np.zeros(0), np.zeros(0)
+    if isinstance(waves, SeaRanges):
+        ratios, turns = sea_bands(waves.spectrum, waves.peak, waves.spread, waves.components)
+        turns = np.random.default_rng(1).permutation(turns)
+    out.sea_ratio = wp.array(ratios, dtype=float, device=device)
+    out.sea_turn = wp.array(turns, dtype=float, device=device)
     return out

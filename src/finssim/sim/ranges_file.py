@@ -30,7 +30,8 @@ from finssim.sim.distributions import (
     sentence,
     unknown,
 )
-from finssim.sim.site import SurroundingsError, Wave
+from finssim.sim.site import SurroundingsError
+from finssim.sim.water import SeaState, Wave
 from finssim.vehicles.terms import Term
 
 SHIPPED = Path(__file__).parent / "ranges"
@@ -39,6 +40,8 @@ MAX_WAVES = 8
 """Most waves that may be drawn for a world: every one costs time in every step."""
 LONGEST = 2.0
 """Longest delay that may be drawn, of a command or of what is seen [s]."""
+DEEP = 1000.0
+"""Depth of deep water [m]."""
 FASTEST_WATER = 10.0
 """[m/s]"""
 
@@ -143,6 +146,48 @@ class WaveRanges(RangesPart):
                 f"{0.07 * shortest:.3g} m here: a linear wave breaks above it"
             ) from None
         return self
+
+
+class SeaRanges(RangesPart):
+    """A sea state of random height, period and direction: the components of `SeaState`, whose phases are drawn too."""
+
+    spectrum: Literal["jonswap", "pierson-moskowitz"]
+    height: Scale
+    """Significant wave height [m]."""
+    period: Above0
+    """Period of the spectrum's peak [s]."""
+    spread: float = Field(default=0.0, ge=0.0, lt=1.4)
+    """Standard deviation of the directions [rad]."""
+    peak: float = Field(default=3.3, ge=1.0, le=10.0)
+    """Enhancement of JONSWAP's peak [-]."""
+    components: int = Field(default=MAX_WAVES, ge=1, le=MAX_WAVES)
+    """Number of waves."""
+
+    @model_validator(mode="after")
+    def _unbroken(self) -> "SeaRanges":
+        height, period = bounds_of(self.height)[1], bounds_of(self.period)[0]
+        if height > 0.0:
+            try:
+                sea = SeaState(
+                    spectrum=self.spectrum, height=height, period=period, peak=self.peak, components=self.components
+                )  # fmt: skip
+                sea.waves(DEEP)
+            except SurroundingsError as error:
+                raise ValueError(str(error)) from None
+        return self
+
+
+class ProfileRanges(RangesPart):
+    """The current profile of the given water, with a random factor and turned by a random angle."""
+
+    scale: Scale = ONE
+    turn: Interval = NONE
+    """[rad]"""
+
+
+def _waves_or_sea(value: Any) -> Any:
+    """Read a mapping with a spectrum as a sea state, so that a refusal names its words alone."""
+    return checked(SeaRanges, value) if isinstance(value, Mapping) and "spectrum" in value else value
 
 
 class DriftRanges(RangesPart):
@@ -309,11 +354,18 @@ class Ranges(RangesPart):
     vertical_current: Annotated[Interval, AfterValidator(_swimmable)] = NONE
     """Upwards [m/s]."""
     current_drift: DriftRanges | None = None
-    waves: WaveRanges | None = None
+    waves: Annotated[WaveRanges | SeaRanges | None, BeforeValidator(_waves_or_sea)] = None
+    current_profile: ProfileRanges | None = None
     tether: TetherRanges | None = None
     sensors: SensorRanges | None = None
     correlated: tuple[Correlated, ...] = ()
     curriculum: Curriculum | None = None
+
+    @property
+    def most_waves(self) -> int:
+        """Greatest number of waves that are drawn for a world."""
+        waves = self.waves
+        return waves.components if isinstance(waves, SeaRanges) else 0 if waves is None else waves.count[1]
 
     @model_validator(mode="before")
     @classmethod

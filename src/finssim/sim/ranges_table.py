@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.distributions import Distribution, Drawn, distribution_of, unknown
 from finssim.sim.measured import SENSORS
-from finssim.sim.ranges_file import AXES, MAX_WAVES, EachScales, Offsets, Ranges
+from finssim.sim.ranges_file import AXES, MAX_WAVES, EachScales, Offsets, Ranges, SeaRanges
 from finssim.vehicles.terms import Term
 
 TURN = Distribution(uniform=(0.0, 6.2831853))
@@ -76,6 +76,11 @@ def _table() -> Iterator[DrawnNumber]:
         yield DrawnNumber(f"waves.{i}.wavelength", "m", 1.0, world=True)
         for name in ("heading", "phase"):
             yield DrawnNumber(f"waves.{i}.{name}", "rad", 0.0, world=True, angle=True, told=False)
+    yield DrawnNumber("sea.height", "m", 0.0, world=True)
+    yield DrawnNumber("sea.period", "s", 1.0, world=True)
+    yield DrawnNumber("sea.heading", "rad", 0.0, world=True, angle=True, told=False)
+    yield DrawnNumber("current_profile.scale", world=True)
+    yield DrawnNumber("current_profile.turn", "rad", 0.0, world=True)
 
 
 def _sensor_unit(name: str) -> str:
@@ -161,7 +166,12 @@ def _stated_entries(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn
         yield f"{name}.all", scales.all
         yield from ((f"{name}.each.{k}", scales.each) for k in range(thrusters))
     yield from ((f"thrust.failure.{k}", ranges.thrust.failure) for k in range(thrusters))
-    for part, names in (("tether", TETHER), ("sensors", SENSORS), ("current_drift", ("deviation", "time"))):
+    for part, names in (
+        ("tether", TETHER),
+        ("sensors", SENSORS),
+        ("current_drift", ("deviation", "time")),
+        ("current_profile", ("scale", "turn")),
+    ):
         inner = getattr(ranges, part)
         if inner is not None:
             yield from ((f"{part}.{name}", getattr(inner, name)) for name in names)
@@ -171,6 +181,14 @@ def _stated_entries(ranges: Ranges, thrusters: int) -> Iterator[tuple[str, Drawn
 def _directions(ranges: Ranges) -> Iterator[tuple[str, Drawn]]:
     if distribution_of(ranges.current).bounds()[1] > 0.0:
         yield "current.direction", TURN
+    if isinstance(ranges.waves, SeaRanges):
+        yield from (
+            ("sea.height", ranges.waves.height),
+            ("sea.period", ranges.waves.period),
+            ("sea.heading", TURN),
+        )
+        yield from ((f"waves.{i}.phase", TURN) for i in range(ranges.waves.components))
+        return
     if ranges.waves is None or ranges.waves.count[1] == 0:
         return
     low, high = ranges.waves.count

@@ -26,10 +26,11 @@ from finssim.sim.lanes import LANES
 from finssim.sim.launch import KernelSequence
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import SimulatorError, build_plant
-from finssim.sim.site import Dock, RectangularPool, TetherLine, Water
+from finssim.sim.site import Dock, RectangularPool, TetherLine
 from finssim.sim.solids import WorldSolids, layout_of, pool_of, refresh_clearing
 from finssim.sim.state import HISTORY, VehicleState, clear_actuators, new_state
 from finssim.sim.step import physics_kernel, tick
+from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import ReferenceWater as Fluid
 

@@ -1,124 +1,26 @@
-"""Surroundings of the vehicles: moving water, a pool with walls, a tether. Plain data, checked on construction."""
+"""Surroundings of the vehicles: a pool with walls, a tether, a dock. Plain data, checked on construction."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from finssim.core.registry import WORLDS
 from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
 from finssim.physics.tether import Tether
-from finssim.physics.water import WaterArrays, dispersion
 
 
 class SurroundingsError(ValueError):
-    """A description of water, pool or tether that cannot be."""
+    """A description of water, pool or tether that is not possible."""
 
 
-def _require(condition: bool, sentence: str) -> None:
+def require(condition: bool, sentence: str) -> None:
+    """Refuse a description by a sentence unless a condition holds."""
     if not condition:
         raise SurroundingsError(sentence)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wave:
-    """One linear wave; its period follows from its length and the depth."""
-
-    amplitude: float
-    """Half the height from trough to crest [m]."""
-    wavelength: float
-    """[m]"""
-    heading: float = 0.0
-    """Direction of travel, from world x towards y [rad]."""
-    phase: float = 0.0
-    """[rad]"""
-
-    def __post_init__(self) -> None:
-        _require(self.wavelength > 0.0, f"wave: wavelength is {self.wavelength}, expected a length above 0 m")
-        _require(
-            0.0 <= self.amplitude < 0.07 * self.wavelength,
-            f"wave: amplitude {self.amplitude} m is not small for a wavelength of {self.wavelength} m: "
-            "a linear wave breaks above 0.07 wavelengths; give less",
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Water:
-    """Moving water, the same in every world until it is randomised."""
-
-    current: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Velocity at the still surface, world frame [m/s]."""
-    shear: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Change of the current with height, d(current)/dz [1/s]."""
-    drift_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviation of the slowly drifting part [m/s]."""
-    drift_time: float = 15.0
-    """Its correlation time [s]."""
-    waves: Sequence[Wave] = ()
-    depth: float = 1.0
-    """Still water depth, for the wave dispersion [m]."""
-
-    def __post_init__(self) -> None:
-        numbers = (*self.current, *self.shear, *self.drift_std, self.drift_time, self.depth)
-        _require(all(math.isfinite(x) for x in numbers), "water: every number must be finite")
-        _require(self.depth > 0.0, f"water: depth is {self.depth}, expected more than 0 m")
-        _require(min(self.drift_std) >= 0.0, "water: drift_std is a standard deviation, expected 0 or more")
-
-    @property
-    def drifting(self) -> bool:
-        """True if the current has a random part that must be advanced every step."""
-        return any(x > 0.0 for x in self.drift_std) and self.drift_time > 0.0
-
-    @property
-    def moving(self) -> bool:
-        """True if there are currents or waves."""
-        return self.drifting or bool(self.waves) or any((*self.current, *self.shear))
-
-    def arrays(
-        self, worlds: int, density: float, gravity: float, device: wp.Device, max_waves: int = 0
-    ) -> WaterArrays:
-        """Return the same water for every world, as Warp arrays with room for `max_waves` more waves.
-
-        Args:
-            worlds: How many.
-            density: Of the water [kg/m³].
-            gravity: [m/s²].
-            device: Of the arrays.
-            max_waves: How many more.
-        """
-
-        def full(value: object, dtype: object) -> wp.array:
-            return wp.full(worlds, value=value, dtype=dtype, device=device)
-
-        n = len(self.waves) + max_waves
-        k = np.array([2.0 * math.pi / w.wavelength for w in self.waves])
-        columns = {
-            "wave_amplitude": [w.amplitude for w in self.waves],
-            "wave_number": k,
-            "wave_frequency": dispersion(k, self.depth, gravity),
-            "wave_heading": [w.heading for w in self.waves],
-            "wave_phase": [w.phase for w in self.waves],
-        }
-        out = WaterArrays()
-        out.density, out.gravity, out.depth = density, gravity, self.depth
-        out.n_waves, out.moving = n, int(self.moving or max_waves > 0)
-        out.current = full(wp.vec3(*self.current), wp.vec3)
-        out.shear = full(wp.vec3(*self.shear), wp.vec3)
-        out.drift = wp.zeros(worlds, dtype=wp.vec3, device=device)
-        out.drift_rate = wp.zeros(worlds, dtype=wp.vec3, device=device)
-        out.drift_std = full(wp.vec3(*self.drift_std), wp.vec3)
-        out.drift_time = full(self.drift_time if self.drifting else 0.0, float)
-        for name, values in columns.items():
-            # An unused component has amplitude 0; its wave number 1 keeps 1/(1 - exp(-2kh)) finite.
-            table = np.full((worlds, max(n, 1)), 1.0 if name == "wave_number" else 0.0, dtype=np.float32)
-            table[:, : len(self.waves)] = values
-            setattr(out, name, wp.array(table, dtype=float, device=device))
-        return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,11 +42,11 @@ class RectangularPool:
 
     def __post_init__(self) -> None:
         numbers = (self.length, self.width, self.depth, self.stiffness, self.damping, self.friction)
-        _require(all(math.isfinite(x) for x in numbers), "pool: every number must be finite")
-        _require(
+        require(all(math.isfinite(x) for x in numbers), "pool: every number must be finite")
+        require(
             min(self.length, self.width, self.depth) > 0.0, "pool: length, width and depth must exceed 0 m"
         )
-        _require(
+        require(
             min(self.stiffness, self.damping, self.friction) >= 0.0,
             "pool: wall coefficients must not be negative",
         )
@@ -175,9 +77,9 @@ class TetherLine:
 
     def __post_init__(self) -> None:
         numbers = (*self.anchor, *self.attachment, self.diameter, self.drag_coefficient, self.wet_weight)
-        _require(all(math.isfinite(x) for x in numbers), "tether: every number must be finite")
-        _require(self.diameter > 0.0, f"tether: diameter is {self.diameter}, expected more than 0 m")
-        _require(self.drag_coefficient >= 0.0, "tether: drag_coefficient must not be negative")
+        require(all(math.isfinite(x) for x in numbers), "tether: every number must be finite")
+        require(self.diameter > 0.0, f"tether: diameter is {self.diameter}, expected more than 0 m")
+        require(self.drag_coefficient >= 0.0, "tether: drag_coefficient must not be negative")
 
     def struct(self) -> Tether:
         """The struct that kernels take."""
