@@ -7,9 +7,9 @@ import pytest
 
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import OPEN, draw_plant, positioning_of, site_of
-from finssim.pool.plant_spec import PlantSpec, PlantSpecError
+from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
 from finssim.pool.positioning import POSITIONING, Positioning
-from finssim.pool.run import make_plan
+from finssim.pool.run import SiteChoice, make_plan
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.links.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid
@@ -125,3 +125,24 @@ def test_ways_keep_their_speed():
     assert way_of("square", 100.0, 0.3).duration == pytest.approx(40.0 / 0.3)
     with pytest.raises(ValueError, match="line, square"):
         way_of("spiral", 1.0, 0.3)
+
+
+def test_a_water_file_adds_to_the_site(tmp_path):
+    """A vehicle that hangs in open water drifts with the profile at its depth, and a plant file keeps the water."""
+    (tmp_path / "p.csv").write_text("depth,east,north\n0,0.3,0\n8,0.0,0.3\n", encoding="utf-8")
+    (tmp_path / "water.yaml").write_text(
+        "current: p.csv\nwaves: {spectrum: jonswap, height: 0.05, period: 3.0}\n"
+    )
+    choice = SiteChoice(
+        site="open-water", severity="nominal", water=tmp_path / "water.yaml", start="0,0,-4,0"
+    )
+    plan, start = choice.plan()
+    water = plan.spec.circulation.water
+    assert water.profile.depths == (0.0, 8.0)
+    world = plan.world(None, start=start, seed=1, truth=None)
+    world.exchange(60.0, ())
+    x, y, _ = world.plant.position
+    assert 3.0 < x < 10.0 and 3.0 < y < 10.0
+    world.close()
+    plan.spec.write(tmp_path / "plant.yaml")
+    assert load_plant_spec(tmp_path / "plant.yaml").circulation.water == water

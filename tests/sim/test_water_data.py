@@ -1,17 +1,21 @@
 """Water as data: profiles over depth and time, sea states, water files, and what is drawn of them."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import warp as wp
 
+from finssim.cli.simulate import simulate
 from finssim.evaluation.plants import PlantError, load_plant
+from finssim.learning.train import TrainingSettings
 from finssim.physics.water import Flow, WaterArrays, flow_at, wave_number
 from finssim.sim import CurrentProfile, SeaState, Simulator, SurroundingsError, Water, load_water
 from finssim.sim.randomize import Randomization
 from finssim.sim.ranges_file import Ranges, RangesError
 from finssim.sim.water import read_profile, sea_bands
+from finssim.tasks import task_named
 
 wp.set_module_options({"enable_backward": False})
 TABLE = """depth,time,east,north,up
@@ -231,3 +235,27 @@ def test_a_drawn_profile_is_the_given_one_scaled_and_turned():
         np.testing.assert_allclose(found, [R @ (0.2, 0.0), R @ (0.0, 0.1)], atol=1e-6)
     with pytest.raises(RangesError, match="the ranges draw current_profile, and the water has none"):
         drawn(ranges, Water())
+
+
+def test_the_command_simulates_in_the_water_of_a_file(tmp_path, table):
+    """The vehicle drifts east with the water, and the record beside the table names it."""
+    (tmp_path / "water.yaml").write_text("current: profile.csv\ndepth: 30.0\n")
+    out = tmp_path / "run.csv"
+    simulate(
+        vehicle="finsrov", command="surge=0", duration=60.0, out=out, depth=1.0, water=tmp_path / "water.yaml"
+    )
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    assert rows["x"][-1] > 5.0 and abs(rows["y"][-1]) < 2.0
+    assert json.loads((tmp_path / "run.csv.json").read_text())["water"]["profile"]["depths"] == [
+        0.0,
+        5.0,
+        20.0,
+    ]
+
+
+def test_a_training_is_in_the_water_of_a_file(tmp_path, table):
+    (tmp_path / "water.yaml").write_text("current: profile.csv\ndepth: 30.0\n")
+    task = task_named("t1")
+    environment = TrainingSettings(water=tmp_path / "water.yaml").environment(task, 2, None, 1)
+    assert environment.simulator.surroundings[0].profile.depths == (0.0, 5.0, 20.0)
+    assert TrainingSettings().environment(task, 2, None, 1).simulator.surroundings[0].profile is None

@@ -231,7 +231,9 @@ def first_problem(error: Any) -> str:
         error: A `pydantic.ValidationError`.
     """
     problem = error.errors()[0]
-    location, message = ".".join(map(str, problem["loc"])), str(problem["msg"]).removeprefix("Value error, ")
+    # Names of alternatives, which begin with a bracket, are no part of a place.
+    parts = [str(part) for part in problem["loc"] if not str(part).startswith("(")]
+    location, message = ".".join(parts), str(problem["msg"]).removeprefix("Value error, ")
     if problem["type"] == "literal_error":
         message = f"is {problem['input']!r}, expected {problem['ctx']['expected']}"
     return f"{location}: {message}" if location else message

@@ -15,6 +15,7 @@ from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
+from finssim.physics.water import WaterArrays, profile_at
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.sim import Dock, RectangularPool, Simulator, TetherLine, Water, Wave
 from finssim.sim.plant_arrays import NO_LIMIT
@@ -483,7 +484,7 @@ def drive(
     steps: wp.array(dtype=int),
     thrust: wp.array2d(dtype=vec8),
     disturbance: wp.array2d(dtype=vec6),
-    current: wp.array(dtype=wp.vec3),
+    surroundings: WaterArrays,
     motors: MotorBank,
     propellers: PropellerBank,
     hidden: Hidden,
@@ -503,7 +504,7 @@ def drive(
         steps: Physics steps so far, (worlds,).
         thrust: Written: along the thrusters' axes [N], (worlds, vehicles).
         disturbance: Written: wrench about the body origin, body frame [N, N m], (worlds, vehicles).
-        current: Written: velocity of the water at the body origin, world frame [m/s], (worlds,).
+        surroundings: Water of the engine; its current is written, to which the engine adds the profile.
         motors: Motors and speed loops.
         propellers: What makes thrust of their speeds.
         hidden: What acts on the body besides.
@@ -524,7 +525,10 @@ def drive(
     q = quaternion[0, 0]
     nu = velocity[0, 0]
     water = circulation_at(circulation, x, t)
-    current[0] = water
+    surroundings.current[0] = water
+    if surroundings.profile_depth.shape[0] > 0:
+        profile = profile_at(surroundings, 0, -wp.min(x[2], 0.0), t)
+        water += profile.velocity
     nu_r = nu - join(wp.quat_rotate_inv(q, water), wp.vec3(0.0))
     thrust[0, 0] = delivered_thrust(propellers, motors.speed, nu_r)
     up = up_in_body(q)
@@ -585,7 +589,7 @@ class Plant:
         banks += [gyre(spec.circulation, spec.basin), slack_line(spec.tether)]
         self._banks = banks  # a recorded launch does not keep the arrays inside structs alive
         state = [s.state.position, s.state.quaternion, s.state.velocity, s.state.steps]
-        written = [s.command.thrust, s.command.disturbance, s.water.current]
+        written = [s.command.thrust, s.command.disturbance, s.water]
         # One slice of the generator's 32 bits per plant: seeds that differ by one must not share numbers.
         key = int(np.random.SeedSequence([seed, 71]).generate_state(1)[0] >> 1)
         pipeline.add(drive, [*state, *written, *banks, self.step, motor_steps, key])

@@ -561,7 +561,12 @@ class SiteChoice:
         """
         if self.water is None:
             return spec
-        circulation = spec.circulation.model_copy(update={"water": load_water(self.water)})
+        water = load_water(self.water)
+        if water.drifting or any(water.shear):
+            raise PlantSpecError(
+                f"{self.water}: shear and drift_std are not for the pool: give the table of a current"
+            )
+        circulation = spec.circulation.model_copy(update={"water": water})
         return spec.model_copy(update={"circulation": circulation})
 
     def plan(self) -> tuple[PoolPlan, Station]:

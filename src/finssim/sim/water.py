@@ -221,22 +221,30 @@ def sea_bands(spectrum: str, peak: float, spread: float, components: int) -> tup
     return ratios, np.interp(middle, share / share[-1], angle)
 
 
-def _kind_of_waves(value: Any) -> str:
-    return "spectrum" if isinstance(value, (dict, SeaState)) else "list"
+def _kind(value: Any) -> str:
+    if isinstance(value, (dict, SeaState, CurrentProfile)):
+        return "(one)"
+    return "(file)" if isinstance(value, (str, Path)) else "(list)"
 
 
 Waves = Annotated[
-    Annotated[Sequence[Wave], Tag("list")] | Annotated[SeaState, Tag("spectrum")],
-    Discriminator(_kind_of_waves),
+    Annotated[Sequence[Wave], Tag("(list)")] | Annotated[SeaState, Tag("(one)")], Discriminator(_kind)
 ]
 """Waves one by one, or a sea state."""
+Current = Annotated[
+    Annotated[tuple[float, float, float], Tag("(list)")]
+    | Annotated[CurrentProfile, Tag("(one)")]
+    | Annotated[Path, Tag("(file)")],
+    Discriminator(_kind),
+]
+"""Velocity [m/s], a profile of it over depth and time, or the table of one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Water:
     """Moving water, the same in every world until it is randomised."""
 
-    current: tuple[float, float, float] | CurrentProfile | str | Path = (0.0, 0.0, 0.0)
+    current: Current = (0.0, 0.0, 0.0)
     """Velocity at the still surface, world frame [m/s]; or a profile over depth and time, or the table of one, which
     becomes `profile`."""
     shear: tuple[float, float, float] = (0.0, 0.0, 0.0)
