@@ -204,7 +204,7 @@ class Nominal:
     waves: int  # waves of the given water stay in the first slots
     sea_ratio: wp.array(
         dtype=float
-    )  # frequencies of a drawn sea's waves, parts of the peak's; none without a sea
+    )  # frequencies of a drawn sea's waves over the peak's [-]; none without a sea
     sea_turn: wp.array(dtype=float)  # their directions from the sea's [rad]
     extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units, one world
     factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
