@@ -108,6 +108,24 @@ class torpedo:
         tau_crossflow = crossFlowDrag(self.L, self.diam, self.diam, nu_r)
         g = gvect(self.W, self.B, eta[4], eta[3], self.r_bg, self.r_bb)
 """
+MSS = """
+function [xdot,U,M] = remus(x,ui)
+mu = deg2rad(63.446827); g_mu = gravity(mu); rho = 1026;
+nu = x(1:6); alpha = atan2(nu(3), nu(1));
+L_auv = 1.6; D_auv = 0.19; a = L_auv/2; b = D_auv/2; S = 0.7 * L_auv * D_auv;
+r_bG = [ 0 0 0.02 ]'; r_bB = [ 0 0 0 ]';
+CD_0 = 0.42 * pi * b^2 / S;
+[MRB,CRB] = spheroid(a,b,nu(4:6),r_bG);
+[MA,CA] = imlay61(a, b, nu, 0.3);
+CA(5,3) = 0; CA(5,1) = 0; CA(6,1) = 0; CA(6,2) = 0;
+m = MRB(1,1); W = m * g_mu; B = W;
+D = Dmtrx([20 20 1],[0.3 0.8],MRB,MA,[W r_bG' r_bB']);
+D(1,1) = D(1,1) * exp(-3 * U);
+tau_liftdrag = forceLiftDrag(D_auv,S,CD_0,alpha,U);
+tau_crossflow = crossFlowDrag(L_auv,D_auv,D_auv,nu,'cylinder');
+xdot = [ (MRB + MA) \\ (tau_liftdrag + tau_crossflow); ...
+         nu ];
+"""
 REMUS = {"RHO": "1026", "LENGTH": "1.6", "DIAM": "0.19", "CDRAG": "0.42"}
 LONG = {"RHO": "1000", "LENGTH": "2.4", "DIAM": "0.24", "CDRAG": "0.3"}
 
@@ -199,6 +217,24 @@ def test_free_decay_of_a_torpedo_in_roll(tmp_path):
     assert vehicle.mass_matrix() == pytest.approx(
         np.outer(F, F) * (Torpedo().M_RB + Torpedo().M_A), rel=1e-9, abs=1e-9
     )
+
+
+def test_functions_of_mss_give_the_matrices_of_a_torpedo(tmp_path):
+    """spheroid (1025 kg/m³), imlay61 (1026 kg/m³), Dmtrx and gravity, as remus100.m of MSS calls them."""
+    draft = read(tmp_path, MSS, "remus.m")
+    draft.missing = {}
+    group = draft.values.pop("thruster_groups")["thruster"]
+    draft.values["thrusters"] = {"t": {"position": [0, 0, 0], "axis": [1, 0, 0]} | group}
+    vehicle, origin = draft.vehicle(tmp_path), Torpedo(1.6, 0.19, m=4 / 3 * np.pi * 1025 * 0.8 * 0.095**2)
+    added = Torpedo(1.6, 0.19).M_A
+    assert vehicle.mass_matrix() == pytest.approx(np.outer(F, F) * (origin.M_RB + added), rel=1e-9, abs=1e-9)
+    M, W = np.diag(origin.M_RB + added), origin.W / 9.81 * 9.8214
+    swing = 2 * np.array([0.3, 0.8]) * np.sqrt(W * 0.02 * M[3:5])
+    expected = [0.0, M[1] / 20, M[2] / 20, *swing, M[5] / 1.0]
+    D = np.diag(vehicle.hydrodynamics["calibrated"].linear_damping)
+    assert D == pytest.approx(expected, rel=1e-4)
+    assert any("model cylinder is left out" in sentence for sentence in draft.different)
+    assert vehicle.buoyancy == pytest.approx(vehicle.weight)
 
 
 # Conversions, one by one

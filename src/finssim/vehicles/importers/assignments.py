@@ -19,6 +19,7 @@ import numpy as np
 
 from finssim.core.budget import read_bytes
 from finssim.core.rotations import skew
+from finssim.vehicles.importers import torpedo
 from finssim.vehicles.part import VehicleError
 
 __all__ = ["Assignments", "read_assignments"]
@@ -47,6 +48,22 @@ def _hmtrx(r: Any) -> Any:
     return np.block([[np.eye(3), -skew(np.ravel(r))], [np.zeros((3, 3)), np.eye(3)]])
 
 
+def _spheroid(a: float, b: float, _: Any, r: Any) -> Any:
+    m = 4.0 / 3.0 * math.pi * 1025.0 * a * b**2
+    return _hmtrx(r).T @ np.diag([m, m, m, *torpedo.spheroid_moments(a, b, m)]) @ _hmtrx(r)
+
+
+def _imlay61(a: float, b: float, _: Any, r44: float = 0.0) -> Any:
+    return np.diag(torpedo.spheroid_added_mass(a, b, 4.0 / 3.0 * math.pi * torpedo.RHO * a * b**2, r44))
+
+
+def _dmtrx(times: Any, ratios: Any, rigid: Any, added: Any, hydrostatics: Any) -> Any:
+    W, _, _, z_g, _, _, z_b = np.ravel(hydrostatics)
+    return np.diag(
+        torpedo.slow_damping(np.diag(rigid + added), np.ravel(times), np.ravel(ratios), W * (z_g - z_b))
+    )
+
+
 OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: operator.pow, ast.MatMult: operator.matmul, ast.USub: operator.neg, ast.UAdd: operator.pos,
@@ -59,9 +76,11 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "eye": _filled(lambda n: np.eye(n[0])), "identity": _filled(lambda n: np.eye(n[0])), "zeros": _filled(np.zeros),
     "ones": _filled(np.ones), "Smtrx": lambda r: skew(np.ravel(r)), "skew": lambda r: skew(np.ravel(r)),
     "Hmtrx": _hmtrx, "block": lambda rows: np.block([[np.atleast_2d(x) for x in row] for row in rows if row]),
+    "spheroid": _spheroid, "imlay61": _imlay61, "Dmtrx": _dmtrx,
+    "gravity": lambda mu: 9.78032534 * (1 + 1.93185e-3 * np.sin(mu) ** 2) / (1 - 6.69438e-3 * np.sin(mu) ** 2) ** 0.5,
     "struct": lambda *words: dict(zip(words[::2], words[1::2], strict=True)),
 }  # fmt: skip
-"""Last part of a function's name -> the function."""
+"""Last part of a function's name -> the function; some of MSS are among them."""
 
 
 @dataclass
@@ -117,7 +136,8 @@ class Assignments:
         if isinstance(target, ast.Tuple | ast.List):
             several = isinstance(node, ast.Tuple | ast.List) and len(node.elts) == len(target.elts)
             for k, part in enumerate(target.elts):
-                self._assign(part, node.elts[k] if several else ast.Constant(None), names)
+                first = node if self.matlab and k == 0 else ast.Constant(None)
+                self._assign(part, node.elts[k] if several else first, names)
             return
         try:
             value = self.value(node, names)
@@ -213,7 +233,9 @@ class Assignments:
             return np.asarray(self.value(node.value, names))[self._index(node.slice, names)]
         if isinstance(node, ast.Call):
             types = ("float", "int")  # of np.array(..., float)
-            arguments = [self.value(x, names) for x in node.args if _dotted(x) not in types]
+            # The functions of a spheroid take velocities, too, which are not read.
+            one = self._or_none if _last(node.func) in ("spheroid", "imlay61") else self.value
+            arguments = [one(x, names) for x in node.args if _dotted(x) not in types]
             if self.matlab and _dotted(node.func) in names:
                 return np.asarray(names[_dotted(node.func)])[tuple(int(x) - 1 for x in arguments)]
             return FUNCTIONS[_last(node.func)](*arguments)
@@ -310,6 +332,8 @@ def _statements(text: str) -> Iterator[str]:
             line = ""
         elif kind == "operator" and token in (";", "\n"):
             line += "],[" if brackets.endswith("[") else ""
+        elif token == ":" and brackets.endswith("("):
+            line += ",None,"  # a range, which is not read
         elif kind == "operator" and token in "[({])}":
             brackets = brackets + token if token in "[({" else brackets[:-1]
             line += {"[": "block([[", "]": "]])", "{": "(", "}": ")"}.get(token, token)

@@ -32,7 +32,8 @@ FORCES, VELOCITIES = "XYZKMN", "uvwpqr"
 NAMES = {
     "mass": "m mass", "weight": "W weight", "buoyancy": "B buoyancy",
     "volume": "V vol volume nabla V_disp displaced_volume",
-    "density": "rho density rho_w rho_FW water_density", "gravity": "g gravity", "length": "L length L_auv",
+    "density": "rho density rho_w rho_FW water_density", "gravity": "g g_mu gravity",
+    "nMax": "nMax n_max", "length": "L length L_auv",
     "width": "diam D_auv width", "height": "diam D_auv height",
     "center_of_gravity": "r_bg r_bG r_g r_G rg r_cg g_center COG CG",
     "center_of_buoyancy": "r_bb r_bB r_b r_B rb r_cb b_center COB CB",
@@ -286,13 +287,13 @@ def _put_hydrodynamics(names: _Names, draft: Draft) -> None:
         torpedo.add_drag(draft, *torpedo.lift_drag(*lift))
     if len(flow) == 3:
         torpedo.add_drag(draft, torpedo.cross_flow(*flow), np.zeros((6, 6)))
+    elif flow:
+        draft.different.append(f"cross-flow drag of the model {flow[-1]} is left out: only Hoerner's is read")
     if any({(4, 0), (4, 2), (5, 0), (5, 1)} <= cleared for cleared in found.cleared.values()):
         torpedo.remove_munk(draft)
-    words = {key: names.first(key) for key in (*torpedo.PROPELLER, "nMax", "T_n")} | {
-        "L": names.first("length")
-    }
+    words = {key: names.first(key) for key in (*torpedo.PROPELLER, "nMax")} | {"L": names.first("length")}
     if None not in words.values():
-        torpedo.put_propeller(draft, words)
+        torpedo.put_propeller(draft, words | {"T_n": names.first("T_n")})
     if not any(
         np.any(draft.values["hydrodynamics"]["calibrated"][f"{k}_damping"]) for k in ("linear", "quadratic")
     ):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from finssim.core.yaml_file import read_mapping
+from finssim.vehicles.importers import torpedo
 from finssim.vehicles.importers.assignments import Assignments, read_assignments
 from finssim.vehicles.importers.coefficients import draft_of
 from finssim.vehicles.importers.draft import Draft, VehicleImporter
@@ -106,17 +107,11 @@ def _torpedo(n: Mapping[str, Any]) -> Assignments:
     """Return the numbers that `torpedo.py` computes from its words, under the names of the field."""
     m, a, b, W = n["mass"], n["length"] / 2.0, n["diam"] / 2.0, n["mass"] * 9.81
     rg, rb = np.array(n["r_bg"], float), np.array(n["r_bb"], float)
-    moments = m * np.array([0.4 * b**2, 0.2 * (a**2 + b**2), 0.2 * (a**2 + b**2)])
-    e = math.sqrt(1.0 - (b / a) ** 2)
-    log = math.log((1.0 + e) / (1.0 - e))
-    alpha, beta = 2.0 * (1.0 - e**2) / e**3 * (0.5 * log - e), 1.0 / e**2 - (1.0 - e**2) / (2.0 * e**3) * log
-    k1, k2 = alpha / (2.0 - alpha), beta / (2.0 - beta)
-    k = e**4 * (beta - alpha) / ((2.0 - e**2) * (2.0 * e**2 - (2.0 - e**2) * (beta - alpha)))
-    added = np.array([m * k1, m * k2, m * k2, n["r44"] * moments[0], k * moments[1], k * moments[2]])
-    M = added + np.concatenate([[m] * 3, moments + m * (rg @ rg - rg**2)])
-    swing = np.sqrt(np.maximum(W * (rg[2] - rb[2]) / M[3:5], 0.0)) * [n["zeta_roll"], n["zeta_pitch"]]
+    moments, added = torpedo.spheroid_moments(a, b, m), torpedo.spheroid_added_mass(a, b, m, n["r44"])
     values = dict(n) | {"g": 9.81, "W": W, "B": W, "I_g": moments, "MA": added, "r_bg": rg, "r_bb": rb}
-    values["D"] = np.array([0.0, 0.0, M[2] / n["T_sway"], *(2.0 * M[3:5] * swing), M[5] / n["T_yaw"]])
+    M = added + np.concatenate([[m] * 3, moments + m * (rg @ rg - rg**2)])
+    times, ratios = np.array([math.inf, n["T_sway"], n["T_yaw"]]), np.array([n["zeta_roll"], n["zeta_pitch"]])
+    values["D"] = torpedo.slow_damping(M, times, ratios, W * (rg[2] - rb[2])) * [1, 0, 1, 1, 1, 1]
     area = n["area_fraction"] * 4.0 * a * b
     calls = {"forceLiftDrag": [2.0 * b, area, n["Cd"] * math.pi * b**2 / area, n["e"]],
              "crossFlowDrag": [2.0 * a, 2.0 * b, 2.0 * b]}  # fmt: skip

@@ -49,6 +49,47 @@ HOERNER = (
 """Beam by twice the draft [-], and cross-flow drag coefficient of Hoerner's curve [-]."""
 
 
+def spheroid_moments(a: float, b: float, mass: float) -> Array:
+    """Return the moments of inertia of a homogeneous spheroid [kg m²], (3,).
+
+    Args:
+        a: Its half length [m].
+        b: Its radius [m].
+        mass: Its mass [kg].
+    """
+    return mass * np.array([0.4 * b**2, 0.2 * (a**2 + b**2), 0.2 * (a**2 + b**2)])
+
+
+def spheroid_added_mass(a: float, b: float, mass: float, roll: float) -> Array:
+    """Return the diagonal of the added mass of a spheroid by Lamb's k-factors [kg, kg m²], (6,).
+
+    Args:
+        a: Its half length [m].
+        b: Its radius [m].
+        mass: Of the water that it displaces [kg].
+        roll: Added moment in roll, as a share of its moment of inertia [-].
+    """
+    e = math.sqrt(1.0 - (b / a) ** 2)
+    log = math.log((1.0 + e) / (1.0 - e))
+    alpha, beta = 2.0 * (1.0 - e**2) / e**3 * (0.5 * log - e), 1.0 / e**2 - (1.0 - e**2) / (2.0 * e**3) * log
+    k1, k2 = alpha / (2.0 - alpha), beta / (2.0 - beta)
+    k = e**4 * (beta - alpha) / ((2.0 - e**2) * (2.0 * e**2 - (2.0 - e**2) * (beta - alpha)))
+    return np.array([mass * k1, mass * k2, mass * k2, *(spheroid_moments(a, b, mass) * [roll, k, k])])
+
+
+def slow_damping(mass: Array, times: Array, ratios: Array, stiffness: float) -> Array:
+    """Return the diagonal of the linear damping of a torpedo [N s/m, N m s], (6,).
+
+    Args:
+        mass: Diagonal of its mass matrix [kg, kg m²], (6,).
+        times: Time constants in surge, sway, which is that of heave, and yaw [s], (3,).
+        ratios: Damping ratios in roll and pitch [-], (2,).
+        stiffness: W (z_g - z_b) [N m].
+    """
+    swing = 2.0 * ratios * np.sqrt(max(stiffness, 0.0) * mass[3:5])
+    return np.array([mass[0] / times[0], *(mass[1:3] / times[1]), *swing, mass[5] / times[2]])
+
+
 def lift_drag(span: float, area: float, drag: float, efficiency: float = OSWALD) -> tuple[Array, Array]:
     """Return D2 [N s²/m²] and Du [N s²/m²] of lift and drag of a hull, (6, 6) each, x forward, y right, z down.
 
@@ -126,7 +167,7 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
 
     Args:
         draft: Draft with water and hydrodynamics.
-        words: Numbers of `PROPELLER`, `nMax` [rpm], `T_n` [s], `L` [m] and, where given, `w` [-].
+        words: Numbers of `PROPELLER`, `nMax` [rpm], `L` [m] and, where given, `T_n` [s] and `w` [-].
     """
     n, D = words["nMax"] / 60.0, words["D_prop"]
     drag = draft.values["hydrodynamics"]["calibrated"]["quadratic_damping"][0][0]
@@ -145,7 +186,10 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
             "derived",
             note,
         )
-    draft.put(f"{path}.time_constant", words["T_n"])
+    if words.get("T_n") is None:
+        draft.guess(f"{path}.time_constant", LAG, "not in the file")
+    else:
+        draft.put(f"{path}.time_constant", words["T_n"])
     draft.put(f"{path}.axis", [1.0, 0.0, 0.0])
     draft.guess(f"{path}.position", [-words["L"] / 2.0, 0.0, 0.0], "at the stern, on the axis")
     draft.values["thrusters"]["propeller"]["domain"] = "speed"
