@@ -97,6 +97,16 @@ interface: {height: 1.0}
     "seeing/seeing.yaml": "extends: finsrov\norigin: measured\nsource: here\nperception:\n"
     "  altimeter: {device: altimeter.yaml, rate: 5.0, position: "
     "[0, 0, -0.1], orientation: [0, 0.70710678, 0, 0.70710678]}\n",
+    "dvl.jsonl": "".join(
+        f'{{"time": {90 + 20 * (i % 3)}, "vx": 0.{i}, "vy": -0.1, "vz": 0.0, "fom": 0.002, "velocity_valid": '
+        f'{"true" if i % 4 else "false"}, "status": 0, "format": "json_v1"}}\n' for i in range(30)
+    ),
+    "vehicle1.csv": "Timestamp,roll,pitch,heading,rollRate,altitudeRelative,battery0.voltage\n" + "".join(
+        f"2026-05-04 10:00:{i:02d}.000,{i % 7},-2.0,{(350 + i) % 360},0.{i},-1.{i},--.--\n" for i in range(30)
+    ),
+    "fixes.csv": "timestamp,position_valid,x,y,z,std\n" + "".join(
+        f"{1.7e9 + 0.2 * i:.1f},{i % 5 > 0},{0.1 * i:.1f},2.0,1.{i},0.2\n" for i in range(30)
+    ),
     "map.yaml": "vehicle: bluerov2_heavy\npassive: true\nfiles:\n  \"*_imu.csv\":\n    time: time_secs\n"
     "    columns: {p: x_angvel, q: y_angvel, r: z_angvel, ax: x_linacc, ay: y_linacc, az: z_linacc}\n",
 }  # fmt: skip
@@ -173,6 +183,10 @@ def kinds() -> list[Kind]:
         Kind("log of an import", "logs/small_imu.csv", (
             "trials import {} --map SEEDS/map.yaml --out OUT/trials", "trials import {} --out OUT/trials",
         )),
+        *(
+            Kind(file, file, ("trials import {} --vehicle bluerov2 --out OUT/trials",))
+            for file in ("dvl.jsonl", "vehicle1.csv", "fixes.csv")
+        ),
         Kind("BIN", "small.BIN", ("trials import {} --vehicle bluerov2 --split arming --out OUT/trials",)),
         Kind("tlog", "small.tlog", ("trials import {} --vehicle bluerov2_heavy --out OUT/trials",)),
         Kind("bag in SQLite", "bags/sqlite3/sqlite3.db3", ("trials import {} --map SEEDS/bag.yaml --out OUT/t",), folder=1),  # noqa: E501

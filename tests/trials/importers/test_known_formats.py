@@ -303,6 +303,8 @@ def test_px4_logs(tmp_path):
 def test_px4_logs_split_by_arming_with_outputs_of_a_map(tmp_path):
     pytest.importorskip("pyulog")
     path = ulog(tmp_path / "dive.ulg")
+    codes = {item.code for item in one(path, vehicle="bluerov2").findings}
+    assert "outputs_unassigned" in codes and "pulses_unnamed" not in codes
     (tmp_path / "map.yaml").write_text("vehicle: bluerov2\nsplit: arming\nardusub: {outputs: {C1: -T1}}")
     trial = one(path, column_map=tmp_path / "map.yaml")
     assert len(trial.series("p")[1]) == 100

@@ -80,7 +80,12 @@ def _outputs(data: dict[str, Any], t: Array, request: Request) -> Stream:
         i: np.where((values > 800.0) & (values < 2200.0), values, np.nan) for i, values in pulses.items()
     }
     outputs = {i: (f"C{i}", 1) for i, values in pulses.items() if np.isfinite(values).any()}
-    note, vehicle, stated = finding("pulses_unnamed"), request.vehicle, request.mapped.ardusub.outputs
+    vehicle, stated = request.vehicle, request.mapped.ardusub.outputs
+    note = (
+        finding("outputs_unassigned", vehicle=vehicle.name)
+        if vehicle is not None
+        else finding("pulses_unnamed")
+    )
     if vehicle is not None and (stated or all(t.motor_index is not None for t in vehicle.thrusters.values())):
         outputs, note = outputs_of(vehicle, {}, stated)
     channels = {
