@@ -295,6 +295,8 @@ IMPORTERS = Family(
         "vehicle.stonefish": "finssim.vehicles.importers.stonefish:STONEFISH",
         "trial.qgroundcontrol": "finssim.trials.importers.table:QGROUNDCONTROL",
         "trial.acoustic": "finssim.trials.importers.table:ACOUSTIC",
+        "trial.waterlinked_csv": "finssim.trials.importers.table:WATER_LINKED",
+        "trial.waterlinked_period_csv": "finssim.trials.importers.table:WATER_LINKED_PERIOD",
         "trial.waterlinked": "finssim.trials.importers.water_linked:WATER_LINKED",
         "trial.ulog": "finssim.trials.importers.ulog:ULOG",
         "trial.ardupilot": "finssim.trials.importers.ardusub:ARDUPILOT",

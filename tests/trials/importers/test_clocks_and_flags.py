@@ -306,6 +306,7 @@ def test_an_import_ends_with_what_it_did_not_read(tmp_path):
         b"\xef\xbb\xbfsep=,\nt,u\n0,0.5\n0.1,0.25\n",
         b't,u\n0,"0,5"\n"0,1","0,25"\n',
         b"t\tu\n0\t0,5\n0,1\t0,25\n",
+        b"t;u\n2026-05-04 10:00:00,5;0,5\n2026-05-04 10:00:00,6;0,25\n",
         "t;u;T [\u20ac\u00b0]\n0;0,5;1\n0,1;0,25;2\n".encode("cp1252"),
     ],
 )
@@ -314,4 +315,4 @@ def test_texts_of_spreadsheets_are_read(tmp_path, content):
     (tmp_path / "log.csv").write_bytes(content)
     (trial,) = read_trials([Path(tmp_path / "log.csv")])
     np.testing.assert_array_equal(trial.channels["u"], [0.5, 0.25])
-    np.testing.assert_allclose(trial.t, [0.0, 0.1])
+    np.testing.assert_allclose(trial.t, [0.0, 0.1], atol=1e-6)

@@ -109,6 +109,17 @@ def test_dead_reckoning_is_read_on_the_same_clock_only(tmp_path):
     assert "x" not in trial.channels and "position_local, which has another clock" in str(trial.findings[-1])
 
 
+@pytest.mark.parametrize("name", ["time", "time_of_validity"])
+def test_tables_of_a_doppler_log_need_no_map(tmp_path, name):
+    """As the maker's parser writes them, with periods, and with Unix times."""
+    times = PERIOD if name == "time" else np.round(1e6 * (1.7e9 + CLOCK)).astype(np.int64)
+    trial = one(csv(tmp_path / "dvl.csv", **{name: times}, **VELOCITIES, status=0 * GOOD))
+    for column, expected in (("u", U), ("v", V), ("w", W)):
+        np.testing.assert_allclose(trial.series(column)[1], expected[GOOD], atol=1e-12)
+    np.testing.assert_allclose(trial.t, CLOCK[GOOD] - CLOCK[GOOD][0], atol=2e-6)
+    assert note(trial, "invalid_left_out").values["samples"] == N - GOOD.sum()
+
+
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
@@ -395,12 +406,25 @@ def with_type(path):
 
 
 FIX = {"timestamp": T, "position_valid": GOOD, "x": T, "y": T, "z": T}
+VELOCITIES = {
+    "vx": U,
+    "vy": -V,
+    "vz": -W,
+    "fom": 0.002 + 0 * T,
+    "altitude": 1 + 0 * T,
+    "velocity_valid": GOOD,
+}
 UNKNOWN = {
     "csv": ("a.csv", lambda path: csv(path, t=T, u=T, turboness=T)),
     "npz": ("a.npz", lambda path: npz(path, t=T, u=T, turboness=np.arange(3))),
     "qgroundcontrol": ("a.csv", lambda path: path.write_text(ground_station(turboness=T)) and path),
     "acoustic": ("a.csv", lambda path: csv(path, **FIX, turboness=T)),
     "waterlinked": ("a.json", with_type),
+    "waterlinked_csv": (
+        "a.csv",
+        lambda path: csv(path, **VELOCITIES, time_of_validity=1e6 * (1.7e9 + T), turboness=T),
+    ),
+    "waterlinked_period_csv": ("a.csv", lambda path: csv(path, **VELOCITIES, time=PERIOD, turboness=T)),
     "ulog": ("a.ulg", lambda path: ulog(path, (*list(FORMATS)[:3], "cpuload"))),
 }
 

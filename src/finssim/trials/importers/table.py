@@ -302,7 +302,7 @@ def _time(table: ColumnTable, time: TimeColumn, label: str) -> Array:
 
 def _date(word: str) -> str:
     """Return a date as NumPy reads it: universal time without saying so, and a day for a time without one."""
-    word = re.sub(r"(Z|[+-]00:?00)$", "", word.strip())
+    word = re.sub(r"(Z|[+-]00:?00)$", "", word.strip()).replace(",", ".")
     return f"1970-01-01T{word}" if re.match(r"\d\d:\d", word) else word or "NaT"
 
 
@@ -338,6 +338,8 @@ def known_table(file: str) -> LogImporter:
 
 ACOUSTIC = known_table("acoustic.yaml")
 QGROUNDCONTROL = known_table("qgroundcontrol.yaml")
+WATER_LINKED = known_table("water_linked_csv.yaml")
+WATER_LINKED_PERIOD = known_table("water_linked_period_csv.yaml")
 TABLE = LogImporter(
     title="a table (.csv, .txt, .parquet, .npz)",
     recognises=lambda path, head: path.is_file() and path.suffix.lower() in SUFFIXES,
