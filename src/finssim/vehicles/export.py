@@ -56,6 +56,8 @@ def export_vehicle(
     lost += [
         "shape of the hull, which is a box of the displaced volume, and the layer in which buoyancy fades"
     ]
+    if any(t.torque_constant for t in vehicle.thrusters.values()):
+        lost.append("reaction torque of propellers")
     if any(t.c_plus != t.c_minus for t in vehicle.thrusters.values()):
         lost += ["thrust coefficient of reverse rotation (c_minus): gz-sim has one for both directions"]
     if np.any(chosen.reference_point):

@@ -191,6 +191,9 @@ class Thruster(Part):
     """T = c_plus ω² for ω > 0 [N s²/rad²]."""
     c_minus: Positive
     """T = -c_minus ω² for ω < 0 [N s²/rad²]."""
+    torque_constant: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
+    """k of the propeller's torque k ω|ω| on the water, about `axis` [N m s²/rad²]: above 0 where the shaft turns about
+    `axis` for positive thrust (right-handed), below 0 where it turns against it. The vehicle feels the opposite."""
     rpm_min: Negative
     """Fastest reverse shaft speed [rpm]."""
     rpm_max: Positive
@@ -215,6 +218,11 @@ class Thruster(Part):
     """Sign between positive thrust and the controller's positive command."""
     esc: Esc | None = None
     """Speed controller, for vehicles that log or take pulse widths."""
+
+    @property
+    def reaction(self) -> float:
+        """Moment about `axis` on the vehicle over the thrust [m]: -k / c, with the mean of c_plus and c_minus."""
+        return -2.0 * self.torque_constant / (self.c_plus + self.c_minus)
 
     def thrust(self, shaft_speed: ArrayLike) -> Array:
         """Steady thrust T = c± ω|ω| [N] (paper, eq. 16), positive along `axis`.

@@ -300,7 +300,9 @@ class Vehicle(Part):
     def thruster_matrix(self, point: Any = (0.0, 0.0, 0.0)) -> Array:
         """B of tau = B f, for unit thrust in canonical order.
 
-        B = [a_1 ... a_n; (r_1 - point) × a_1 ... ]                                       (paper, eq. 17)
+        B = [a_1 ... a_n; (r_1 - point) × a_1 + q_1 a_1 ... ]                             (paper, eq. 17)
+
+        The reaction q of a propeller's torque is 0 where the vehicle file gives no torque constant.
 
         Args:
             point: Body point about which moments are taken [m], (3,).
@@ -310,7 +312,8 @@ class Vehicle(Part):
         """
         axes = np.array([thruster.axis for thruster in self.thrusters.values()])
         arms = np.array([thruster.position for thruster in self.thrusters.values()]) - np.asarray(point)
-        return np.vstack([axes.T, np.cross(arms, axes).T])
+        reactions = np.array([thruster.reaction for thruster in self.thrusters.values()])
+        return np.vstack([axes.T, np.cross(arms, axes).T + reactions * axes.T])
 
     @property
     def control_matrix(self) -> Array:
