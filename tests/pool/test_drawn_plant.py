@@ -59,6 +59,18 @@ def test_matrices_are_coupled_and_physical():
         assert np.abs(extra[0, 2]) > 0.01 and np.abs(extra[1, 3]) > 0.01
 
 
+def test_couplings_that_could_add_energy_are_made_smaller():
+    """A vehicle whose sideways drag rolls it: the plant is one that only loses energy; `Damping` checks it."""
+    strong = load_vehicle("bluerov2").hydrodynamics["calibrated"].quadratic_damping.copy()
+    strong[3, 1] = -strong[1, 1]
+    vehicle = load_vehicle("bluerov2").replace(
+        {"hydrodynamics.calibrated.quadratic_damping": strong.tolist()}
+    )
+    found = np.array(draw_plant(vehicle, 1).damping.quadratic)
+    usual = np.array(draw_plant(load_vehicle("bluerov2"), 1).damping.quadratic)
+    assert np.diag(found) == pytest.approx(np.diag(usual)) and 0.0 < -found[3, 1] < 0.5 * strong[1, 1]
+
+
 def test_the_mean_plant_is_the_vehicle():
     """Over seeds, added mass and thrust are the file's, to within what 40 draws of ±10 and ±15 % leave."""
     specs = [draw_plant(FINSROV, seed, "realistic") for seed in range(40)]

@@ -48,12 +48,12 @@ def refusal(folder, content):
     ids=lambda x: getattr(x, "name", ""),
 )
 def test_it_moves_as_the_equations_of_uuv_simulator(tmp_path, robot, force, ahead):
-    """Within 0.5 % at all times: couplings of added mass, full damping, a centre of gravity beside the origin.
+    """Within 1 % at all times: couplings of added mass, full damping, a centre of gravity beside the origin.
 
     The torpedo moves ahead, for astern uuv_simulator changes the sign of the damping by forward speed.
     """
     path = write(tmp_path, text(robot))
-    assert_moves_alike(imported(path), Origin(robot), force, tolerance=0.005, ahead=ahead)
+    assert_moves_alike(imported(path), Origin(robot), force, tolerance=0.01, ahead=ahead)
 
 
 @pytest.mark.slow

@@ -317,7 +317,7 @@ def _water(
     hull = hull_share(vehicle, spread.hull_share, drag)
     panels = hull["form_drag"] * drag
     outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
-    D1, D2 = less_share(vehicle, D1, D2, outer_drag)
+    D1, D2 = _dissipative(*less_share(vehicle, D1, D2, outer_drag))
     axes = [
         {
             "center": tuple((np.asarray(hydro.reference_point) + draw.around(spread.center, 3)).tolist()),
@@ -330,6 +330,19 @@ def _water(
         "damping": {**axes[1], "linear": D1.tolist(), "quadratic": D2.tolist()},
         "hull": hull,
     }
+
+
+def _dissipative(D1: Array, D2: Array) -> tuple[Array, Array]:
+    """Return D1 and D2 with couplings as small as `Damping` asks for; those that are small enough stay as they are."""
+    scale = np.sqrt(np.maximum(np.outer(np.diag(D1), np.diag(D1)), 1e-24))
+    least = min(float(np.linalg.eigvalsh((D1 + D1.T) / 2.0 / scale)[0]), 0.0)
+    off = np.abs(D2 - np.diag(np.diag(D2)))
+    need = off.sum(axis=1) / 3.0 + 2.0 * off.sum(axis=0) / 3.0
+    room = float((np.diag(D2)[need > 0.0] / need[need > 0.0]).min(initial=np.inf))
+    if least >= -1e-9 and room >= 1.0 - 1e-9:
+        return D1, D2
+    kept = np.where(np.eye(6, dtype=bool), 1.0, 0.999 * min(room, 1.0 / (1.0 - least), 1.0))
+    return kept * D1, kept * D2
 
 
 def _congruent(matrix: Any, change: Array) -> Array:

@@ -307,7 +307,7 @@ def enclosing_ellipsoid(points: Array) -> Array:
     steps = 0
     while True:
         mean = weights @ points
-        spread = weights @ points**2 - mean**2
+        spread = np.maximum(weights @ points**2 - mean**2, 1e-18)  # flat parts have no third axis
         reach = ((points - mean) ** 2 / (3.0 * spread)).sum(axis=1)
         farthest = int(np.argmax(reach))
         excess = float(reach[farthest]) - 1.0

@@ -146,7 +146,7 @@ def read_urdf(path: Path, folders: Sequence[Path] = ()) -> Draft:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    return (b"<robot" in head and b"<scenario" not in head) or path.suffix.lower() in (".urdf", ".xacro")
+    return path.suffix.lower() in (".urdf", ".xacro") or (b"<robot" in head and path.suffix.lower() != ".scn")
 
 
 URDF = VehicleImporter(

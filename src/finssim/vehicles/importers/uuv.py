@@ -43,7 +43,6 @@ from finssim.vehicles.importers.thrust_curve import (
 )
 from finssim.vehicles.importers.xml_file import Element, flag, number, numbers, refuse_unknown
 from finssim.vehicles.part import VehicleError
-from finssim.vehicles.vehicle import moved_to_origin, skew
 
 __all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv"]
 
@@ -329,17 +328,13 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     if hydrodynamics is None:
         raise VehicleError(f"{where} is missing: add it")
     refuse_unknown(hydrodynamics, WORDS["hydrodynamic_model"], where)
-    arm = np.eye(6)
-    arm[3:, :3] = skew(centre)
     for word, matrix in coefficients(hydrodynamics, boxes.get(base), where).items():
-        turned = flu_of_frd(matrix)
-        if word == "added_mass":
-            turned = moved_to_origin((turned + turned.T) / 2.0, centre)
-        elif word != "surge_damping" or np.any(matrix):
-            turned = arm @ turned
-        else:
-            continue
-        draft.put(f"hydrodynamics.calibrated.{word}", plain(turned))
+        turned = (matrix + matrix.T) / 2.0 if word == "added_mass" else matrix
+        if word != "surge_damping" or np.any(matrix):
+            draft.put(f"hydrodynamics.calibrated.{word}", plain(flu_of_frd(turned)))
+    draft.put(
+        "hydrodynamics.calibrated.reference_point", plain(centre), "derived", "centre of gravity of base_link"
+    )
     _note_differences(hydrodynamics, centre, draft)
 
     managed = _managed(model, base)
@@ -403,7 +398,7 @@ def _note_differences(hydrodynamics: Element, centre: Array, draft: Draft) -> No
         )
     if np.abs(centre).max() > 1e-3:
         draft.different.append(
-            "the added mass acts on the centre of gravity; uuv_simulator takes the acceleration of the link's origin"
+            "the velocity in the water is that of the centre of gravity, in uuv_simulator that of the link's origin"
         )
     if not np.any(draft.values["hydrodynamics"]["calibrated"]["added_mass"]):
         draft.different.append("the added mass is 0 on every axis: a real vehicle accelerates more slowly")

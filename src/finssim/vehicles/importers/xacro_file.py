@@ -37,7 +37,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     name: getattr(math, name)
     for name in (
         "acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "degrees", "exp", "fabs", "floor", "fmod", "hypot",
-        "log", "log10", "radians", "sin", "sinh", "sqrt", "tan", "tanh",
+        "log", "log10", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh",
     )
 } | {f.__name__: f for f in (abs, bool, float, int, len, max, min, round, str, sum)}  # fmt: skip
 """Functions of an expression."""
