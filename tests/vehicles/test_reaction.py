@@ -52,13 +52,13 @@ def test_a_vehicle_with_one_screw_rolls_against_it(tmp_path, constant, side):
 def test_two_that_turn_against_each_other_cancel(tmp_path):
     (tmp_path / "twin.yaml").write_text(
         "extends: finsrov\norigin: guessed\nsource: own\nthrusters:\n"
-        "  H_LF: {torque_constant: 1.0e-5}\n  H_RF: {torque_constant: -1.0e-5}\n"
+        "  H_LF: {torque_constant: 1.0e-5}\n  H_RB: {torque_constant: 1.0e-5}\n"
     )
     twin, plain = fs.load_vehicle(tmp_path / "twin.yaml"), fs.load_vehicle("finsrov")
     change = twin.thruster_matrix() - plain.thruster_matrix()
-    for name, sign in (("H_LF", -1.0), ("H_RF", 1.0)):
+    for name in ("H_LF", "H_RB"):  # of one kind, with opposite axes
         thruster, column = twin.thrusters[name], change[:, twin.thruster_names.index(name)]
-        q = sign * 1.0e-5 / (0.5 * (thruster.c_plus + thruster.c_minus))
+        q = -1.0e-5 / (0.5 * (thruster.c_plus + thruster.c_minus))
         np.testing.assert_allclose(column, [0.0, 0.0, 0.0, *(q * np.asarray(thruster.axis))], atol=1e-15)
     assert np.count_nonzero(np.abs(change).sum(axis=0)) == 2
     assert change[3].sum() == pytest.approx(0.0, abs=1e-12)
