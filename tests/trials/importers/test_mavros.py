@@ -323,6 +323,13 @@ def test_a_doppler_log_is_read_in_its_own_axes(bag, tmp_path):
     assert invalid == {"velocity_valid": 20, "fom": 10}
 
 
+def test_a_doppler_log_comes_before_the_estimate_of_the_autopilot(bag, tmp_path):
+    """As position deltas in ArduSub logs; its position stays, and one line says that the velocity is the sensor's."""
+    trial = one(bag.odom().imu().dvl().write(tmp_path / "a"))
+    np.testing.assert_allclose(trial.series("v")[1], np.cos(TIMES)[np.arange(N) % 10 != 0], atol=1e-12)
+    assert "x" in trial.channels and {"velocity_at_sensor", "columns_left_out"} <= set(codes(trial))
+
+
 def test_one_unusable_topic_does_not_refuse_a_bag(bag, tmp_path):
     """Messages that are cut, and a topic whose samples are all invalid."""
     bag.imu().dvl(valid=lambda i: False).odom()

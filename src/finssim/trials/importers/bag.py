@@ -136,6 +136,10 @@ def read(path: Path, request: Request) -> TrialStreams:
                 f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(types)}"
             )
         _collect(reader, sources, findings)
+        logs = [
+            topic for topic, source in sources.items() if source.rank >= 0 and _is_dvl(reader, source.kind)
+        ]
+        findings += [finding("velocity_at_sensor", kind=topic) for topic in logs]
         events = _events(reader) if native else []
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
     times = times_of(sources, findings)
@@ -167,7 +171,7 @@ def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> LogTopic:
         raise CalibrationError(
             f"{topic} is of type {kind}, for which no columns are usual: give 'columns: {{u: FIELD, ...}}'"
         )
-    rank = [*KNOWN["mavros"], *finssim_record.THRUSTERS, *KNOWN["usual"], *KNOWN["dvl"]].index(name)
+    rank = [*KNOWN["dvl"], *KNOWN["mavros"], *finssim_record.THRUSTERS, *KNOWN["usual"]].index(name)
     keys = {name: getattr(source, name) for name in source.model_fields_set - {"columns"}}
     return LogTopic(usual[name].model_copy(update=keys), rank, kind)
 
@@ -187,7 +191,7 @@ def _known(reader: Any, types: Mapping[str, str]) -> dict[str, LogTopic]:
         inside = "mavros" in topic.split("/") or topic.startswith(
             tuple(root for root in roots if root != "/")
         )
-        for rank, (end, of, source) in enumerate(known):
+        for rank, (end, of, source) in enumerate(known, start=len(KNOWN["dvl"])):
             if (topic, end) in own and kind == of and (inside or "/" in roots):
                 out[topic] = LogTopic(source, rank, kind)
         command = COMMANDS.search(topic) and re.search("Pose|Twist|Odometry", kind)
