@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 
-from finssim.vehicles import HydrodynamicSet, load_vehicle
+from finssim.core.registry import CATALOGUE
+from finssim.vehicles import HydrodynamicSet, check, check_vehicle, load_vehicle
 
 FLIP = np.array([1.0, -1.0, -1.0])  # NED body axes (x forward, y right, z down) to ours
 FLIP6 = np.diag([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
@@ -215,3 +217,32 @@ def test_bluerov2_sets_answer_a_push_as_the_survey_of_them_says(name, m_eff, spe
     d1, d2 = np.diag(chosen.linear_damping), np.diag(chosen.quadratic_damping)
     np.testing.assert_allclose([terminal_speed(d1[i], d2[i], 50.0) for i in range(3)], speeds, atol=0.0051)
     assert terminal_speed(d1[5], d2[5], 5.0) == pytest.approx(yaw_rate, abs=0.0051)
+
+
+PUBLISHED = yaml.safe_load((CATALOGUE / "published.yaml").read_text())
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_top_speed_is_near_the_published_one_or_has_a_reason(name):
+    """d1 v + d2 v² = thrust; a difference of more than a fifth has a reason, and a reason has a difference."""
+    vehicle, row = load_vehicle(name), PUBLISHED[name]
+    chosen = vehicle.hydrodynamics["calibrated"]
+    d1, d2 = chosen.linear_damping[0, 0], chosen.axis_drag[0]
+    thrust = vehicle.wrench_limits[0]
+    speed = 2.0 * thrust / (d1 + math.sqrt(d1**2 + 4.0 * d2 * thrust))
+    assert (abs(speed / row["top_speed"] - 1.0) > 0.2) == ("why" in row), speed
+    (found,) = (result for result in check_vehicle(vehicle) if result.name == "top speed")
+    assert (
+        found.passed
+        and f"{speed:.2f} m/s; the real one {row['top_speed']} m/s ({row['source']})" in found.sentence
+    )
+
+
+def test_a_top_speed_far_from_the_published_one_is_reported(monkeypatch):
+    """Without a reason; and a vehicle of a user's file has no published one."""
+    monkeypatch.setattr(
+        check, "read_mapping", lambda *_, **__: {"remus100": {"top_speed": 1.5, "source": "x"}}
+    )
+    (found,) = (result for result in check_vehicle(load_vehicle("remus100")) if result.name == "top speed")
+    assert not found.passed and found.sentence == "2.60 m/s; the real one 1.5 m/s (x)"
+    assert not [r for r in check_vehicle(load_vehicle("finsrov")) if r.name == "top speed"]

@@ -230,7 +230,7 @@ CATALOGUE = Path(__file__).parents[1] / "vehicles/catalogue"
 
 VEHICLES = Family(
     "vehicle",
-    {path.stem: path for path in sorted(CATALOGUE.glob("*.yaml"))},
+    {path.stem: path for path in sorted(CATALOGUE.glob("*.yaml")) if path.stem != "published"},
     check="finssim.vehicles.loader:check_registered",
 )
 """Name -> path of the vehicle file."""

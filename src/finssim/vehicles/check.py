@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.registry import TERMS
-from finssim.vehicles.capability import trim, wrench_capability
+from finssim.core.registry import CATALOGUE, TERMS
+from finssim.core.yaml_file import read_mapping
+from finssim.vehicles.capability import terminal_speeds, trim, wrench_capability
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Vehicle
@@ -19,6 +20,8 @@ __all__ = ["CheckResult", "check_vehicle"]
 
 CURVE_TOLERANCE = 0.01
 """Relative gap accepted between a force limit and the curve at the speed limit."""
+SPEED_TOLERANCE = 0.2
+"""Relative difference of top speed from the published one that needs no reason."""
 VOLUME_TOLERANCE = 0.02
 CENTROID_TOLERANCE = 0.02
 """Distance accepted between the hull's centroid and the centre of buoyancy, relative to the longest side."""
@@ -36,7 +39,8 @@ def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
     """Check what no single number shows; the loader has already refused what cannot be simulated at all.
 
     Returns:
-        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull.
+        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull, and top
+        speed beside that of the real vehicle, where `catalogue/published.yaml` has it.
     """
     return [
         *_mass_matrices(vehicle),
@@ -46,6 +50,7 @@ def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
         _trim(vehicle),
         _stability(vehicle),
         *_hull(vehicle),
+        *_top_speed(vehicle),
     ]
 
 
@@ -206,3 +211,17 @@ def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
         gap <= CENTROID_TOLERANCE * float(vehicle.body.size.max()),
         f"the hull's centroid is {gap:.3g} m from the centre of buoyancy",
     )
+
+
+def _top_speed(vehicle: Vehicle) -> Iterator[CheckResult]:
+    published = CATALOGUE / "published.yaml"
+    if vehicle.path is None or vehicle.path.parent != CATALOGUE or "calibrated" not in vehicle.hydrodynamics:
+        return
+    row = read_mapping(published, VehicleError, such_as="remus100: {top_speed: 2.5}").get(vehicle.name)
+    if row is not None:
+        speed, real = float(terminal_speeds(vehicle)[0]), row["top_speed"]
+        passed = abs(speed / real - 1.0) <= SPEED_TOLERANCE or "why" in row
+        why = f"; {row['why']}" if "why" in row else ""
+        yield CheckResult(
+            "top speed", passed, f"{speed:.2f} m/s; the real one {real:g} m/s ({row['source']}){why}"
+        )
