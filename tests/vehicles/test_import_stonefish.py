@@ -14,7 +14,7 @@ from finssim.core.mesh import MeshError, load_obj, load_stl, mesh_volume, write_
 from finssim.vehicles import VehicleError, load_vehicle
 from finssim.vehicles.importers import stonefish
 from finssim.vehicles.importers.draft import read_foreign
-from reference.gz_sim import euler
+from reference.gz_sim import element, euler
 from reference.imported import imported, simulated, unnoticed
 from reference.stonefish import DEAD, FLUID, RHO, TABLE, Origin, thruster, write
 
@@ -88,6 +88,38 @@ def test_mass_and_buoyancy_are_sums_of_the_parts(tmp_path):
     lift = sum(force for force, _ in origin.lifts)
     assert body["displaced_volume"] * RHO * 9.81 == pytest.approx(lift, rel=1e-9)
     assert draft.vehicle(tmp_path).mass_matrix() == pytest.approx(origin.rigid, rel=1e-3, abs=0.02)
+
+
+def test_a_link_at_a_joint_is_a_part_of_the_body(tmp_path):
+    """A lamp in a link of its own, at the same place: the same body, and the joint is held."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    usual = read_foreign(write(tmp_path / "a"))
+    path = write(tmp_path / "b")
+    file = tmp_path / "b/data/robot.scn"
+    root = fromstring(file.read_text())
+    robot, lamp = root.find("robot"), root.find(".//external_part[@name='lamp']")
+    place = lamp.find("compound_transform").attrib
+    root.find(".//base_link").remove(lamp)
+    lamp.remove(lamp.find("compound_transform"))
+    lamp.tag = "link"
+    joint = element(robot, "joint", name="hinge", type="revolute")
+    for tag, words in (("parent", {"name": "base"}), ("child", {"name": "lamp"}), ("origin", place)):
+        element(joint, tag, **words)
+    robot.append(lamp)
+    file.write_bytes(tostring(root))
+    draft = read_foreign(path)
+    assert any("'hinge' (revolute)" in sentence for sentence in draft.different)
+    for key, value in usual.values["body"].items():
+        assert np.asarray(draft.values["body"][key]) == pytest.approx(np.asarray(value), abs=1e-9)
+    found, expected = (x.vehicle(tmp_path).mass_matrix() for x in (draft, usual))
+    assert found == pytest.approx(
+        expected, rel=0.01, abs=0.1
+    )  # the added mass acts on the centre of each link
+    joint.find("parent").set("name", "nothing")
+    file.write_bytes(tostring(root))
+    with pytest.raises(VehicleError, match="holds to no link of the robot"):
+        read_foreign(path)
 
 
 def test_added_mass_of_shapes():
@@ -164,6 +196,7 @@ def test_a_thruster_of_fluid_dynamics(tmp_path):
     factor = RHO * 1e-4 / (4.0 * math.pi**2)
     assert surge.c_plus == pytest.approx(0.4 * factor) and surge.c_minus == pytest.approx(0.3 * factor)
     assert surge.rpm_max == pytest.approx(200.0 * 30.0 / math.pi) and surge.time_constant == 0.1
+    assert surge.torque_constant == pytest.approx(0.02 * 0.1 * factor)  # a right propeller's, on the water
 
 
 def test_a_left_propeller_pushes_back_with_its_forward_side(tmp_path):
@@ -289,11 +322,11 @@ def test_every_word_of_the_robot_is_read_refused_or_named(tmp_path):
     world = fromstring(path.read_text())
     world.remove(world.find("include"))
     world.extend(deepcopy(list(root)))
-    for element in world.iter("propeller"):
-        for child in list(element):
-            element.remove(child)
+    for propeller in world.iter("propeller"):
+        for child in list(propeller):
+            propeller.remove(child)
     found = set(unnoticed(lambda: deepcopy(world), read_foreign, tmp_path / "scenarios/all.scn"))
-    assert found <= {"nedx", "oceanx", "waterx", "materialx", "hydrodynamicsx", "massx", "torque_coeffx"}
+    assert found <= {"nedx", "oceanx", "waterx", "materialx", "hydrodynamicsx", "massx"}
 
 
 def test_the_command_imports_and_lists(tmp_path, capsys):

@@ -39,7 +39,6 @@ from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.vehicles.importers.draft import LAG, Draft, VehicleImporter, put_controlled_axes, put_envelope
 from finssim.vehicles.importers.rigid import IDENTITY, LinkPose, combined, flu_of_frd, plain
 from finssim.vehicles.importers.thrust_curve import (
-    ThrustCurve,
     dead_zone,
     interpolated,
     mirrored,
@@ -195,7 +194,7 @@ def scenario(path: Path, files: ScenarioFiles, draft: Draft) -> list[Element]:
 
 @dataclass
 class Solid:
-    """A part, in the frame of its link."""
+    """A part, in the frame of the base link or that in which this is level."""
 
     mass: float
     """[kg]"""
@@ -456,11 +455,11 @@ def solid_of(
     water: float,
     where: str,
 ) -> Solid:
-    """Return a part in the frame of its link.
+    """Return a part in the frame in which it has a pose.
 
     Args:
         part: The element.
-        place: Pose of the part in the link.
+        place: Its pose.
         external: Whether the water meets it.
         files: ScenarioFiles of the scenario.
         densities: Material -> density [kg/m³].
@@ -538,32 +537,20 @@ def solid_of(
     )
 
 
-def solids_of(link: Element, *context: object, where: str) -> list[Solid]:
-    """Return the parts of a link, in its frame; `context` is that of `solid_of` after `external`."""
+def solids_of(link: Element, pose: LinkPose, *context: object, where: str) -> list[Solid]:
+    """Return the parts of a link in the frame in which it has a pose; `context` is that of `solid_of`."""
     if word(link, "type", where) != "compound":
-        return [solid_of(link, IDENTITY, True, *context, where)]
+        return [solid_of(link, pose, True, *context, where)]
     refuse_unknown(link, SOLID, where)
     parts = []
     for tag in ("external_part", "internal_part"):
         for part in link.findall(tag):
             at = f"{where}: part '{part.get('name', '')}'"
-            place = pose_of(part.find("compound_transform"), f"{at}: compound_transform")
+            place = pose.after(pose_of(part.find("compound_transform"), f"{at}: compound_transform"))
             parts.append(solid_of(part, place, tag == "external_part", *context, at))
     if not parts:
         raise VehicleError(f"{where}: has no part, expected one or more external ones: add them")
     return parts
-
-
-def moved(solid: Solid, pose: LinkPose) -> Solid:
-    """Return a part in the frame in which its link has a pose."""
-    surface = solid.surface
-    if surface is not None:
-        surface = surface[0] @ pose.turn.T + pose.place, surface[1]
-    lift, frame = pose.turn @ solid.lift + pose.place, pose.after(solid.frame)
-    return Solid(
-        solid.mass, solid.volume, lift, frame, solid.moments, solid.added, pose.turn @ solid.turn, solid.coefficients,
-        surface,
-    )  # fmt: skip
 
 
 def rigid(parts: Sequence[Solid], augmented: bool) -> tuple[float, Array, Array]:
@@ -662,70 +649,81 @@ def _links(
             f"{where}: link '{name}' is not joined to the base link, or is not there: correct it"
         )
     return {
-        name: (
-            poses[name],
-            [moved(x, poses[name]) for x in solids_of(link, *context, where=f"{where}: link '{name}'")],
-        )
+        name: (poses[name], solids_of(link, poses[name], *context, where=f"{where}: link '{name}'"))
         for name, link in elements.items()
     }
 
 
-def _curve(actuator: Element, density: float, where: str) -> tuple[ThrustCurve, float, float | None, str]:
-    """Return thrust curve, greatest speed [rad/s], time constant [s] and how it comes about, of a thruster."""
-    specs, propeller = actuator.find("specs"), actuator.find("propeller")
+def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> None:
+    """Set thrust, torque, limits and time constant of a thruster, in the old or the new syntax."""
 
-    def of(element: Element | None, tag: str, name: str = "value") -> float:
-        inner = None if element is None else element.find(tag)
-        return float(values(inner, name, 1, f"{where}: {tag}")[0])
+    def of(place: str, default: str | None = None) -> float:
+        tag, _, attribute = place.partition("@")
+        return float(values(actuator.find(tag), attribute or "value", 1, f"{where}: {tag}", default)[0])
 
-    def spec(name: str, default: str | None = None) -> float:
-        return float(values(specs, name, 1, f"{where}: specs", default)[0])
+    def kind_of(tag: str) -> str:
+        return word(actuator.find(tag), "type", f"{where}: {tag}")
 
-    right = word(propeller, "right", f"{where}: propeller").lower() in ("true", "1")
-    factor = (
-        density * float(values(propeller, "diameter", 1, f"{where}: propeller")[0]) ** 4 / (4.0 * math.pi**2)
-    )
-    if specs is not None and specs.get("max_rpm") is not None:
-        forward = spec("thrust_coeff")
-        backward = spec("thrust_coeff_backward", repr(forward))
-        curve = quadratic(factor * forward, factor * backward, where)
-        return curve, spec("max_rpm") * math.pi / 30.0, 1.0 / 8.0, "proportional gain 8 of its controller"
-    rotor, model = actuator.find("rotor_dynamics"), actuator.find("thrust_model")
-    kind = word(model, "type", f"{where}: thrust_model")
-    if kind == "fluid_dynamics":  # its coefficients are those of the force ahead and astern, for both hands
-        forward, backward = (of(model, "thrust_coeff", side) for side in ("forward", "reverse"))
-        curve = quadratic(factor * forward, factor * backward, where)
-    elif kind == "quadratic":
-        curve = quadratic(abs(of(model, "thrust_coeff")), abs(of(model, "thrust_coeff")), where)
-    elif kind == "deadband":
-        left, ahead = (of(model, "thrust_coeff", side) for side in ("reverse", "forward"))
-        curve = dead_zone(left, ahead, of(model, "deadband", "lower"), of(model, "deadband", "upper"), where)
-    elif kind == "linear_interpolation" and model is not None:
-        texts = [word(model.find(tag), "value", f"{where}: {tag}") for tag in ("input", "output")]
+    right = word(actuator.find("propeller"), "right", f"{where}: propeller").lower() in ("true", "1")
+    diameter, old = of("propeller@diameter"), actuator.find("specs[@max_rpm]") is not None
+    factor = draft.values["water"]["density"] * diameter**4 / (4.0 * math.pi**2)
+    model = "fluid_dynamics" if old else kind_of("thrust_model")
+    if model == "fluid_dynamics":  # its coefficients are those of the force ahead and astern, for both hands
+        if old:
+            ahead, turning = of("specs@thrust_coeff"), of("specs@torque_coeff", "0")
+            astern = of("specs@thrust_coeff_backward", repr(ahead))
+        else:
+            ahead, astern = (of(f"thrust_model/thrust_coeff@{side}") for side in ("forward", "reverse"))
+            turning = of("thrust_model/torque_coeff")
+        curve = quadratic(factor * ahead, factor * astern, where)
+        torque = factor * diameter * turning * (1.0 if right else -1.0)
+        draft.put(f"thrusters.{name}.torque_constant", torque, "derived", "torque_coeff")
+        falls = "the thrust of Stonefish falls with the inflow; here it does not"
+        draft.different += [falls] if falls not in draft.different else []
+    elif model == "quadratic":
+        curve = quadratic(*2 * [abs(of("thrust_model/thrust_coeff"))], where)
+    elif model == "deadband":
+        sides = ("thrust_coeff@reverse", "thrust_coeff@forward", "deadband@lower", "deadband@upper")
+        curve = dead_zone(*(of(f"thrust_model/{side}") for side in sides), where)
+    elif model == "linear_interpolation":
+        texts = [
+            word(actuator.find(f"thrust_model/{x}"), "value", f"{where}: {x}") for x in ("input", "output")
+        ]
         columns = [numbers(text, len(texts[0].split()), f"{where}: thrust_model") for text in texts]
         curve = interpolated(columns[0], columns[1], where)
     else:
-        raise VehicleError(f"{where}: thrust_model is '{kind}', expected quadratic, deadband, linear_interpolation or "
-                           "fluid_dynamics: correct it")  # fmt: skip
-    if not right and kind != "fluid_dynamics":
+        known = "quadratic, deadband, linear_interpolation or fluid_dynamics"
+        raise VehicleError(f"{where}: thrust_model is '{model}', expected {known}: correct it")
+    if not right and model != "fluid_dynamics":
         curve = mirrored(curve)
-    greatest, dynamics = abs(spec("max_setpoint")), word(rotor, "type", f"{where}: rotor_dynamics")
-    if dynamics == "first_order":
-        return curve, greatest, of(rotor, "time_constant"), "time_constant"
-    if dynamics == "mechanical_pi" and rotor is not None:
-        if rotor.find("rotor_inertia") is not None:
-            return curve, greatest, of(rotor, "rotor_inertia") / of(rotor, "kp"), "rotor_inertia / kp"
-        return curve, greatest, None, "the inertia of the rotor is computed from its mesh"
-    if dynamics == "yoerger":
-        steady = steady_speed(of(rotor, "beta"), 0.0, of(rotor, "alpha"), where)
-        return curve, steady(greatest), None, "the dynamics yoerger have none"
-    if dynamics == "bessa":
-        steady = steady_speed(of(rotor, "kt") / of(rotor, "rm"), of(rotor, "kv1"), of(rotor, "kv2"), where)
-        return curve, steady(greatest), None, "the dynamics bessa have none"
-    if dynamics != "zero_order":
-        raise VehicleError(f"{where}: rotor_dynamics is '{dynamics}', expected zero_order, first_order, yoerger, bessa "
-                           "or mechanical_pi: correct it")  # fmt: skip
-    return curve, greatest, None, "the dynamics zero_order follow at once"
+
+    dynamics = "" if old else kind_of("rotor_dynamics")
+    greatest = of("specs@max_rpm") * math.pi / 30.0 if old else abs(of("specs@max_setpoint"))
+    lag: float | None = None
+    how = f"the dynamics {dynamics} have none"
+    if old:
+        lag, how = 1.0 / 8.0, "proportional gain 8 of its controller"
+    elif dynamics == "first_order":
+        lag, how = of("rotor_dynamics/time_constant"), "time_constant"
+    elif dynamics == "mechanical_pi":
+        how = "the inertia of the rotor is computed from its mesh"
+        if actuator.find("rotor_dynamics/rotor_inertia") is not None:
+            lag, how = of("rotor_dynamics/rotor_inertia") / of("rotor_dynamics/kp"), "rotor_inertia / kp"
+    elif dynamics == "yoerger":
+        greatest = steady_speed(of("rotor_dynamics/beta"), 0.0, of("rotor_dynamics/alpha"), where)(greatest)
+    elif dynamics == "bessa":
+        kt, rm, kv1, kv2 = (of(f"rotor_dynamics/{x}") for x in ("kt", "rm", "kv1", "kv2"))
+        greatest = steady_speed(kt / rm, kv1, kv2, where)(greatest)
+    elif dynamics != "zero_order":
+        known = "zero_order, first_order, yoerger, bessa or mechanical_pi"
+        raise VehicleError(f"{where}: rotor_dynamics is '{dynamics}', expected {known}: correct it")
+    put_curve(
+        draft, name, curve, curve.thrust(-greatest), curve.thrust(greatest), "greatest speed of the thruster"
+    )
+    if lag is None:
+        draft.guess(f"thrusters.{name}.time_constant", LAG, how)
+    else:
+        draft.put(f"thrusters.{name}.time_constant", lag, "derived", how)
 
 
 def _put_thruster(
@@ -744,33 +742,15 @@ def _put_thruster(
     draft.put(f"{path}.position", plain(flu_of_frd(pose.place)))
     draft.put(f"{path}.axis", plain(flu_of_frd(pose.turn[:, 0])), "derived", "x axis of its origin")
     if actuator.get("type") == "thruster":
-        curve, greatest, lag, how = _curve(actuator, draft.values["water"]["density"], where)
-        put_curve(
-            draft,
-            name,
-            curve,
-            curve.thrust(-greatest),
-            curve.thrust(greatest),
-            "greatest speed of the thruster",
-        )
-        if lag is None:
-            draft.guess(f"{path}.time_constant", LAG, how)
-        else:
-            draft.put(f"{path}.time_constant", lag, "derived", how)
+        _put_propeller(actuator, name, draft, where)
         return
-    specs, turns = actuator.find("specs"), 100.0 * math.pi
-    names = (
-        ("lower_limit", "upper_limit")
-        if actuator.get("type") == "push"
-        else ("lower_thrust_limit", "upper_thrust_limit")
-    )
-    ends = [
-        math.nan if specs is None or specs.get(x) is None else float(values(specs, x, 1, where)[0])
-        for x in names
-    ]
-    low, high = ends if ends[0] < ends[1] else (-math.inf, math.inf)
-    scale = (high if math.isfinite(high) else draft.values["body"]["mass"]) / turns**2
-    put_curve(draft, name, quadratic(abs(scale), abs(scale), where), low, high, "limits of the thruster")
+    specs, kind = actuator.find("specs"), "" if actuator.get("type") == "push" else "thrust_"
+    ends = [-math.inf, math.inf]
+    if specs is not None and specs.get(f"lower_{kind}limit") and specs.get(f"upper_{kind}limit"):
+        own = [float(values(specs, f"{end}_{kind}limit", 1, where)[0]) for end in ("lower", "upper")]
+        ends = own if own[0] < own[1] else ends
+    factor = abs(ends[1] if math.isfinite(ends[1]) else draft.values["body"]["mass"]) / (100.0 * math.pi) ** 2
+    put_curve(draft, name, quadratic(factor, factor, where), *ends, "limits of the thruster")
     for key in ("c_plus", "c_minus", "rpm_min", "rpm_max"):
         draft.guess(
             f"{path}.{key}",
@@ -849,10 +829,6 @@ def read_stonefish(path: Path, folders: Sequence[Path] = ()) -> Draft:
             raise VehicleError(f"{where}: unknown type '{kind}': correct it")
     if not draft.values.get("thrusters"):
         raise VehicleError(f"{path}: the robot has no thruster, expected one or more: add them")
-    if any(a.find("thrust_model[@type='fluid_dynamics']") is not None for a in robot.findall("actuator")):
-        draft.different.append(
-            "the thrust of Stonefish falls with the inflow and has a reaction torque; here it does not"
-        )
     solids = [solid for _, parts in links.values() for solid in parts]
     put_envelope(draft, [x.surface[0] * [1.0, -1.0, -1.0] for x in solids if x.surface is not None])
     put_controlled_axes(draft)
