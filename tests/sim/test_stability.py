@@ -12,6 +12,7 @@ from finssim.sim.stability import FreeMotion, stability
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import restoring
 from reference.imported import simulated
+from vehicles.minnow import MINNOW
 
 
 def course_matrix(vehicle, u):
@@ -71,3 +72,11 @@ def test_show_says_what_a_vehicle_does_without_control(capsys):
     assert boundary.run(app, ["vehicles", "show", "finsrov", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["without_control"]
     assert told["roll"][2] is None and 0.1 < told["course"][2] < 0.3
+
+
+@pytest.mark.slow
+def test_show_of_a_vehicle_whose_set_has_another_name(tmp_path, capsys):
+    """No model of the simulation has it: the rest is shown."""
+    (tmp_path / "minnow.yaml").write_text(MINNOW.replace("  calibrated:", "  mine:"))
+    assert boundary.run(app, ["vehicles", "show", str(tmp_path / "minnow.yaml")]) == 0
+    assert "Without control" not in capsys.readouterr().out

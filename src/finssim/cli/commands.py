@@ -176,14 +176,17 @@ def show_vehicle(
 
         for sensor in vehicle.perception:
             device_of(vehicle, sensor)
-    model = "calibrated" if "calibrated" in vehicle.hydrodynamics else next(iter(vehicle.hydrodynamics))
-    top, found = stability(vehicle, model)
+    model = next(
+        (name for name in ("calibrated", "simplified", "mesh") if name in vehicle.hydrodynamics), None
+    )
+    top, found = (None, {}) if model is None else stability(vehicle, model)
     motions = {n: (m.words(m.at_rest), m.words(m.at_top_speed), m.unstable_above) for n, m in found.items()}
     if as_json:
         print(json.dumps(vehicle_data(vehicle) | {"top_speed": top, "without_control": motions}))
     else:
         print_vehicle(vehicle, Console())
-        print_motions(top, motions, Console())
+        if top is not None:
+            print_motions(top, motions, Console())
     if picture is not None:
         from finssim.core.files import atomic_write
         from finssim.vehicles.show import draw_vehicle
