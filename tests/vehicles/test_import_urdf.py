@@ -346,8 +346,10 @@ def test_the_command_imports_and_lists(tmp_path, capsys):
     }
     rest = " | ".join(report["not read"])
     assert (
-        "uuv_fin (steering by fins comes with actuators)" in rest and "scaling_damping (uuv_simulator" in rest
+        "plugin fin (steering by fins comes with actuators)" in rest
+        and "scaling_damping (uuv_simulator" in rest
     )
+    assert vehicle.title == "saga (uuv_simulator)"
     assert vehicle.body.size.tolist() == [0.448, 0.2384, 0.28066] and vehicle.controlled_axes == (
         "surge",
         "heave",
@@ -390,6 +392,13 @@ def test_refusals_are_sentences(tmp_path, old, new, sentence):
     content = text(SAGA)
     assert old in content
     assert sentence in refusal(tmp_path, content.replace(old, new))
+
+
+def test_older_names_of_the_plugins_are_read(tmp_path):
+    """Without uuv_ and without ros."""
+    old = text(SAGA).replace("libuuv_", "lib").replace("_ros_plugin", "_plugin")
+    usual = read_foreign(write(tmp_path, text(SAGA)))
+    assert read_foreign(write(tmp_path, old, "old.xacro")).values["thrusters"] == usual.values["thrusters"]
 
 
 def test_other_dynamics_of_a_thruster(tmp_path):

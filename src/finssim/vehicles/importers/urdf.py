@@ -139,7 +139,7 @@ def read_urdf(path: Path, folders: Sequence[Path] = ()) -> Draft:
         draft = read_model(model, None, path, "URDF with plugins of gz-sim", inside)
     else:
         raise VehicleError(
-            f"{path}: has no hydrodynamics, expected a plugin Hydrodynamics of gz-sim or one of {', '.join(PLUGINS)}"
+            f"{path}: has no hydrodynamics, expected a plugin Hydrodynamics of gz-sim or {PLUGINS[0]} of uuv_simulator"
         )
     draft.not_read += left
     return draft

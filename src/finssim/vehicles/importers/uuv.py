@@ -48,8 +48,13 @@ __all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv"]
 
 Array = NDArray[np.float64]
 
-OBJECT, THRUSTER = "uuv_underwater_object", "uuv_thruster"
-PLUGINS = tuple(f"lib{name}{ros}_plugin.so" for name in (OBJECT, THRUSTER) for ros in ("_ros", ""))
+OBJECT, THRUSTER = "underwater_object", "thruster"
+PLUGINS = tuple(
+    f"lib{prefix}{name}{ros}_plugin.so"
+    for prefix in ("uuv_", "")  # older versions have no prefix
+    for name in (OBJECT, THRUSTER)
+    for ros in ("_ros", "")
+)
 """File names of the plugins that are read."""
 FACTORS = {
     f"{word}_{what}"
@@ -275,7 +280,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     plugins: dict[str, list[Element]] = {}
     for plugin in element.findall("plugin"):
         kind = plugin.get("filename", "").removeprefix("lib").removesuffix(".so").removesuffix("_plugin")
-        plugins.setdefault(kind.removesuffix("_ros"), []).append(plugin)
+        plugins.setdefault(kind.removesuffix("_ros").removeprefix("uuv_"), []).append(plugin)
     objects, thrusters = plugins.get(OBJECT, []), plugins.get(THRUSTER, [])
     if len(objects) != 1 or not thrusters:
         raise VehicleError(
@@ -358,7 +363,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     else:
         put_envelope(draft, [shape.corners for shape in shapes])
     put_controlled_axes(draft)
-    remarks = {"uuv_fin": " (steering by fins comes with actuators)"}
+    remarks = {"fin": " (steering by fins comes with actuators)"}
     note_rest(model, plugins, {OBJECT, THRUSTER}, remarks, turning)
     return draft
 

@@ -152,7 +152,7 @@ def packages_near(path: Path, folders: Iterable[Path] = ()) -> dict[str, Path]:
     """
     parents = path.resolve().parents
     home = next((i for i, folder in enumerate(parents) if (folder / "package.xml").is_file()), None)
-    around = [] if home is None else [parents[i] for i in range(home, min(home + 3, len(parents)))]
+    around = [] if home is None else [x for x in parents[home : home + 3] if x.name]
     found: dict[str, Path] = {}
     seen = 0
     for root in (*(folder.resolve() for folder in folders), *around):
