@@ -8,7 +8,7 @@ import pytest
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.sim.stability import FreeMotion, stability
+from finssim.sim.free_motion import FreeMotion, stability
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import restoring
 from reference.imported import simulated

@@ -164,7 +164,7 @@ def show_vehicle(
     """
     from rich.console import Console
 
-    from finssim.sim.stability import stability
+    from finssim.sim.free_motion import stability
     from finssim.vehicles import load_vehicle
     from finssim.vehicles.show import print_motions, print_vehicle, vehicle_data
 
