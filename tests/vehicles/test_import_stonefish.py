@@ -346,6 +346,8 @@ def test_the_command_imports_and_lists(tmp_path, capsys):
     ("old", "new", "sentence"),
     [
         ('type="box"', 'type="torus"', "type is 'torus'"),
+        ('physics="floating" buoyant', 'physics="foo" buoyant', "physics is 'foo'"),
+        ('type="compound" physics="submerged"', 'type="compound" physics="surface"', "physics is 'surface'"),
         ('radius="0.06"', 'radius="nan"', "radius is 'nan'"),
         ('radius="0.06"', 'radius="-1"', "expected more than 0"),
         ('<material name="Foam"/>', "", "material: name is missing"),

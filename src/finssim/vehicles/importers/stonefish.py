@@ -96,6 +96,11 @@ def refuse_strange(element: Element, known: set[str], where: str, draft: Draft) 
     refuse_unknown(element, {*known, *ros}, where)
 
 
+def scalar(element: Element | None, name: str, where: str, default: str | None = None) -> float:
+    """Return the number of an attribute, in its unit."""
+    return float(values(element, name, 1, where, default)[0])
+
+
 def pose_of(element: Element | None, where: str) -> LinkPose:
     """Return the pose `xyz`, `rpy` of an element, in axes forward, right, down."""
     if element is None:
@@ -386,7 +391,7 @@ def _primitive(
         size = values(dimensions, "xyz", 3, where) / 2.0
         mesh = box_mesh(size)
     elif kind == "cylinder":
-        size = np.array([float(values(dimensions, name, 1, where)[0]) for name in ("radius", "height")]) / [
+        size = np.array([scalar(dimensions, name, where) for name in ("radius", "height")]) / [
             1.0,
             2.0,
         ]
@@ -396,7 +401,7 @@ def _primitive(
         mesh = sphere_mesh(float(size[0]))
     if size.min() <= 0.0:
         raise VehicleError(f"{where}: its dimensions are {size.tolist()}, expected more than 0")
-    half = float(values(dimensions, "thickness", 1, where, "-1")[0]) / 2.0
+    half = scalar(dimensions, "thickness", where, "-1") / 2.0
     shell = 0.0 < half < size.min()
     volume, moments = _measure(kind, size + half if shell else size)
     moments = volume * moments
@@ -410,19 +415,17 @@ def _model(
     part: Element, files: ScenarioFiles, where: str
 ) -> tuple[float, Array, Array, LinkPose, tuple[Vertices, Faces]]:
     """Return volume, centre, moments per density, their axes, and mesh, of a part with a mesh, in the mesh's frame."""
-    physical = part.find("physical")
-    mesh = None if physical is None else physical.find("mesh")
+    mesh = part.find("physical/mesh")
     file = files.find(word(mesh, "filename", f"{where}: mesh"), where)
     try:
         vertices, faces = (load_obj if file.suffix.lower() == ".obj" else load_stl)(file)
     except MeshError as error:
         raise VehicleError(f"{where}: {error}") from None
-    vertices = vertices * float(values(mesh, "scale", 1, where, "1")[0])
+    vertices = vertices * scalar(mesh, "scale", where, "1")
     if mesh_volume(vertices, faces) < 0.0:
         faces = faces[:, ::-1]
     vertices, faces = refined(vertices, faces)
-    thickness = None if physical is None else physical.find("thickness")
-    shell = -1.0 if thickness is None else float(values(thickness, "value", 1, where)[0])
+    shell = scalar(part.find("physical/thickness"), "value", where, "-1")
     normal, area, place = face_geometry(vertices, faces)
     volume = mesh_volume(vertices, faces)
     if shell <= 0.0 and volume <= 1e-9 * float(area.sum()) and part.find("mass") is not None:
@@ -461,7 +464,7 @@ def solid_of(
         part: The element.
         place: Its pose.
         external: Whether the water meets it.
-        files: ScenarioFiles of the scenario.
+        files: Files of the scenario.
         densities: Material -> density [kg/m³].
         water: Density of the water [kg/m³].
         where: What a message calls it.
@@ -472,15 +475,12 @@ def solid_of(
         raise VehicleError(
             f"{where}: type is '{kind}', expected one of box, cylinder, sphere, model: change it"
         )
-    if kind == "model":
-        physical = part.find("physical")
-        outer = pose_of(None if physical is None else physical.find("origin"), f"{where}: origin of physical")
-        volume, centre, moments, axes, mesh = _model(part, files, where)
-    else:
-        outer = pose_of(part.find("origin"), f"{where}: origin")
-        volume, centre, moments, axes, mesh = _primitive(part, kind, where)
-    frame = outer.after(axes)
-    lift = place.after(outer).turn @ centre + place.after(outer).place
+    if mode not in ("submerged", "floating", "surface", "aerodynamic", "disabled"):
+        raise VehicleError(f"{where}: physics is '{mode}', expected submerged or floating: change it")
+    outer = pose_of(part.find("physical/origin" if kind == "model" else "origin"), f"{where}: origin")
+    form = _model(part, files, where) if kind == "model" else _primitive(part, kind, where)
+    volume, centre, moments, axes, mesh = form
+    frame, at = outer.after(axes), place.after(outer)
 
     # Its shape in the water, in the axes of its moments.
     points = (mesh[0] - axes.place) @ axes.turn
@@ -496,23 +496,20 @@ def solid_of(
     added, turning = added_mass(fit, size, water)
     Cd = np.abs(frame.turn @ Cd)
     coefficients = np.array([Cd, 0.1 * Cd])
-    given = part.find("hydrodynamics")
     for row, name in enumerate(("quadratic_drag", "viscous_drag")):
-        if given is not None and given.get(name):
-            own = values(given, name, 3, where)
-            coefficients[row] = own if own.min() >= 0.0 else coefficients[row]
+        own = values(part.find("hydrodynamics"), name, 3, where, "-1 -1 -1")
+        coefficients[row] = own if own.min() >= 0.0 else coefficients[row]
 
     # Its mass: of its material, or as given.
-    mass_of, inertia_of, cg = part.find("mass"), part.find("inertia"), part.find("cg")
-    mass = -1.0 if mass_of is None else float(values(mass_of, "value", 1, where)[0])
+    mass, cg = scalar(part.find("mass"), "value", where, "-1"), part.find("cg")
+    own = values(part.find("inertia"), "xyz", 3, where, "0 0 0")
     material = word(part.find("material"), "name", f"{where}: material")
-    if material not in densities and (mass <= 0.0 or (cg is not None and inertia_of is None)):
+    if material not in densities and (mass <= 0.0 or (cg is not None and not own.any())):
         raise VehicleError(
             f"{where}: material '{material}' is in no file that is read: give the scenario that includes it, or a mass"
         )
     density = densities.get(material, 1.0)
     own_mass, moments = density * volume, density * moments
-    own = np.zeros(3) if inertia_of is None else values(inertia_of, "xyz", 3, where)
     if mass > 0.0 and not own.any() and cg is None:
         moments = moments * mass / own_mass
     elif own.any():
@@ -520,25 +517,25 @@ def solid_of(
     if cg is not None:
         frame = pose_of(cg, f"{where}: cg")
     wet = mode in ("submerged", "floating")
-    surface = None
-    if external and wet:
-        at = place.after(outer)
-        surface = mesh[0] @ at.turn.T + at.place, mesh[1]
     return Solid(
         mass if mass > 0.0 else own_mass,
         volume if wet and word(part, "buoyant", where, "true").lower() in ("true", "1") else 0.0,
-        lift,
+        at.turn @ centre + at.place,
         place.after(frame),
         moments,
         (float(added.mean()), turning) if external and mode == "submerged" else (0.0, np.zeros(3)),
         place.turn,
         coefficients,
-        surface,
+        (mesh[0] @ at.turn.T + at.place, mesh[1]) if external and wet else None,
     )
 
 
 def solids_of(link: Element, pose: LinkPose, *context: object, where: str) -> list[Solid]:
     """Return the parts of a link in the frame in which it has a pose; `context` is that of `solid_of`."""
+    if word(link, "physics", where, "submerged") not in ("submerged", "floating"):
+        raise VehicleError(
+            f"{where}: physics is '{link.get('physics')}', expected submerged or floating: change it"
+        )
     if word(link, "type", where) != "compound":
         return [solid_of(link, pose, True, *context, where)]
     refuse_unknown(link, SOLID, where)
@@ -613,12 +610,9 @@ def _links(
     elements = {link.get("name", ""): link for link in [base, *robot.findall("link")]}
     poses = {base.get("name", ""): IDENTITY}
     start = robot.find("world_transform")
-    angles = (
-        []
-        if start is None or "$" in start.get("rpy", "")
-        else values(start, "rpy", 3, f"{where}: world_transform")
-    )
-    upright = quat_to_matrix(quat_from_euler(*angles[:2], 0.0)) if len(angles) else np.eye(3)
+    known = start is not None and "$" not in start.get("rpy", "")
+    angles = values(start, "rpy", 3, f"{where}: world_transform") if known else np.zeros(3)
+    upright = quat_to_matrix(quat_from_euler(angles[0], angles[1], 0.0))
     if upright[2, 2] < 0.0:
         poses = {base.get("name", ""): LinkPose(upright, np.zeros(3))}
         draft.different.append("base_link is upside down in the scenario: the body's axes are level there")
@@ -659,7 +653,7 @@ def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> No
 
     def of(place: str, default: str | None = None) -> float:
         tag, _, attribute = place.partition("@")
-        return float(values(actuator.find(tag), attribute or "value", 1, f"{where}: {tag}", default)[0])
+        return scalar(actuator.find(tag), attribute or "value", f"{where}: {tag}", default)
 
     def kind_of(tag: str) -> str:
         return word(actuator.find(tag), "type", f"{where}: {tag}")
@@ -747,7 +741,7 @@ def _put_thruster(
     specs, kind = actuator.find("specs"), "" if actuator.get("type") == "push" else "thrust_"
     ends = [-math.inf, math.inf]
     if specs is not None and specs.get(f"lower_{kind}limit") and specs.get(f"upper_{kind}limit"):
-        own = [float(values(specs, f"{end}_{kind}limit", 1, where)[0]) for end in ("lower", "upper")]
+        own = [scalar(specs, f"{end}_{kind}limit", where) for end in ("lower", "upper")]
         ends = own if own[0] < own[1] else ends
     factor = abs(ends[1] if math.isfinite(ends[1]) else draft.values["body"]["mass"]) / (100.0 * math.pi) ** 2
     put_curve(draft, name, quadratic(factor, factor, where), *ends, "limits of the thruster")
@@ -805,12 +799,12 @@ def read_stonefish(path: Path, folders: Sequence[Path] = ()) -> Draft:
     oceans = [x for e in elements if e.tag == "environment" for x in e.iter("water") if x.get("density")]
     draft.guess("water.gravity", GRAVITY, "a scenario gives none: that of Stonefish")
     if oceans:
-        draft.put("water.density", float(values(oceans[0], "density", 1, f"{path}: water")[0]))
+        draft.put("water.density", scalar(oceans[0], "density", f"{path}: water"))
     else:
         draft.guess("water.density", DENSITY, "the file gives none: that of Stonefish")
     water = draft.values["water"]["density"]
     densities = {
-        x.get("name", ""): float(values(x, "density", 1, f"{path}: material '{x.get('name', '')}'")[0])
+        x.get("name", ""): scalar(x, "density", f"{path}: material '{x.get('name', '')}'")
         for e in elements
         if e.tag == "materials"
         for x in e.findall("material")
