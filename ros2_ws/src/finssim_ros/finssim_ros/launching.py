@@ -20,7 +20,7 @@ FILE = "params_file"
 
 def description(graph):
     """Return the launch description of a graph; an argument left empty leaves a parameter to the file."""
-    options = read("finssim.extensions.ros2.up:Options").options
+    options = list(read("finssim.extensions.ros2.up:Options").all_options())
     meanings = {option.name: f"{option.metavar or 'NUMBER'}: {option.help}" for option in options}
     declared = {name: meanings[name] for name in launch_arguments(graph)}
     declared[FILE] = "FILE: Your own parameter file, in place of the package's."
