@@ -110,14 +110,12 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
     if path.suffix in (".yaml", ".yml") or path.name != text or foreign:
         path = path if beside is None or path.is_absolute() else beside / path
         if not path.is_file():
-            raise VehicleError(
-                f"{text}: no such file: give the path of a vehicle file, or one of {_available()}"
-            )
+            raise VehicleError(_no_file(text))
         return path, text
     if beside is not None and (beside / f"{text}.yaml").is_file():
         return beside / f"{text}.yaml", f"{text}.yaml"
     if text not in VEHICLES:
-        raise VehicleError(_unknown(text))
+        raise VehicleError(_no_file(text) if path.suffix else _unknown(text))
     try:
         return VEHICLES[text], f"catalogue/{text}.yaml"
     except RegistryError as error:
@@ -180,9 +178,11 @@ def check_registered(name: str, path: Any) -> None:
         raise VehicleError(f"{name} is {str(path)!r}, expected the pathlib.Path of a file {name}.yaml")
 
 
+def _no_file(name: str) -> str:
+    return f"{name}: no such file: give the path of a vehicle file, or one of {_available()}"
+
+
 def _unknown(name: str) -> str:
-    if Path(name).suffix:
-        return f"{name}: no such file: give the path of a vehicle file, or one of {_available()}"
     return f"unknown vehicle '{name}'{did_you_mean(name, catalogue())} available: {_available()}"
 
 
