@@ -9,7 +9,7 @@ import pytest
 
 from finssim.core.rotations import quat_from_euler, wrap_angle
 from finssim.localization import LocalizationError, localize
-from finssim.localization.detection.detections import Frame, write_detections
+from finssim.localization.detection.detections import Frame, read_detections, write_detections
 from finssim.localization.detection.families import printable
 from finssim.localization.localize import prior_sources
 from finssim.localization.overhead_camera import write_pool
@@ -178,6 +178,20 @@ def test_a_wrong_imu_file_is_refused(files, text, words):
     (files / "imu.csv").write_text(text)
     with pytest.raises(LocalizationError, match=words):
         located(files, depth=0.5, imu=files / "imu.csv")
+
+
+def test_corners_in_another_order_give_the_same_poses(files):
+    """As AprilTag's own library lists them: bottom left first, counter-clockwise; the vehicle has two tags."""
+    options = {"depth": files / "depth.csv", "imu": files / "imu.csv"}
+    _, expected = located(files, **options)
+    frames = [
+        replace(frame, detections=tuple(replace(d, corners=d.corners[::-1]) for d in frame.detections))
+        for frame in read_detections(files / "tags.csv")
+    ]
+    write_detections(frames, files / "tags.csv")
+    found, rows = located(files, **options)
+    assert rows == expected and errors(rows)[0] < 0.01
+    assert any("corners are read as bottom-left, bottom-right" in note for note in found.summary["notes"])
 
 
 def test_tags_of_another_family_are_not_ours(files):
