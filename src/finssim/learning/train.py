@@ -30,7 +30,7 @@ class TrainingError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings:
-    """What a policy is trained with: the vehicle, how it acts and is observed, and the learner."""
+    """Settings of a training: the vehicle, its actions and observations, and the learner."""
 
     learner: str | None = None
     """(NAME) Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo, several

@@ -25,7 +25,7 @@ HEAD = 1 << 16
 
 @dataclass(frozen=True)
 class Request:
-    """What the user says about a log."""
+    """Options of the user for a log."""
 
     mapped: ColumnMap
     """Map file; an empty one if there is none."""

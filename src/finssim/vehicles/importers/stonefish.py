@@ -216,7 +216,7 @@ class Solid:
     turn: Array
     """Axes of the coefficients of drag [-], (3, 3)."""
     coefficients: Array
-    """Those of drag, then those of friction [-], (2, 3)."""
+    """Coefficients of drag, then of friction [-], (2, 3)."""
     surface: tuple[Vertices, Faces] | None
     """Surface that the water meets [m]; None: it meets none."""
 
@@ -723,7 +723,7 @@ def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> No
 def _put_thruster(
     actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
 ) -> None:
-    """Set a thruster, or a force of limited size that stands for one."""
+    """Set a thruster, or a force of limited size in its place."""
     refuse_strange(actuator, ACTUATOR, where, draft)
     name = re.sub(r"[^A-Za-z0-9_-]", "_", actuator.get("name", "") or "thruster")[:64]
     link = word(actuator.find("link"), "name", f"{where}: link")
