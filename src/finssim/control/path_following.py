@@ -133,7 +133,7 @@ class LineOfSight:
     """Greatest slope [rad]."""
 
     def reset(self, n: int = 1) -> Array:
-        """Return the integrals at the start, (n, 2)."""
+        """Return the integrals at the start [m s], (n, 2)."""
         return np.zeros((n, 2))
 
     def aim(self, memory: Array, errors: PathErrors, period: float) -> tuple[tuple[Array, Array], Array]:
@@ -179,7 +179,7 @@ class SeabedFollower:
         It is the own depth until the seabed was seen.
 
         Args:
-            memory: From `reset` or the call before.
+            memory: From `reset` or the call before [m, m/s], (n, 2).
             depth: Of the vehicle below the surface [m], (n,).
             altitude: What the altimeter measured above the seabed [m], (n,); not finite where it saw nothing.
             period: Time since the call before [s].
