@@ -195,18 +195,18 @@ def test_a_torpedo_reaches_the_speeds_of_pythonvehiclesimulator(tmp_path, words)
 
 @pytest.mark.slow
 def test_a_torpedo_goes_straight_where_the_munk_moment_is_left_out(tmp_path):
-    """Small sway, yaw, heave and pitch at 2 m/s die out as the origin's, but for cross flow of sway and yaw at once."""
+    """Sway and yaw, heave and pitch at 2 m/s die out as the origin's: within 1 % of each velocity's greatest."""
     vehicle, origin = read(tmp_path, pvs(REMUS), "remus.py").vehicle(tmp_path), Torpedo()
-    nu = np.array([[2.0, 0.02, 0, 0, 0, 0.05], [2.0, 0, 0.02, 0, 0.05, 0]])
-    tau = np.zeros((2, 6))
+    nu = np.array([[2.0, 0.2, 0, 0, 0, 0.3], [2.0, 0, 0.2, 0, 0.3, 0], [2.0, -0.2, 0.2, 0, 0.1, 0.3]])
+    tau = np.zeros((3, 6))
     tau[:, 0] = 0.5 * 1026 * 0.42 * np.pi * 0.095**2 * 4.0
-    upright = np.repeat(np.eye(3)[None], 2, axis=0)
+    upright = np.repeat(np.eye(3)[None], 3, axis=0)
     found = simulated(vehicle, upright, nu, tau, 2.0)
     expected = origin.run(upright, nu, tau, 2.0)[1][::5]
-    for k, axes in enumerate(([1, 5], [2, 4])):
+    for k, axes in enumerate(([0, 1, 5], [0, 2, 4], [0, 1, 2, 4, 5])):
         scale = np.abs(expected[:, k, axes]).max(axis=0)
-        assert (np.abs(found - expected)[:, k, axes] < 0.06 * scale).all()
-    assert abs(found[-1, 0, 5]) < 0.01
+        assert (np.abs(found - expected)[:, k, axes] < 0.01 * scale).all()
+    assert abs(found[-1, 0, 5]) < 0.1
 
 
 def test_free_decay_of_a_torpedo_in_roll(tmp_path):

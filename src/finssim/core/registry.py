@@ -261,7 +261,10 @@ SENSORS = Family(
 
 TERMS = Family(
     "term",
-    {"surge_damping": "finssim.physics.terms.surge_damping:SURGE_DAMPING"},
+    {
+        name: f"finssim.physics.terms.{name}:{name.upper()}"
+        for name in ("surge_damping", "cross_flow_drag", "lift_drag", "munk_relief")
+    },
     check="finssim.physics.terms.composed:check_registered",
 )
 """Key in a hydrodynamic set of a vehicle file -> its `finssim.physics.terms.Term`."""

@@ -284,18 +284,19 @@ def _put_hydrodynamics(names: _Names, draft: Draft) -> None:
         for f in ("forceLiftDrag", "crossFlowDrag")
     )
     if len(lift) in (3, 4):
-        torpedo.add_drag(draft, *torpedo.lift_drag(*lift))
+        torpedo.put_lift_drag(draft, *lift)
     if len(flow) == 3:
-        torpedo.add_drag(draft, torpedo.cross_flow(*flow), np.zeros((6, 6)))
+        torpedo.put_cross_flow(draft, *flow)
     elif flow:
         draft.different.append(f"cross-flow drag of the model {flow[-1]} is left out: only Hoerner's is read")
     if any({(4, 0), (4, 2), (5, 0), (5, 1)} <= cleared for cleared in found.cleared.values()):
-        torpedo.remove_munk(draft)
+        torpedo.put_munk_relief(draft)
     words = {key: names.first(key) for key in (*torpedo.PROPELLER, "nMax")} | {"L": names.first("length")}
     if None not in words.values():
         torpedo.put_propeller(draft, words | {"T_n": names.first("T_n")})
-    if not any(
-        np.any(draft.values["hydrodynamics"]["calibrated"][f"{k}_damping"]) for k in ("linear", "quadratic")
+    hull = draft.values["hydrodynamics"]["calibrated"]
+    if "cross_flow_drag" not in hull and not any(
+        np.any(hull[f"{k}_damping"]) for k in ("linear", "quadratic")
     ):
         raise VehicleError(
             f"{names.label}: no damping is read, expected Xu or Xuu and so on, or a matrix D: add them"

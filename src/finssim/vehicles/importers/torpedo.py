@@ -6,7 +6,7 @@ Their equations, x forward, y right, z down, b span, S area of the hull, alpha a
     Y = -rho/2 T Cd sum_k |v + x_k r| (v + x_k r) dx,  N = -rho/2 T Cd sum_k x_k |v + x_k r| (v + x_k r) dx
     X = (1 - t) rho D⁴ (KT_0 n|n| + (KT_max - KT_0) / Ja_max (1 - w) U / D |n|)                n in 1/s
 
-A vehicle file holds these along each axis alone and, in heave, for small alpha at any forward speed.
+The terms `lift_drag`, `cross_flow_drag` and `munk_relief` of a vehicle file hold the hull.
 """
 
 from __future__ import annotations
@@ -18,28 +18,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.vehicles.importers.draft import LAG, Draft
-from finssim.vehicles.importers.rigid import flu_of_frd, plain
 
 __all__ = [
     "PROPELLER",
-    "add_drag",
-    "cross_flow",
     "guess_thruster",
-    "lift_drag",
+    "put_cross_flow",
+    "put_lift_drag",
+    "put_munk_relief",
     "put_propeller",
-    "remove_munk",
 ]
 
 Array = NDArray[np.float64]
 
+SET = "hydrodynamics.calibrated"
+"""Path of the hydrodynamic set that importers write."""
 PROPELLER = ("D_prop", "t_prop", "KT_0", "KT_max", "Ja_max")
 """Words of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
 RHO, WAKE, OSWALD = 1026.0, 0.056, 0.7
 """Density [kg/m³] that the library's drag has, wake fraction and Oswald's efficiency of PythonVehicleSimulator [-]."""
 RPM = 3000.0
 """Guessed shaft speed at the limit of a thruster [rpm]."""
-STRIPS = np.arange(21) / 20.0 - 0.5
-"""Places of the strips over the length [-]."""
 HOERNER = (
     (0.0109, 0.1766, 0.3530, 0.4519, 0.4728, 0.4929, 0.4933, 0.5585, 0.6464, 0.8336, 0.9880, 1.3081, 1.6392, 1.8600,
      2.3129, 2.6000, 3.0088, 3.4508, 3.7379, 4.0031),
@@ -90,75 +88,47 @@ def slow_damping(mass: Array, times: Array, ratios: Array, stiffness: float) -> 
     return np.array([mass[0] / times[0], *(mass[1:3] / times[1]), *swing, mass[5] / times[2]])
 
 
-def lift_drag(span: float, area: float, drag: float, efficiency: float = OSWALD) -> tuple[Array, Array]:
-    """Return D2 [N s²/m²] and Du [N s²/m²] of lift and drag of a hull, (6, 6) each, x forward, y right, z down.
+def put_lift_drag(draft: Draft, span: float, area: float, drag: float, efficiency: float = OSWALD) -> None:
+    """Set lift and drag of a hull by its angle of attack.
 
     Args:
+        draft: Draft with hydrodynamics.
         span: Of the hull as a wing [m].
         area: Of the hull as a wing [m²].
         drag: CD_0 [-].
         efficiency: Oswald's [-].
     """
-    D2, Du = np.zeros((6, 6)), np.zeros((6, 6))
     ratio, q = span**2 / area, 0.5 * RHO * area
     slope = math.pi * ratio / (1.0 + math.sqrt(1.0 + (ratio / 2.0) ** 2))
-    D2[0, 0] = q * drag
-    D2[2, 2] = q * (drag + (slope * math.pi / 2.0) ** 2 / (math.pi * efficiency * ratio))
-    Du[2, 2] = q * (slope + drag)
-    return D2, Du
+    induced = q * slope**2 / (math.pi * efficiency * ratio)
+    found = {"drag": q * drag, "lift": q * slope, "induced": induced}
+    for key, value in found.items():
+        draft.put(f"{SET}.lift_drag.{key}", value, "derived", "lift and drag of the hull as a wing")
+    draft.different.append(
+        "lift and induced drag of the hull go with the sine of the angle of attack, in the file with the angle"
+    )
 
 
-def cross_flow(length: float, beam: float, draught: float) -> Array:
-    """Return D2 of cross-flow drag in sway [N s²/m²] and yaw [N m s²], (6, 6).
+def put_cross_flow(draft: Draft, length: float, beam: float, draught: float) -> None:
+    """Set cross-flow drag in sway and yaw: 21 strips, a twentieth of the length each, reach beyond the hull's ends.
 
     Args:
+        draft: Draft with hydrodynamics.
         length: Of the hull [m].
         beam: Of the hull [m].
         draught: Height of the hull [m].
     """
-    D2, x = np.zeros((6, 6)), length * STRIPS
-    factor = 0.5 * RHO * draught * float(np.interp(beam / (2.0 * draught), *HOERNER)) * length / 20.0
-    D2[1, 1] = factor * len(x)
-    D2[5, 5] = factor * float(np.sum(np.abs(x) ** 3))
-    return D2
+    across = 0.5 * RHO * draught * float(np.interp(beam / (2.0 * draught), *HOERNER))
+    for key, value in (("length", 1.05 * length), ("center", 0.0), ("sway", across)):
+        draft.put(f"{SET}.cross_flow_drag.{key}", value, "derived", "cross flow past 21 strips of the hull")
 
 
-def add_drag(draft: Draft, D2: Array, Du: Array) -> None:
-    """Add quadratic damping (6, 6) [N s²/m², N m s²] and surge damping (6, 6) [N s²/m², N s²/rad] of a hull.
-
-    Args:
-        draft: Draft with hydrodynamics.
-        D2: Along each axis alone [N s²/m², N m s²], x forward, y right, z down, (6, 6).
-        Du: At forward speed [N s²/m², N s²/rad], in the same axes, (6, 6).
-    """
-    chosen = draft.values["hydrodynamics"]["calibrated"]
-    for key, matrix in (("quadratic_damping", D2), ("surge_damping", Du)):
-        if np.any(matrix):
-            total = flu_of_frd(matrix) + np.array(chosen.get(key, np.zeros((6, 6))))
-            draft.put(
-                f"hydrodynamics.calibrated.{key}",
-                plain(total),
-                "derived",
-                "lift, drag and cross flow of the hull",
-            )
-    sentence = (
-        "drag of the hull is exact along each axis alone; where two velocities act, small angles are assumed"
-    )
-    if sentence not in draft.different:
-        draft.different.append(sentence)
-
-
-def remove_munk(draft: Draft) -> None:
-    """Cancel, at forward speed, the terms of C_A in pitch and yaw that these programs set to 0.
-
-    -C_A nu has (A33 - A11) u w in pitch and (A11 - A22) u v in yaw, A11 u q in heave and -A11 u r in sway.
-    """
+def put_munk_relief(draft: Draft) -> None:
+    """Cancel the products of two velocities in C_A that these programs set to 0."""
     A = np.diag(np.array(draft.values["hydrodynamics"]["calibrated"]["added_mass"]))
-    Du = np.zeros((6, 6))
-    Du[4, 2], Du[5, 1], Du[2, 4], Du[1, 5] = A[2] - A[0], A[0] - A[1], A[0], -A[0]
-    add_drag(draft, np.zeros((6, 6)), Du)
+    draft.put(f"{SET}.munk_relief", A[:3].tolist(), "derived", "the file sets these terms of C_A to 0")
     draft.different.append(
-        "the Munk moment, which the file sets to 0, is cancelled at forward speed; a real hull has it, and needs fins"
+        "the Munk moment, which the file sets to 0, is cancelled; a real hull has it, and needs fins"
     )
 
 
@@ -170,7 +140,8 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
         words: Numbers of `PROPELLER`, `nMax` [rpm], `L` [m] and, where given, `T_n` [s] and `w` [-].
     """
     n, D = words["nMax"] / 60.0, words["D_prop"]
-    drag = draft.values["hydrodynamics"]["calibrated"]["quadratic_damping"][0][0]
+    hull = draft.values["hydrodynamics"]["calibrated"]
+    drag = hull["quadratic_damping"][0][0] + hull.get("lift_drag", {}).get("drag", 0.0)
     scale = (1.0 - words["t_prop"]) * draft.values["water"]["density"] * D**4
     fall = scale * (words["KT_0"] - words["KT_max"]) / words["Ja_max"] * (1.0 - words.get("w", WAKE)) / D * n
     rest = scale * words["KT_0"] * n**2
