@@ -7,7 +7,7 @@ import warp as wp
 
 from finssim.core.registry import TERMS
 from finssim.physics.terms.composed import composed, layout, parameter_row
-from finssim.physics.types import mat66, vec6
+from finssim.physics.types import mat66, vec6, vec8
 from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.terms import unit_of
@@ -53,7 +53,7 @@ def evaluated(term, role, numbers, nu):
     @wp.kernel(enable_backward=False, module="unique")
     def sample(x: wp.array3d(dtype=float), nu_r: wp.array(dtype=vec6), out: wp.array(dtype=vec6)):
         i = wp.tid()
-        out[i] = function(x, 0, 0, nu_r[i], wp.vec3(0.0, 0.0, 1.0), 5.0, 1000.0)
+        out[i] = function(x, 0, 0, nu_r[i], wp.vec3(0.0, 0.0, 1.0), 5.0, 1000.0, vec8())
 
     row = np.asarray(parameter_row((term,), numbers), np.float32)[None, None]
     out = wp.zeros(len(nu), dtype=vec6, device="cpu")

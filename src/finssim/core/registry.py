@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "ACTUATORS",
     "COMMANDS",
     "FAMILIES",
     "IMPORTERS",
@@ -269,6 +270,17 @@ TERMS = Family(
 )
 """Key in a hydrodynamic set of a vehicle file -> its `finssim.physics.terms.Term`."""
 
+ACTUATORS = Family(
+    "actuator",
+    {
+        name: f"finssim.physics.actuators.{name}:{name.upper()}"
+        for name in ("propeller", "fin", "buoyancy", "moving_mass", "gimbal")
+    },
+    check="finssim.physics.terms.composed:check_actuator",
+)
+"""`kind` of a section under `actuators` in a vehicle file -> its `finssim.vehicles.actuators.ActuatorKind`; `propeller`
+is that of the sections under `thrusters`."""
+
 LEARNERS = Family(
     "learner",
     {
@@ -318,5 +330,15 @@ IMPORTERS = Family(
 """What is imported, a dot, and the format -> the importer: of vehicles a `VehicleImporter`, of logs a `LogImporter`, of
 lenses a `LensImporter`."""
 
-FAMILIES: tuple[Family, ...] = (VEHICLES, TASKS, SENSORS, TERMS, LEARNERS, COMMANDS, WORLDS, IMPORTERS)
+FAMILIES: tuple[Family, ...] = (
+    VEHICLES,
+    TASKS,
+    SENSORS,
+    TERMS,
+    ACTUATORS,
+    LEARNERS,
+    COMMANDS,
+    WORLDS,
+    IMPORTERS,
+)
 """All families."""

@@ -4,7 +4,7 @@
 
 import warp as wp
 
-from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6, vec6d
+from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6, vec6d, vec9
 
 
 @wp.func
@@ -41,6 +41,12 @@ def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) 
     v = linear(nu)
     omega = angular(nu)
     return join(mass * (v + wp.cross(omega, r_g)), inertia * omega + mass * wp.cross(r_g, v))
+
+
+@wp.func
+def symmetric_inertia(x: vec9) -> wp.mat33:
+    """Matrix of the last six numbers of x [kg m²]: xx, yy, zz, xy, xz, yz."""
+    return wp.mat33(x[3], x[6], x[7], x[6], x[4], x[8], x[7], x[8], x[5])
 
 
 @wp.func

@@ -31,6 +31,21 @@ def admissible(command: vec8, lower: vec8, upper: vec8, dead_minus: vec8, dead_p
 
 
 @wp.func
+def beyond_play(target: vec8, x: vec8, play: vec8) -> vec8:
+    """Return the point nearest to x within `play` of the target, where a drive with play comes to rest.
+
+    Args:
+        target: Commanded values [N, rad, m³ or m].
+        x: Values now, in the same units.
+        play: Half width of the dead band or backlash, in the same units.
+
+    Returns:
+        In the same units.
+    """
+    return wp.min(wp.max(x, target - play), target + play)
+
+
+@wp.func
 def steps_ago(age: float, rate: float) -> int:
     """Return the number of control steps at `rate` [1/s] since the command that is `age` [s] old was issued."""
     return wp.max(int(wp.ceil(age * rate - 1.0e-4)), 0)

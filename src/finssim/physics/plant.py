@@ -39,6 +39,7 @@ class VehicleParameters:
     force_max: vec8  # [N]
     dead_minus: vec8  # commands between dead_minus and dead_plus give nothing [N]
     dead_plus: vec8  # [N]
+    play: vec8  # a target no farther than this does not move the actuator, in its unit
     gain: vec8  # ratio of delivered to nominal thrust; 0 is a dead thruster
     time_constant: vec8  # [s]
     slew: vec8  # [N/s] or, for a speed lag, [rad/s²]
@@ -54,7 +55,7 @@ class VehicleParameters:
 class VehicleCommand:
     """Thruster commands and external wrench of one vehicle."""
 
-    thrust: vec8  # commanded thruster force [N]
+    thrust: vec8  # commanded thruster force [N]; of other actuators the commanded value [rad, m³ or m]
     disturbance: vec6  # extra wrench about the body origin, body frame [N, N m]
 
 

@@ -10,6 +10,7 @@ MAX_THRUSTERS = 8
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec8 = wp.types.vector(length=MAX_THRUSTERS, dtype=wp.float32)
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 mat68 = wp.types.matrix(shape=(6, MAX_THRUSTERS), dtype=wp.float32)

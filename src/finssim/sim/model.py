@@ -16,7 +16,7 @@ from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
 from finssim.physics.plant import VehicleParameters, refresh_plant
 from finssim.physics.tether import Tether
-from finssim.physics.types import vec6, vec8
+from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 from finssim.physics.water import WaterArrays
 from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.simulator import checked_choice, find_device
@@ -33,6 +33,7 @@ def acceleration(
     nu: ArrayLike,
     tau: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     *,
+    actuators: ArrayLike | None = None,
     hydrodynamics: str = "calibrated",
 ) -> NDArray[np.float64]:
     """Return the acceleration of a vehicle in still, open water.
@@ -47,12 +48,14 @@ def acceleration(
         eta: Position of the body origin, world frame [m], and attitude, (..., 6) with roll, pitch and yaw [rad], or
             (..., 7) with a quaternion body to world, xyzw. The world's z is up, and 0 on the water surface.
         nu: Velocity of the body origin, body frame [m/s, rad/s], (..., 6).
-        tau: Wrench of the actuators and of everything else from outside, about the body origin, body frame [N, N m],
+        tau: Wrench of everything else from outside, about the body origin, body frame [N, N m],
             (..., 6).
+        actuators: Steady value of each actuator, (..., n) in the order of `Vehicle.channel_names`: static thrust [N]
+            of a thruster, angle [rad], volume [m³] or position [m] of another; all 0 if None.
         hydrodynamics: Hydrodynamic model: calibrated, mesh or simplified.
 
     Returns:
-        nu_dot, body frame [m/s², rad/s²], (..., 6), broadcast over the leading axes of the three.
+        nu_dot, body frame [m/s², rad/s²], (..., 6), broadcast over the leading axes of the arguments.
 
     Raises:
         SimulatorError: A shape does not fit, a number is not finite, a quaternion has no length, or the vehicle has no
@@ -62,14 +65,16 @@ def acceleration(
     start_warp()
     body = load_vehicle(vehicle)
     checked_choice(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
+    n = len(body.channel_names)
     arrays = {"eta": (eta, (6, 7)), "nu": (nu, (6,)), "tau": (tau, (6,))}
+    arrays["actuators"] = (np.zeros(n) if actuators is None else actuators, (n,))
     checked = [_checked(name, value, lengths) for name, (value, lengths) in arrays.items()]
     try:
         shape = np.broadcast_shapes(*(array.shape[:-1] for array in checked))
     except ValueError:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(arrays, checked, strict=True))
         raise SimulatorError(f"the leading axes of {shapes} do not broadcast") from None
-    pose, velocity, wrench = (
+    pose, velocity, wrench, values = (
         np.broadcast_to(array, (*shape, array.shape[-1])).reshape(-1, array.shape[-1]) for array in checked
     )
     if pose.shape[1] == 6:
@@ -79,7 +84,11 @@ def acceleration(
         if not (length > 0.0).all():
             raise SimulatorError("eta holds a quaternion of length 0, expected 1 (xyzw)")
         quaternion = pose[:, 3:] / length
-    columns = ((pose[:, :3], wp.vec3), (quaternion, wp.quat), (velocity, vec6), (wrench, vec6))
+    channels = np.zeros((len(values), MAX_THRUSTERS))
+    channels[:, :n] = values
+    columns = (
+        (pose[:, :3], wp.vec3), (quaternion, wp.quat), (velocity, vec6), (wrench, vec6), (channels, vec8),
+    )  # fmt: skip
     inputs = [wp.array(column.astype(np.float32), dtype=kind, device="cpu") for column, kind in columns]
     nu_dot = wp.zeros(len(pose), dtype=vec6, device="cpu")
     kernel, parameters = _model(body, hydrodynamics)
@@ -123,6 +132,7 @@ def _acceleration_kernel(model: str, terms: tuple[Any, ...]) -> wp.Kernel:
         quaternion: wp.array(dtype=wp.quat),
         nu: wp.array(dtype=vec6),
         tau: wp.array(dtype=vec6),
+        values: wp.array(dtype=vec8),
         plant: wp.array2d(dtype=VehicleParameters),
         extra: wp.array3d(dtype=float),
         hull: HullMesh,
@@ -131,9 +141,10 @@ def _acceleration_kernel(model: str, terms: tuple[Any, ...]) -> wp.Kernel:
         nu_dot: wp.array(dtype=vec6),
     ):
         i = wp.tid()
+        pushed = plant[0, 0].G * values[i]
         motion = motion_at(
-            plant, extra, hull, water, tether, 0, 0, position[i], quaternion[i], nu[i], nu[i], vec8(), vec6(), tau[i],
-            0.0, 0.0, 0.0,
+            plant, extra, hull, water, tether, 0, 0, position[i], quaternion[i], nu[i], nu[i], values[i], pushed,
+            tau[i], 0.0, 0.0, 0.0,
         )  # fmt: skip
         nu_dot[i] = motion.nu_dot
 

@@ -1,6 +1,6 @@
 """Parameter arrays of the physics kernel, made from vehicle files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from finssim.core.registry import TERMS
 from finssim.physics.plant import VehicleParameters
-from finssim.physics.terms.composed import layout, row_length
+from finssim.physics.terms.composed import Item, layout, row_length
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.packed import Packed
+from finssim.vehicles.actuators import installed
 
 if TYPE_CHECKING:
     from finssim.vehicles import Vehicle
-    from finssim.vehicles.terms import Term
 
 Matrix = NDArray[np.float64]
 
@@ -77,19 +77,22 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
         "skin_drag": getattr(hydro, "skin_drag", 0.0),
         **getattr(hydro, "term_parameters", {}),
         **thruster_parameters(vehicle),
+        **{p: x for item, part in installed(vehicle).items() for p, x in item.numbers(part, vehicle).items()},
     }
 
 
-def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple["Term", ...]:
-    """The terms that at least one of the vehicles has, in the order of their rows."""
+def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple[Item, ...]:
+    """The terms and actuators that at least one of the vehicles has, in the order of their rows."""
     names = {name for vehicle in vehicles for name in getattr(vehicle.hydrodynamics.get(model), "terms", {})}
-    return tuple(TERMS[name] for name in sorted(names))
+    actuators = {item for vehicle in vehicles for item in installed(vehicle)}
+    return (*(TERMS[name] for name in sorted(names)), *sorted(actuators, key=lambda item: item.name))
 
 
 class PlantArrays(Packed):
-    """Parameters of vehicles by (world, vehicle): those of `VehicleParameters`, and those of the vehicles' terms."""
+    """Parameters of vehicles by (world, vehicle): those of `VehicleParameters`, and those of their terms and
+    actuators."""
 
-    def __init__(self, terms: tuple["Term", ...], shape: tuple[int, int], device: wp.Device) -> None:
+    def __init__(self, terms: tuple[Item, ...], shape: tuple[int, int], device: wp.Device) -> None:
         """Zeros."""
         super().__init__(VehicleParameters, shape, device)
         self.terms = terms
@@ -106,13 +109,15 @@ class PlantArrays(Packed):
 
 
 def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
-    """The thruster fields of `VehicleParameters` for one vehicle; absent thrusters are zero."""
-    thrusters = list(vehicle.thrusters.values())
+    """The fields of `VehicleParameters` by channel for one vehicle: thrusters, then its other actuators, then zeros.
+
+    A channel whose c_plus is 0 follows its command, in the unit of the actuator, whatever the others' domain.
+    """
+    thrusters, others = list(vehicle.thrusters.values()), list(vehicle.actuators.values())
     n = len(thrusters)
-    if n > MAX_THRUSTERS:
-        raise SimulatorError(
-            f"vehicle '{vehicle.name}' has {n} thrusters; at most {MAX_THRUSTERS} are simulated"
-        )
+    if n + len(others) > MAX_THRUSTERS:
+        count = f"{n} thrusters" + (f" and {len(others)} other actuators" if others else "")
+        raise SimulatorError(f"vehicle '{vehicle.name}' has {count}; at most {MAX_THRUSTERS} are simulated")
     delays = {t.delay for t in thrusters}
     domains = {t.domain for t in thrusters}
     if len(delays) > 1 or len(domains) > 1:
@@ -121,24 +126,28 @@ def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
         )
     speed = domains == {"speed"}
 
-    def column(values: list[float]) -> Matrix:
-        return np.array(values + [0.0] * (MAX_THRUSTERS - n))
+    def column(values: Iterable[float], of_others: Iterable[float] = ()) -> Matrix:
+        row = [*values, *(of_others or [0.0] * len(others))]
+        return np.array(row + [0.0] * (MAX_THRUSTERS - len(row)))
 
     B = np.zeros((6, MAX_THRUSTERS))
     B[:, :n] = vehicle.thruster_matrix()
     return {
         "B": B,
-        "force_min": column([t.force_min for t in thrusters]),
-        "force_max": column([t.force_max for t in thrusters]),
-        "dead_minus": column([-_force_at(t.dead_rpm_minus, t.c_minus) if speed else 0.0 for t in thrusters]),
-        "dead_plus": column([_force_at(t.dead_rpm_plus, t.c_plus) if speed else 0.0 for t in thrusters]),
+        "force_min": column((t.force_min for t in thrusters), [a.minimum for a in others]),
+        "force_max": column((t.force_max for t in thrusters), [a.maximum for a in others]),
+        "dead_minus": column(-_force_at(t.dead_rpm_minus, t.c_minus) if speed else 0.0 for t in thrusters),
+        "dead_plus": column(_force_at(t.dead_rpm_plus, t.c_plus) if speed else 0.0 for t in thrusters),
+        "play": column((0.0 for _ in thrusters), [a.play for a in others]),
         "gain": np.ones(MAX_THRUSTERS),
-        "time_constant": column([t.time_constant for t in thrusters]),
-        "slew": column([NO_LIMIT if t.slew is None else t.slew for t in thrusters]),
+        "time_constant": column((t.time_constant for t in thrusters), [a.time_constant for a in others]),
+        "slew": column(
+            (min(t.slew, NO_LIMIT) for t in thrusters), [min(a.rate_limit, NO_LIMIT) for a in others]
+        ),
         "delay": max(delays, default=0.0),
         "speed_lag": int(speed),
-        "c_plus": column([t.c_plus or 0.0 for t in thrusters]),
-        "c_minus": column([t.c_minus or 0.0 for t in thrusters]),
+        "c_plus": column(t.c_plus for t in thrusters),
+        "c_minus": column(t.c_minus for t in thrusters),
     }
 
 

@@ -17,12 +17,13 @@ from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
+from finssim.physics.lanes import LANES
 from finssim.physics.plant import VehicleCommand, refresh_plant
 from finssim.physics.solids import Solids
+from finssim.physics.terms.composed import composed
 from finssim.physics.tether import Tether
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.physics.water import advance_drift
-from finssim.sim.lanes import LANES
 from finssim.sim.launch import KernelSequence
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import SimulatorError, build_plant
@@ -42,7 +43,7 @@ class Simulator:
 
     Attributes:
         state: Warp arrays by (world, vehicle); see `State`.
-        command: Thruster force commands [N] and disturbance wrenches; write them before `step`.
+        command: Commands of thrusters [N] and other actuators, and disturbance wrenches; write them before `step`.
         plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
         water: Water by world.
         funnel: Poses of the docks, and how hard vehicles touched them, by world.
@@ -205,6 +206,7 @@ class Simulator:
             terms=self.plant.terms,
             funnel_present=self.dock is not None,
             solids_present=self._solids is not None,
+            play_present=bool(self.plant.play.numpy().any()),
             lanes=self.in_lanes,
         )
         around = [self.hull, self.water, self.walls, self.tether.array, self.funnel, self.solids]
@@ -229,6 +231,8 @@ class Simulator:
     def in_lanes(self) -> bool:
         """True if blocks of worlds are stepped together: on a processor, for what the traced code supports."""
         traceable = self.integrator == "midpoint" and self.hydrodynamics != "mesh"
+        # A moving mass changes the mass matrix, which takes double precision to solve: one world at a time.
+        traceable = traceable and composed(self.plant.terms, "shift") is None
         return self.device.is_cpu and traceable and not self.water.moving and self.dock is None
 
     def add_reset(self, pipeline: KernelSequence, mask: wp.array) -> None:
@@ -348,7 +352,31 @@ class Simulator:
         Raises:
             SimulatorError: the shape is wrong or a number is not finite.
         """
-        self.command.thrust.assign(thrust_table(force, self.vehicles, self.worlds))
+        table = thrust_table(force, self.vehicles, self.worlds)
+        for i, vehicle in enumerate(self.vehicles):
+            if vehicle.actuators:  # the others keep their commands
+                table[:, i, len(vehicle.thrusters) :] = self.numpy_command()[:, i, len(vehicle.thrusters) :]
+        self.command.thrust.assign(table)
+
+    def numpy_command(self) -> NDArray[np.float32]:
+        """Return a copy of the commands by channel, (worlds, vehicles, 8): thrusts [N], others in their unit."""
+        return np.array(self.command.thrust.numpy())
+
+    def set_actuators(self, values: ArrayLike) -> None:
+        """Command every actuator: thrusters and the others.
+
+        Args:
+            values: One number per channel, in the order of `Vehicle.channel_names`: static thrust [N] of a thruster,
+                angle [rad], volume [m³] or position [m] of another; shape broadcastable to (worlds, vehicles, n), n
+                channels of the vehicle that has most. Vehicles with fewer leave the last numbers unused.
+
+        Raises:
+            SimulatorError: The shape is wrong or a number is not finite.
+        """
+        n = max(len(vehicle.channel_names) for vehicle in self.vehicles)
+        table = np.zeros((self.worlds, len(self.vehicles), MAX_THRUSTERS), dtype=np.float32)
+        table[..., :n] = self._by_vehicle(values, n, "actuator command")
+        self.command.thrust.assign(table)
 
     def set_wrench(self, wrench: ArrayLike) -> None:
         """Command thruster forces that come nearest to a wrench within the thrusters' limits (paper, eq. 18).

@@ -21,8 +21,8 @@ class VehicleState:
     acceleration: vec6  # nu_dot in this state, body frame [m/s², rad/s²]
     coasting: vec6  # mean nu_dot of the last substep without thrust and contacts [m/s², rad/s²], extrapolated
     pressed: vec6  # mean nu_dot of the last substep by contacts [m/s², rad/s²]
-    actuator: vec8  # lagged force [N] or propeller speed [rad/s]
-    thrust: vec8  # delivered by each thruster [N]
+    actuator: vec8  # lagged force [N] or propeller speed [rad/s]; of other actuators their value
+    thrust: vec8  # delivered by each thruster [N]; of other actuators their value [rad, m³ or m]
     clearing: wp.vec4  # a ball without solids of the world: centre, world frame, and radius [m]
 
 

@@ -15,17 +15,11 @@ from finssim.physics.inertia import (
     coriolis_wrench,
     rigid_body_momentum,
     solve_spd,
+    symmetric_inertia,
     water_acceleration_wrench,
 )
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
-from finssim.physics.motors import admissible, first_order, speed_of_thrust, steps_ago, thrust_of_speed
-from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
-from finssim.physics.solids import Solids, solids_within, solids_wrench
-from finssim.physics.terms.composed import composed, row_length
-from finssim.physics.tether import Tether, tether_wrench
-from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, symmetric_times, vec6, vec8
-from finssim.physics.water import Flow, WaterArrays, flow_at
-from finssim.sim.lanes import (
+from finssim.physics.lanes import (
     LANES,
     LaneLoop,
     NumberArray,
@@ -36,6 +30,20 @@ from finssim.sim.lanes import (
     block_source,
     lane_function,
 )
+from finssim.physics.motors import (
+    admissible,
+    beyond_play,
+    first_order,
+    speed_of_thrust,
+    steps_ago,
+    thrust_of_speed,
+)
+from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
+from finssim.physics.solids import Solids, solids_within, solids_wrench
+from finssim.physics.terms.composed import Item, composed, row_length
+from finssim.physics.tether import Tether, tether_wrench
+from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, symmetric_times, vec6, vec8
+from finssim.physics.water import Flow, WaterArrays, flow_at
 from finssim.sim.midpoint import (
     DOCK_STEP,
     WALL_STEP,
@@ -47,7 +55,6 @@ from finssim.sim.midpoint import (
     yielding,
 )
 from finssim.sim.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
-from finssim.vehicles.terms import Term
 
 # Thrusters: what the lag tends to, what it delivers, and the delay line's command.
 
@@ -60,7 +67,7 @@ def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int,
         c_plus = plant[w, v].c_plus
         c_minus = plant[w, v].c_minus
         for k in range(MAX_THRUSTERS):
-            T[k] = thrust_of_speed(actuator[k], c_plus[k], c_minus[k])
+            T[k] = wp.where(c_plus[k] > 0.0, thrust_of_speed(actuator[k], c_plus[k], c_minus[k]), actuator[k])
     return wp.cw_mul(plant[w, v].gain, T)
 
 
@@ -82,7 +89,7 @@ def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force
         c_plus = plant[w, v].c_plus
         c_minus = plant[w, v].c_minus
         for k in range(MAX_THRUSTERS):
-            target[k] = speed_of_thrust(force[k], c_plus[k], c_minus[k])
+            target[k] = wp.where(c_plus[k] > 0.0, speed_of_thrust(force[k], c_plus[k], c_minus[k]), force[k])
     return target
 
 
@@ -159,7 +166,7 @@ def motion_function(
     runge_kutta: bool,
     water_moving: bool = False,
     tether_present: bool = False,
-    terms: tuple[Term, ...] = (),
+    terms: tuple[Item, ...] = (),
 ) -> Any:
     """Return the Warp function of the equation of motion, without the terms that a simulation does not need.
 
@@ -168,10 +175,11 @@ def motion_function(
         runge_kutta: Whether the integrator is `rk4`, which needs no relaxation.
         water_moving: Whether there are currents or waves.
         tether_present: Whether there is a tether.
-        terms: Those that some vehicle has, in the order of the rows of their parameters.
+        terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
     """
     hydrodynamic_wrench = HYDRODYNAMICS[model]
     term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
+    actuator_wrench, mass_shift = composed(terms, "push"), composed(terms, "shift")
     added_mass = model != "simplified"
 
     @wp.func
@@ -208,7 +216,16 @@ def motion_function(
         """
         out = StateDerivative()
         up = up_in_body(q)
-        momentum = rigid_body_momentum(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, nu)
+        r_g = plant[w, v].r_g
+        inertia = plant[w, v].inertia
+        tau = tau_other
+        if wp.static(mass_shift is not None):
+            shift = mass_shift(extra, w, v, nu, up, -position[2], water.density, thrust)
+            first = wp.vec3(shift[0], shift[1], shift[2])
+            r_g = r_g + first / plant[w, v].mass
+            inertia = inertia + symmetric_inertia(shift)
+            tau = tau + join(wp.vec3(0.0), wp.cross(first, -water.gravity * up))
+        momentum = rigid_body_momentum(plant[w, v].mass, r_g, inertia, nu)
         flow = Flow()
         nu_r = nu
         water_b = wp.vec3(0.0)
@@ -220,7 +237,7 @@ def motion_function(
         else:
             flow.normal = wp.vec3(0.0, 0.0, 1.0)
         wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
-        tau = tau_other + wet.tau
+        tau = tau + wet.tau
         if wp.static(added_mass):
             momentum_A = wet.wet * symmetric_times(plant[w, v].M_A, nu_r)
             momentum += momentum_A
@@ -235,8 +252,10 @@ def motion_function(
         if wp.static(term_wrench is not None):
             r_h = plant[w, v].r_h
             nu_h = twist_at(nu_r, r_h)
-            tau_h = term_wrench(extra, w, v, nu_h, up, -position[2], water.density)
+            tau_h = term_wrench(extra, w, v, nu_h, up, -position[2], water.density, thrust)
             tau += wet.wet * wrench_from(tau_h, r_h)
+        if wp.static(actuator_wrench is not None):
+            tau += wet.wet * actuator_wrench(extra, w, v, nu_r, up, -position[2], water.density, thrust)
         if wp.static(tether_present):
             tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         tau -= coriolis_wrench(momentum, nu)
@@ -245,15 +264,15 @@ def motion_function(
         if wp.static(model == "mesh"):
             damped = wp.where(wet.wet > 0.0, 1.0, 0.0)
         share = vec6(damped, damped, damped, damped, damped, damped)
-        if wp.static(added_mass):
-            if wet.wet == 1.0 and wet.wet_rate <= 0.0:
+        if wp.static(added_mass or mass_shift is not None):
+            if wp.static(mass_shift is None) and wet.wet == 1.0 and wet.wet_rate <= 0.0:
                 out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + pushed
             else:
                 s_dot = wp.max(wet.wet_rate, 0.0)
                 tau += wet.wet * (plant[w, v].B * thrust)
                 tau -= s_dot * symmetric_times(plant[w, v].M_A, nu_start - join(water_b, wp.vec3(0.0)))
                 s = wet.wet + 0.5 * h * s_dot
-                M = mass_matrix(plant[w, v].mass, plant[w, v].r_g, plant[w, v].inertia, s * plant[w, v].M_A)
+                M = mass_matrix(plant[w, v].mass, r_g, inertia, s * plant[w, v].M_A)
                 out.nu_dot = solve_spd(M, tau)
                 dry = wp.cw_div(wp.get_diag(plant[w, v].M_A), wp.get_diag(M))
                 share = damped * (vec6(1.0, 1.0, 1.0, 1.0, 1.0, 1.0) + (1.0 - s) * dry)
@@ -270,7 +289,7 @@ def motion_function(
                 out.relaxation = wp.cw_mul(share, relaxation_of(plant, w, v, nu_r))
                 if wp.static(term_slope is not None):
                     nu_m = twist_at(nu_r, plant[w, v].r_m)
-                    falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density)
+                    falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density, thrust)
                     out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
         return out
 
@@ -285,9 +304,10 @@ def physics_kernel(
     walls_present: bool = True,
     tether_present: bool = True,
     speed_lag: bool = True,
-    terms: tuple[Term, ...] = (),
+    terms: tuple[Item, ...] = (),
     funnel_present: bool = False,
     solids_present: bool = False,
+    play_present: bool = False,
     lanes: bool = False,
 ) -> wp.Kernel:
     """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
@@ -299,10 +319,11 @@ def physics_kernel(
         walls_present: Whether there is a pool to bump into.
         tether_present: Whether there is a tether.
         speed_lag: Whether some vehicle's motors lag in speed rather than in force.
-        terms: Those that some vehicle has, in the order of the rows of their parameters.
+        terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
         funnel_present: Whether there is a dock to enter.
         solids_present: Whether there is a world with solids to bump into.
-        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.sim.lanes`.
+        play_present: Whether some actuator has play.
+        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.physics.lanes`.
 
     Returns:
         A kernel over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), which takes the
@@ -421,6 +442,8 @@ def physics_kernel(
         elapsed = float(wp.max(k, 0)) * h
         t = float(step) * control_step + elapsed
         target = delayed_command(commands, w, v, head, elapsed, plant[w, v].delay, h, rate)
+        if wp.static(play_present):
+            target = beyond_play(target, actuator, plant[w, v].play)
         mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
         after = first_order(actuator, target, plant[w, v].alpha, max_change)
         thrust = thrust_of(plant, w, v, mean)

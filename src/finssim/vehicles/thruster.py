@@ -176,6 +176,21 @@ def _root(emf: float, load: float, volts: Array) -> Array:
     return np.divide(2.0 * volts, denominator, out=np.zeros_like(denominator), where=denominator != 0.0)
 
 
+class Inflow(Part):
+    """Thrust and torque that a propeller loses as water flows towards it: T = c ω|ω| - a |ω| V_a.
+
+    V_a is (1 - w) times the velocity of the disc along the axis, relative to the water. Of a propeller with
+    K_T = K_0 + K_1 J and diameter D: c = ρ D⁴ K_0 / (2π)², a = -ρ D³ K_1 / (2π); of K_Q, b = -ρ D⁴ K_1 / (2π).
+    """
+
+    thrust_loss: NonNegative
+    """a [N s²/(m rad)]."""
+    torque_loss: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
+    """b of the torque k ω|ω| - b |ω| V_a on the water about the axis [N s²/rad]; of the sign of `torque_constant`."""
+    wake_fraction: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)] = 0.0
+    """w [-]."""
+
+
 class Thruster(Part):
     """A thruster: its position, its steady thrust T = c± ω|ω| (paper, eq. 16) and its response to commands."""
 
@@ -194,6 +209,10 @@ class Thruster(Part):
     torque_constant: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
     """k of the propeller's torque k ω|ω| on the water, about `axis` [N m s²/rad²]: above 0 where the shaft turns about
     `axis` for positive thrust (right-handed), below 0 where it turns against it. The vehicle feels the opposite."""
+    inflow: Inflow | None = None
+    """Loss of thrust and torque in a flow; none where the file gives none."""
+    diameter: Positive | None = None
+    """Diameter of the propeller [m]."""
     rpm_min: Negative
     """Fastest reverse shaft speed [rpm]."""
     rpm_max: Positive

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +13,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
 from finssim.core.page import notebook_html
+from finssim.vehicles.actuators import Actuator, read_actuators
 from finssim.vehicles.autopilot import Autopilot, refuse_misfit
 from finssim.vehicles.defaults import (
     DEFAULTS,
@@ -199,6 +201,8 @@ class Vehicle(Part):
     """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
     thrusters: dict[str, Thruster]
     """Thrusters by name, in the canonical order of every thruster vector."""
+    actuators: dict[str, SerializeAsAny[Actuator]] = Field(default_factory=dict)
+    """Fins, buoyancy engines and other actuators by name; their channels come after those of the thrusters."""
     controlled_axes: tuple[Axis, ...] = AXES
     """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
@@ -220,6 +224,11 @@ class Vehicle(Part):
     """The file it was read from."""
     provenance: dict[str, Provenance] = Field(default_factory=dict, exclude=True)
     """Origin of the numbers by dotted path; see `origin_of`."""
+
+    @field_validator("actuators", mode="before")
+    @classmethod
+    def _by_kind(cls, value: Any) -> Any:
+        return read_actuators(value)
 
     @field_validator("controlled_axes", mode="before")
     @classmethod
@@ -264,6 +273,25 @@ class Vehicle(Part):
         return self
 
     @model_validator(mode="after")
+    def _channels(self) -> Vehicle:
+        for name, actuator in self.actuators.items():
+            if name in self.thrusters:
+                raise refuse_section(f"actuators: '{name}' is the name of a thruster: take another")
+            named = [*getattr(actuator, "wake", {}), *filter(None, [getattr(actuator, "thruster", None)])]
+            for thruster in named:
+                if thruster not in self.thrusters:
+                    raise refuse_section(
+                        f"actuators.{name}: no thruster '{thruster}'{did_you_mean(thruster, list(self.thrusters))} "
+                        f"expected one of {', '.join(self.thrusters)}"
+                    )
+            for thruster in getattr(actuator, "wake", {}):
+                if self.thrusters[thruster].diameter is None:
+                    raise refuse_section(
+                        f"actuators.{name}: is in the wake of '{thruster}', whose diameter is missing: add it"
+                    )
+        return self
+
+    @model_validator(mode="after")
     def _mixed_right(self) -> Vehicle:
         if self.autopilot is not None:
             refuse_misfit(self.autopilot, self.thrusters, self.control_matrix)
@@ -289,6 +317,21 @@ class Vehicle(Part):
     def thruster_names(self) -> tuple[str, ...]:
         """Names in canonical order."""
         return tuple(self.thrusters)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels of a command: thrusters, then other actuators."""
+        return (*self.thrusters, *self.actuators)
+
+    @property
+    def channel_limits(self) -> tuple[Array, Array]:
+        """Least and greatest value of each channel, thrust [N] or in the unit of the actuator, (n,) each."""
+        lower, upper = self.force_limits
+        others = list(self.actuators.values())
+        return (
+            np.concatenate([lower, [a.minimum for a in others]]),
+            np.concatenate([upper, [a.maximum for a in others]]),
+        )
 
     @property
     def force_limits(self) -> tuple[Array, Array]:
@@ -403,10 +446,15 @@ class Vehicle(Part):
     def _repr_html_(self) -> str:
         return notebook_html(f"{self.name}: {self.title}", ("", ""), self._summary())
 
+    def _others(self) -> str:
+        """Return the other actuators by kind, as in `, 4 fin, 1 buoyancy`."""
+        counts = Counter(actuator.kind for actuator in self.actuators.values())
+        return "".join(f", {count} {kind}" for kind, count in counts.items())
+
     def _summary(self) -> list[tuple[str, str]]:
         return [
             ("mass", f"{self.body.mass:g} kg"),
-            ("actuators", f"{len(self.thrusters)} thrusters"),
+            ("actuators", f"{len(self.thrusters)} thrusters{self._others()}"),
             ("controlled axes", " ".join(self.controlled_axes)),
             ("hydrodynamics", f"hydrodynamics {' '.join(self.hydrodynamics)}"),
         ]

@@ -1,13 +1,15 @@
-"""Adding terms, and the functions that evaluate all terms of a simulation, written from the terms that it has.
+"""Adding terms, and the functions that evaluate all terms and actuators of a simulation, written from what it has.
 
-A term's functions are called by the names of their arguments:
+The functions of a term or of a kind of actuator are called by the names of their arguments:
 
     nu_r      velocity relative to the water at the reference point of the set, body frame [m/s, rad/s], vec6
     up        world's z axis in the body frame, vec3
     depth     of the body origin below the still surface [m]
     density   of the water [kg/m³]
+    thrust    of each thruster [N], vec8
+    value     of an actuator: its angle, volume or position, float
 
-and each of the term's parameters by its name: a float, vec3, vec6 or mat66. The engine takes a wrench in proportion to
+and each parameter by its name: a float, vec3, vec6, vec8 or mat66. The engine takes a wrench in proportion to
 the part of the vehicle that is under water, and moves it from the reference point to the body origin.
 """
 
@@ -26,20 +28,30 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.registry import TERMS
-from finssim.physics.types import mat66, vec6
+from finssim.physics.lanes import LaneRow, lane_function, zero_of
+from finssim.physics.types import mat66, vec6, vec8, vec9
+from finssim.vehicles.actuators import Actuator, ActuatorKind, InstalledActuator
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.terms import Term
 
-STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float}
+STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float, "thrust": vec8}
 """Arguments that a term's functions may take besides its parameters."""
-KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "mat66": mat66}
+VALUE: dict[str, Any] = {**STATE, "value": float}
+"""The same of an actuator's functions."""
+ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "shift": vec9}
+"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push` and `shift`."""
+KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "vec8": vec8, "mat66": mat66}
 """Types of a parameter."""
 PIECE = 8
 """Multiple to which a row of parameters is padded, since a processor reads so many numbers together."""
 
 
+Item = Term | InstalledActuator
+"""What has parameters in a row and functions of them."""
+
+
 class TermError(ValueError):
-    """A term that cannot be added."""
+    """A term or a kind of actuator that cannot be used."""
 
 
 def add_term(term: Term) -> Term:
@@ -75,33 +87,65 @@ def check_registered(name: str, term: Any) -> None:
             f"term '{term.name}' has units of {', '.join(term.units)}, expected of its parameters: "
             f"{', '.join(term.parameters)}"
         )
+    _refuse_arguments(f"term '{term.name}'", _functions(term), STATE, term.parameters)
+
+
+def check_actuator(name: str, kind: Any) -> None:
+    """Refuse what is no kind of actuator, or one that cannot be evaluated.
+
+    Args:
+        name: Value of `kind` in a vehicle file.
+        kind: The object that is registered under it.
+
+    Raises:
+        TermError: It is no `ActuatorKind`, has another name, or an argument that is neither state nor parameter.
+    """
+    if not isinstance(kind, ActuatorKind) or kind.name != name or not name.isidentifier():
+        raise TermError(
+            f"{name} is {kind!r:.80}, expected a finssim.vehicles.actuators.ActuatorKind of that name"
+        )
+    if not issubclass(kind.schema, Actuator) or (kind.wrench is None and kind.shift is None):
+        raise TermError(
+            f"actuator '{name}': expected a schema derived from Actuator, and a wrench or a shift"
+        )
+    _refuse_arguments(f"actuator '{name}'", _functions(InstalledActuator(kind, 0)), VALUE, kind.units)
+
+
+def _refuse_arguments(
+    label: str, functions: Mapping[str, Any], state: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> None:
+    """Refuse functions with an argument that is neither state nor parameter, and parameters that none takes."""
     used = set()
-    for role, function in _functions(term).items():
+    for role, function in functions.items():
         for name, kind in _arguments(function).items():
-            expected = [STATE[name]] if name in STATE else list(KINDS.values())
-            if (name not in STATE and name not in term.parameters) or kind not in expected:
+            expected = [state[name]] if name in state else list(KINDS.values())
+            if (name not in state and name not in parameters) or kind not in expected:
                 raise TermError(
-                    f"term '{term.name}': {role} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
-                    f"{', '.join([*STATE, *term.parameters])}; parameters are {', '.join(KINDS)}"
+                    f"{label}: {role} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
+                    f"{', '.join([*state, *parameters])}; parameters are {', '.join(KINDS)}"
                 )
             used.add(name)
-    unused = [name for name in term.parameters if name not in used]
+    unused = [name for name in parameters if name not in used]
     if unused:
-        raise TermError(f"term '{term.name}': no function takes the parameter '{unused[0]}'")
+        raise TermError(f"{label}: no function takes the parameter '{unused[0]}'")
 
 
 @cache  # not as a term is added: this starts Warp, which a vehicle file alone does not need
-def _require_zero(term: Term) -> None:
-    """Refuse a wrench of parameters that are zero: vehicles without a term are simulated so beside those with it."""
-    tau = term.wrench.func(**{name: _example(name, kind) for name, kind in _arguments(term.wrench).items()})
-    if any(float(x) != 0.0 for x in tau):
-        raise TermError(
-            f"term '{term.name}': its wrench is not zero where all its parameters are: make it so"
-        )
+def _require_zero(item: Item, role: str) -> None:
+    """Refuse a function that is not zero where parameters are: vehicles without it are simulated so beside others."""
+    function = _functions(item)[role]
+    examples = (_example(name, kind) for name, kind in _arguments(function).items())
+    result = lane_function(function)(*examples).numbers
+    if any(float(x) != 0.0 for x in result):
+        raise TermError(f"'{item.name}': its {role} is not zero where all its parameters are: make it so")
 
 
-def _functions(term: Term) -> dict[str, Any]:
-    return {role: f for role in ("wrench", "slope") if (f := getattr(term, role)) is not None}
+def _functions(item: Item) -> dict[str, Any]:
+    if isinstance(item, InstalledActuator):
+        functions = {"push": item.kind.wrench, "shift": item.kind.shift}
+    else:
+        functions = {"wrench": item.wrench, "slope": item.slope}
+    return {role: function for role, function in functions.items() if function is not None}
 
 
 @cache
@@ -112,18 +156,21 @@ def _arguments(function: Any) -> dict[str, Any]:
 
 def _example(name: str, kind: Any) -> Any:
     """A state in which forces act, and parameters that are zero."""
-    if name == "nu_r":
-        return vec6(0.7, -0.4, 0.5, 0.3, -0.6, 0.2)
-    if name == "up":
-        return wp.vec3(0.6, 0.0, 0.8)
-    return 3.0 if name in STATE else kind()
+    numbers = {
+        "nu_r": (0.7, -0.4, 0.5, 0.3, -0.6, 0.2), "up": (0.6, 0.0, 0.8), "thrust": (5.0,) * 8, "value": (0.3,),
+        "depth": (3.0,), "density": (3.0,),
+    }.get(name)  # fmt: skip
+    value = zero_of(kind)
+    if numbers is None:
+        return value
+    return value.like(numbers) if isinstance(value, LaneRow) else numbers[0]
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A parameter in a row of the array that holds those of all terms of a simulation."""
+    """A parameter in a row of the array that holds those of all terms and actuators of a simulation."""
 
-    term: Term
+    term: Item
     name: str
     path: str
     kind: Any
@@ -136,8 +183,8 @@ class Slot:
 
 
 @cache
-def layout(terms: tuple[Term, ...]) -> tuple[Slot, ...]:
-    """Return the position of the parameters of some terms in a row."""
+def layout(terms: tuple[Item, ...]) -> tuple[Slot, ...]:
+    """Return the position of the parameters of some terms and actuators in a row."""
     slots, first = [], 0
     for term in terms:
         kinds = {name: kind for f in _functions(term).values() for name, kind in _arguments(f).items()}
@@ -147,7 +194,7 @@ def layout(terms: tuple[Term, ...]) -> tuple[Slot, ...]:
     return tuple(slots)
 
 
-def row_length(terms: tuple[Term, ...]) -> int:
+def row_length(terms: tuple[Item, ...]) -> int:
     """Numbers in a row, a multiple of `PIECE`."""
     return PIECE * max(1, -(-sum(slot.size for slot in layout(terms)) // PIECE))
 
@@ -162,39 +209,40 @@ def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArra
 
 
 @cache
-def composed(terms: tuple[Term, ...], role: str) -> Any:
-    """Sum of what the terms give, as a `wp.func` of (x, w, v, nu_r, up, depth, density) -> vec6.
+def composed(terms: tuple[Item, ...], role: str) -> Any:
+    """Sum of what the terms or actuators give, as a `wp.func` of (x, w, v, nu_r, up, depth, density, thrust).
 
     Args:
-        terms: The terms, in the order of their rows.
-        role: `wrench` or `slope`.
+        terms: Terms and actuators, in the order of their rows.
+        role: A key of `ROLES`.
 
     Returns:
-        None where no term gives it. x holds the parameters, (worlds, vehicles, `row_length`).
+        None where no item gives it. x holds the parameters, (worlds, vehicles, `row_length`).
     """
-    space: dict[str, Any] = {"wp": wp, "vec6": vec6, "mat66": mat66, "vec3": wp.vec3}
+    space: dict[str, Any] = {"wp": wp, "vec6": vec6, "vec8": vec8, "mat66": mat66, "vec3": wp.vec3}
     calls = []
-    for term in terms:
-        _require_zero(term)
-        function = _functions(term).get(role)
+    for item in terms:
+        function = _functions(item).get(role)
         if function is None:
             continue
-        slots = {slot.name: slot for slot in layout(terms) if slot.term is term}
-        arguments = [name if name in STATE else _read(slots[name]) for name in _arguments(function)]
-        space[f"t_{term.name}"] = function
-        calls.append(f"t_{term.name}({', '.join(arguments)})")
+        _require_zero(item, role)
+        places = {slot.name: _read(slot) for slot in layout(terms) if slot.term == item}
+        if isinstance(item, InstalledActuator):
+            places["value"] = f"thrust[{item.channel}]"
+        arguments = [name if name in STATE else places[name] for name in _arguments(function)]
+        space[f"t_{item.name}"] = function
+        calls.append(f"t_{item.name}({', '.join(arguments)})")
     if not calls:
         return None
-    head = "x: wp.array3d(dtype=float), w: int, v: int, nu_r: vec6, up: wp.vec3, depth: float, density: float"
+    head = (
+        "x: wp.array3d(dtype=float), w: int, v: int, nu_r: vec6, up: wp.vec3, depth: float, density: float, "
+        "thrust: vec8"
+    )
     text = f"def added_{role}({head}):\n    return {' + '.join(calls)}\n"
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    position = f"<{role} of {', '.join(term.name for term in terms)}, {digest}>"
-    linecache.cache[position] = (
-        len(text),
-        None,
-        text.splitlines(keepends=True),
-        position,
-    )  # Warp reads the source
+    position = f"<{role} of {', '.join(item.name for item in terms)}, {digest}>"
+    lines = text.splitlines(keepends=True)
+    linecache.cache[position] = (len(text), None, lines, position)  # Warp reads the source
     space["__name__"] = f"{__name__}_{digest}"
     exec(compile(text, position, "exec"), space)
     return wp.func(space[f"added_{role}"], module=wp.get_module(space["__name__"]))
@@ -220,7 +268,7 @@ def _sampler(terms: tuple[Term, ...]) -> wp.Kernel:
         tau: wp.array2d(dtype=vec6),
     ):
         i, k = wp.tid()
-        tau[i, k] = added_wrench(x, k, 0, nu_r[i], up[i], depth[i], density)
+        tau[i, k] = added_wrench(x, k, 0, nu_r[i], up[i], depth[i], density, vec8())
 
     return sample
 

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from finssim.physics.contact import PoolWalls
+from finssim.physics.lanes import LANES, LaneError, StructArray, Trace, UniformStruct, lane_function
 from finssim.sim import RectangularPool, Simulator, TetherLine
-from finssim.sim.lanes import LANES, LaneError, StructArray, Trace, UniformStruct, lane_function
 from reference.cases import PAIRS, random_states
 
 CASES = [(name, model) for name, model in PAIRS if model != "mesh"]

@@ -9,6 +9,8 @@ notes the condition: a world for which it does not hold is left to the kernel fo
 depends on that world alone, whoever shares its block.
 """
 
+# mypy: disable-error-code="no-any-return"
+
 from __future__ import annotations
 
 import builtins
@@ -256,6 +258,7 @@ class _Library:
     sin = staticmethod(_each("sine({})", math.sin))
     cos = staticmethod(_each("cosine({})", math.cos))
     exp = staticmethod(_each("exponential({})", math.exp))
+    atan2 = staticmethod(_each("arctangent({}, {})", math.atan2))
     ceil = staticmethod(_each("ceiling({})", math.ceil))
     min = staticmethod(_each("least({}, {})", min))
     max = staticmethod(_each("most({}, {})", max))
@@ -654,6 +657,7 @@ const auto root = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = __builti
 const auto sine = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::sinf(x[l]); return y; };
 const auto cosine = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::cosf(x[l]); return y; };
 const auto exponential = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::expf(x[l]); return y; };
+const auto arctangent = [](F y, F x) { F z; for (int l = 0; l < LANES; ++l) z[l] = ::atan2f(y[l], x[l]); return z; };
 const auto ceiling = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = __builtin_ceilf(x[l]); return y; };
 const auto to_float = [](I x) { return __builtin_convertvector(x, F); };
 const auto to_int = [](F x) { return __builtin_convertvector(x, I); };

@@ -1,0 +1,1 @@
+"""Kinds of actuators, one file each: keys in a vehicle file, wrench or shift of mass, and units."""

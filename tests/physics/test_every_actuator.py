@@ -1,0 +1,376 @@
+"""Laws that every kind of actuator obeys: those of the package, of installed packages, and one of a program."""
+# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
+
+import numpy as np
+import pytest
+import warp as wp
+
+import finssim as fs
+from finssim.core.registry import ACTUATORS
+from finssim.physics.actuators.fin import DRAG_MAX
+from finssim.physics.types import join, vec6
+from finssim.sim import SimulatorError, Water
+from finssim.vehicles import VehicleError
+from finssim.vehicles.actuators import Actuator, ActuatorKind, installed
+from finssim.vehicles.part import Positive, Vector3
+
+DEEP = [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
+RNG = np.random.default_rng(35)
+RHO, G = 1025.0, 9.81
+
+
+class Brake(Actuator):
+    """A drogue whose drag along its line is what its value says: a kind from outside the package."""
+
+    position: Vector3
+    size: Positive
+
+
+@wp.func
+def brake_wrench(value: float, nu_r: vec6, density: float, position: wp.vec3, size: float) -> vec6:
+    force = wp.vec3(-0.5 * density * size * value * wp.abs(nu_r[0]) * nu_r[0], 0.0, 0.0)
+    return join(force, wp.cross(position, force))
+
+
+BRAKE = ActuatorKind(
+    name="brake", schema=Brake, unit="1", units={"position": "m", "size": "m²"}, wrench=brake_wrench
+)
+FIN = {
+    "kind": "fin", "position": [-0.6, 0.0, 0.1], "span": [0.0, 0.0, 1.0], "area": 0.02, "lift_slope": 3.0, "stall": 0.3,
+    "drag": [0.01, 0.02, 1.1], "minimum": -0.5, "maximum": 0.5,
+}  # fmt: skip
+SECTIONS = {
+    "fin": FIN,
+    "buoyancy": {"kind": "buoyancy", "position": [0.4, 0.0, 0.05], "minimum": -1e-3, "maximum": 1e-3},
+    "moving_mass": {
+        "kind": "moving_mass", "mass": 4.0, "position": [0.1, 0.0, -0.05], "axis": [1.0, 0.0, 0.0], "minimum": -0.2,
+        "maximum": 0.2,
+    },
+    "gimbal": {
+        "kind": "gimbal", "thruster": "propeller", "axis": [0.0, 0.0, 1.0], "minimum": -0.4, "maximum": 0.4,
+    },
+    "brake": {"kind": "brake", "position": [0.0, 0.0, 0.3], "size": 0.1, "minimum": 0.0, "maximum": 1.0},
+}  # fmt: skip
+EVERY = pytest.mark.parametrize("name", sorted({*ACTUATORS, "brake"} - {"propeller"}))
+
+
+def hull(actuators, **changes):
+    """A torpedo with one propeller, without hydrodynamic couplings, and some actuators."""
+    ACTUATORS["brake"] = BRAKE
+    text = {
+        "title": "test hull", "description": "for tests", "water": {"density": RHO, "gravity": G},
+        "body": {
+            "mass": 30.0, "inertia": [0.2, 3.5, 3.5], "center_of_gravity": [0.02, 0.0, -0.02],
+            "displaced_volume": 30.0 / RHO, "center_of_buoyancy": [0.0, 0.0, 0.0], "size": [1.4, 0.2, 0.2],
+            "surface_half_height": 0.1,
+        },
+        "hydrodynamics": {
+            "calibrated": {
+                "added_mass": [1.0, 30.0, 30.0, 0.1, 4.0, 4.0],
+                "linear_damping": [2.0, 20.0, 20.0, 0.5, 8.0, 8.0],
+                "quadratic_damping": [6.0, 100.0, 100.0, 0.2, 9.0, 9.0],
+            }
+        },
+        "thrusters": {
+            "propeller": {
+                "position": [-0.7, 0.0, 0.0], "axis": [1.0, 0.0, 0.0], "force_min": -40.0, "force_max": 40.0,
+                "c_plus": 1.6e-3, "c_minus": 1.4e-3, "rpm_min": -1600.0, "rpm_max": 1600.0, "domain": "speed",
+                "time_constant": 0.2, "diameter": 0.14, **changes.pop("propeller", {}),
+            }
+        },
+        "controlled_axes": ["surge"], "actuators": actuators,
+    }  # fmt: skip
+    from finssim.vehicles.vehicle import Vehicle
+
+    return Vehicle(**text, name="hull")
+
+
+def wrench(vehicle, nu, values):
+    """Wrench of the actuators: M times what they add to the acceleration, (n, 6) [N, N m]."""
+    zero = np.zeros(len(vehicle.channel_names))
+    gained = fs.acceleration(vehicle, DEEP, nu, actuators=values) - fs.acceleration(
+        hull({}), DEEP, nu, actuators=zero[:1]
+    )
+    return gained @ vehicle.mass_matrix().T
+
+
+@EVERY
+def test_at_its_rest_value_it_only_feels_the_flow(name):
+    """Value 0 at rest in the water: nothing."""
+    vehicle = hull({name: SECTIONS[name]})
+    np.testing.assert_allclose(wrench(vehicle, np.zeros(6), [0.0, 0.0]), 0.0, atol=2e-4)
+
+
+@EVERY
+def test_its_force_at_rest_does_no_work_on_a_vehicle_that_stands(name):
+    """Without a flow and without thrust a fin, a gimbal and a brake give nothing at any value."""
+    vehicle = hull({name: SECTIONS[name]})
+    tau = wrench(vehicle, np.zeros(6), [0.0, vehicle.actuators[name].maximum])
+    active = name in ("buoyancy", "moving_mass")
+    assert (np.abs(tau).max() > 1e-3) == active
+
+
+@EVERY
+def test_a_step_follows_lag_rate_and_travel(name):
+    """Commanded beyond its travel: it moves at its rate, by its lag, and stops at its end; equal in all worlds."""
+    end = SECTIONS[name]["maximum"]
+    section = {**SECTIONS[name], "time_constant": 0.2, "rate_limit": 2.0 * end}
+    sim = fs.Simulator(hull({name: section}), worlds=9, control_step=0.05)
+    sim.place(position=(0.0, 0.0, -50.0))
+    sim.set_actuators([0.0, 3.0 * end])
+    values = []
+    for _ in range(60):
+        sim.step()
+        values.append(sim.numpy("thrust")[:, 0, 1].copy())
+    x = np.array(values)
+    assert (x == x[:, :1]).all()
+    np.testing.assert_allclose(x[-1], end, rtol=1e-5)
+    rate = np.diff(np.vstack([np.zeros(9), x]), axis=0)[:, 0] / 0.05
+    assert rate.max() <= 2.0 * end * (1.0 + 1e-4)
+    # At the rate until the way left is the rate times the time constant, then the lag.
+    t = 0.05 * np.arange(1, 61)
+    lag = end - 0.4 * end * np.exp(-(t - 0.3) / 0.2)
+    expected = np.where(t <= 0.3, np.minimum(2.0 * end * t, end), lag)
+    np.testing.assert_allclose(x[:, 0], expected, atol=1e-4 * end)
+
+
+@EVERY
+def test_play_keeps_it_from_the_command(name):
+    """It stays while the command is within its play, and then stops short of it by as much, from both sides."""
+    top, play = SECTIONS[name]["maximum"], 0.1 * SECTIONS[name]["maximum"]
+    sim = fs.Simulator(hull({name: {**SECTIONS[name], "play": play}}), control_step=0.05)
+    sim.place(position=(0.0, 0.0, -50.0))
+    steps = ((0.9 * play, 0.0), (0.5 * top, 0.4 * top), (0.35 * top, 0.4 * top), (0.2 * top, 0.3 * top))
+    for command, expected in steps:
+        sim.set_actuators([0.0, command])
+        for _ in range(3):
+            sim.step()
+        np.testing.assert_allclose(sim.numpy("thrust")[0, 0, 1], expected, atol=1e-6 * top)
+
+
+@EVERY
+def test_vehicles_with_and_without_it_share_a_simulation(name):
+    """Beside one with the actuator, a vehicle without it moves as it does alone."""
+    plain, fitted = hull({}), hull({name: SECTIONS[name]})
+    ends = []
+    for crew in ([plain], [fitted, plain]):
+        sim = fs.Simulator(crew, control_step=0.1)
+        sim.place(position=(0.0, 0.0, -50.0), velocity=(1.0, 0.1, 0.0, 0.0, 0.0, 0.1))
+        for _ in range(20):
+            sim.step()
+        ends.append(np.r_[sim.numpy("position")[0, -1], sim.numpy("velocity")[0, -1]])
+    np.testing.assert_allclose(ends[0], ends[1], rtol=2e-5, atol=2e-5)
+
+
+@EVERY
+@pytest.mark.slow
+def test_both_integrators_agree(name):
+    """`rk4`, one world at a time, and `midpoint`, eight worlds together, on a manoeuvre of 5 s."""
+    vehicle, ends = hull({name: SECTIONS[name]}), []
+    for integrator, substeps in (("rk4", 8), ("midpoint", 8)):
+        sim = fs.Simulator(vehicle, control_step=0.05, integrator=integrator, substeps=substeps)
+        sim.place(position=(0.0, 0.0, -50.0), velocity=(1.5, 0.0, 0.0, 0.0, 0.0, 0.0))
+        sim.set_actuators([10.0, 0.5 * SECTIONS[name]["maximum"]])
+        for _ in range(100):
+            sim.step()
+        ends.append(np.r_[sim.numpy("position")[0, 0], sim.numpy("quaternion")[0, 0]])
+    np.testing.assert_allclose(ends[0], ends[1], atol=2e-3)
+
+
+# Fins
+
+
+def fin(**changes):
+    return hull({"fin": {**FIN, **changes}})
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.25, -0.29])
+def test_lift_and_drag_of_a_fin_are_the_closed_forms(alpha):
+    """Going straight: L = ½ρ A a α U² to the side of the leading edge, D = ½ρ A (d0 + d1 |α| + d2 α²) U²."""
+    U = 1.7
+    q = 0.5 * RHO * 0.02 * U**2
+    tau = wrench(fin(), [U, 0, 0, 0, 0, 0], [0.0, alpha])
+    L, D = q * 3.0 * alpha, q * (0.01 + 0.02 * abs(alpha) + 1.1 * alpha**2)
+    np.testing.assert_allclose(tau, [-D, L, 0.0, -0.1 * L, -0.1 * D, -0.6 * L], atol=4e-3)
+
+
+def test_its_slope_is_its_derivative():
+    """Around zero deflection dY/dδ = ½ρ A a U², and so falls -Y with the sideways speed, by ½ρ A (a + d0) U."""
+    U, h = 2.0, 1e-2
+    ends = [wrench(fin(), [U, 0, 0, 0, 0, 0], [0.0, s * h])[1] for s in (1.0, -1.0)]
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * h), 0.5 * RHO * 0.02 * 3.0 * U**2, rtol=2e-3)
+    ends = [wrench(fin(), [U, s * h, 0, 0, 0, 0], [0.0, 0.0])[1] for s in (1.0, -1.0)]
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * h), -0.5 * RHO * 0.02 * 3.01 * U, rtol=1e-2)
+
+
+def test_a_fin_takes_energy_out_whatever_the_flow():
+    """At any deflection and velocity, turning too: nu · tau <= 0, for lift does no work and drag takes it."""
+    nu = RNG.uniform(-2.0, 2.0, (200, 6))
+    values = np.column_stack([np.zeros(200), RNG.uniform(-0.5, 0.5, 200)])
+    power = (nu * wrench(fin(), nu, values)).sum(1)
+    assert (power <= 2e-2).all() and power.min() < -10.0
+
+
+def test_a_fin_is_symmetric():
+    """Mirrored flow and deflection give the mirrored force."""
+    nu = np.array([1.2, 0.4, 0.0, 0.0, 0.0, 0.2])
+    mirror, turned = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0]), wrench(fin(), nu, [0.0, 0.2])
+    np.testing.assert_allclose(wrench(fin(), mirror * nu, [0.0, -0.2]), mirror * turned, atol=4e-3)
+
+
+def test_beyond_the_stall_lift_falls_to_nothing_at_a_right_angle():
+    """Moving sideways alone the fin is a plate: drag as its coefficient's limit says, and no lift."""
+    V = 1.5
+    tau = wrench(fin(), [0, V, 0, 0, 0, 0], [0.0, 0.0])
+    np.testing.assert_allclose(tau[:2], [0.0, -0.5 * RHO * 0.02 * DRAG_MAX * V**2], atol=1e-2)
+    a = np.array([0.3, 0.8, 1.2, 1.5])
+    nu = V * np.column_stack([np.cos(a), np.sin(a), *np.zeros((4, 4))])
+    across = np.column_stack([-np.sin(a), np.cos(a)])
+    lifts = np.abs((wrench(fin(), nu, np.zeros((4, 2)))[:, :2] * across).sum(1))
+    expected = 0.5 * RHO * 0.02 * V**2 * 3.0 * 0.3 * (np.pi / 2 - a) / (np.pi / 2 - 0.3)
+    np.testing.assert_allclose(lifts, expected, atol=2e-2)
+
+
+def test_without_incidence_only_the_deflection_counts():
+    """`incidence: 0`: sideways motion adds to the speed and not to the angle."""
+    tau = wrench(fin(incidence=0.0), [1.2, 0.5, 0, 0, 0, 0], [0.0, 0.1])
+    q = 0.5 * RHO * 0.02 * (1.2**2 + 0.5**2)
+    np.testing.assert_allclose(tau[:2], [-q * (0.01 + 0.002 + 0.011), q * 0.3], atol=4e-3)
+
+
+def test_a_propeller_s_wake_makes_a_fin_work_at_rest():
+    """V² = 2 k T / (ρ A_disc) where the vehicle stands: lift at the bollard (momentum theory)."""
+    T, k = 20.0, 0.6
+    vehicle = hull({"fin": {**FIN, "wake": {"propeller": k}}})
+    gained = wrench(vehicle, np.zeros(6), [T, 0.2])
+    square = 2.0 * k * T / (RHO * np.pi * 0.07**2)
+    np.testing.assert_allclose(gained[1], 0.5 * RHO * 0.02 * 3.0 * 0.2 * square, rtol=1e-3)
+
+
+def test_a_current_is_part_of_the_flow():
+    """At rest in water that moves aft, a fin steers as it does ahead in still water."""
+    found = []
+    for water, speed in ((None, 1.0), (Water(current=(-1.0, 0.0, 0.0)), 0.0)):
+        sim = fs.Simulator(fin(), control_step=0.01, substeps=1, water=water)
+        sim.place(position=(0.0, 0.0, -50.0), velocity=(speed, 0.0, 0.0, 0.0, 0.0, 0.0))
+        sim.set_actuators([0.0, 0.2])
+        for _ in range(20):
+            sim.step()
+        found.append(sim.numpy("velocity")[0, 0, [1, 5]].copy())
+    np.testing.assert_allclose(found[0], found[1], atol=1e-4)
+
+
+# Propellers
+
+
+INFLOW = {"thrust_loss": 0.01, "torque_loss": 4e-4, "wake_fraction": 0.1}
+
+
+def test_thrust_and_torque_fall_with_the_inflow():
+    """T = c ω² - a ω V_a and Q = k ω² - b ω V_a; the vehicle feels -Q about the axis."""
+    changes = {"inflow": INFLOW, "torque_constant": 1e-4}
+    vehicle, U, T = hull({}, propeller=changes), 2.0, 25.0
+    omega, ahead = np.sqrt(T / 1.6e-3), 0.9 * U
+    tau = wrench(vehicle, [U, 0, 0, 0, 0, 0], [T])
+    mean = 1e-4 * 2.0 / (1.6e-3 + 1.4e-3)  # thrust to torque by the mean of both directions
+    np.testing.assert_allclose(tau[0], T - 0.01 * omega * ahead, rtol=1e-4)
+    np.testing.assert_allclose(tau[3], -mean * T + 4e-4 * omega * ahead, atol=1e-3)
+
+
+def test_the_inflow_takes_energy_out():
+    """Its part of the thrust works against the motion, ahead and astern, for either direction of rotation."""
+    nu = RNG.uniform(-2.0, 2.0, (100, 6))
+    values = RNG.uniform(-40.0, 40.0, (100, 1))
+    without = wrench(hull({}), nu, values)
+    power = (nu * (wrench(hull({}, propeller={"inflow": {"thrust_loss": 0.01}}), nu, values) - without)).sum(
+        1
+    )
+    assert (power <= 1e-2).all() and power.min() < -1.0
+
+
+# Buoyancy and mass
+
+
+def test_a_buoyancy_engine_lifts_and_pitches():
+    """ρ g V upwards at its place."""
+    tau = wrench(hull({"tank": SECTIONS["buoyancy"]}), np.zeros(6), [0.0, 5e-4])
+    F = RHO * G * 5e-4
+    np.testing.assert_allclose(tau, [0, 0, F, 0, -0.4 * F, 0], atol=1e-3)
+
+
+def test_a_moved_mass_moves_centre_and_inertia():
+    """With the mass at r + δ the vehicle accelerates like one whose body has that centre and inertia."""
+    delta, m, p = 0.15, 4.0, np.array([0.1, 0.0, -0.05])
+    vehicle, nu = hull({"battery": SECTIONS["moving_mass"]}), [1.0, 0.2, -0.1, 0.1, 0.3, -0.2]
+    r_g, M = vehicle.body.center_of_gravity, vehicle.body.mass
+    r = p + [delta, 0.0, 0.0]
+    moved = r_g + m / M * (r - p)
+
+    def about_origin(r, m):
+        return m * (r @ r * np.eye(3) - np.outer(r, r))
+
+    inertia = vehicle.body.inertia + about_origin(r_g, M) - about_origin(p, m)
+    inertia += about_origin(r, m) - about_origin(moved, M)
+    expected = hull({}).replace({"body.center_of_gravity": moved.tolist(), "body.inertia": inertia.tolist()})
+    found = fs.acceleration(vehicle, DEEP, nu, actuators=[0.0, delta])
+    np.testing.assert_allclose(found, fs.acceleration(expected, DEEP, nu), atol=2e-4)
+
+
+def test_a_gimbal_turns_the_thrust():
+    """T (cos δ, sin δ, 0) at the disc."""
+    T, d = 30.0, 0.3
+    tau = wrench(hull({"nozzle": SECTIONS["gimbal"]}), np.zeros(6), [T, d])
+    np.testing.assert_allclose(tau, [T * np.cos(d), T * np.sin(d), 0, 0, 0, -0.7 * T * np.sin(d)], atol=2e-3)
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({**FIN, "kind": "wing"}, "kind is 'wing'"),
+        ({k: x for k, x in FIN.items() if k != "area"}, "area is missing"),
+        ({**FIN, "colour": 3}, "unknown key 'colour'"),
+        ({**FIN, "minimum": 0.1}, "a travel that holds 0"),
+        ({**FIN, "chord": [0.0, 0.0, 1.0]}, "not perpendicular"),
+        ({**FIN, "stall": 1.6}, "less than a right angle"),
+        ({**FIN, "wake": {"screw": 0.5}}, "no thruster 'screw'"),
+        ({**SECTIONS["gimbal"], "thruster": "screw"}, "no thruster 'screw'"),
+    ],
+)
+def test_a_section_that_cannot_be_is_refused(tmp_path, section, words):
+    """One sentence that names file, actuator and key."""
+    import yaml
+
+    file = tmp_path / "rov.yaml"
+    file.write_text(
+        yaml.safe_dump(
+            {"extends": "remus100", "title": "x", "origin": "guessed", "actuators": {"rudder": section}}
+        ),
+        encoding="utf-8",
+    )
+    with pytest.raises(VehicleError, match=words) as error:
+        fs.load_vehicle(file)
+    assert "rudder" in str(error.value)
+
+
+def test_actuators_are_part_of_the_file_and_of_its_digest():
+    """What is read is written again and read as the same; another area is another vehicle."""
+    vehicle = fin()
+    again = type(vehicle)(**vehicle.values(), name="hull")
+    assert again.sha256 == vehicle.sha256 and again.values() == vehicle.values()
+    assert vehicle.replace({"actuators.fin.area": 0.03}).sha256 != vehicle.sha256
+    assert vehicle.channel_names == ("propeller", "fin") and len(installed(vehicle)) == 1
+
+
+def test_commands_keep_to_channels():
+    """Thrust commands leave the other actuators where they are; too many channels are refused."""
+    sim = fs.Simulator(fin(), worlds=2)
+    sim.set_actuators([5.0, 0.1])
+    sim.set_thrust([10.0])
+    np.testing.assert_allclose(sim.numpy_command()[:, 0, :2], [[10.0, 0.1]] * 2)
+    with pytest.raises(SimulatorError, match="expected"):
+        sim.set_actuators([1.0, 2.0, 3.0])
+    with pytest.raises(SimulatorError, match="1 thrusters and 8 other actuators; at most 8"):
+        fs.Simulator(hull({f"fin{i}": FIN for i in range(8)}))
