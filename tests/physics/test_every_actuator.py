@@ -11,9 +11,12 @@ from finssim.core.registry import ACTUATORS
 from finssim.physics.actuators.fin import DRAG_MAX
 from finssim.physics.types import join, vec6
 from finssim.sim import SimulatorError, Water
+from finssim.sim.ranges_file import Ranges
 from finssim.vehicles import VehicleError
 from finssim.vehicles.actuators import Actuator, ActuatorKind, installed
+from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.part import Positive, Vector3
+from reference.draws import draw
 
 DEEP = [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
 RNG = np.random.default_rng(35)
@@ -377,3 +380,32 @@ def test_commands_keep_to_channels():
         sim.set_actuators([1.0, 2.0, 3.0])
     with pytest.raises(SimulatorError, match="1 thrusters and 8 other actuators; at most 8"):
         fs.Simulator(hull({f"fin{i}": FIN for i in range(8)}))
+
+
+def test_top_speed_counts_the_inflow():
+    """In the simulation at full thrust a propeller that loses thrust reaches the speed that `terminal_speeds` says."""
+    vehicle = hull({}, propeller={"inflow": {"thrust_loss": 0.02, "wake_fraction": 0.2}})
+    stable = {"hydrodynamics.calibrated.added_mass": [1.0, 1.0, 1.0, 0.1, 4.0, 4.0]}  # no Munk moment
+    level = vehicle.replace({"body.center_of_gravity": [0.0, 0.0, -0.02], **stable})
+    sim = fs.Simulator(level, control_step=0.1)
+    sim.place(position=(0.0, 0.0, -50.0))
+    sim.set_thrust([40.0])
+    for _ in range(600):
+        sim.step()
+    expected = terminal_speeds(level)[0]
+    np.testing.assert_allclose(sim.numpy("velocity")[0, 0, 0], expected, rtol=1e-3)
+    assert expected < 0.8 * terminal_speeds(hull({}))[0]
+
+
+def test_ranges_draw_the_parameters_of_all_fins():
+    """`fin: {lift_slope: ...}` scales both fins of a world alike; a scale of thrust leaves angles alone."""
+    two = {"rudder": FIN, "stern": {**FIN, "span": [0.0, 1.0, 0.0], "lift_slope": 2.0}}
+    parts = {"fin": {"lift_slope": [0.5, 1.5]}, "thrust": {"all": [0.5, 0.6]}}
+    sim, _ = draw(parts, vehicles=hull(two), worlds=200, seed=3)
+    slopes = np.array([sim.plant.fields[f"actuators.fin_{k}.lift_slope"].numpy()[:, 0] for k in (1, 2)])
+    np.testing.assert_allclose(slopes[1] / slopes[0], 2.0 / 3.0, rtol=1e-5)
+    assert 1.45 < slopes[0].min() < 1.7 and 4.3 < slopes[0].max() < 4.55
+    gain = sim.plant.gain.numpy()[:, 0]
+    assert (gain[:, 0] < 0.61).all() and (gain[:, 1:] == 1.0).all()
+    with pytest.raises(ValueError, match="lift_slop"):
+        Ranges.model_validate({"name": "x", "fin": {"lift_slop": [0.5, 1.5]}})

@@ -297,18 +297,21 @@ def write_thrusters(
     lag = vec8()
     added = vec8()
     nominal_lag = n.plant[0, v].time_constant
+    c_plus = n.plant[0, v].c_plus
     for k in range(MAX_THRUSTERS):
-        gain[k] = (
+        drawn_gain = (
             x[w, v, wp.static(COLUMN["thrust.all"])]
             * x[w, v, wp.static(COLUMN["thrust.each.0"]) + k]
             * x[w, v, wp.static(COLUMN["thrust.failure.0"]) + k]
         )
+        thrusts = c_plus[k] > 0.0  # not a fin or another actuator
+        gain[k] = wp.where(thrusts, drawn_gain, 1.0)
         each = (
             x[w, v, wp.static(COLUMN["time_constant.all"])]
             * x[w, v, wp.static(COLUMN["time_constant.each.0"]) + k]
         )
         lag[k] = nominal_lag[k] * each + x[w, v, wp.static(COLUMN["added_time_constant"])]
-        added[k] = x[w, v, wp.static(COLUMN["added_dead_zone"])]
+        added[k] = wp.where(thrusts, x[w, v, wp.static(COLUMN["added_dead_zone"])], 0.0)
     plant[w, v].gain = gain
     plant[w, v].time_constant = lag
     plant[w, v].delay = drawn_delay(x, w, v, n.plant[0, v].delay)
@@ -726,7 +729,7 @@ def _nominal_vehicles(simulator: "Simulator", waves: WaveRanges | SeaRanges | No
     out.plant, out.extra = plant.array, plant.extra
     slots = layout(plant.terms)
     for field, name_of in (("factor", str), ("added", added_entry)):
-        columns = [INDEX.get(name_of(slot.path), -1) for slot in slots for _ in range(slot.size)]
+        columns = [INDEX.get(name_of(slot.entry), -1) for slot in slots for _ in range(slot.size)]
         setattr(out, field, wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device))
     H, M_A = [], []
     for vehicle in vehicles:

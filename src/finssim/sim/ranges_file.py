@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from finssim.core.registry import TERMS
+from finssim.core.registry import ACTUATORS, TERMS
 from finssim.core.yaml_file import read_mapping
 from finssim.sim.distributions import (
     Above0,
@@ -32,6 +32,7 @@ from finssim.sim.distributions import (
 )
 from finssim.sim.site import SurroundingsError
 from finssim.sim.water import SeaState, Wave
+from finssim.vehicles.actuators import ActuatorKind
 from finssim.vehicles.terms import Term
 
 SHIPPED = Path(__file__).parent / "ranges"
@@ -333,7 +334,8 @@ class Ranges(RangesPart):
     linear_damping: AxisScales = AxisScales()
     quadratic_damping: AxisScales = AxisScales()
     terms: dict[str, Interval] = Field(default_factory=dict)
-    """Distributions of the vehicle's terms by entry (see `term_entries`); in a file under the term's name."""
+    """Distributions of the vehicle's terms and actuators by entry (see `term_entries`); in a file under the name of the
+    term, or of the kind of actuator."""
     mesh_drag: Scale = ONE
     """Factor on form and skin drag of the mesh model."""
     thrust: ThrustScales = ThrustScales()
@@ -377,9 +379,10 @@ class Ranges(RangesPart):
             name, _, parameter = entry.partition(".")
             out[name] = {**out.get(name, {}), parameter: drawn} if parameter else drawn
         for name in [name for name in out if name not in cls.model_fields]:
-            term = TERMS.get(str(name))
-            if term is not None:  # another is refused as an unknown entry
-                terms |= _of_term(term, out.pop(name))
+            family = TERMS if name in TERMS else ACTUATORS
+            member = family.get(str(name))
+            if member is not None:  # another is refused as an unknown entry
+                terms |= _of_member(member, out.pop(name))
         return {**out, "terms": terms} if terms else out
 
     @model_validator(mode="after")
@@ -390,25 +393,26 @@ class Ranges(RangesPart):
         return self
 
 
-def _of_term(term: Term, stated: Any) -> dict[str, Any]:
-    """Return the distributions of a term by entry.
+def _of_member(member: Term | ActuatorKind, stated: Any) -> dict[str, Any]:
+    """Return the distributions of a term or a kind of actuator by entry.
 
     Raises:
         ValueError: An entry that it does not have, or a range that cannot be; one sentence.
     """
-    from finssim.sim.ranges_table import term_entries  # the table imports this module
+    from finssim.sim.ranges_table import actuator_entries, term_entries  # the table imports this module
 
-    entries = {entry.name: entry for entry in term_entries(term)}
-    if term.name in entries:
-        stated = {term.name: stated}
+    found = term_entries(member) if isinstance(member, Term) else actuator_entries(member)
+    entries = {entry.name: entry for entry in found}
+    if member.name in entries:
+        stated = {member.name: stated}
     elif isinstance(stated, Mapping):
-        stated = {f"{term.name}.{key}": drawn for key, drawn in stated.items()}
+        stated = {f"{member.name}.{key}": drawn for key, drawn in stated.items()}
     else:
-        raise ValueError(f"{term.name}: is {stated!r}, expected ranges of {', '.join(entries)}")
+        raise ValueError(f"{member.name}: is {stated!r}, expected ranges of {', '.join(entries)}")
     out = {}
     for name, drawn in stated.items():
         if name not in entries:
-            raise ValueError(f"{term.name}: {unknown(name, entries)}")
+            raise ValueError(f"{member.name}: {unknown(name, entries)}")
         try:
             kind: Any = Scale if entries[name].unit == "1" else Interval
             out[name] = TypeAdapter(kind).validate_python(drawn)

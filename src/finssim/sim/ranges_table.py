@@ -10,6 +10,7 @@ from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.distributions import Distribution, Drawn, distribution_of, unknown
 from finssim.sim.measured import SENSORS
 from finssim.sim.ranges_file import AXES, MAX_WAVES, EachScales, Offsets, Ranges, SeaRanges
+from finssim.vehicles.actuators import ActuatorKind
 from finssim.vehicles.terms import Term
 
 TURN = Distribution(uniform=(0.0, 6.2831853))
@@ -101,18 +102,28 @@ WORLD_END = len(ENTRIES)
 def term_entries(term: Term) -> list[DrawnNumber]:
     """Entries of a term: `lift.coefficient`, a factor on each parameter, and `lift.added_coefficient`, to be added.
 
-    Only parameters that are one number in a section of their own can be added to. The streams follow from the names.
+    Only parameters that are one number in a section of their own can be added to.
     """
     scalars, out = term.scalars(), []
     for name, path in term.parameters.items():
         out.append(DrawnNumber(path))
         if path in scalars and path != term.name:
             out.append(DrawnNumber(added_entry(path), term.units[name], 0.0))
-    for entry in out:
+    return _registered(out)
+
+
+def _registered(entries: list[DrawnNumber]) -> list[DrawnNumber]:
+    """Add entries to the table, where it lacks them; their streams follow from their names."""
+    for entry in entries:
         if entry.name not in INDEX:
             INDEX[entry.name] = len(ENTRIES)
             ENTRIES.append(replace(entry, stream=(1 << 20) + zlib.crc32(entry.name.encode()) % (1 << 28)))
-    return out
+    return entries
+
+
+def actuator_entries(kind: ActuatorKind) -> list[DrawnNumber]:
+    """Entries of a kind of actuator: `fin.lift_slope`, a factor on a parameter of all actuators of that kind."""
+    return _registered([DrawnNumber(f"{kind.name}.{name}") for name in kind.scalars])
 
 
 def added_entry(path: str) -> str:

@@ -128,18 +128,34 @@ def terminal_speed(d1: float, d2: float, tau: float) -> float:
 def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
     """Steady speed on each axis alone at its symmetric wrench limit, from d1 and d2 of that axis and its terms.
 
+    A propeller that loses thrust in a flow does so at its speed of rotation for that limit.
+
     Returns:
         [m/s, rad/s], (6,)
     """
     chosen = _coefficients(vehicle, hydrodynamics)
+    drag = np.diag(chosen.linear_damping) + _inflow_damping(vehicle)
     return np.array(
-        [
-            terminal_speed(*row)
-            for row in zip(
-                np.diag(chosen.linear_damping), chosen.axis_drag, vehicle.wrench_limits, strict=True
-            )
-        ]
+        [terminal_speed(*row) for row in zip(drag, chosen.axis_drag, vehicle.wrench_limits, strict=True)]
     )
+
+
+def _inflow_damping(vehicle: Vehicle) -> Array:
+    """Loss of thrust per speed on each axis at the axis' symmetric wrench limit [N s/m, N m s], (6,).
+
+    a |ω| (1 - w) (B_i)² of each thruster, with the thrust f that the limit takes and ω = sqrt(|f| / c).
+    """
+    if all(thruster.inflow is None for thruster in vehicle.thrusters.values()):
+        return np.zeros(6)
+    B = vehicle.control_matrix
+    loss = np.zeros(6)
+    for i, limit in enumerate(vehicle.wrench_limits):
+        forces = limit * np.linalg.pinv(B)[:, i]
+        for column, force, thruster in zip(B[i], forces, vehicle.thrusters.values(), strict=True):
+            if thruster.inflow is not None:
+                share = thruster.inflow.thrust_loss * (1.0 - thruster.inflow.wake_fraction)
+                loss[i] += share * abs(float(thruster.speed(force))) * column**2
+    return loss
 
 
 def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:

@@ -138,6 +138,9 @@ def _tables(vehicle: Vehicle) -> Iterator[Table]:
             yield _table(f"Terms: {name}", ("", "value", "unit"), _terms(vehicle, name, chosen))
     heads = ("", "position [m]", "axis", "force [N]", "rpm", "lag [s]", "acts on", "motor")
     yield _table("Thrusters", heads, _thrusters(vehicle))
+    if vehicle.actuators:
+        heads = ("", "kind", "position [m]", "travel", "rate [1/s]", "lag [s]", "play")
+        yield _table("Other actuators (angles in rad, volumes in m³, ways in m)", heads, _others(vehicle))
     if "sensors" not in vehicle.defaults:
         heads = ("", "kind", "position [m]", "rate [Hz]", "latency [s]", "lost")
         aboard = (
@@ -246,6 +249,20 @@ def _thrusters(vehicle: Vehicle) -> Iterator[Sequence[str]]:
             f"{t.delay:g} + {t.time_constant:g}{_mark(vehicle, f'{path}.time_constant')}",
             t.domain,
             "" if t.motor_index is None else f"M{t.motor_index + 1} {t.motor_sign:+d}",
+        )
+
+
+def _others(vehicle: Vehicle) -> Iterator[Sequence[str]]:
+    for name, actuator in vehicle.actuators.items():
+        path, place = f"actuators.{name}", getattr(actuator, "position", None)
+        yield (
+            escape(name),
+            actuator.kind,
+            "" if place is None else _rounded(place),
+            f"{actuator.minimum:g} {actuator.maximum:+g}{_mark(vehicle, f'{path}.maximum')}",
+            "" if math.isinf(actuator.rate_limit) else f"{actuator.rate_limit:g}",
+            f"{actuator.time_constant:g}",
+            f"{actuator.play:g}",
         )
 
 

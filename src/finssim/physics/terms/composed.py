@@ -177,6 +177,11 @@ class Slot:
     first: int
 
     @property
+    def entry(self) -> str:
+        """Name in a ranges file: of a term its path, of an actuator kind and parameter, as in `fin.lift_slope`."""
+        return f"{self.term.kind.name}.{self.name}" if isinstance(self.term, InstalledActuator) else self.path
+
+    @property
     def size(self) -> int:
         """Numbers in it."""
         return 1 if self.kind is float else int(np.prod(self.kind._shape_))
