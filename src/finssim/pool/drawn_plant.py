@@ -42,7 +42,7 @@ class Spread:
     """Distance of a plant of one severity from the vehicle file: ±, uniform, unless a name says otherwise."""
 
     hydrodynamics: float
-    """Spread of every diagonal entry of added mass and damping [-]."""
+    """Spread of every diagonal entry of added mass and damping, and of the forces of each term [-]."""
     center: float
     """Spread of the points where they are diagonal, per axis [m]."""
     tilt_deg: float
@@ -56,9 +56,11 @@ class Spread:
     deduction: tuple[float, float]
     """Least and most of the thrust [-]."""
     thrust: float
-    """Spread of each propeller's thrust, in each direction [-]."""
+    """Spread of each propeller's thrust, in each direction, and of the gain of other actuators [-]."""
     motor: float
-    """Spread of each motor's lag, delay and slowest speed [-]."""
+    """Spread of each motor's lag, delay and slowest speed, and of the lag of other actuators [-]."""
+    offset: float
+    """Misalignment of other actuators, of half their travel [-]."""
     fade: float
     """Discharge of the battery in a quarter of an hour [-]."""
     resistance: float
@@ -94,6 +96,7 @@ SPREADS: dict[Severity, Spread] = by_severity(
     deduction=((0.0, 0.0), (0.02, 0.06), (0.04, 0.12)),
     thrust=(0.0, 0.15, 0.25),
     motor=(0.0, 0.2, 0.35),
+    offset=(0.0, 0.02, 0.04),
     fade=(0.0, 0.04, 0.08),
     resistance=(0.0, 0.03, 0.06),
     mass=(0.0, 0.012, 0.025),
@@ -201,7 +204,7 @@ def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float
         T = np.linalg.pinv(B) @ (F[i] * np.eye(6)[i])
         speed = np.array([abs(t.speed(f)) for t, f in zip(thrusters, T, strict=True)])
         motion = np.eye(3)[i] if i < 3 else np.cross(np.eye(3)[i - 3], position)
-        along = v[i] * np.sum(axis * motion, axis=1)
+        along = v[i] * np.sum(axis * motion, axis=1) * [t.inflow is None for t in thrusters]
         stall = p.advance_at_zero_thrust * p.diameter / (2.0 * math.pi) * np.maximum(speed, 20.0)
         drag[i] += B[i] @ (np.abs(T) * p.own_share * along / stall)
     return np.where(v > 0.0, drag + deduction * F, 0.0)
@@ -276,6 +279,9 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
             "clock_start": int(draw.within(2.0e4, 4.0e5)),
         },
     }
+    further = _Draw(np.random.default_rng([seed, DRAWN, 1]))
+    sections["actuators"] = _actuators(vehicle, spread, further)
+    sections["terms"] = {name: 1.0 + further.around(spread.hydrodynamics) for name in hydro.terms}
     return PlantSpec.model_validate({**sections, **_water(vehicle, hydro, spread, draw, sections)})
 
 
@@ -309,11 +315,8 @@ def _water(
     M_A = _congruent(hydro.added_mass, draw.around(half, 6))
     factor = draw.around(half, 6)
     D1, D2 = _congruent(hydro.linear_damping, factor), _congruent(hydro.quadratic_damping, factor)
-    if hydro.terms:
-        raise PlantSpecError(
-            f"vehicle '{vehicle.name}' has {', '.join(hydro.terms)}, which the pool's plants do not model"
-        )
-    drag = panel_drag(vehicle)
+    # Terms describe the flow around the hull already.
+    drag = np.zeros(6) if hydro.terms else panel_drag(vehicle)
     hull = hull_share(vehicle, spread.hull_share, drag)
     panels = hull["form_drag"] * drag
     outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
@@ -377,6 +380,17 @@ def _thrusters(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
             "full_rpm": HEADROOM * max(t.rpm_max, -t.rpm_min) * (1.0 + draw.around(0.1 * spread.motor)),
         }
     return built
+
+
+def _actuators(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
+    return {
+        name: {
+            "gain": 1.0 + draw.around(spread.thrust),
+            "offset": draw.around(0.5 * spread.offset * (a.maximum - a.minimum)),
+            "time_constant": a.time_constant * (1.0 + draw.around(spread.motor)),
+        }
+        for name, a in vehicle.actuators.items()
+    }
 
 
 def _buoyancy(spread: Spread, draw: _Draw) -> dict[str, Any]:

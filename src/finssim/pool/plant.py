@@ -14,7 +14,7 @@ from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
 from finssim.physics.terms.composed import layout
-from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
+from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays, profile_at
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.sim import Dock, RectangularPool, Simulator, TetherLine, Water, Wave
@@ -128,15 +128,16 @@ class PropellerBank:
     place: wp.array(dtype=wp.vec3)  # body frame [m]
     c_plus: wp.array(dtype=float)  # as built, less the thrust deduction [N s²/rad²]
     c_minus: wp.array(dtype=float)  # the same for reverse [N s²/rad²]
-    own_share: float  # share of a propeller's own induced speed
+    own_share: wp.array(dtype=float)  # share of the vehicle's own speed along the thrust in the inflow
     share: wp.array2d(dtype=float)  # part of neighbour j's induced speed that enters propeller k
     stall: float  # J0 D / 2π: inflow at which a shaft speed gives no thrust, per shaft speed [m]
     disc: float  # 2 ρ times the disc's area [kg/m]
+    others: wp.array(dtype=float)  # commands of the channels behind the propellers [rad, m³ or m]
 
 
 @wp.func
 def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu_r: vec6) -> vec8:
-    """Thrust that reaches the vehicle, T = T_bollard (1 - V / (J0 n D)), by propeller [N].
+    """Thrust that reaches the vehicle, T = T_bollard (1 - V / (J0 n D)), by propeller [N], and the other commands.
 
     The inflow V is a share of the vehicle's own speed along the thrust, v·a sign T, and what the neighbours' jets add:
     their induced speed sqrt(|T| / 2 ρ A), by momentum theory, falling with distance.
@@ -155,10 +156,12 @@ def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu
         for j in range(propellers.count):
             V += propellers.share[k, j] * wp.sqrt(wp.abs(bollard[j]) / propellers.disc)
         inflow = wp.dot(propellers.axis[k], linear(nu_r) + wp.cross(angular(nu_r), propellers.place[k]))
-        V += propellers.own_share * wp.sign(bollard[k]) * inflow
+        V += propellers.own_share[k] * wp.sign(bollard[k]) * inflow
         slowest = wp.static(2.0 * math.pi * SLOWEST)
         loss = V / (propellers.stall * wp.max(wp.abs(speed[k]), slowest))
         T[k] = bollard[k] * (1.0 - wp.clamp(loss, -1.0, 1.0))
+    for k in range(propellers.count, MAX_THRUSTERS):
+        T[k] = propellers.others[k]
     return T
 
 
@@ -187,8 +190,9 @@ def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> Pr
         c_plus=[t.c_plus * b.gain_plus * (1.0 - b.deduction) for t, b in built],
         c_minus=[t.c_minus * b.gain_minus * (1.0 - b.deduction) for t, b in built],
         share=induced_shares(vehicle, spec),
+        own_share=[0.0 if t.inflow else spec.propellers.own_share for t in nominal],
+        others=np.zeros(MAX_THRUSTERS),
     )
-    bank.own_share = spec.propellers.own_share
     bank.stall = spec.propellers.advance_at_zero_thrust * spec.propellers.diameter / (2.0 * math.pi)
     bank.disc = 2.0 * vehicle.water.density * 0.25 * math.pi * spec.propellers.diameter**2
     return bank
@@ -502,7 +506,7 @@ def drive(
         quaternion: Body to world, xyzw, (worlds, vehicles).
         velocity: Twist, body frame [m/s, rad/s], (worlds, vehicles).
         steps: Physics steps so far, (worlds,).
-        thrust: Written: along the thrusters' axes [N], (worlds, vehicles).
+        thrust: Written: along the thrusters' axes [N], and commands of other actuators, (worlds, vehicles).
         disturbance: Written: wrench about the body origin, body frame [N, N m], (worlds, vehicles).
         surroundings: Water of the engine; its current is written, to which the engine adds the profile.
         motors: Motors and speed loops.
@@ -570,10 +574,20 @@ class Plant:
         Raises:
             PlantSpecError: The plant is not of this vehicle.
         """
-        if set(spec.thrusters) != set(vehicle.thruster_names):
+        terms = getattr(vehicle.hydrodynamics["calibrated"], "terms", {})
+        for kind, have, wanted in (
+            ("thrusters", spec.thrusters, vehicle.thrusters),
+            ("actuators", spec.actuators, vehicle.actuators),
+            ("terms", spec.terms, terms),
+        ):
+            if set(have) != set(wanted):
+                raise PlantSpecError(
+                    f"plant '{spec.title}' has the {kind} {', '.join(have) or 'none'}, but {vehicle.name} "
+                    f"has {', '.join(wanted) or 'none'}: draw a plant around this vehicle"
+                )
+        if terms and (spec.hull.form_drag or spec.hull.skin_drag):
             raise PlantSpecError(
-                f"plant '{spec.title}' has the thrusters {', '.join(spec.thrusters)}, but {vehicle.name} "
-                f"has {', '.join(vehicle.thruster_names)}: draw a plant around this vehicle"
+                f"plant '{spec.title}' has drag of the hull's panels beside {', '.join(terms)}: set `hull` to 0"
             )
         self.vehicle, self.spec = vehicle, spec
         self.steps_per_period = math.ceil(period / LONGEST_STEP - 1e-9)
@@ -585,7 +599,8 @@ class Plant:
         self._views()
         s = self.simulator
         pipeline = s.pipeline()
-        banks = [self.motors, propeller_bank(vehicle, spec), _hidden(vehicle, spec)]
+        propellers = propeller_bank(vehicle, spec)
+        banks = [self.motors, propellers, _hidden(vehicle, spec)]
         banks += [gyre(spec.circulation, spec.basin), slack_line(spec.tether)]
         self._banks = banks  # a recorded launch does not keep the arrays inside structs alive
         state = [s.state.position, s.state.quaternion, s.state.velocity, s.state.steps]
@@ -596,6 +611,10 @@ class Plant:
         s.add_step(pipeline)
         self._step = captured(pipeline.run)
         self.steps = 0
+        self._others = propellers.others.numpy()[len(vehicle.thrusters) : len(vehicle.channel_names)]
+        built = [spec.actuators[name] for name in vehicle.actuators]
+        self._gain = np.array([a.gain for a in built])
+        self._offset = np.array([a.offset for a in built])
 
     def _simulator(
         self, position: ArrayLike, quaternion: ArrayLike, world: Any | None, dock: Dock | None
@@ -625,10 +644,20 @@ class Plant:
             threads=1,
             water_moves=bool(spec.circulation.eddies or any(spec.circulation.stream) or water.moving),
         )
-        none = {slot.path: 0.0 for slot in layout(simulator.plant.terms)}
-        for name, value in (_engine_fields(vehicle, spec) | none).items():
-            view = simulator.plant.fields[name].numpy()
+        fields = simulator.plant.fields
+        for name, value in _engine_fields(vehicle, spec).items():
+            view = fields[name].numpy()
             view[...] = value
+        for slot in layout(simulator.plant.terms):
+            if slot.term.name in spec.terms and slot.term.units[slot.name].startswith("N"):
+                view = fields[slot.path].numpy()
+                view *= spec.terms[slot.term.name]
+        n = len(vehicle.thrusters)
+        for name, value in _motors_fields().items():
+            fields[name].numpy()[..., :n] = value
+        for k, actuator in enumerate((spec.actuators[name] for name in vehicle.actuators), start=n):
+            fields["time_constant"].numpy()[..., k] = actuator.time_constant
+            fields["gain"].numpy()[..., k] = actuator.gain
         simulator.place(position=position, quaternion=quaternion)
         simulator.refresh()
         return simulator
@@ -643,6 +672,8 @@ class Plant:
         """Body frame [m/s, rad/s]; a view, (6,)."""
         self.thrust = s.numpy("thrust")[0, 0, :n]
         """Delivered, canonical order [N]; a view, (n,)."""
+        self.values = s.numpy("thrust")[0, 0, n : len(self.vehicle.channel_names)]
+        """Values of the other actuators [rad, m³ or m]; a view, (m,)."""
         self.water_velocity = s.water.current.numpy()[0]
         """At the body, world frame [m/s]; a view, (3,)."""
         self.target = self.motors.target.numpy()
@@ -655,6 +686,15 @@ class Plant:
         """-1 to 1; a view, (n,)."""
         self.electric = self.motors.electric.numpy()
         """Battery voltage [V] and current [A]; a view, (2,)."""
+
+    def set_points(self, values: ArrayLike) -> None:
+        """Set what the firmware asks of the other actuators [rad, m³ or m], (m,)."""
+        self._others[:] = np.asarray(values, float) + self._offset
+
+    @property
+    def measured_values(self) -> Array:
+        """Values of the other actuators as their sensors have them [rad, m³ or m], (m,)."""
+        return np.asarray(self.values / self._gain - self._offset)
 
     @property
     def time(self) -> float:
@@ -686,7 +726,7 @@ def captured(run: Callable[[], None]) -> Callable[[], None]:
 
 
 def _engine_fields(vehicle: Vehicle, spec: PlantSpec) -> dict[str, Any]:
-    """Return the engine's parameters: the true body, no damping of its own, and an actuator without dynamics."""
+    """Return the engine's parameters: the true body, no damping of its own, and thrusters without dynamics."""
     body = spec.body
     r_g = np.array(body.center_of_gravity)
     to_origin = body.mass * (r_g @ r_g * np.eye(3) - np.outer(r_g, r_g))
@@ -699,15 +739,16 @@ def _engine_fields(vehicle: Vehicle, spec: PlantSpec) -> dict[str, Any]:
         "M_A": spec.added_mass.about_origin(),
         "D1": 0.0,
         "D2": 0.0,
-        "force_min": -1.0e6,
-        "force_max": 1.0e6,
         "dead_minus": 0.0,
         "dead_plus": 0.0,
-        "time_constant": 0.0,
-        "slew": NO_LIMIT,
         "delay": 0.0,
         "speed_lag": 0,
     }
+
+
+def _motors_fields() -> dict[str, float]:
+    """Return the parameters of the thrusters' channels in the engine, where motors and thrust are the plant's."""
+    return {"force_min": -1.0e6, "force_max": 1.0e6, "time_constant": 0.0, "slew": NO_LIMIT}
 
 
 def _hidden(vehicle: Vehicle, spec: PlantSpec) -> Hidden:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -304,13 +304,24 @@ class TrueThruster(Section):
     """Speed at full throttle on a full battery [rpm]."""
 
 
+class TrueActuator(Section):
+    """One actuator besides the thrusters, as built; its force law is that of the vehicle file."""
+
+    gain: float = Field(gt=0.0)
+    """Change of its value over that of its sensor [-]."""
+    offset: float
+    """Value at which its sensor shows 0, over the gain [rad, m³ or m]."""
+    time_constant: float = Field(ge=0.0)
+    """[s]"""
+
+
 class Propellers(Section):
     """Loss of thrust by moving water: T (1 - V / (J0 n D)), V the inflow, n turns a second."""
 
     diameter: float = Field(default=0.07, gt=0.0)
     """D [m]."""
     own_share: float = Field(default=0.0, ge=0.0)
-    """Part of the vehicle's own speed along the axis that enters V [-]."""
+    """Part of the vehicle's own speed along the axis that enters V [-]; 0 where the vehicle file has an `inflow`."""
     advance_at_zero_thrust: float = Field(default=0.8, gt=0.0)
     """J0 [-]"""
     induced_share: float = Field(default=0.0, ge=0.0, le=1.0)
@@ -400,6 +411,10 @@ class PlantSpec(Section):
     hull: HullDrag = HullDrag()
     thrusters: dict[str, TrueThruster]
     """True thrusters by name, as in the vehicle file."""
+    actuators: dict[str, TrueActuator] = {}
+    """True actuators besides the thrusters, by name."""
+    terms: dict[str, Annotated[float, Field(gt=0.0)]] = {}
+    """Factor on the forces of each hydrodynamic term of the vehicle [-]."""
     propellers: Propellers = Propellers()
     battery: Battery = Battery()
     buoyancy: BuoyancyDrift = BuoyancyDrift()
