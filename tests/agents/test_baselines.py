@@ -19,8 +19,9 @@ from finssim.agents.pid import Pid, PidMemory
 from finssim.control.guidance import Goal
 from finssim.core.rotations import quat_from_euler, quat_multiply, quat_rotate
 from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, make
-from finssim.tasks.fitting import coefficients_of, driven_axes
+from finssim.tasks.fitting import driven_axes
 from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.capability import coefficients_of
 
 SINGLE = ("t1", "t2", "t3", "docking")
 HOLONOMIC = [name for name in catalogue() if len(driven_axes(load_vehicle(name))) == 3]

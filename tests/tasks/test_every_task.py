@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from finssim.tasks import TASKS, EnvironmentSetupError, make, numeric_tasks
-from finssim.tasks.fitting import coefficients_of, driven_axes
+from finssim.tasks.fitting import driven_axes
 from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.capability import coefficients_of
 from reference.examples import example
 
 NUMERIC = numeric_tasks()

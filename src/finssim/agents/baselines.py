@@ -19,13 +19,13 @@ from finssim.core.rotations import (
     quat_from_yaw,
     quat_rotate,
 )
-from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
 from finssim.tasks.moving_target import TARGET_SCALE
 from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
 from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
 from finssim.tasks.trajectory_tracking import LOOK_AHEAD
 from finssim.vehicles import Vehicle
+from finssim.vehicles.capability import coefficients_of
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.float32]

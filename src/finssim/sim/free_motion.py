@@ -1,4 +1,4 @@
-"""Stability of a vehicle without control: its model, linearised about level motion at constant speed."""
+"""A vehicle's model, linearised about level motion at constant speed; its stability without control."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from finssim.control.course import LinearModel, course_speeds, top_speed
 from finssim.sim.model import acceleration
-from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.capability import terminal_speeds
+from finssim.sim.plant_arrays import SimulatorError
+from finssim.vehicles import Vehicle
+from finssim.vehicles.capability import coefficients_of
 
-__all__ = ["MOTIONS", "FreeMotion", "stability"]
+__all__ = ["MOTIONS", "FreeMotion", "linear_model", "stability"]
 
 Array = NDArray[np.float64]
 
 MOTIONS = {"surge": (0,), "course": (1, 5), "roll": (3, 6), "pitch": (2, 4, 7)}
 """Motion -> its states: surge; sway and yaw rate; roll rate and angle; heave, pitch rate and angle."""
-STEP, DEPTH, USUAL = 1e-3, -100.0, 2.0
-"""Step of the differences [m/s, rad/s, rad], depth [m], and top speed of a vehicle that has none [m/s]."""
+STEP, DEPTH = 1e-3, -100.0
+"""Step of the differences [m/s, rad/s, rad], and depth [m]."""
 SLOW = 5e-3
 """Rate below which a motion neither grows nor dies out [1/s]; differences over a step of v|v| are smaller."""
 
@@ -42,19 +44,91 @@ class FreeMotion(NamedTuple):
         return f"{change} in {1.0 / abs(rate.real):.3g} s{swing}"
 
 
-def _system_matrices(vehicle: Vehicle, speeds: Array, hydrodynamics: str) -> Array:
+def linear_model(
+    vehicle: Vehicle, speeds: ArrayLike | None = None, hydrodynamics: str | None = None
+) -> LinearModel:
+    """Return a vehicle about level motion over its speed, with the columns of its channels, by central differences.
+
+    The channels that hold a speed are the least thrusts for it, with every other actuator at 0; what else it takes to
+    stay level is left to the integrals of a controller.
+
+    Args:
+        vehicle: The vehicle.
+        speeds: Surge in equal steps [m/s], (n,); those of `course_speeds` if None.
+        hydrodynamics: Its set; that with coefficients if None.
+
+    Raises:
+        SimulatorError: No thruster drives it ahead.
+    """
+    model = hydrodynamics or coefficients_of(vehicle)
+    lower, upper = (np.asarray(limit, float) for limit in vehicle.channel_limits)
+    surge = course_speeds(vehicle) if speeds is None else np.asarray(speeds, float)
+    eta, nu = np.zeros((len(surge), 6)), np.zeros((len(surge), 6))
+    eta[:, 2], nu[:, 0] = DEPTH, surge
+    trim = _trim(vehicle, eta, nu, model)
+    A = _system_matrices(vehicle, surge, model, trim)
+    B = np.zeros((len(surge), 8, trim.shape[1]))
+    for k in range(trim.shape[1]):
+        step = 1e-2 * (upper[k] - lower[k])
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = trim.copy()
+            moved[:, k] += sign * step
+            ends.append(acceleration(vehicle, eta, nu, hydrodynamics=model, actuators=moved))
+        B[:, :6, k] = (ends[0] - ends[1]) / (2.0 * step)
+    lag = [part.time_constant for part in (*vehicle.thrusters.values(), *vehicle.actuators.values())]
+    inertia = vehicle.mass_matrix(model)
+    return LinearModel(surge, A, B, trim, inertia, lower, upper, np.asarray(lag, float))
+
+
+def _trim(vehicle: Vehicle, eta: Array, nu: Array, model: str) -> Array:
+    """Return the channels that hold surges: the least thrusts, by the secant method, (n, channels)."""
+    thrusters = len(vehicle.thrusters)
+    ahead = np.asarray(vehicle.thruster_matrix())[0]
+    if not (ahead @ ahead > 0.0):
+        raise SimulatorError(f"{vehicle.name}: no thruster drives it ahead, so it holds no speed")
+    mass = vehicle.mass_matrix(model)
+
+    def surplus(force: Array) -> tuple[Array, Array]:
+        channels = np.zeros((len(force), len(vehicle.channel_names)))
+        channels[:, :thrusters] = force[:, None] * ahead / (ahead @ ahead)
+        nu_dot = acceleration(vehicle, eta, nu, hydrodynamics=model, actuators=channels)
+        return (nu_dot @ mass.T)[:, 0], channels
+
+    before = np.zeros(len(nu))
+    left, _ = surplus(before)
+    force = -left
+    for _ in range(8):
+        now, channels = surplus(force)
+        change = now - left
+        step = np.where(
+            np.abs(change) > 1e-9, -now * (force - before) / np.where(change == 0.0, 1.0, change), 0.0
+        )
+        before, left, force = force, now, force + step
+    return surplus(force)[1]
+
+
+def _system_matrices(
+    vehicle: Vehicle, speeds: Array, hydrodynamics: str, channels: Array | None = None
+) -> Array:
     """Return A of x_dot = A x about level motion, for the state (nu, roll, pitch), in SI units, (n, 8, 8).
 
-    The wrench that holds the motion, from thrusters and fins, stays constant.
+    The wrench that holds the motion, besides that of the channels, stays constant.
 
     Args:
         vehicle: The vehicle.
         speeds: Surge [m/s], (n,).
         hydrodynamics: Its set.
+        channels: Of its actuators, (n, channels); all at 0 if None.
     """
     eta, nu = np.zeros((len(speeds), 6)), np.zeros((len(speeds), 6))
     eta[:, 2], nu[:, 0] = DEPTH, speeds
-    hold = -acceleration(vehicle, eta, nu, hydrodynamics=hydrodynamics) @ vehicle.mass_matrix(hydrodynamics).T
+
+    def rates(place: Array, velocity: Array, hold: Array | float = 0.0) -> Array:
+        wrench = np.broadcast_to(hold, velocity.shape)
+        return acceleration(vehicle, place, velocity, wrench, hydrodynamics=hydrodynamics, actuators=channels)
+
+    hold = -rates(eta, nu) @ vehicle.mass_matrix(hydrodynamics).T
     A = np.zeros((len(speeds), 8, 8))
     for k in range(8):
         state = np.concatenate([nu, eta[:, 3:5]], axis=1)
@@ -63,7 +137,7 @@ def _system_matrices(vehicle: Vehicle, speeds: Array, hydrodynamics: str) -> Arr
             moved = state.copy()
             moved[:, k] += sign * STEP
             place = np.concatenate([eta[:, :3], moved[:, 6:], eta[:, 5:]], axis=1)
-            ends.append(acceleration(vehicle, place, moved[:, :6], hold, hydrodynamics=hydrodynamics))
+            ends.append(rates(place, moved[:, :6], hold))
         A[:, :6, k] = (ends[0] - ends[1]) / (2.0 * STEP)
     A[:, 6, 3] = A[:, 7, 4] = 1.0
     return A
@@ -78,10 +152,7 @@ def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[floa
         vehicle: The vehicle.
         hydrodynamics: Its set.
     """
-    top = USUAL
-    if isinstance(vehicle.hydrodynamics[hydrodynamics], HydrodynamicSet):
-        reached = float(terminal_speeds(vehicle, hydrodynamics)[0])
-        top = reached if 0.0 < reached < math.inf else USUAL
+    top = top_speed(vehicle, hydrodynamics)
     speeds = np.linspace(0.0, top, 101)
     values, vectors = np.linalg.eig(_system_matrices(vehicle, speeds, hydrodynamics))
     part = np.abs(

@@ -12,7 +12,6 @@ from finssim.physics.types import vec6
 from finssim.sim import Dock, RectangularPool
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.fitting import coefficients_of
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
 from finssim.tasks.terms import (
@@ -31,7 +30,7 @@ from finssim.tasks.terms import (
     uniform3,
 )
 from finssim.vehicles import Vehicle
-from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles.capability import coefficients_of, terminal_speeds
 
 DISTANCE_SCALE = 3.0
 """Distances are divided by this in the observation [m]."""

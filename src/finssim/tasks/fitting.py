@@ -14,8 +14,8 @@ from finssim.control.axis_model import axis_model
 from finssim.sim import RectangularPool
 from finssim.tasks.measurement import TRAINING, MeasurementNoise
 from finssim.tasks.task import Task
-from finssim.vehicles import HydrodynamicSet, Vehicle
-from finssim.vehicles.capability import terminal_speeds
+from finssim.vehicles import Vehicle
+from finssim.vehicles.capability import coefficients_of, terminal_speeds
 from finssim.vehicles.defaults import POOL, room
 
 Array = NDArray[np.float64]
@@ -72,12 +72,6 @@ def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
     names = ("surge", "sway", "heave")
     limits = vehicle.wrench_limits
     return tuple(i for i, name in enumerate(names) if limits[i] > 0.0 and name in vehicle.controlled_axes)
-
-
-def coefficients_of(vehicle: Vehicle) -> str:
-    """Return the name of the hydrodynamic set that describes the vehicle: the calibrated one, if its file has it."""
-    sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
-    return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 
 def fit(vehicle: Vehicle) -> TaskScaling:

@@ -16,6 +16,7 @@ __all__ = [
     "Restoring",
     "Trim",
     "WrenchCapability",
+    "coefficients_of",
     "level_speed",
     "restoring",
     "terminal_speed",
@@ -123,6 +124,12 @@ def terminal_speed(d1: float, d2: float, tau: float) -> float:
     if d1 == 0.0 and d2 == 0.0:
         return math.inf
     return 2.0 * tau / (d1 + math.sqrt(d1 * d1 + 4.0 * d2 * tau))
+
+
+def coefficients_of(vehicle: Vehicle) -> str:
+    """Return the name of the hydrodynamic set that describes the vehicle: the calibrated one, if its file has it."""
+    sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
+    return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 
 def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:

@@ -1,0 +1,553 @@
+"""The autopilot of vehicles that must move to steer: speed, course over ground, and depth or pitch.
+
+A linear model over speed (`finssim.sim.free_motion.linear_model`) gives its gains. About level motion at a speed U the
+state is
+
+    x = (u - U, v, w, p, q, r, roll, pitch, heading, z, integrals of the errors of speed, heading, and depth or pitch)
+
+with heading' = r and z' = w - U pitch (z up; pitch is positive with the bow down). Wrenches (X, K, M, N) reach the
+vehicle behind the lag of its actuators. The feedback of x and of what is on its way minimises the sum of
+(error / scale)² + (wrench / limit)²: a linear-quadratic regulator with integral action (Anderson and Moore 1990). The
+bounded allocation of `finssim.control.allocation` then gives the channels nearest to the demand within the travel of
+the fins and the limits of thrust, for a cruciform tail, an X tail or any other. Between the speeds of the model
+everything is interpolated. An integral rests while the channels cannot follow it.
+
+In a current the course over ground differs from the heading by the crab angle. The heading answers at once and is
+controlled; the crab angle is followed slowly: wanted heading = wanted course - crab angle.
+"""
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator,index"
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from finssim.control import ControlError
+from finssim.control.allocation import AllocationData, allocate, allocation_data
+from finssim.control.guidance import Measured
+from finssim.core.rotations import quat_rotate
+from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
+from finssim.vehicles import HydrodynamicSet, Vehicle
+from finssim.vehicles.capability import coefficients_of, terminal_speeds
+
+Array = npt.NDArray[np.float64]
+
+AXES = (0, 3, 4, 5)
+"""Axes of the wrench that are demanded: surge, roll, pitch, yaw."""
+SCALES = {
+    0: 0.3,
+    6: math.radians(30.0),
+    7: math.radians(20.0),
+    8: math.radians(25.0),
+    9: 1.5,
+}
+"""State -> its error whose cost equals that of a whole limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
+INTEGRAL_TIME = 6.0
+"""The integral of an error costs as much as the error when that has lasted this long [s]."""
+STEEPEST = math.radians(25.0)
+"""Greatest pitch that is asked for [rad]."""
+WIDEST = math.radians(60.0)
+"""Greatest error of the heading that is acted on [rad]."""
+CRAB_TIME = 4.0
+"""Time constant with which the crab angle is followed [s]."""
+TURNING = 0.1
+"""Yaw rate at which the crab angle is followed half as fast [rad/s]."""
+INDEPENDENT = 0.2
+"""Part of an axis' wrench that has to be left without the others, for the axis to be controlled [-]."""
+SHORT = 0.02
+"""Part of an axis' limit by which a wrench falls short if its integral rests [-]."""
+SHORTEST_LAG = 0.05
+"""Time constant of an actuator that states less [s]."""
+
+SLOWEST, FASTEST, SPEEDS = 0.25, 0.95, 8
+"""Speeds of the gains, as shares of top speed, and their number; the least and the greatest that an action asks for."""
+USUAL_TOP = 2.0
+"""Top speed of a vehicle whose model states none [m/s]."""
+FARTHEST = 5.0
+"""Change of depth that an action of 1 asks for [m]."""
+
+STATES = 13
+Row = wp.types.vector(length=STATES + len(AXES), dtype=float)
+Wrench4 = wp.types.vector(length=len(AXES), dtype=float)
+
+
+class LinearModel(NamedTuple):
+    """A vehicle with c channels about level motion at n speeds, body frame.
+
+    Channels are in their own units: thrust [N], angle [rad], volume [m³] or position [m].
+    """
+
+    speeds: Array
+    """Surge U, in equal steps [m/s], (n,)."""
+    A: Array
+    """Of x' = A x + B (channels - trim), with x = (nu, roll, pitch) [m/s, rad/s, rad], (n, 8, 8)."""
+    B: Array
+    """Acceleration per unit of a channel [m/s² or rad/s²], (n, 8, c)."""
+    trim: Array
+    """Channels that hold the speed [N], (n, c); those other than thrusts are 0."""
+    inertia: Array
+    """Mass matrix with the added mass, about the body origin [kg, kg m, kg m²], (6, 6)."""
+    lower: Array
+    """Least value of each channel [N, rad, m³, m], (c,)."""
+    upper: Array
+    """Greatest value of each channel [N, rad, m³, m], (c,)."""
+    lag: Array
+    """Time constant of each channel [s], (c,)."""
+
+    @property
+    def travel(self) -> Array:
+        """Half the travel of each channel, in its unit, (c,)."""
+        return 0.5 * (self.upper - self.lower)
+
+
+@wp.struct
+class CourseData:
+    """Numbers of each vehicle that `steer` uses, built by `course_data`: first index the vehicle, second the speed."""
+
+    first: wp.array(dtype=float)
+    """Least speed [m/s]."""
+    spacing: wp.array(dtype=float)
+    """Step between speeds [m/s]."""
+    gains: wp.array3d(dtype=Row)
+    """Feedback of the state and of the wrench on its way, by axis: for depth, then for pitch, (vehicles, 2 n, 4)."""
+    reach: wp.array2d(dtype=Wrench4)
+    """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
+    slack: wp.array2d(dtype=Wrench4)
+    """Wrench that may be missing while integrals go on [N, N m], (vehicles, n)."""
+    hold: wp.array2d(dtype=float)
+    """Surge force of the trim [N], (vehicles, n)."""
+    trim: wp.array2d(dtype=vec8)
+    """Channels that hold the speed [N], (vehicles, n)."""
+    columns: wp.array3d(dtype=Wrench4)
+    """Wrench (X, K, M, N) by channel, (vehicles, n, 8) [N or N m per unit of the channel]."""
+    share: wp.array(dtype=Wrench4)
+    """Share of its way that a wrench goes in a period behind its lag [-], (vehicles,)."""
+    travel: wp.array(dtype=vec8)
+    """Half the travel of each channel, in its unit, (vehicles,)."""
+    allocation: AllocationData
+    """Allocation to parts of `travel` from the trim; its vehicle type is vehicle * n + speed."""
+    period: float
+    """Time between two commands [s]."""
+
+
+@wp.struct
+class CourseOrder:
+    """What the autopilot is asked to do now."""
+
+    speed: float  # wanted surge [m/s]
+    turn: float  # wanted course less the present course over ground, counter-clockwise from above [rad]
+    rise: float  # wanted height less the present one [m]; without effect where the pitch is held
+    pitch: float  # wanted pitch, positive with the bow down [rad]; where the depth is held, slope of the way
+    by_pitch: int  # 1: hold the pitch; 0: hold the depth
+
+
+@wp.struct
+class CourseAnswer:
+    """What the autopilot commands, and what it remembers."""
+
+    channels: vec8
+    """Commands, in the units of the channels."""
+    memory: vec8
+    """Integrals of speed [m], of heading [rad s], and of depth [m s] or pitch [rad s]; the crab angle [rad]; and the
+    wrench on its way [N, N m]."""
+
+
+@wp.func
+def between(low: Any, high: Any, share: float):
+    """Return what lies a share of the way from `low` to `high`."""
+    return low + share * (high - low)
+
+
+@wp.func
+def crab_angle(q: wp.quat, nu: vec6, least: float) -> float:
+    """Course over ground less heading [rad]; 0 below a speed ahead of `least` [m/s].
+
+    Args:
+        q: Attitude, body to world.
+        nu: Velocity over ground, body frame [m/s, rad/s].
+        least: Speed below which the course is not known [m/s].
+    """
+    bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    v = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
+    ahead = bow[0] * v[0] + bow[1] * v[1]
+    if ahead < least * wp.sqrt(bow[0] * bow[0] + bow[1] * bow[1]):
+        return 0.0
+    return wp.atan2(bow[0] * v[1] - bow[1] * v[0], ahead)
+
+
+@wp.func
+def steer(
+    order: CourseOrder, q: wp.quat, nu: vec6, memory: vec8, vehicle: int, data: CourseData
+) -> CourseAnswer:
+    """Return the channels that carry out an order, and the memory for the next.
+
+    Args:
+        order: What is wanted.
+        q: Attitude, body to world.
+        nu: Velocity over ground, body frame [m/s, rad/s].
+        memory: From the command before, as in `CourseAnswer` [m, rad s, rad, N, N m]; zeros at the start.
+        vehicle: First index into `data`.
+        data: From `course_data`.
+    """
+    count = data.trim.shape[1]
+    place = wp.clamp((nu[0] - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
+    k = wp.min(int(place), count - 2)
+    s = place - float(k)
+    goal = wp.clamp((order.speed - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
+    k_goal = wp.min(int(goal), count - 2)
+    row = k + order.by_pitch * count
+
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    crab = crab_angle(q, nu, 0.5 * data.first[vehicle])
+    off = memory[3] - crab - order.turn
+    reach = between(data.reach[vehicle, row], data.reach[vehicle, row + 1], s)
+    x = Row()
+    for i in range(1, 6):
+        x[i] = nu[i]
+    x[1] = nu[1] - memory[3] * nu[0]  # through the water: a current carries the vehicle along
+    x[0] = wp.clamp(nu[0] - order.speed, -reach[0], reach[0])
+    x[6] = wp.atan2(up[1], up[2])
+    x[7] = wp.clamp(wp.asin(wp.clamp(-up[0], -1.0, 1.0)) - order.pitch, -reach[1], reach[1])
+    x[8] = wp.clamp(wp.atan2(wp.sin(off), wp.cos(off)), -reach[2], reach[2])
+    x[9] = wp.clamp(-order.rise, -reach[3], reach[3])
+    for i in range(3):
+        x[10 + i] = memory[i]
+    for i in range(4):
+        x[13 + i] = memory[4 + i]
+
+    wrench = Wrench4()
+    for i in range(4):
+        wrench[i] = -wp.dot(between(data.gains[vehicle, row, i], data.gains[vehicle, row + 1, i], s), x)
+    wrench[0] += between(data.hold[vehicle, k_goal], data.hold[vehicle, k_goal + 1], goal - float(k_goal))
+    wrench[0] -= between(data.hold[vehicle, k], data.hold[vehicle, k + 1], s)
+
+    tau = vec6(wrench[0], 0.0, 0.0, wrench[1], wrench[2], wrench[3])
+    travel = data.travel[vehicle]
+    low = wp.cw_mul(travel, allocate(tau, vehicle * count + k, data.allocation))
+    high = wp.cw_mul(travel, allocate(tau, vehicle * count + k + 1, data.allocation))
+    achieved = Wrench4()
+    for i in range(MAX_THRUSTERS):
+        achieved += (1.0 - s) * low[i] * data.columns[vehicle, k, i]
+        achieved += s * high[i] * data.columns[vehicle, k + 1, i]
+
+    answer = CourseAnswer()
+    answer.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
+    after = memory
+    for i in range(3):
+        axis = wp.where(i == 0, 0, wp.where(i == 1, 3, 2))
+        state = wp.where(i == 0, 0, wp.where(i == 1, 8, 9 - 2 * order.by_pitch))
+        bound = reach[wp.where(i == 0, 0, wp.where(i == 1, 2, 3 - 2 * order.by_pitch))]
+        step = data.period * x[state]
+        push = -data.gains[vehicle, row, axis][10 + i] * step
+        short = wrench[axis] - achieved[axis]
+        if wp.abs(x[state]) < bound and not (
+            short * push > 0.0 and wp.abs(short) > data.slack[vehicle, k][axis]
+        ):
+            after[i] = memory[i] + step
+    turning = nu[5] / wp.static(TURNING)  # while it turns, it slips sideways through the water
+    after[3] = memory[3] + data.period / wp.static(CRAB_TIME) / (1.0 + turning * turning) * (crab - memory[3])
+    for i in range(4):
+        after[4 + i] = between(memory[4 + i], achieved[i], data.share[vehicle][i])
+    answer.memory = after
+    return answer
+
+
+@wp.func
+def order_of(
+    speed: float, turn: float, dive: float, by_pitch: int, vehicle: int, data: CourseData
+) -> CourseOrder:
+    """Return the order of an action of mode `course` or `course_pitch`.
+
+    Args:
+        speed: Part of the way from the middle speed to the greatest, or to the least below 0 [-].
+        turn: Part of `WIDEST` to turn the course, counter-clockwise from above [-].
+        dive: Part of `FARTHEST` to go down, or of `STEEPEST` to point the bow down [-].
+        by_pitch: 1: pitch; 0: depth.
+        vehicle: First index into `data`.
+        data: From `course_data`.
+    """
+    order = CourseOrder()
+    whole = data.spacing[vehicle] * float(data.trim.shape[1] - 1)
+    order.speed = data.first[vehicle] + 0.5 * (1.0 + wp.clamp(speed, -1.0, 1.0)) * whole
+    order.turn = wp.static(WIDEST) * wp.clamp(turn, -1.0, 1.0)
+    order.by_pitch = by_pitch
+    if by_pitch != 0:
+        order.pitch = wp.static(STEEPEST) * wp.clamp(dive, -1.0, 1.0)
+    else:
+        order.rise = -wp.static(FARTHEST) * wp.clamp(dive, -1.0, 1.0)
+    return order
+
+
+@wp.kernel(enable_backward=False)
+def steer_rows(
+    orders: wp.array(dtype=CourseOrder),
+    q: wp.array(dtype=wp.quat),
+    nu: wp.array(dtype=vec6),
+    memory: wp.array(dtype=vec8),
+    data: CourseData,
+    channels: wp.array(dtype=vec8),
+    after: wp.array(dtype=vec8),
+):
+    """`steer` for the first vehicle, row by row.
+
+    Args:
+        orders: What is wanted, (N,).
+        q: Attitudes, body to world, (N,).
+        nu: Velocities over ground, body frame [m/s, rad/s], (N,).
+        memory: From the command before, as in `CourseAnswer` [m, rad s, rad, N, N m], (N,).
+        data: From `course_data`.
+        channels: Written: commands, in the units of the channels [N, rad, m³, m], (N,).
+        after: Written: memory for the next command, in the units of `memory` [m, rad s, rad, N, N m], (N,).
+    """
+    i = wp.tid()
+    answer = steer(orders[i], q[i], nu[i], memory[i], 0, data)
+    channels[i] = answer.channels
+    after[i] = answer.memory
+
+
+def top_speed(vehicle: Vehicle, hydrodynamics: str) -> float:
+    """Return the top speed ahead by a hydrodynamic set [m/s]; `USUAL_TOP` where it has no coefficients or no end."""
+    if not isinstance(vehicle.hydrodynamics[hydrodynamics], HydrodynamicSet):
+        return USUAL_TOP
+    reached = float(terminal_speeds(vehicle, hydrodynamics)[0])
+    return reached if 0.0 < reached < math.inf else USUAL_TOP
+
+
+def course_speeds(vehicle: Vehicle) -> Array:
+    """Return the speeds of a vehicle's autopilot, the least and the greatest at the ends [m/s], (n,)."""
+    top = top_speed(vehicle, coefficients_of(vehicle))
+    return np.linspace(SLOWEST * top, FASTEST * top, SPEEDS)
+
+
+class Tuning(NamedTuple):
+    """Numbers of one vehicle at its n speeds."""
+
+    gains: Array
+    """Feedback of the state [N or N m per its unit], for depth and then for pitch, (2 n, 4, 17)."""
+    reach: Array
+    """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (2 n, 4)."""
+    columns: Array
+    """Wrench (X, K, M, N) per unit of a channel [N or N m], (n, 4, c)."""
+    limits: Array
+    """Wrench of each of the four axes at half the travel of the channels, 0 of one not controlled [N, N m], (n, 4)."""
+    weights: Array
+    """Of the six axes in the allocation [1/N, 1/(N m)], (n, 6)."""
+    lag: Array
+    """Time constant of each axis [s], (4,)."""
+
+
+def tuned(model: LinearModel, name: str) -> Tuning:
+    """Return the gains of a vehicle from its linear model.
+
+    Args:
+        model: The model.
+        name: Of the vehicle, for messages.
+
+    Raises:
+        ControlError: Its actuators do not control surge, pitch and yaw, or what they do not control is unstable.
+    """
+    wrenches = model.inertia @ model.B[:, :6]
+    columns = wrenches[:, AXES]
+    limits = _authority(columns * model.travel)
+    if not (limits[:, [0, 2, 3]] > 0.0).all():
+        raise ControlError(
+            f"{name}: its actuators do not control surge, pitch and yaw, each without the others, as the autopilot "
+            "needs: take a vehicle with fins or thrusters for them"
+        )
+    share = (columns[-1] * model.travel) ** 2
+    lag = np.divide(
+        share @ np.maximum(model.lag, SHORTEST_LAG),
+        share.sum(axis=1),
+        out=np.full(4, SHORTEST_LAG),
+        where=share.sum(axis=1) > 0.0,
+    )
+    weights = np.zeros((len(columns), 6))
+    weights[:, AXES] = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
+    rows = [
+        _regulator(model, i, weights[i], limits[i], lag, by_pitch, name)
+        for by_pitch in (False, True)
+        for i in range(len(columns))
+    ]
+    gains = np.stack(rows)
+    n = len(columns)
+    reach = np.full((2 * n, 4), np.inf)
+    reach[:, 0] = 2.0 * SCALES[0]
+    reach[:, 1] = STEEPEST
+    reach[:, 2] = np.minimum(WIDEST, 1.0 * limits[np.arange(2 * n) % n, 3] / np.abs(gains[:, 3, 8]))
+    reach[:n, 3] = STEEPEST * np.abs(gains[:n, 2, 7] / gains[:n, 2, 9])
+    return Tuning(gains, reach, columns, limits, weights, lag)
+
+
+def _authority(wrench: Array) -> Array:
+    """Return what each of the four axes gets with the others left alone, 0 where that is not possible, (n, 4).
+
+    Args:
+        wrench: Of every channel at half its travel [N, N m], (n, 4, c).
+    """
+    found = np.zeros(wrench.shape[:2])
+    for i, rows in enumerate(wrench):
+        scaled = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+        for axis in range(4):
+            others = scaled[[k for k in (0, 2, 3) if k != axis]]  # roll is controlled where it can be
+            free = scaled[axis] - others.T @ np.linalg.lstsq(others.T, scaled[axis], rcond=1e-6)[0]
+            if np.linalg.norm(free) > INDEPENDENT:
+                found[i, axis] = np.abs(rows[axis, np.abs(free) > 1e-9]).sum()
+    return found
+
+
+def _regulator(
+    model: LinearModel, i: int, weights: Array, limits: Array, lag: Array, by_pitch: bool, name: str
+) -> Array:
+    """Return the gains at one speed [N or N m per unit of the state], (4, 17)."""
+    from scipy.linalg import solve_continuous_are
+
+    n = STATES
+    weighted = weights[:, None] * (model.inertia @ model.B[i, :6]) * model.travel
+    mix = model.travel[:, None] * np.linalg.pinv(weighted, rcond=1e-6)[:, AXES] * weights[list(AXES)]
+    A, B, Q = np.zeros((n + 4, n + 4)), np.zeros((n + 4, 4)), np.zeros(n + 4)
+    A[:8, :8] = model.A[i]
+    A[8, 5] = 1.0
+    A[9, 2], A[9, 7] = 1.0, -model.speeds[i]
+    A[[10, 11, 12], [0, 8, 7 if by_pitch else 9]] = 1.0
+    A[:8, n:] = model.B[i] @ mix
+    A[n:, n:], B[n:] = -np.diag(1.0 / lag), np.diag(1.0 / lag)
+    for state, scale in SCALES.items():
+        Q[state] = scale**-2
+    for k, state in ((10, 0), (11, 8), (12, 7 if by_pitch else 9)):
+        Q[k] = (SCALES[state] * INTEGRAL_TIME) ** -2
+    driven = np.flatnonzero(limits > 0.0)
+    kept = np.array([k for k in range(n + 4) if not (k == 9 and by_pitch) and (k < n or k - n in driven)])
+    a, b, r = A[np.ix_(kept, kept)], B[np.ix_(kept, driven)], np.diag(limits[driven] ** -2)
+    try:
+        P = solve_continuous_are(a, b, np.diag(Q[kept]), r)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ControlError(
+            f"{name}: at {model.speeds[i]:.3g} m/s something is unstable that its actuators do not control"
+        ) from error
+    gains = np.zeros((4, n + 4))
+    gains[np.ix_(driven, kept)] = np.linalg.solve(r, b.T @ P)
+    return gains
+
+
+def course_data(
+    models: Sequence[LinearModel], names: Sequence[str], period: float, device: Any = "cpu"
+) -> CourseData:
+    """Return the numbers of the autopilots of one or more vehicles, which have equally many speeds.
+
+    Args:
+        models: Linear model of each vehicle.
+        names: Of the vehicles.
+        period: Time between two commands [s].
+        device: Warp device.
+
+    Raises:
+        ControlError: A vehicle cannot be steered so.
+    """
+    found = [tuned(model, name) for model, name in zip(models, names, strict=True)]
+    data = CourseData()
+
+    def stored(rows: Any, dtype: Any) -> Any:
+        return wp.array(np.asarray(rows, dtype=np.float32), dtype=dtype, device=device)
+
+    def padded(rows: Array) -> Array:
+        return np.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, MAX_THRUSTERS - rows.shape[-1])])
+
+    data.first = stored([model.speeds[0] for model in models], float)
+    data.spacing = stored([model.speeds[1] - model.speeds[0] for model in models], float)
+    data.gains = stored([one.gains for one in found], Row)
+    data.reach = stored([np.minimum(one.reach, 1e6) for one in found], Wrench4)
+    data.slack = stored([SHORT * one.limits for one in found], Wrench4)
+    data.hold = stored(
+        [
+            np.einsum("nc,nc->n", one.columns[:, 0], model.trim)
+            for model, one in zip(models, found, strict=True)
+        ],
+        float,
+    )
+    data.trim = stored([padded(model.trim) for model in models], vec8)
+    data.columns = stored([np.swapaxes(padded(one.columns), 1, 2) for one in found], Wrench4)
+    data.share = stored([1.0 - np.exp(-period / one.lag) for one in found], Wrench4)
+    data.travel = stored([padded(model.travel) for model in models], vec8)
+    rows = []  # in parts of the travel: the channels have different units
+    for model, one in zip(models, found, strict=True):
+        for i, trim in enumerate(model.trim):
+            low, high = (model.lower - trim) / model.travel, (model.upper - trim) / model.travel
+            wrench = model.inertia @ model.B[i, :6] * model.travel
+            rows.append((wrench, np.minimum(low, 0.0), np.maximum(high, 0.0), one.weights[i]))
+    B, lower, upper, weights = zip(*rows, strict=True)
+    data.allocation = allocation_data(B, lower, upper, weights, device=device)
+    data.period = period
+    return data
+
+
+class CoursePilot:
+    """The autopilot of one vehicle, for one of it or for a batch; its memory is an argument and a result."""
+
+    def __init__(self, model: LinearModel, name: str, period: float) -> None:
+        """Tune the autopilot.
+
+        Args:
+            model: Of the vehicle.
+            name: Of the vehicle.
+            period: Time between two commands [s].
+
+        Raises:
+            ControlError: The vehicle cannot be steered so, or the period is not positive.
+        """
+        if not period > 0.0:
+            raise ControlError(f"period is {period}, expected a positive time in seconds")
+        self.period, self.model = period, model
+        self.data = course_data([model], [name], period)
+
+    def reset(self, n: int = 1) -> Array:
+        """Return the memory of n vehicles at the start [m, rad s, rad, N, N m], (n, 8)."""
+        return np.zeros((n, 8))
+
+    def command(
+        self,
+        memory: Array,
+        measured: Measured,
+        *,
+        speed: npt.ArrayLike,
+        course: npt.ArrayLike,
+        depth: npt.ArrayLike | None = None,
+        pitch: npt.ArrayLike = 0.0,
+    ) -> tuple[Array, Array]:
+        """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 8).
+
+        Args:
+            memory: From `reset` or the command before [m, rad s, rad, N, N m], (n, 8).
+            measured: The vehicles' states, with n rows.
+            speed: Wanted surge [m/s], (n,).
+            course: Wanted course over ground, counter-clockwise from the world's x axis [rad], (n,).
+            depth: Wanted depth below the surface [m], (n,); None: hold the pitch.
+            pitch: Wanted pitch, positive with the bow down [rad], (n,); with a depth, slope of the way.
+        """
+        q, nu = (np.atleast_2d(np.asarray(x, float)) for x in (measured.quaternion, measured.nu))
+        n = len(q)
+        ground = quat_rotate(q, nu[:, :3])
+        bow = quat_rotate(q, [1.0, 0.0, 0.0])
+        known = (ground[:, :2] * bow[:, :2]).sum(axis=1) >= 0.5 * self.model.speeds[0] * np.hypot(
+            *bow[:, :2].T
+        )
+        way = np.where(known[:, None], ground, bow)
+        struct: Any = CourseOrder
+        orders = np.zeros(n, dtype=struct.numpy_dtype())
+        orders["speed"], orders["pitch"] = speed, pitch
+        orders["turn"] = np.asarray(course) - np.arctan2(way[:, 1], way[:, 0])
+        if depth is None:
+            orders["by_pitch"] = 1
+        else:
+            orders["rise"] = -np.asarray(depth, float) - np.atleast_2d(measured.position)[:, 2]
+        rows = ((q, wp.quat), (nu, vec6), (memory, vec8))
+        given: list[Any] = [wp.array(x.astype(np.float32), dtype=kind, device="cpu") for x, kind in rows]
+        given.insert(0, wp.array(orders, dtype=CourseOrder, device="cpu"))
+        out = [wp.zeros(n, dtype=vec8, device="cpu") for _ in range(2)]
+        wp.launch(steer_rows, n, [*given, self.data, *out], device="cpu")
+        channels, after = (array.numpy().astype(float) for array in out)
+        return channels[:, : self.model.trim.shape[1]], after
