@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from finssim.control import ControlError
+from finssim.control.course import FARTHEST, STEEPEST, WIDEST, course_speeds
 from finssim.control.modes import (
     MODES,
     ModeData,
@@ -19,6 +20,7 @@ from finssim.control.modes import (
 )
 from finssim.physics.types import vec8
 from finssim.vehicles import catalogue, load_vehicle
+from reference.tails import tailed
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,22 @@ class Craft:
     def thruster_names(self):
         return tuple(f"T{i}" for i in range(self.control_matrix.shape[1]))
 
+    @property
+    def channel_names(self):
+        return self.thruster_names
+
+    @property
+    def channel_limits(self):
+        return self.force_limits
+
 
 @pytest.fixture
 def craft(layout):
     return Craft(layout.B, (layout.lower, layout.upper), layout.wrench_limits)
 
 
-OWN = [name for name in MODES if not MODES[name].pilot]
-"""Modes of every vehicle; what needs an autopilot is tested in test_ardusub.py."""
+OWN = [name for name in MODES if not MODES[name].pilot and not MODES[name].course]
+"""Modes of every vehicle; ArduSub's is tested in test_ardusub.py, the autopilot of course in sim/test_course.py."""
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -158,3 +168,27 @@ def test_unknown_modes_and_impossible_scales_are_refused(craft):
     for scale in (1.5, -0.1, [1.0, 1.0, 1.0], float("nan")):
         with pytest.raises(ControlError, match="scale"):
             action_mode("wrench6", craft, scale)
+
+
+def test_surfaces_are_all_channels_in_their_own_units():
+    """A propeller in newtons, then four fins in radians, each in parts of its limits either way."""
+    vehicle = tailed("x")
+    mode = action_mode("surfaces", vehicle)
+    assert mode.labels == ("propeller", "fin_0", "fin_1", "fin_2", "fin_3")
+    got = mode.to_thrusters([0.5, 1.0, -1.0, 0.2, 0.0])
+    assert got == pytest.approx([0.5 * 41.203, 0.35, -0.35, 0.07, 0.0], rel=1e-6)
+    assert action_mode("thruster8", vehicle).to_thrusters([1.0]) == pytest.approx([41.203])
+
+
+def test_modes_by_course_state_what_their_numbers_mean_and_need_the_state():
+    vehicle = tailed("cruciform")
+    deep, pitched = (action_mode(name, vehicle) for name in ("course", "course_pitch"))
+    assert (deep.labels, pitched.labels) == (("speed", "course", "depth"), ("speed", "course", "pitch"))
+    speeds = course_speeds(vehicle)
+    assert deep.definition["lower"] == pytest.approx([speeds[0], -WIDEST, -FARTHEST])
+    assert pitched.definition["upper"] == pytest.approx([speeds[-1], WIDEST, STEEPEST])
+    assert mode_from_dict(json.loads(json.dumps(deep.describe())), vehicle).definition == deep.definition
+    with pytest.raises(
+        ControlError, match="course is carried out by an autopilot that needs the vehicle's state"
+    ):
+        deep.to_thrusters([0.0, 0.0, 0.0])

@@ -8,7 +8,11 @@ import pandas
 import pytest
 import warp as wp
 
+from finssim.control.course import FARTHEST, STEEPEST, WIDEST, CoursePilot, course_speeds
+from finssim.control.guidance import Known
 from finssim.control.modes import action_mode
+from finssim.core.rotations import quat_rotate
+from finssim.sim.free_motion import linear_model
 from finssim.sim.randomize import Randomization
 from finssim.sim.site import RectangularPool
 from finssim.sim.state import State
@@ -38,7 +42,7 @@ def same(first, second):
     return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("action", ["wrench6", "wrench4", "thruster8"])
+@pytest.mark.parametrize("action", ["wrench6", "wrench4", "thruster8", "surfaces", "course"])
 def test_equal_seeds_are_equal_runs_and_others_are_not(action):
     """Bitwise, through several episodes, with randomisation and noise."""
 
@@ -130,7 +134,7 @@ def test_unknown_names_are_refused():
         environment(action="wrench5")
 
 
-@pytest.mark.parametrize("name", ["wrench6", "wrench4", "thruster8", "pilot6"])
+@pytest.mark.parametrize("name", ["wrench6", "wrench4", "thruster8", "pilot6", "surfaces"])
 def test_an_action_commands_what_its_mode_says(name):
     """The environment's kernels and the mode that runs on the robot give the same thrusts, beyond ±1 too."""
     env = environment(200, action=name, **({"vehicle": "bluerov2_heavy"} if name == "pilot6" else {}))
@@ -140,6 +144,37 @@ def test_an_action_commands_what_its_mode_says(name):
     commanded = env.simulator.command.thrust.numpy()[:, 0]
     # Forces of up to 8 N in float32; where limits bind, a rounding of the wrench moves them a little more.
     np.testing.assert_allclose(commanded, mode.to_thrusters(action), atol=2e-4)
+
+
+@pytest.mark.parametrize(("name", "dive"), [("course", "depth"), ("course_pitch", "pitch")])
+def test_an_order_is_carried_out_as_by_the_autopilot_of_one_robot(name, dive):
+    """Step by step the same channels, from the same states and a memory of its own; an episode starts with none."""
+    env = environment(6, action=name, auto_reset=False)
+    vehicle, state = env.nominal[0], env.simulator.state
+    pilot = CoursePilot(linear_model(vehicle), vehicle.name, TASK.control_step)
+    speeds, rng = course_speeds(vehicle), np.random.default_rng(3)
+    memory = pilot.reset(6)
+    for _ in range(5):
+        a = rng.uniform(-1.2, 1.2, (6, 3))
+        x, q, nu = (
+            np.array(y.numpy()[:, 0], float) for y in (state.position, state.quaternion, state.velocity)
+        )
+        env.step(a)
+        speed, turn, down = np.clip(a, -1.0, 1.0).T
+        now = quat_rotate(q, nu[:, :3])
+        bow = quat_rotate(q, [1.0, 0.0, 0.0])
+        ahead = (now * bow)[:, :2].sum(axis=1) / np.linalg.norm(bow[:, :2], axis=1)
+        way = np.where((ahead >= 0.5 * speeds[0])[:, None], now, bow)
+        order = {
+            "speed": speeds[0] + 0.5 * (1.0 + speed) * (speeds[-1] - speeds[0]),
+            "course": np.arctan2(way[:, 1], way[:, 0]) + WIDEST * turn,
+            dive: FARTHEST * down - x[:, 2] if dive == "depth" else STEEPEST * down,
+        }
+        channels, memory = pilot.command(memory, Known(None, x, q, nu), **order)
+        np.testing.assert_allclose(env.simulator.command.thrust.numpy()[:, 0], channels, atol=2e-3)
+    assert env.arrays.steering.numpy().any()
+    env.reset()
+    assert not env.arrays.steering.numpy().any()
 
 
 def test_a_scaled_wrench_is_that_part_of_the_limits():

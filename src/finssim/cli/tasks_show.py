@@ -164,7 +164,8 @@ def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None
     Args:
         task (NAME|FILE.py:CLASS): Task, or your own as FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        action (MODE): wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        action (MODE): wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
+            task's own if not given.
 
     Raises:
         EnvironmentSetupError, ControlError, VehicleError: As `describe_task`.

@@ -3,6 +3,8 @@
 A mode mixes the components of an action to parts of the vehicle's wrench limits, which are allocated to the thrusters,
 to parts of the thrusters' own limits, or to the axes of an autopilot, whose mixer drives the thrusters. The batch does
 so for all worlds and the robot for one, with the same function (`thrusts_of`) and the same numbers (`mode_data`).
+`surfaces` commands every channel, fins and other actuators too; `course` and `course_pitch` are orders to the autopilot
+of `finssim.control.course`, which needs to know how the vehicle moves.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
@@ -10,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +21,7 @@ import warp as wp
 from finssim.control import ControlError
 from finssim.control.allocation import AllocationData, RowLaunch, allocate, allocation_data, axis_weights
 from finssim.control.ardusub import FROM_BODY, MixerData, dead_band, mixed_thrusts, mixer_data, thrust_tables
+from finssim.control.course import FARTHEST, STEEPEST, WIDEST, course_speeds
 from finssim.control.policy import first_difference, plain_data
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
@@ -46,6 +49,11 @@ class ModeKind(NamedTuple):
     thrusters (m, n), or of the autopilot's demands (m, 6)."""
     pilot: bool = False
     """True if the components are the axes of the vehicle's autopilot."""
+    channels: bool = False
+    """True if the components drive all channels: thrusters, then the other actuators."""
+    course: Literal["", "depth", "pitch"] = ""
+    """What the third component is if they are speed, course and that, of `finssim.control.course`; empty: they are
+    not."""
 
 
 def _axes(*axes: int) -> ModeKind:
@@ -67,6 +75,18 @@ MODES: dict[str, ModeKind] = {
     ),
     "wrench6": _axes(0, 1, 2, 3, 4, 5),
     "wrench4": _axes(0, 1, 2, 5),
+    "surfaces": ModeKind(
+        False,
+        lambda vehicle: tuple(vehicle.channel_names),
+        lambda vehicle: np.eye(len(vehicle.channel_names)),
+        channels=True,
+    ),
+    "course": ModeKind(
+        False, lambda vehicle: ("speed", "course", "depth"), lambda vehicle: np.eye(3), course="depth"
+    ),
+    "course_pitch": ModeKind(
+        False, lambda vehicle: ("speed", "course", "pitch"), lambda vehicle: np.eye(3), course="pitch"
+    ),
     "pilot6": ModeKind(False, lambda vehicle: AXES, lambda vehicle: FROM_BODY.T * _gain(vehicle), pilot=True),
 }
 """Action modes by name; another is one entry."""
@@ -159,7 +179,7 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
         device: Warp device.
     """
     kind, data = MODES[name], ModeData()
-    limits = [vehicle.force_limits for vehicle in vehicles]
+    limits = [_limits(kind, vehicle) for vehicle in vehicles]
     columns = [_columns(kind, *arguments) for arguments in zip(vehicles, scales, strict=True)]
     data.columns = wp.array(_padded(columns), dtype=vec8, device=device)
     data.lower = wp.array(_padded([lower for lower, _ in limits]), dtype=vec8, device=device)
@@ -211,6 +231,12 @@ def before_dead_band(part: npt.ArrayLike, dead_band: npt.ArrayLike) -> Array:
     return np.sign(part) * np.where(size <= band, size * QUIET / band, QUIET + (1.0 - QUIET) * rest)
 
 
+def _limits(kind: ModeKind, vehicle: Any) -> tuple[Array, Array]:
+    """Return the least and greatest thrusts [N], or values of all channels in their units."""
+    lower, upper = vehicle.channel_limits if kind.channels else vehicle.force_limits
+    return np.asarray(lower, float), np.asarray(upper, float)
+
+
 def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
     """Return the effect of each component at 1: a wrench [N, N m] or demands [-], (m, 6), or shares of the thrusters'
     limits, (m, n)."""
@@ -239,15 +265,16 @@ class ActionMode:
     """Names of the components."""
     definition: dict[str, tuple[float, ...]]
     """Limits and scale, as `describe` has them: `scale`, with the `limits` of the wrench at action 1 and scale 1 about
-    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], and of an autopilot its `factors`, row by
-    row, `gain` and `dead_band` by axis [-]."""
+    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], of all channels in their units, or of
+    speed [m/s], course [rad] and depth [m] or pitch [rad]; and of an autopilot its `factors`, row by row, `gain` and
+    `dead_band` by axis [-]."""
     columns: Array = field(repr=False, compare=False)
     """Effect of each component at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6), or
     shares of the thrusters' limits, (m, n)."""
     thrusters: int
-    """Number of the vehicle's thrusters n."""
-    launch: RowLaunch = field(repr=False, compare=False)
-    """Actions to thrusts, by `thrusts_of`."""
+    """Number of the vehicle's thrusters n, or of its channels where the mode commands them."""
+    launch: RowLaunch | None = field(repr=False, compare=False)
+    """Actions to thrusts, by `thrusts_of`; None where they take the vehicle's state."""
 
     @property
     def size(self) -> int:
@@ -282,9 +309,16 @@ class ActionMode:
     def to_thrusters(self, action: npt.ArrayLike) -> Array:
         """Thrusts in canonical order [N], (..., n), for actions (..., m); components beyond +-1 saturate.
 
+        In mode `surfaces` they are all channels, in their units.
+
         Raises:
-            ControlError: The action has another length, or holds NaN.
+            ControlError: The action has another length, or holds NaN; or the mode needs the vehicle's state.
         """
+        if self.launch is None:
+            raise ControlError(
+                f"{self.name} is carried out by an autopilot that needs the vehicle's state: use "
+                "finssim.control.course.CoursePilot"
+            )
         a = np.asarray(action, float)
         if a.shape[-1:] != (self.size,):
             raise ControlError(f"{self.name} action has shape {a.shape}, expected (..., {self.size})")
@@ -333,16 +367,20 @@ def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -
             "gain": [vehicle.autopilot.gain],
             "dead_band": axis_dead_band(vehicle, parts),
         }
+    elif kind.course:
+        speeds, dive = course_speeds(vehicle), FARTHEST if kind.course == "depth" else STEEPEST
+        ends = [speeds[0], -WIDEST, -dive], [speeds[-1], WIDEST, dive]
+        numbers = {"lower": ends[0], "upper": ends[1], "scale": parts}
     else:
-        lower, upper = vehicle.force_limits
+        lower, upper = _limits(kind, vehicle)
         numbers = {"lower": lower, "upper": upper, "scale": parts}
     return ActionMode(
         name=name,
         labels=kind.labels(vehicle),
         definition={key: tuple(map(float, values)) for key, values in numbers.items()},
         columns=_columns(kind, vehicle, parts),
-        thrusters=len(vehicle.thruster_names),
-        launch=RowLaunch(thrusts_row, vec8, mode_data(name, [vehicle], [parts])),
+        thrusters=len(vehicle.channel_names if kind.channels or kind.course else vehicle.thruster_names),
+        launch=None if kind.course else RowLaunch(thrusts_row, vec8, mode_data(name, [vehicle], [parts])),
     )
 
 

@@ -435,7 +435,8 @@ def collect(
         episodes: Number of episodes, counted per agent. Not for records.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given.
+        action: Action mode: wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
+            task's own if not given.
         randomize (FILE): Ranges of vehicle and water parameters, by name or file.
         observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
             through a filter), a file of other fixes, estimator (about what localization is off by) or truth.

@@ -41,7 +41,8 @@ class TrainingSettings:
     hydrodynamics: str = "calibrated"
     """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
     action: str | None = None
-    """(MODE) Action mode: wrench6, wrench4, thruster8 or pilot6; the task's own if not given."""
+    """(MODE) Action mode: wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
+    task's own if not given."""
     randomize: str | Path | None = None
     """(FILE) Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
     open_water, no_thruster_dynamics, or a file."""

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from finssim.physics.funnel import Funnel
-from finssim.physics.types import vec6
+from finssim.physics.types import vec6, vec8
 
 
 @wp.struct
@@ -18,6 +18,15 @@ class ReferenceTable:
     spacing: float  # time between two knots [s]
     duration: wp.array(dtype=float)  # time from progress 0 to 1; held from then on [s]
     offset: wp.array(dtype=float)  # share of the way at the start
+    given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
+
+
+@wp.struct
+class PathTable:
+    """The path of every world: straight legs from point to point."""
+
+    points: wp.array2d(dtype=wp.vec3)  # (worlds, points), world frame [m]
+    leg: wp.array(dtype=int)  # the leg that is followed now
     given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
 
 
@@ -113,8 +122,10 @@ class TaskArrays:
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
+    path: PathTable  # of tasks along a path in space
     target: TargetMotion  # of tasks whose goal moves
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
+    steering: wp.array2d(dtype=vec8)  # (worlds, vehicles): memory of autopilots [m, rad, N, N m]
     messages: MessageTable  # of tasks whose agents talk to each other
     net: NetTable  # of tasks whose agents hold a net
     answers: Answers  # of tasks in plain torch

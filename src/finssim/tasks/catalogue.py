@@ -190,7 +190,8 @@ def make(
         worlds: How many at once.
         vehicle: A vehicle, a catalogue name or a file; or one for each of the task's vehicles.
         hydrodynamics: calibrated, mesh or simplified.
-        action: thruster8, wrench6, wrench4 or pilot6 (ArduSub's axes); the task's own if None.
+        action: thruster8, wrench6, wrench4, pilot6 (ArduSub's axes), surfaces, course or course_pitch; the task's
+            own if None.
         randomize: Ranges, or the name or file of some, from which vehicle and water are drawn in every episode.
         observe: What the controller sees: truth, estimator (noise, offset and delay of the robot's own localization),
             training (the noise that the task is trained with), sensors (what the vehicle's own sensors and position

@@ -10,10 +10,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.control.course import CourseData, course_data, order_of, steer
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
 from finssim.sim import RectangularPool, Simulator, TetherLine, Water
+from finssim.sim.free_motion import linear_model
 from finssim.sim.launch import KernelSequence
 from finssim.sim.randomize import Draws, Randomization
 from finssim.sim.site import described_world
@@ -74,6 +76,26 @@ def act(
     command[w, v].thrust = thrusts_of(a, v, data)
 
 
+@wp.kernel(enable_backward=False)
+def act_by_course(
+    arrays: TaskArrays,
+    command: wp.array2d(dtype=VehicleCommand),
+    data: CourseData,
+    by_pitch: int,
+    world_offset: int,
+):
+    """Write the channels of every vehicle by its autopilot, which sees what the agent sees."""
+    i, v = wp.tid()
+    w = world_offset + i
+    order = order_of(
+        arrays.action[w, 3 * v], arrays.action[w, 3 * v + 1], arrays.action[w, 3 * v + 2], by_pitch, v, data
+    )
+    q = arrays.quaternion[w, v]
+    answer = steer(order, q, arrays.velocity[w, v], arrays.steering[w, v], v, data)
+    command[w, v].thrust = answer.channels
+    arrays.steering[w, v] = answer.memory
+
+
 class Environment:
     """The task's agents, which are the first vehicles of every world, act; the task commands the others.
 
@@ -120,7 +142,8 @@ class Environment:
                 forces of wrenches, and the task is fitted to it; `vehicle` then only delivers. `vehicle` if None.
             worlds: How many at once.
             hydrodynamics: calibrated, mesh or simplified.
-            action: thruster8, wrench6, wrench4 or pilot6 (ArduSub's axes); the task's own if None.
+            action: thruster8, wrench6, wrench4, pilot6 (ArduSub's axes), surfaces, course or course_pitch; the task's
+                own if None.
             wrench_scale: Part of each wrench limit that action 1 of an agent stands for, one number or (6,).
             randomization: Drawn anew for every episode; none if None.
             noise: On what the controller sees, or the sensors that it sees with; none if None.
@@ -166,6 +189,10 @@ class Environment:
             # The dock is the goal: the same memory.
             self.arrays.funnel = funnel = self.simulator.funnel
             self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
+        if MODES[self.action_mode].course:
+            self.arrays.steering = wp.zeros((worlds, len(vehicles)), dtype=vec8, device=self.device)
+            names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
+            self._steering = course_data(models, names, task.control_step, self.device)
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
@@ -242,9 +269,13 @@ class Environment:
         # task commands is in parts of all of the limits, however gently the agents are to act.
         agent_scale = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
         scales = [agent_scale if v < self.agents else 1.0 for v in range(len(self.nominal))]
-        modes = mode_data(self.action_mode, self.nominal, scales, self.device)
-        command = self.simulator.command.array
-        self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
+        command, kind = self.simulator.command.array, MODES[self.action_mode]
+        if kind.course:
+            inputs = [self.arrays, command, self._steering, int(kind.course == "pitch")]
+            self._step.add(act_by_course, inputs, vehicles=len(self.nominal))
+        else:
+            modes = mode_data(self.action_mode, self.nominal, scales, self.device)
+            self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
         if self.draws is not None:
             self.draws.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
@@ -514,10 +545,11 @@ def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicl
         EnvironmentSetupError: They differ in number, name or order.
     """
     for vehicle, expected in zip(vehicles, nominal, strict=True):
-        if vehicle.thruster_names != expected.thruster_names:
+        if vehicle.channel_names != expected.channel_names:
+            kind = "actuators" if vehicle.thruster_names == expected.thruster_names else "thrusters"
             raise EnvironmentSetupError(
-                f"{vehicle.name} has thrusters {', '.join(vehicle.thruster_names)}, "
-                f"expected those that its controller commands: {', '.join(expected.thruster_names)}"
+                f"{vehicle.name} has {kind} {', '.join(vehicle.channel_names)}, "
+                f"expected those that its controller commands: {', '.join(expected.channel_names)}"
             )
 
 

@@ -34,13 +34,13 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
                 f"vehicle '{vehicle_or_name.name}' does not control {', '.join(missing)}, which task '{task.name}' "
                 f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes)}; take another vehicle"
             )
-    if mode == "thruster8" and task.others:
+    if mode not in ("wrench6", "wrench4", "pilot6") and task.others:
         raise EnvironmentSetupError(
-            f"actions of task '{task.name}' are by thruster, expected wrench4 or wrench6: {', '.join(task.others)} is "
+            f"actions of task '{task.name}' are by {mode}, expected wrench4 or wrench6: {', '.join(task.others)} is "
             "commanded by wrench"
         )
-    counts = {len(vehicle_or_name.thrusters) for vehicle_or_name in vehicles}
-    if mode == "thruster8" and len(counts) > 1:
+    counts = {len(one.channel_names if mode == "surfaces" else one.thruster_names) for one in vehicles}
+    if mode in ("thruster8", "surfaces") and len(counts) > 1:
         raise EnvironmentSetupError(
             f"vehicles have {', '.join(map(str, sorted(counts)))} thrusters, expected equal numbers for actions by "
             "thruster: take wrench6 or wrench4"

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from finssim.physics.types import vec6
+from finssim.physics.types import vec6, vec8
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 
@@ -107,6 +107,8 @@ def open_episode(arrays: TaskArrays, w: int):
         arrays.earned[w, i] = 0.0
     for i in range(arrays.action.shape[1]):
         arrays.previous_action[w, i] = 0.0
+    for v in range(arrays.steering.shape[1]):
+        arrays.steering[w, v] = vec8()
 
 
 @wp.func
