@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.sim import Simulator
-from finssim.trials.inputs import delivered, thruster_motors, wrench_motors
+from finssim.trials.inputs import delivered, channel_motors, wrench_motors
 from finssim.vehicles import load_vehicle
 
 
@@ -37,7 +37,7 @@ def test_thrust_agrees_with_the_simulator(name, changes, step):
         simulator.step()
         thrust[k + 1] = simulator.numpy("thrust")[0, 0, :n]
     t = step * np.arange(steps + 1)
-    ours = delivered(thruster_motors(vehicle), t[:-1], command, t)
+    ours = delivered(channel_motors(vehicle), t[:-1], command, t)
     scale = np.maximum(-lower, upper)
     slewed = {"thrusters.*.slew"} & set(changes) and vehicle.thrusters[
         vehicle.thruster_names[0]
@@ -48,7 +48,7 @@ def test_thrust_agrees_with_the_simulator(name, changes, step):
 def test_a_step_of_force_is_an_exponential():
     """T = F (1 - exp(-(t - delay) / time_constant)) after the delay, at times that fall on no sample."""
     vehicle = load_vehicle("finsrov")
-    motors = thruster_motors(vehicle)
+    motors = channel_motors(vehicle)
     command = np.zeros((3, 8))
     command[1:] = 5.0
     at = np.array([0.0, 1.0, 1.0 + motors.delay[0], 1.1234, 1.5, 9.0])
@@ -61,7 +61,7 @@ def test_a_step_of_force_is_an_exponential():
 def test_a_slew_limit_is_a_ramp_and_then_an_exponential():
     """While the way to go exceeds slew x time_constant the force climbs by the slew alone."""
     vehicle = load_vehicle("finsrov").replace({"thrusters.*.slew": 10.0})
-    motors = thruster_motors(vehicle)
+    motors = channel_motors(vehicle)
     command = np.array([[0.0], [7.0]]) * np.ones(8)
     knee = (7.0 - 10.0 * motors.time_constant[0]) / 10.0
     at = 1.0 + motors.delay[0] + np.array([0.0, 0.5 * knee, knee, knee + motors.time_constant[0]])
@@ -79,5 +79,5 @@ def test_a_commanded_wrench_lags_like_equal_thrusters_do():
     t, at = np.arange(60) * 0.1, np.linspace(0.0, 6.0, 333)
     force = rng.uniform(-3.0, 3.0, (60, 8))
     B = vehicle.thruster_matrix()
-    lagged = delivered(thruster_motors(vehicle), t, force, at) @ B.T
+    lagged = delivered(channel_motors(vehicle), t, force, at) @ B.T
     np.testing.assert_allclose(delivered(wrench_motors(vehicle), t, force @ B.T, at), lagged, atol=1e-9)

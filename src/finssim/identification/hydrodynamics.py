@@ -73,7 +73,7 @@ def fit_hydrodynamics(
         trials: None of them held out.
         vehicle: Gives the rigid body, the motors and what is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        estimate: Further parameters, of `EXTRAS` and of the vehicle's terms.
+        estimate: Further parameters, of `EXTRAS`, of the vehicle's terms and of its actuators.
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         horizon: Longest stretch that is simulated without a restart [s].

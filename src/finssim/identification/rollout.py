@@ -74,7 +74,7 @@ class Segment:
     commanded: bool
     """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
     thrusters: bool
-    """True if the k forces are the vehicle's thrusters in canonical order."""
+    """True if the k forces are the vehicle's channels: thrusters in canonical order, then its other actuators."""
     position: Array
     """Position at the start, world frame [m], (3,); 0 if unknown."""
     quaternion: Array
@@ -413,7 +413,7 @@ class Rollouts:
             B = np.zeros((6, MAX_THRUSTERS))
             B[:, : s.B.shape[1]] = s.B
             field: dict[str, Any] = {"B": B}
-            names = ("force_min", "force_max", "dead_minus", "dead_plus", "time_constant", "slew")
+            names = ("force_min", "force_max", "dead_minus", "dead_plus", "time_constant", "slew", "play")
             lagged = s.commanded and s.thrusters
             if lagged:
                 field |= {name: self.nominal[name] for name in (*names, "delay", "speed_lag")}
@@ -421,7 +421,7 @@ class Rollouts:
                 # Wrenches that were asked for pass through the motors too, as if through six equal ones.
                 n = len(self.vehicle.thrusters)
                 tc = float(np.mean(self.nominal["time_constant"][:n])) if s.commanded else 0.0
-                values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT)
+                values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT, 0.0)
                 field |= {
                     name: np.full(MAX_THRUSTERS, value) for name, value in zip(names, values, strict=True)
                 }

@@ -45,6 +45,7 @@ from finssim.identification.uncertainty import Covariance, Evidence, degeneracy,
 from finssim.identification.vehicle_file import scaled_thrust
 from finssim.identification.weak_form import weak_form
 from finssim.physics.terms.composed import parameter_row, term_wrenches
+from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError, Finding, finding
@@ -52,6 +53,7 @@ from finssim.trials.inputs import require_axes, require_fittable
 from finssim.trials.motion import Motion
 from finssim.trials.trial import COLUMNS, Trial
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
+from finssim.vehicles.actuators import installed
 from finssim.vehicles.terms import unit_of
 
 __all__ = ["EXTRAS", "fit_by_simulation"]
@@ -120,6 +122,36 @@ def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coo
     return Coordinate(path, unit_of(path), start, *chosen.term_scalars[path], scale)
 
 
+def actuator_fields(vehicle: Vehicle) -> dict[str, dict[str, float]]:
+    """Parameter of a kind of actuator, `fin.lift_slope` -> field of the plant and number of each actuator of that kind.
+
+    A fit moves one factor on all of them. Each number has the unit of its kind.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for item, section in installed(vehicle).items():
+        numbers = item.numbers(section, vehicle)
+        for name in item.kind.scalars:
+            path = item.parameters[name]
+            out.setdefault(f"{item.kind.name}.{name}", {})[path] = float(numbers[path])
+    return out
+
+
+def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, float]:
+    """Changes of the vehicle file that multiply a parameter of all actuators of a kind, `fin.lift_slope`."""
+    kind, _, key = name.partition(".")
+    if kind == "propeller":
+        return {
+            f"thrusters.{n}.inflow.{key}": factor * float(getattr(t.inflow, key))
+            for n, t in vehicle.thrusters.items()
+            if t.inflow is not None
+        }
+    return {
+        f"actuators.{n}.{key}": factor * float(getattr(a, key))
+        for n, a in vehicle.actuators.items()
+        if a.kind == kind
+    }
+
+
 class Parameters:
     """The free numbers of a fit.
 
@@ -153,7 +185,7 @@ class Parameters:
             vehicle: Gives the start and everything that is not free.
             axes: Whose added mass and damping are free.
             damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
-            extras: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`.
+            extras: Of `EXTRAS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its actuators.
             biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
                 M nu_dot + D nu + b = tau.
             start: Coordinate -> where it starts, in its unit, in place of the vehicle file's number.
@@ -175,6 +207,7 @@ class Parameters:
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras, self.retained = damping, tuple(extras), tuple(retained)
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
+        self.actuators = {name: fields for name, fields in actuator_fields(vehicle).items() if name in extras}
         self.biases = tuple(a for a in AXES if a in biases)
         self.r_h = np.asarray(self.set.reference_point, float)
         self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
@@ -224,6 +257,7 @@ class Parameters:
         }
         out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
+        out += [Coordinate(name, "-", 1.0, 0.02, 50.0, 1.0) for name in self.actuators]
         out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
         for axis in self.imposed:
             i = AXES.index(axis)
@@ -313,8 +347,14 @@ class Parameters:
             fields["r_b"] = r_b
         for path in self.terms:
             fields[path] = self.value(x, path)[:, None]
+        for name, numbers in self.actuators.items():
+            factor = self.value(x, name)[:, None]
+            fields |= {field: factor * number for field, number in numbers.items()}
         if "thrust_scale" in self._at:
-            fields["gain"] = np.repeat(self.value(x, "thrust_scale")[:, None, None], 8, axis=-1)
+            n, others = len(self.vehicle.thrusters), len(self.vehicle.actuators)
+            gain = np.repeat(self.value(x, "thrust_scale")[:, None, None], MAX_THRUSTERS, axis=-1)
+            gain[..., n : n + others] = 1.0
+            fields["gain"] = gain
         bias = np.zeros((W, 1, 6))
         for axis in self.biases:
             bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
@@ -1168,9 +1208,8 @@ def other_estimates(
 ) -> tuple[dict[str, Estimate], list[Finding]]:
     """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
-    units = {c.name: c.unit for c in p.coordinates if c.name in PATHS} | {
-        path: unit_of(path) for path in p.terms
-    }
+    reported = {*PATHS, *p.terms, *p.actuators}
+    units = {c.name: c.unit for c in p.coordinates if c.name in reported}
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
         half, note = 0.5 * (high - low), ""
@@ -1184,7 +1223,7 @@ def other_estimates(
             note = "the trials do not determine it"
         elif half > limit:
             note = f"uncertain by ±{half:.2g} {unit}"
-        path = PATHS[name] if name in PATHS else f"{SET}.{name}"
+        path = f"{SET}.{name}" if name in p.terms else PATHS.get(name)
         out[name] = Estimate(
             name=name,
             estimate=value,
@@ -1508,6 +1547,9 @@ def changes(
     for path in p.terms:
         if found[path].identifiable:
             out[str(found[path].path)] = found[path].estimate
+    for name in p.actuators:
+        if found[name].identifiable:
+            out |= scaled_actuators(p.vehicle, name, found[name].estimate)
     if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
         out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
     return out
@@ -2062,7 +2104,8 @@ def fit_by_simulation(
         trials: Of any inputs, rates and measured columns.
         vehicle: Gives the rigid body, the motors and everything that is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        estimate: Of `EXTRAS`, and parameters of the vehicle's terms, such as `lift.coefficient`. Buoyancy comes
+        estimate: Of `EXTRAS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its actuators, such
+            as `fin.lift_slope`, of which a factor is fitted. Buoyancy comes
             with heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`; or one of the last three by axis.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
@@ -2167,6 +2210,7 @@ def _check(
         raise CalibrationError(f"unknown damping '{damping}'; available: {', '.join(DAMPING)}")
     chosen = vehicle.hydrodynamics.get("calibrated")
     known = [*EXTRAS, *(chosen.term_scalars if isinstance(chosen, HydrodynamicSet) else ())]
+    known += actuator_fields(vehicle)
     for word in estimate:
         if word not in known:
             raise CalibrationError(

@@ -5,7 +5,8 @@ Time stamps. Row k of a trial at `rate` has time t_k = k / rate and holds
 - the state at t_k: velocity of the body origin, attitude, position, angular rate, and what an accelerometer at the
   IMU's place reads at t_k (later by the sensor's latency where the vehicle's own sensors measure);
 - commands that are held over [t_k, t_k + 1/rate);
-- applied inputs (`rpm_*`, `force_*`, `tau_*`) at t_k, as telemetry gives them (motors lag, so they are continuous).
+- applied inputs (`rpm_*`, `force_*`, `tau_*`, `actuator_*`) at t_k, as telemetry gives them (motors lag, so they are
+  continuous).
 """
 
 from __future__ import annotations
@@ -60,9 +61,10 @@ class Recording:
     acceleration: NDArray[np.float32]
     """nu_dot [m/s², rad/s²], (n, W, 6)."""
     thrust: NDArray[np.float32]
-    """Thrust that the vehicle file gives for the propellers' speeds, before a plant's `gain` [N], (n, W, k)."""
+    """Thrust that the vehicle file gives for the propellers' speeds, before a plant's `gain` [N], and the values of the
+    other actuators, by channel, (n, W, k)."""
     command: NDArray[np.float32]
-    """Thrust asked for from this state on [N], (n, W, k)."""
+    """Command of each channel from this state on: thrust [N], others in their unit, (n, W, k)."""
 
 
 def record(
@@ -95,7 +97,7 @@ def record(
         spread: Scales the initial conditions, which are at rest and level at 0: at 1, standard deviations of 0.02 m/s,
             0.02 rad/s, 0.01 rad of roll and pitch, and any heading.
         each_step: Called before every step, for what the engine does not have: it may read the simulator's state and
-            write `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
+            write `command.thrust`, `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
 
     Raises:
         CalibrationError: There is no programme, a field of the plant is unknown, or the motion did not stay finite.
@@ -121,14 +123,16 @@ def record(
     simulator.command.disturbance.numpy()[:, 0] = np.asarray(disturbance)
     _start(simulator, depth, spread, seed)
     command = np.repeat(_commands(programmes, vehicle), per_command, axis=0)
-    n, k = len(command) + 1, len(vehicle.thrusters)
+    n, thrusters, k = len(command) + 1, len(vehicle.thrusters), len(vehicle.channel_names)
+    told = np.zeros((n, worlds, k), dtype=np.float32)
     shapes = {"position": 3, "quaternion": 4, "velocity": 6, "acceleration": 6, "actuator": k}
     states = {name: np.empty((n, worlds, size), dtype=np.float32) for name, size in shapes.items()}
     for i in range(n):
         if i > 0:
-            simulator.command.thrust.numpy()[:, 0, :k] = command[i - 1]
+            simulator.command.thrust.numpy()[:, 0, :thrusters] = command[i - 1]
             if each_step is not None:
                 each_step(simulator)
+            told[i - 1] = simulator.command.thrust.numpy()[:, 0, :k]
             simulator.step()
         for name, out in states.items():
             out[i] = simulator.numpy(name)[:, 0, : shapes[name]]
@@ -138,7 +142,8 @@ def record(
     # There is no acceleration before the first step; the one right after it is that of the start.
     states["acceleration"][0] = states["acceleration"][1]
     thrust = _nominal_thrust(states.pop("actuator"), vehicle, bool(simulator.plant.speed_lag.numpy().any()))
-    return Recording(step=STEP, thrust=thrust, command=np.concatenate([command, command[-1:]]), **states)
+    told[-1] = told[-2]
+    return Recording(step=STEP, thrust=thrust, command=told, **states)
 
 
 def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> float:
@@ -190,11 +195,11 @@ def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.f
 
 
 def _nominal_thrust(actuator: NDArray[np.float32], vehicle: Vehicle, speeds: bool) -> NDArray[np.float32]:
-    """Thrusts from what lags in the simulator: forces already, or shaft speeds."""
-    if not speeds:
-        return actuator
-    thrusters = vehicle.thrusters.values()
-    return np.stack([x.thrust(actuator[..., k]) for k, x in enumerate(thrusters)], axis=-1).astype(np.float32)
+    """Thrusts from what lags in the simulator: forces already, or shaft speeds; other actuators as they are."""
+    out = actuator.copy()
+    for k, thruster in enumerate(vehicle.thrusters.values() if speeds else ()):
+        out[..., k] = thruster.thrust(actuator[..., k])
+    return out
 
 
 # What sensors make of a true motion: noise profiles for synthetic trials.
@@ -508,7 +513,7 @@ def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every
     if "force" in inputs:
         out |= {f"force_{name}": thrust[..., k] for k, (name, _) in thrusters}
     if "wrench" in inputs:
-        tau = thrust @ vehicle.control_matrix.T
+        tau = thrust[..., : len(thrusters)] @ vehicle.control_matrix.T
         out |= {name: tau[..., i] for i, name in enumerate(TAU)}
     if "command" in inputs:
         out |= {f"command_{name}": command[..., k] for k, (name, _) in thrusters}
@@ -517,7 +522,9 @@ def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every
             f"pwm_{name}": thruster.pulse(thruster.speed(command[..., k]))
             for k, (name, thruster) in thrusters
         }
-    return out
+    values = command if set(inputs) <= {"command", "pwm"} else thrust
+    others = enumerate(vehicle.actuators, start=len(thrusters))
+    return out | {f"actuator_{name}": values[..., k] for k, name in others}
 
 
 def _end(programme: Programme, recording: Recording, world: int) -> float:

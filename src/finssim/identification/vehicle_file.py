@@ -19,7 +19,7 @@ import yaml
 
 from finssim.core.files import atomic_write
 from finssim.core.provenance import provenance
-from finssim.core.registry import TERMS
+from finssim.core.registry import ACTUATORS, TERMS
 from finssim.identification.fit import Estimate, Fit
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
 from finssim.vehicles import (
@@ -706,6 +706,8 @@ def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
     if excess is not None and excess.identifiable:
         low, high = ((vehicle.weight + x) / (vehicle.weight + excess.estimate) for x in excess.ci95)
         factors["volume"] = Factor(low, high, "told")
+    for kind, key in (name.split(".", 1) for name in fit.estimates if name.partition(".")[0] in ACTUATORS):
+        factors[f"{kind}.{key}"] = _of_estimate(fit.estimates[f"{kind}.{key}"])
     scale = fit.estimates.get("thrust_scale")
     if scale is not None:
         factors["thrust.all"] = _of_estimate(scale)

@@ -124,6 +124,8 @@ def require_axes(axes: Sequence[str] | None) -> None:
 
 NO_LIMIT = 1.0e9
 """Force and slew of a motor that has no limit."""
+SHORT = 1.0e-6
+"""Time constant of an actuator that has none [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,29 +154,31 @@ class Motors:
     """[N s²/rad²]"""
 
 
-def thruster_motors(vehicle: Vehicle) -> Motors:
-    """Motors of the vehicle's thrusters, in canonical order."""
-    thrusters = list(vehicle.thrusters.values())
-    speed = np.array([t.domain == "speed" for t in thrusters])
+def channel_motors(vehicle: Vehicle) -> Motors:
+    """Motors of the vehicle's thrusters and of its other actuators, in the order of `Vehicle.channel_names`."""
+    thrusters, others = list(vehicle.thrusters.values()), list(vehicle.actuators.values())
+    speed = np.array([t.domain == "speed" for t in thrusters] + [False] * len(others))
 
-    def column(name: str) -> Array:
-        return np.array([getattr(t, name) for t in thrusters], dtype=float)
+    def column(name: str, of_others: Sequence[float]) -> Array:
+        return np.array([*(getattr(t, name) for t in thrusters), *of_others], dtype=float)
 
     def force_at(name: str) -> Array:
-        at = [t.thrust(getattr(t, name) * 2.0 * np.pi / 60.0) for t in thrusters]
+        at = [t.thrust(getattr(t, name) * 2.0 * np.pi / 60.0) for t in thrusters] + [0.0] * len(others)
         return np.where(speed, at, 0.0)  # a motor that lags in force has no dead zone in the engine
 
+    one = [1.0] * len(others)
+    delays = [t.delay for t in thrusters]
     return Motors(
-        lower=column("force_min"),
-        upper=column("force_max"),
+        lower=column("force_min", [a.minimum for a in others]),
+        upper=column("force_max", [a.maximum for a in others]),
         dead_minus=force_at("dead_rpm_minus"),
         dead_plus=force_at("dead_rpm_plus"),
-        delay=column("delay"),
-        time_constant=column("time_constant"),
-        slew=np.minimum(column("slew"), NO_LIMIT),
+        delay=column("delay", [max(delays, default=0.0)] * len(others)),
+        time_constant=column("time_constant", [max(a.time_constant, SHORT) for a in others]),
+        slew=np.minimum(column("slew", [a.rate_limit for a in others]), NO_LIMIT),
         speed=speed,
-        c_plus=column("c_plus"),
-        c_minus=column("c_minus"),
+        c_plus=column("c_plus", one),
+        c_minus=column("c_minus", one),
     )
 
 
@@ -184,15 +188,15 @@ def wrench_motors(vehicle: Vehicle) -> Motors:
     Exact while all thrusters are equal, lag in force and keep away from their limits; who allocated the wrench, and
     how, is not in the log.
     """
-    motors = thruster_motors(vehicle)
+    thrusters = list(vehicle.thrusters.values())
     six = np.ones(6)
     return Motors(
         lower=-NO_LIMIT * six,
         upper=NO_LIMIT * six,
         dead_minus=0.0 * six,
         dead_plus=0.0 * six,
-        delay=motors.delay.mean() * six,
-        time_constant=motors.time_constant.mean() * six,
+        delay=float(np.mean([t.delay for t in thrusters])) * six,
+        time_constant=float(np.mean([t.time_constant for t in thrusters])) * six,
         slew=NO_LIMIT * six,
         speed=np.zeros(6, bool),
         c_plus=six,
@@ -333,15 +337,15 @@ class InputForces:
     t: Array
     """Times at which all of them are known [s], (n,)."""
     force: Array
-    """[N; N m for the moments of a wrench], (n, k), k <= 8."""
+    """[N; N m for the moments of a wrench; of other actuators their unit], (n, k), k <= 8."""
     B: Array
-    """Wrench about the body origin per unit force, body frame, (6, k)."""
+    """Wrench about the body origin per unit force, body frame, (6, k); zero of other actuators than thrusters."""
     names: tuple[str, ...]
-    """Thrusters, or `tau_x` ... `tau_n`."""
+    """Channels of the vehicle, or `tau_x` ... `tau_n`."""
     commanded: bool
     """True if these were commanded: limits, dead zone, delay, lag and slew of the motors lie before what acted."""
     thrusters: bool
-    """True if the channels are the vehicle's thrusters, in canonical order."""
+    """True if the channels are those of the vehicle: thrusters in canonical order, then its other actuators."""
     held: bool
     """True if a value acts until the next, rather than linearly to it."""
     spans: Array
@@ -375,9 +379,13 @@ def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
     present = input_columns(trial, vehicle)
     kind = first_complete(present, trial, vehicle)
     columns = present[kind]
+    others = _other_columns(trial, vehicle, kind)
     commanded, held, stepped = _between(trial, kind, columns)
-    t, values = _common_times(trial, columns, held)
-    force, B, names = _channels(trial, vehicle, kind, columns, t, values)
+    t, values = _common_times(trial, [*columns, *others], held)
+    force, B, names = _channels(trial, vehicle, kind, columns, t, values[:, : len(columns)])
+    if others:
+        force = np.concatenate([force, values[:, len(columns) :]], axis=1)
+        B, names = np.pad(B, ((0, 0), (0, len(others)))), vehicle.channel_names
     end = _end(trial, t, force) if held else None
     zero_after = end is not None and trial.header.inputs_after == "zero"
     if end is not None and zero_after:
@@ -403,6 +411,36 @@ def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
         source=kind.rstrip("_"),
         findings=(*_assumed(kind, present, stepped), *([finding("inputs_zero_after")] if zero_after else [])),
     )
+
+
+def _other_columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
+    """Columns of the vehicle's actuators besides thrusters, in the order of its channels.
+
+    Raises:
+        CalibrationError: One is missing or unknown, or a wrench is given in place of the thrusters' inputs.
+    """
+    expected = [f"actuator_{name}" for name in vehicle.actuators]
+    for column in trial.channels:
+        if column.startswith("actuator_") and column not in expected:
+            raise CalibrationError(
+                f"{column}: {vehicle.name} has no such actuator{did_you_mean(column, expected)} it has "
+                f"{', '.join(vehicle.actuators) or 'thrusters alone'}",
+                trial.name,
+            )
+    missing = [column for column in expected if not trial.has(column)]
+    if missing:
+        raise CalibrationError(
+            f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing, expected a column for each of the "
+            f"{len(expected)} actuators of {vehicle.name} besides its thrusters: give zeros for one that never moved",
+            trial.name,
+        )
+    if expected and kind == "tau":
+        raise CalibrationError(
+            f"the inputs are a wrench, and {vehicle.name} has {', '.join(vehicle.actuators)}, whose forces depend on "
+            "the flow: give rpm_, force_, pwm_ or command_ of each thruster",
+            trial.name,
+        )
+    return expected
 
 
 def _undriven(trial: Trial) -> InputForces:
@@ -472,7 +510,7 @@ def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
         Wrench [N, N m], (m, 6); NaN outside the recorded inputs and inside their gaps.
     """
     if drive.commanded:
-        motors = thruster_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
+        motors = channel_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
         force = delivered(motors, drive.t, drive.force, t)
     else:
         force = drive.at(t)

@@ -164,8 +164,9 @@ INPUT_PREFIXES: dict[str, Column] = {
     "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
     "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
     "command_": Column("command", "N", "requested thrust of one thruster"),
+    "actuator_": Column("command", "-", "fin or gimbal [rad], buoyancy [m³] or moving mass [m], by its name"),
 }
-"""Columns named PREFIX + thruster name."""
+"""Columns named PREFIX + name of the thruster, or of another actuator."""
 
 
 def column_of(name: str) -> Column | None:

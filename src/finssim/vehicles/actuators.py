@@ -84,11 +84,15 @@ class ActuatorKind:
     numbers: Callable[[Any, Vehicle], Mapping[str, Any]] | None = None
     """Function from section and vehicle to the parameters that no key of the section gives."""
 
+    further: tuple[str, ...] = ()
+    """Parameters besides those of the schema that can be drawn and fitted."""
+
     @cached_property
     def scalars(self) -> tuple[str, ...]:
-        """Names of the parameters that are one number of the section."""
+        """Names of the parameters that can be drawn and fitted: one number each."""
         fields = self.schema.model_fields
-        return tuple(name for name in self.units if name in fields and fields[name].annotation is float)
+        own = (name for name in self.units if name in fields and fields[name].annotation is float)
+        return (*own, *self.further)
 
 
 @dataclass(frozen=True)

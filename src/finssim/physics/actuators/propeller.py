@@ -70,5 +70,6 @@ PROPELLER = ActuatorKind(
         "wake_fraction": "1",
     },
     wrench=inflow_wrench,
+    further=("thrust_loss", "torque_loss"),
     numbers=_numbers,
 )
