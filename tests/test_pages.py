@@ -55,7 +55,7 @@ def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
 
 def test_the_vehicle_on_the_page_loads(tmp_path):
     """The example vehicle is a vehicle, and a wrong axis in it gives the error that the page shows."""
-    (example,) = blocks(ROOT / "docs" / "reference" / "vehicle_file.md", "yaml")
+    example, actuators = blocks(ROOT / "docs" / "reference" / "vehicle_file.md", "yaml")
     (tmp_path / "minnow.yaml").write_text(example, encoding="utf-8")
     assert load_vehicle(tmp_path / "minnow.yaml").thruster_names == ("left", "right")
     (tmp_path / "minnow.yaml").write_text(example.replace("[1, 0, 0]", "[0.94, 0, 0]", 1), encoding="utf-8")
@@ -64,6 +64,10 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
     shown = "minnow.yaml: thrusters.left: axis has length 0.94, expected 1: give a body-frame unit vector"
     assert str(refused.value).endswith(shown)
     assert shown in (ROOT / "docs" / "reference" / "vehicle_file.md").read_text(encoding="utf-8")
+    head = "extends: remus100\norigin: guessed\nthrusters: {propeller: {diameter: 0.14}}\n"
+    (tmp_path / "torpedo.yaml").write_text(head + actuators, encoding="utf-8")
+    names = set(load_vehicle(tmp_path / "torpedo.yaml").actuators)
+    assert names >= {"rudder", "tank", "battery", "nozzle"}
 
 
 def test_the_sensing_the_sweep_and_the_plant_on_the_pages_load(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.sim import Simulator
-from finssim.trials.inputs import delivered, channel_motors, wrench_motors
+from finssim.trials.inputs import channel_motors, delivered, wrench_motors
 from finssim.vehicles import load_vehicle
 
 

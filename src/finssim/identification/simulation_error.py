@@ -137,7 +137,16 @@ def actuator_fields(vehicle: Vehicle) -> dict[str, dict[str, float]]:
 
 
 def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, float]:
-    """Changes of the vehicle file that multiply a parameter of all actuators of a kind, `fin.lift_slope`."""
+    """Changes of the vehicle file that multiply a parameter of all actuators of a kind, `fin.lift_slope`.
+
+    Args:
+        vehicle: The vehicle.
+        name: Kind and parameter.
+        factor: Factor on the number of each actuator [-].
+
+    Returns:
+        Path of each number -> its new value, in the unit of the parameter.
+    """
     kind, _, key = name.partition(".")
     if kind == "propeller":
         return {
