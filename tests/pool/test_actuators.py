@@ -3,12 +3,24 @@
 import numpy as np
 import pytest
 
-from finssim.pool import PlantSpecError, draw_plant
+from finssim.pool import PlantSpecError, VirtualPool, draw_plant, read_truth
 from finssim.pool.drawn_plant import site_of
+from finssim.pool.firmware import Firmware
 from finssim.pool.plant import Plant
+from finssim.robot.links.frames import (
+    HOST,
+    Decoder,
+    LinkError,
+    RejectFlag,
+    crc16_modbus,
+    encode_command,
+    encode_debug_config,
+)
+from finssim.robot.messages import Telemetry, ThrusterCommand
+from finssim.robot.wiring import link_of
 from finssim.sim import Simulator
 from finssim.vehicles import load_vehicle
-from tests.reference.finned import torpedo
+from reference.finned import torpedo
 
 TORPEDO = torpedo()
 NOMINAL = site_of("open-water", draw_plant(TORPEDO, 0, "nominal"))
@@ -75,3 +87,72 @@ def test_plants_of_other_actuators_are_refused():
         Plant(
             load_vehicle("remus100"), draw_plant(load_vehicle("remus100"), 0).model_copy(update={"terms": {}})
         )
+
+
+# Through the wire: what is commanded comes out in the plant, and its values come back.
+
+
+def exchanged(pool, until, command=None):
+    """Newest telemetry of a pool that is sent a command 50 times a second up to a time [s]."""
+    decoder, newest = Decoder(HOST, 1, 4), None
+    while pool.time < until - 1e-6:
+        sent = [] if command is None else [encode_command(command)]
+        for _, data in pool.exchange(pool.time + 0.02, sent).frames:
+            newest = next((m for m in decoder.feed(data) if isinstance(m, Telemetry)), newest)
+    return newest
+
+
+def test_actuators_follow_the_wire_and_stop_when_it_falls_silent():
+    """Setpoints of version 2 move them and telemetry has their values; after the timeout fins go to 0, others stay."""
+    pool = VirtualPool(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
+    heard = exchanged(pool, 2.0, ThrusterCommand(True, (0.3,), (0.2, -0.15, 2e-4, 0.02)))
+    np.testing.assert_allclose(heard.actuators, [0.196, -0.15, 2e-4, 0.02], atol=1e-5)
+    np.testing.assert_allclose(pool.plant.values, heard.actuators, atol=1e-6)
+    heard = exchanged(pool, 3.5)
+    np.testing.assert_allclose(heard.actuators, [0.0, 0.0, 2e-4, 0.02], atol=5e-3)
+    assert heard.actuators[2] == pytest.approx(2e-4, rel=1e-3) and not pool.plant.target.any()
+
+
+def test_a_moving_engine_stops_where_it_is_when_motors_are_switched_off():
+    """Its rate is 2e-4 m³/s: one second on its way, then disabled."""
+    pool = VirtualPool(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
+    exchanged(pool, 1.0, ThrusterCommand(True, (0.0,), (0.0, 0.0, 1e-3, 0.0)))
+    heard = exchanged(pool, 2.0, ThrusterCommand(False, (0.0,), (0.0, 0.0, 1e-3, 0.0)))
+    assert heard.actuators[2] == pytest.approx(2e-4, rel=0.05)
+
+
+def test_a_command_without_setpoints_is_a_bad_frame():
+    """Version 1 does not move a vehicle that has more than thrusters; the echo has the reason."""
+    firmware = Firmware(TORPEDO, NOMINAL)
+    firmware.receive(0.0, encode_debug_config(1, 1, 1))
+    (echo,) = Decoder(HOST, 1, 4).feed(
+        firmware.receive(0.1, encode_command(ThrusterCommand(True, (0.5,))))[0]
+    )
+    assert not echo.accepted and echo.reject_flags == RejectFlag.BAD_FRAME and not firmware.target.any()
+    command = encode_command(ThrusterCommand(True, (0.5,), (0.9, 0.0, 0.0, 0.0)))
+    (echo,) = Decoder(HOST, 1, 4).feed(firmware.receive(0.2, command)[0])
+    assert echo.accepted and echo.command_crc == crc16_modbus(command[2:-2])
+    np.testing.assert_allclose(firmware.setpoints, [0.35, 0.0, 0.0, 0.0])
+
+
+def test_an_autopilot_that_moves_thrusters_alone_is_refused():
+    """In the pool and at the robot's end: one sentence."""
+    with pytest.raises(
+        PlantSpecError, match="firmware ardusub moves thrusters alone, but torpedo has rudder"
+    ):
+        VirtualPool(TORPEDO, NOMINAL, firmware="ardusub")
+    with pytest.raises(LinkError, match="mavlink moves thrusters alone, but torpedo has rudder"):
+        link_of("mavlink", TORPEDO)
+
+
+def test_the_truth_holds_the_values(tmp_path):
+    """One column for each actuator, named in the header; none for a vehicle of thrusters alone."""
+    pool = VirtualPool(
+        TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)), truth=tmp_path / "t.fst"
+    )
+    exchanged(pool, 0.5, ThrusterCommand(True, (0.0,), (0.2, 0.0, 0.0, 0.0)))
+    pool.close()
+    truth = read_truth(tmp_path / "t.fst")
+    assert truth.header["actuators"] == ["rudder", "elevator", "engine", "battery"]
+    assert truth.actuators.shape == (len(truth.time), 4)
+    assert truth.actuators[-1, 0] == pytest.approx(float(pool.plant.values[0]))

@@ -9,6 +9,7 @@ from finssim.robot.bridge import Bridge, BridgeError, BridgeSettings
 from finssim.robot.links.frames import StatusFlag
 from finssim.vehicles import catalogue, load_vehicle
 from reference.bridge_rig import DT, Rig, echo, moves, quiet, reading, telemetry
+from reference.finned import torpedo
 
 FINSROV = load_vehicle("finsrov")
 TILTED = (math.sin(0.2), 0.0, 0.0, math.cos(0.2))  # 0.4 rad of roll: over the file's 20 degrees
@@ -372,3 +373,55 @@ def test_a_slew_for_another_vehicle_is_refused():
     """One rate per thruster."""
     with pytest.raises(BridgeError, match="expected 8"):
         Bridge(FINSROV, BridgeSettings.of(FINSROV, slew=np.ones(6)))
+
+
+TORPEDO = torpedo()
+
+
+def with_values(*values):
+    """Telemetry of version 2 with these values of the other actuators."""
+    return lambda k, n: telemetry(k, n, actuators=values)
+
+
+def test_setpoints_follow_the_thrusts_within_the_travel_of_each_actuator():
+    """Channels beyond the thrusters go out as they are, limited; a command of thrusts alone leaves them."""
+    rig = Rig(TORPEDO)
+    at = with_values(0.0, 0.0, 0.0, 0.0)
+    rig.run(0.2, telemetry_=at)
+    assert rig.bridge.arm(rig.now, "pid") == ""
+    rig.n = 5
+    rig.run(0.3, [5.0, 0.2, -1.0, 2e-4, 0.01], telemetry_=at)
+    assert rig.bridge.state == "armed" and rig.frame.enable and rig.frame.normalised[0] > 0.0
+    np.testing.assert_allclose(rig.frame.setpoints, [0.2, -0.35, 2e-4, 0.01])
+    rig.n = 1
+    rig.run(0.1, 5.0, telemetry_=at)
+    np.testing.assert_allclose(rig.frame.setpoints, [0.2, -0.35, 2e-4, 0.01])
+    rig.n = 3
+    rig.run(0.1, 5.0, telemetry_=at)
+    assert "expected 1 thrusts, or 5 numbers with the other actuators" in rig.bridge.drain()[-1].text
+
+
+@pytest.mark.parametrize("end", ["disarm", "stop"])
+def test_fins_go_to_zero_and_an_engine_stays_when_the_bridge_is_not_armed(end):
+    """On disarming and in a fault: the value of `off`, or that of the newest telemetry where the file has none."""
+    rig = Rig(TORPEDO)
+    at = with_values(0.1, 0.1, 3e-4, 0.02)
+    rig.run(0.2, telemetry_=at)
+    assert rig.bridge.arm(rig.now, "pid") == ""
+    rig.n = 5
+    rig.run(0.3, [5.0, 0.2, 0.2, 2e-4, 0.01], telemetry_=at)
+    getattr(rig.bridge, end)(rig.now, *(["red button"] if end == "stop" else []))
+    rig.step(telemetry_=at)
+    assert quiet(rig.frame)
+    np.testing.assert_allclose(rig.frame.setpoints, [0.0, 0.0, 3e-4, 0.02])
+
+
+def test_a_controller_of_version_1_is_refused_where_there_are_other_actuators():
+    """One sentence names the actuators; a vehicle of thrusters alone arms as ever."""
+    rig = Rig(TORPEDO)
+    rig.run(0.2)
+    reason = rig.bridge.arm(rig.now, "pid")
+    assert reason == (
+        "the motor controller uses version 1 of the protocol, which has thrusters alone: rudder, elevator, engine, "
+        "battery need a firmware with version 2"
+    )

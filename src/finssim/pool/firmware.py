@@ -265,6 +265,7 @@ class Firmware:
 
     Attributes:
         target: Shaft speeds that it asks of the loops, canonical order [rad/s], (n,).
+        setpoints: Values that it asks of the other actuators [rad, m³ or m], (m,).
         commands: How many it has received.
         ordered: Whether its frames cannot overtake each other on the wire.
     """
@@ -287,6 +288,10 @@ class Firmware:
             [i if t.motor_index is None else t.motor_index for i, t in enumerate(thrusters)]
         )
         self._sign = np.array([t.motor_sign or 1 for t in thrusters], dtype=float)
+        others = list(vehicle.actuators.values())
+        self._rest = np.array([math.nan if a.off is None else a.off for a in others])
+        self._travel = np.array([a.minimum for a in others]), np.array([a.maximum for a in others])
+        self._values = np.zeros(len(others))
         self._slow_plus = TURNING * RPM * np.array([t.dead_rpm_plus for t in thrusters])
         self._slow_minus = TURNING * RPM * np.array([-t.dead_rpm_minus for t in thrusters])
         self._spec, self._gravity = spec.firmware, vehicle.water.gravity
@@ -296,7 +301,7 @@ class Firmware:
     def _start(self, now: float) -> None:
         """State after power-on: nothing is remembered, motors are off."""
         self._boot = now
-        self._decoder = Decoder(MCU, self._outputs)
+        self._decoder = Decoder(MCU, self._outputs, len(self._values))
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
         self._sampled = now
         self._last_command: float | None = None
@@ -305,6 +310,7 @@ class Firmware:
         self._enabled = self._timed_out = self._aiming = False
         self._rpm_outputs = np.zeros(self._outputs)
         self.target: Array = np.zeros(len(self._sign))
+        self._stop_others()
         self.commands = 0
 
     def reboot(self, now: float) -> None:
@@ -344,13 +350,17 @@ class Firmware:
         self._bad_frames = bad
         if self._timed_out:
             refused |= RejectFlag.TIMEOUT
-        in_range = _within(command)
+        in_range = _within(command) and len(command.setpoints) == len(self._values)
         self.commands += 1
         if not in_range:
             refused |= RejectFlag.BAD_FRAME
         else:
             self._last_command, self._timed_out, self._enabled = now, False, command.enable
             self._aim(np.array(command.normalised) if command.enable else np.zeros(self._outputs))
+            if command.enable:
+                self.setpoints = np.clip(command.setpoints, *self._travel)
+            else:
+                self._stop_others()
         if not command.enable:
             refused |= RejectFlag.DISABLED
         self._unechoed += 1
@@ -365,11 +375,16 @@ class Firmware:
         self.target = np.where((speeds < self._slow_plus) & (speeds > -self._slow_minus), 0.0, speeds)
         self._aiming = bool(self.target.any())
 
+    def _stop_others(self) -> None:
+        """Send the other actuators to their `off`; those that have none stay where they are."""
+        self.setpoints: Array = np.where(np.isnan(self._rest), self._values, self._rest)
+
     def _echo(self, now: float, command: ThrusterCommand, accepted: bool, refused: int) -> bytes:
         applied = np.zeros(self._outputs)
         applied[self._output] = self._sign * self.target / self._full
         # The CRC as it came: of the same values in the same layout.
-        crc = crc16_modbus(encode_command(command)[1:-3]) if _within(command) else 0
+        within = slice(2, -2) if command.setpoints else slice(1, -3)
+        crc = crc16_modbus(encode_command(command)[within]) if _within(command) else 0
         echo = CommandEcho(
             sequence=self._next(),
             mcu_ms=self.clock(now),
@@ -391,6 +406,7 @@ class Firmware:
         if self._last_command is not None and now - self._last_command > self._timeout:
             self._last_command, self._timed_out, self._enabled = None, True, False
             self._aim(np.zeros(self._outputs))
+            self._stop_others()
 
     def frames(
         self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
@@ -404,6 +420,7 @@ class Firmware:
             plant: Its motors.
             faults: What is wrong.
         """
+        self._values = plant.measured_values
         telemetry = self.telemetry(now, sample, plant.measured_speed, plant.throttle)
         if telemetry is None:
             return []
@@ -436,6 +453,7 @@ class Firmware:
             pressure=sample.pressure,
             flags=self._flags(bool(throttle.any())),
             motor_rpm=tuple(self._rpm_outputs.tolist()),
+            actuators=tuple(self._values.tolist()),
         )
 
     @property

@@ -67,7 +67,7 @@ class Truth(NamedTuple):
     """A truth file's records, by time."""
 
     header: dict[str, Any]
-    """Vehicle, its digest, plant, severity, seed and thruster names."""
+    """Vehicle, its digest, plant, severity, seed and names of the thrusters and, if any, other actuators."""
     time: Array
     """[s], (k,)"""
     position: Array
@@ -84,6 +84,8 @@ class Truth(NamedTuple):
     """Voltage of the battery [V], (k,)."""
     current: Array
     """Velocity of the water at the body, world frame [m/s], (k, 3)."""
+    actuators: Array
+    """Values of the actuators besides thrusters, in the header's order [rad, m³ or m], (k, m)."""
 
 
 class TruthWriter:
@@ -113,7 +115,8 @@ class TruthWriter:
 
         Args:
             time: [s]
-            values: Position, quaternion, nu, shaft rpm, thrust, voltage and current, in this order; float32.
+            values: Position, quaternion, nu, shaft rpm, thrust, voltage, current and values of other actuators, in this
+                order; float32.
         """
         if self._file is None:
             return
@@ -155,6 +158,7 @@ def read_truth(path: str | Path) -> Truth:
         "thrust": n,
         "voltage": 1,
         "current": 3,
+        "actuators": len(header.get("actuators", ())),
     }
     layout = np.dtype([("time", "<f8"), *((name, "<f4", (size,)) for name, size in fields.items())])
     body = data[data.index(b"\n") + 1 :]
@@ -258,6 +262,7 @@ class Faults:
                 depth=held.depth,
                 pressure=held.pressure,
                 motor_rpm=held.motor_rpm,
+                actuators=held.actuators,
             )
         frame = encode_telemetry(telemetry)
         return (
@@ -386,6 +391,11 @@ class VirtualPool:
     def _firmware(self, name: str) -> Firmware | ArduSub:
         if name == "mcu":
             return Firmware(self.vehicle, self.spec)
+        if self.vehicle.actuators:
+            raise PlantSpecError(
+                f"firmware {name} moves thrusters alone, but {self.vehicle.name} has "
+                f"{', '.join(self.vehicle.actuators)}: take firmware mcu"
+            )
         try:
             from finssim.pool.ardusub import ArduSub
         except ImportError:
@@ -464,6 +474,8 @@ class VirtualPool:
                 self._transmit(now, echo)
         firmware.watch(now)
         plant.target[:] = firmware.target
+        if self.vehicle.actuators and isinstance(firmware, Firmware):
+            plant.set_points(firmware.setpoints)
         plant.advance()
         if self.camera is not None or self.positioning is not None:
             self._remember()
@@ -499,6 +511,7 @@ class VirtualPool:
             "plant_seed": self.spec.seed,
             "seed": seed,
         }
+        header |= {"actuators": list(self.vehicle.actuators)} if self.vehicle.actuators else {}
         writer = TruthWriter(path, self.vehicle.thruster_names, header)
         self._write_truth(writer)
         return writer
@@ -507,5 +520,6 @@ class VirtualPool:
         p = self.plant
         rpm = p.shaft_speed / np.float32(RPM)
         writer.write(
-            p.time, (p.position, p.quaternion, p.nu, rpm, p.thrust, p.electric[:1], p.water_velocity)
+            p.time,
+            (p.position, p.quaternion, p.nu, rpm, p.thrust, p.electric[:1], p.water_velocity, p.values),
         )

@@ -208,15 +208,16 @@ EARLY = 0.1
 
 
 class Commander:
-    """Takes thrust commands; what it refuses does not count as a sign of life."""
+    """Takes commands; what it refuses does not count as a sign of life."""
 
-    def __init__(self, thrusters: int, timeout: float) -> None:
+    def __init__(self, thrusters: int, timeout: float, others: int = 0) -> None:
         """
         Args:
-            thrusters: Numbers in a command, n.
+            thrusters: Thrusts in a command, n.
+            others: Values of other actuators that may follow them, m.
             timeout: Age at which a command, or a word from another source, no longer counts [s].
         """
-        self._thrusters = thrusters
+        self._thrusters, self._others = thrusters, others
         self._timeout = timeout
         self.forget()
 
@@ -224,6 +225,8 @@ class Commander:
         """Reset to the state before the first command."""
         self.force: Array = np.zeros(self._thrusters)
         """Of the newest command, canonical order [N], (n,)."""
+        self.setpoints: Array | None = None
+        """Values of the other actuators in the newest command that has them [rad, m³ or m], (m,)."""
         self.received = -math.inf
         """When it came [s]."""
         self.source = ""
@@ -248,7 +251,8 @@ class Commander:
 
         Args:
             now: When it came [s].
-            force: Thrusts along the thrusters' axes, canonical order [N], (n,).
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,), or these and the values of the other
+                actuators [rad, m³ or m], (n + m,).
             source: Who sent it.
             stamp: Time of what its sender knew, robot's clock [s]; None: it does not tell.
         """
@@ -256,8 +260,10 @@ class Commander:
             requested = np.array(force, float)
         except (TypeError, ValueError):
             return "command is no list of numbers"
-        if requested.shape != (self._thrusters,):
-            return f"command has shape {requested.shape}, expected {self._thrusters} thrusts"
+        n, m = self._thrusters, self._others
+        if requested.shape not in ((n,), (n + m,)):
+            channels = f", or {n + m} numbers with the other actuators" if m else ""
+            return f"command has shape {requested.shape}, expected {n} thrusts{channels}"
         if not np.isfinite(requested).all():
             return "command is not finite"
         if stamp is not None:
@@ -265,7 +271,9 @@ class Commander:
                 return f"command is stamped {stamp:.3f} s, received at {now:.3f} s"
             if source == self.source and stamp < self._stamp:
                 return "command is older than the one before"
-        self.force, self.source, self.received = requested, source, now
+        self.force, self.source, self.received = requested[:n], source, now
+        if m and requested.size > n:
+            self.setpoints = requested[n:]
         self._stamp = -math.inf if stamp is None else stamp
         return ""
 
@@ -285,8 +293,8 @@ REORDERED = 1000
 class TelemetryWatch:
     """Watch telemetry for silence, repetition and restarts; `timeout` is in [s]."""
 
-    def __init__(self, outputs: int, timeout: float) -> None:
-        self._outputs = outputs
+    def __init__(self, outputs: int, timeout: float, others: int = 0) -> None:
+        self._outputs, self._others = outputs, others
         self._timeout = timeout
         self.forget()
 
@@ -296,6 +304,16 @@ class TelemetryWatch:
         self._last: Telemetry | None = None
         self._changed = {"gyro": math.inf, "accel": math.inf}
 
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Return the values of the other actuators in the newest message [rad, m³ or m]; empty where it has none."""
+        return () if self._last is None else self._last.actuators
+
+    @property
+    def lacks_actuators(self) -> bool:
+        """Return whether the newest message lacks the vehicle's actuators besides thrusters."""
+        return self._last is not None and len(self.values) < self._others
+
     def age(self, now: float) -> float:
         """Time since the last message that brought something new [s]; infinite before the first."""
         return now - self.fresh_since
@@ -303,7 +321,7 @@ class TelemetryWatch:
     def malformed(self, message: Telemetry) -> str:
         """Return why a message cannot be used; "" if it can."""
         numbers = (*message.quaternion, *message.gyro, *message.accel, message.depth, message.pressure)
-        if not all(map(math.isfinite, (*numbers, *(message.motor_rpm or ())))):
+        if not all(map(math.isfinite, (*numbers, *(message.motor_rpm or ()), *message.actuators))):
             return "a number in the telemetry is not finite"
         if not 0.9 < math.hypot(*message.quaternion) < 1.1:
             return "the attitude in the telemetry is not a unit quaternion"
@@ -606,8 +624,10 @@ class Supervision:
         self.settings = settings
         self.peer = "motor controller"
         """Who sends telemetry, in sentences."""
-        self.commander = Commander(len(vehicle.thrusters), settings.command_timeout)
-        self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout)
+        self._others = tuple(vehicle.actuators)
+        m = len(self._others)
+        self.commander = Commander(len(vehicle.thrusters), settings.command_timeout, m)
+        self.telemetry = TelemetryWatch(outputs, settings.telemetry_timeout, m)
         self.echo, self.deaf = EchoWatch(), Lasting()
         self.state = StateWatch(settings.state_timeout, settings.vision_modes)
         imu = vehicle.sensors.imu
@@ -656,6 +676,11 @@ class Supervision:
         limits = self.settings
         if self.telemetry.age(now) > limits.telemetry_timeout:
             return f"no fresh telemetry from the {self.peer} for {limits.telemetry_timeout:g} s"
+        if self.telemetry.lacks_actuators:
+            return (
+                f"the {self.peer} uses version 1 of the protocol, which has thrusters alone: "
+                f"{', '.join(self._others)} need a firmware with version 2"
+            )
         frozen = self.telemetry.frozen(now, limits.frozen_limit)
         if frozen:
             return f"telemetry is frozen: the {frozen} has repeated its numbers for {limits.frozen_limit:g} s"
@@ -746,10 +771,14 @@ class Bridge:
         self.log = EventLog()
         self.force: Array = np.zeros(self.motors.thrusters)
         """Thrusts of the last tick after all limits, delivered on average, canonical order [N], (n,)."""
+        others = list(vehicle.actuators.values())
+        self.setpoints: Array = np.zeros(len(others))
+        """Values that the last tick asked of the other actuators, within their travel [rad, m³ or m], (m,)."""
+        self._rest = np.array([math.nan if a.off is None else a.off for a in others])
+        self._travel = np.array([a.minimum for a in others]), np.array([a.maximum for a in others])
         self._watchdogs = Supervision(vehicle, self.settings, self.motors.outputs)
         self._commander = self._watchdogs.commander
         self._clock = BridgeClock(self.settings.clock_step)
-        self._off = ThrusterCommand(False, (0.0,) * self.motors.outputs)
         self._memory = self.motors.reset()
         self._ticked: float | None = None
         self._armed_at = self._held_at = math.nan
@@ -824,7 +853,8 @@ class Bridge:
 
         Args:
             now: When it came [s].
-            force: Thrusts along the thrusters' axes, canonical order [N], (n,).
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,); these and the values of the other
+                actuators [rad, m³ or m], (n + m,), which otherwise stay where they are.
             source: Who sent it; two at a time are a fault.
             stamp: Time of what its sender knew, robot's clock [s].
 
@@ -876,11 +906,15 @@ class Bridge:
         if self.state in RUNNING:
             self._watch(self._clock.now)
         if self.state != "armed":
-            return self._off
+            reported = self._watchdogs.telemetry.values or self.setpoints
+            self.setpoints = np.where(np.isnan(self._rest), reported, self._rest)
+            return ThrusterCommand(False, (0.0,) * self.motors.outputs, tuple(self.setpoints.tolist()))
         step = self.settings.slew * dt
         change = np.minimum(np.maximum(self._limited(now) - self.force, -step), step)
         normalised, self.force, self._memory = self.motors.normalised(self.force + change, self._memory, dt)
-        return ThrusterCommand(True, tuple(normalised.tolist()))
+        if self._commander.setpoints is not None:
+            self.setpoints = np.clip(self._commander.setpoints, *self._travel)
+        return ThrusterCommand(True, tuple(normalised.tolist()), tuple(self.setpoints.tolist()))
 
     @property
     def source(self) -> str:

@@ -18,6 +18,8 @@ class ThrusterCommand:
     """False: motors off, whatever the numbers are."""
     normalised: tuple[float, ...]
     """Part of the full-scale shaft speed per motor output, in [-1, 1]."""
+    setpoints: tuple[float, ...] = ()
+    """Values of the actuators besides thrusters, in the order of the vehicle file [rad, m³ or m]."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,9 @@ class Telemetry:
     """Status bits (see `robot.links`)."""
     motor_rpm: tuple[float, ...] | None
     """Speed per motor output, with the controller's own signs [rpm]; None from a firmware that does not report it."""
+    actuators: tuple[float, ...] = ()
+    """Values of the actuators besides thrusters, in the order of the vehicle file [rad, m³ or m]; empty where there are
+    none, or the firmware uses version 1 of the protocol."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,8 @@ class Pilot(Protocol):
         """Forget what was before."""
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,).
+        """Wanted thrusts in canonical order [N], (n,); or one number per channel of the vehicle, in the order of
+        `Vehicle.channel_names`: thrusts, then the values of the other actuators [rad, m³ or m].
 
         Args:
             reading: The vehicle's state.

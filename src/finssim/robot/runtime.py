@@ -176,7 +176,8 @@ class Intake:
             recorder: Takes it down.
             link: Reads what comes; the vehicle's motor controller if None.
         """
-        self.link: Link = link or McuLink(perception.vehicle.mcu.outputs)
+        vehicle = perception.vehicle
+        self.link: Link = link or McuLink(vehicle.mcu.outputs, len(vehicle.actuators))
         self.clock = ClockMap()
         self.pictures: dict[str, Picture] = {}
         """The latest reading of each of the vehicle's own cameras, sonars and altimeters, by name."""
@@ -413,7 +414,8 @@ class Runtime:
         if self.recorder is not None:
             goal = self.guide.at(now - self.started)
             self.recorder.goal(now, goal.position, float(goal.yaw))
-            self.recorder.command(now, force, self.pilot.name, self.vehicle.control_matrix @ force)
+            thrust = force[: self.force.size]
+            self.recorder.command(now, thrust, self.pilot.name, self.vehicle.control_matrix @ thrust)
             self.recorder.policy(
                 now, self.pilot.name, period=self.pilot.period, missed=self.counters.missed, force=force,
                 observation=getattr(self.pilot, "observation", ()), action=getattr(self.pilot, "action", ()),
@@ -421,7 +423,7 @@ class Runtime:
             )  # fmt: skip
 
     def _asked(self, now: float, reading: Reading) -> Array | None:
-        """Return the pilot's thrust; None, and the vehicle stopped, if it fails."""
+        """Return the pilot's thrusts, or one number per channel; None, and the vehicle stopped, if it fails."""
         try:
             force = np.asarray(self.pilot.act(reading, self.guide, now - self.started), float)
         except (
@@ -429,7 +431,8 @@ class Runtime:
         ) as error:  # whatever a pilot does wrong, the thrusters must stop and the loop continue
             self.bridge.stop(now, f"pilot {self.pilot.name} failed: {' '.join(str(error).split())[:200]}")
             return None
-        if force.shape != self.force.shape or not np.isfinite(force).all():
+        channels = (len(self.vehicle.channel_names),)
+        if force.shape not in (self.force.shape, channels) or not np.isfinite(force).all():
             self.bridge.stop(
                 now, f"pilot {self.pilot.name} asks for {force.tolist()}, expected finite thrusts"
             )

@@ -160,7 +160,12 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
         LinkError, ControlError: pymavlink is missing, or the vehicle has no autopilot.
     """
     if not robot.startswith("mavlink"):
-        return McuLink(vehicle.mcu.outputs)
+        return McuLink(vehicle.mcu.outputs, len(vehicle.actuators))
+    if vehicle.actuators:
+        raise LinkError(
+            f"--robot mavlink moves thrusters alone, but {vehicle.name} has {', '.join(vehicle.actuators)}: connect "
+            "its motor controller"
+        )
     try:
         from finssim.robot.links.mavlink import MavlinkLink
     except ModuleNotFoundError:

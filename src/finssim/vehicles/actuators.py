@@ -49,6 +49,9 @@ class Actuator(Part):
     """Fastest change, in the unit of the kind per second."""
     play: NonNegative = 0.0
     """Dead band and backlash: it does not move while its target is no farther than this, in the unit of the kind."""
+    off: Number | None = None
+    """Value to which it goes while the vehicle is disarmed or in a fault, in the unit of the kind; it stays where it
+    is if None."""
 
     @model_validator(mode="after")
     def _neutral_within(self) -> Actuator:
@@ -56,6 +59,8 @@ class Actuator(Part):
             raise refuse_section(
                 f"minimum {self.minimum:g} and maximum {self.maximum:g}: expected a travel that holds 0, the rest value"
             )
+        if self.off is not None and not self.minimum <= self.off <= self.maximum:
+            raise refuse_section(f"off is {self.off:g}, expected {self.minimum:g} to {self.maximum:g}")
         return self
 
 

@@ -10,6 +10,9 @@ from hypothesis import strategies as st
 
 from finssim.robot.links.frames import (
     DEBUG_ECHO,
+    HOST,
+    MCU,
+    Decoder,
     LinkError,
     RejectFlag,
     StatusFlag,
@@ -141,3 +144,38 @@ def test_status_bits_are_where_the_firmware_has_them():
     assert StatusFlag.DIAGNOSTICS & TELEMETRY.flags
     assert command_count(0x8112_0000) == 0x12
     assert [flag.value for flag in RejectFlag] == [2, 4, 8]
+
+
+EXACT = dataclasses.replace(TELEMETRY, quaternion=(0.0, 0.0, 0.0, 1.0))
+
+
+def test_with_other_actuators_frames_are_of_version_2():
+    """Setpoints follow the thrusters of a command, values those of telemetry; all else is as in version 1."""
+    command = dataclasses.replace(COMMAND, setpoints=(0.25, -0.5, 2.0**-12))
+    telemetry = dataclasses.replace(EXACT, actuators=(0.25, -0.5, 2.0**-12))
+    assert encode_command(command) == wire.command_bytes(command) and len(wire.command_bytes(command)) == 53
+    assert encode_telemetry(telemetry) == wire.telemetry_bytes(telemetry)
+    assert len(encode_telemetry(telemetry)) == 98 + 12
+    assert Decoder(MCU, 8, 3).feed(encode_command(command) + encode_command(COMMAND)) == [command, COMMAND]
+    assert Decoder(HOST, 8, 3).feed(encode_telemetry(EXACT) + encode_telemetry(telemetry)) == [
+        EXACT,
+        telemetry,
+    ]
+
+
+def test_a_peer_of_version_1_finds_no_frame_in_version_2():
+    """It counts them as another type, and hears what it knows behind them."""
+    for kinds, one, two in (
+        (MCU, COMMAND, dataclasses.replace(COMMAND, setpoints=(0.1,))),
+        (HOST, EXACT, dataclasses.replace(EXACT, actuators=(0.1,))),
+    ):
+        encode = encode_command if kinds is MCU else encode_telemetry
+        decoder = Decoder(kinds)
+        assert decoder.feed(encode(two) + encode(one)) == [one]
+        assert decoder.refused["unknown_type"] == 1
+
+
+def test_a_setpoint_that_is_no_number_is_not_sent():
+    """As for thrusts: the sender is refused."""
+    with pytest.raises(LinkError, match="setpoints is .*, expected finite numbers"):
+        encode_command(dataclasses.replace(COMMAND, setpoints=(math.nan,)))

@@ -8,24 +8,32 @@ from pathlib import Path
 
 import pytest
 
-from finssim.robot.links.frames import LAYOUTS, Layout, RejectFlag, StatusFlag, encode_command, forms
+from finssim.robot.links.frames import (
+    LAYOUTS,
+    OTHERS,
+    Layout,
+    RejectFlag,
+    StatusFlag,
+    encode_command,
+    forms,
+)
 from robot.links import wire
 from robot.links.test_frames import COMMAND
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "wire.md").read_text(encoding="utf-8")
 TYPES = {"?": "u8", "B": "u8", "H": "u16", "I": "u32", "f": "f32"}
-OUTPUTS = 8
+OUTPUTS, ACTUATORS = 8, 4
 
 
 def table(layout: Layout) -> str:
     """Rows of offset, type, name and meaning of every byte of a frame."""
-    form = forms(layout, OUTPUTS)[0]
+    form = forms(layout, OUTPUTS, ACTUATORS)[0]
     rows, at = (
         [("0", "1 byte" if len(layout.magic) == 1 else "2 bytes", "magic", layout.magic.hex(" ").upper())],
         len(layout.magic),
     )
     for field in form.fields:
-        count = field.values or OUTPUTS
+        count = {0: OUTPUTS, OTHERS: ACTUATORS}.get(field.values, field.values)
         kind = TYPES[field.code] + (f"[{count}]" if field.values != 1 else "")
         always = "" if field.constant is None else f"{field.constant}: "
         rows.append((str(at), kind, f"`{field.name}`", always + field.meaning))

@@ -40,6 +40,10 @@ def with_crc(magic: bytes, body: bytes, tail: bytes = b"") -> bytes:
 
 def command_bytes(command: ThrusterCommand) -> bytes:
     values = command.normalised
+    if command.setpoints:
+        payload = struct.pack(f"<?{len(values)}f", command.enable, *values)
+        payload += struct.pack(f"<{len(command.setpoints)}f", *command.setpoints)
+        return with_crc(b"\xac\xca", struct.pack("<BBH", 2, 2, len(payload)) + payload)
     return with_crc(b"\xaa", struct.pack(f"<B{len(values)}f", command.enable, *values), b"\xbb")
 
 
@@ -50,7 +54,11 @@ def telemetry_bytes(t: Telemetry) -> bytes:
     )
     if t.motor_rpm is not None:
         payload += struct.pack(f"<{len(t.motor_rpm)}f", *t.motor_rpm)
-    return with_crc(b"\xa5\x5a", struct.pack("<BBHHI", 1, 1, len(payload), t.sequence, t.mcu_ms) + payload)
+    payload += struct.pack(f"<{len(t.actuators)}f", *t.actuators)
+    version = 2 if t.actuators else 1
+    return with_crc(
+        b"\xa5\x5a", struct.pack("<BBHHI", 1, version, len(payload), t.sequence, t.mcu_ms) + payload
+    )
 
 
 def echo_bytes(e: CommandEcho) -> bytes:

@@ -12,7 +12,16 @@ from pydantic import Field, model_validator
 
 from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, vec6, vec8
 from finssim.vehicles.actuators import Actuator, ActuatorKind
-from finssim.vehicles.part import Axis, NonNegative, Positive, Probability, Vector3, refuse_section, zeros
+from finssim.vehicles.part import (
+    Axis,
+    NonNegative,
+    Number,
+    Positive,
+    Probability,
+    Vector3,
+    refuse_section,
+    zeros,
+)
 
 QUARTER = 0.5 * np.pi
 DRAG_MAX = 2.0
@@ -22,6 +31,8 @@ DRAG_MAX = 2.0
 class Fin(Actuator):
     """Section of a fin; its value is the deflection [rad], about `span` by the right-hand rule."""
 
+    off: Number | None = 0.0
+    """Deflection while the vehicle is disarmed or in a fault [rad]; it stays where it is if None."""
     position: Vector3
     """Centre of pressure, from the body origin, body frame [m], (3,)."""
     span: Axis

@@ -9,12 +9,14 @@ import warp as wp
 
 from finssim.physics.types import MAX_THRUSTERS, join, vec6, vec8
 from finssim.vehicles.actuators import Actuator, ActuatorKind
-from finssim.vehicles.part import Axis
+from finssim.vehicles.part import Axis, Number
 
 
 class Gimbal(Actuator):
     """Section of a gimbal; its value is the angle [rad] about `axis` by the right-hand rule."""
 
+    off: Number | None = 0.0
+    """Angle while the vehicle is disarmed or in a fault [rad]; it stays where it is if None."""
     thruster: str
     """Name of the thruster that it turns, about the centre of its disc."""
     axis: Axis

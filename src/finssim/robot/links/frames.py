@@ -38,11 +38,15 @@ class Field(NamedTuple):
     meaning: str
     """Meaning with its unit, for the table of the documentation."""
     values: int = 1
-    """Number of values; 0: one per motor output."""
+    """Number of values; 0: one per motor output; `OTHERS`: one per actuator besides thrusters."""
     constant: int | None = None
     """Value that is always sent; None: the message's."""
     order: tuple[int, ...] = ()
     """Index in the message of each value on the wire; empty: as they are."""
+
+
+OTHERS = -1
+"""`Field.values` of what has one value per actuator besides thrusters."""
 
 
 @dataclass(frozen=True)
@@ -62,20 +66,25 @@ class Layout:
 
 
 class TelemetryLayout:
-    """A layout for one number of motor outputs, with or without its optional field: bytes of known length."""
+    """A layout for one number of motor outputs and of other actuators, with or without its optional field: bytes of
+    known length."""
 
-    def __init__(self, layout: Layout, outputs: int, *, complete: bool = True) -> None:
+    def __init__(self, layout: Layout, outputs: int, others: int = 0, *, complete: bool = True) -> None:
         """Args:
         layout: The kind of frame.
         outputs: Motor outputs of the vehicle.
+        others: Actuators of the vehicle besides thrusters.
         complete: False: without the optional field.
         """
         payload = layout.payload if complete else layout.payload[:-1]
-        length = struct.calcsize("<" + _codes(payload, outputs))
+        numbers = {0: outputs, OTHERS: others}
+        self.counts = {f.name: numbers.get(f.values, f.values) for f in (*layout.header, *payload)}
+        """Number of values of each field by its name."""
+        length = struct.calcsize("<" + self._codes(payload))
         header = tuple(f._replace(constant=length) if f.name == "length" else f for f in layout.header)
-        self.layout, self.fields, self.outputs = layout, (*header, *payload), outputs
+        self.layout, self.fields = layout, (*header, *payload)
         self.absent = {} if complete else {layout.optional: None}
-        self._body = struct.Struct("<" + _codes(self.fields, outputs))
+        self._body = struct.Struct("<" + self._codes(self.fields))
         self.crc_at = len(layout.magic) + self._body.size
         self.size = self.crc_at + 2 + len(layout.tail)
 
@@ -94,7 +103,7 @@ class TelemetryLayout:
         """Name, first value, one past the last (0: a single value) and order of what a message holds."""
         places, at = [], 0
         for field in self.fields:
-            count = field.values or self.outputs
+            count = self.counts[field.name]
             if field.constant is None:
                 alone = field.values == 1
                 order = tuple(field.order.index(i) for i in range(count)) if field.order else ()
@@ -118,17 +127,17 @@ class TelemetryLayout:
     def _numbers(self, message: Any) -> list[Any]:
         """Values of all fields in the order of the wire."""
         numbers: list[Any] = []
-        for name, _, _, count, constant, order in self.fields:
+        for name, _, _, values, constant, order in self.fields:
             if constant is not None:
                 numbers.append(constant)
                 continue
             value = getattr(message, name)
-            if count == 1:
+            if values == 1:
                 numbers.append(value)
                 continue
-            if len(value) != (count or self.outputs):
+            if len(value) != self.counts[name]:
                 raise LinkError(
-                    f"{self.layout.title}: {name} has {len(value)} values, expected {count or self.outputs}"
+                    f"{self.layout.title}: {name} has {len(value)} values, expected {self.counts[name]}"
                 )
             numbers.extend([value[i] for i in order] if order else value)
         return numbers
@@ -157,16 +166,18 @@ class TelemetryLayout:
             decoded[name] = tuple([part[i] for i in order]) if order else part
         return self.layout.message(**decoded)
 
+    def _codes(self, fields: tuple[Field, ...]) -> str:
+        return "".join(f"{self.counts[f.name]}{f.code}" for f in fields)
+
 
 @lru_cache(maxsize=64)
-def forms(layout: Layout, outputs: int) -> tuple[TelemetryLayout, ...]:
-    """Every form a layout has for a number of motor outputs, the complete one first."""
-    complete = TelemetryLayout(layout, outputs)
+def forms(layout: Layout, outputs: int, others: int = 0) -> tuple[TelemetryLayout, ...]:
+    """Every form a layout has for a number of motor outputs and of other actuators, the complete one first; none of
+    version 2 where there are no other actuators."""
+    if not others and any(f.values == OTHERS for f in layout.payload):
+        return ()
+    complete = TelemetryLayout(layout, outputs, others)
     return (complete, TelemetryLayout(layout, outputs, complete=False)) if layout.optional else (complete,)
-
-
-def _codes(fields: tuple[Field, ...], outputs: int) -> str:
-    return "".join(f"{f.values or outputs}{f.code}" for f in fields)
 
 
 @lru_cache(maxsize=64)
@@ -247,11 +258,11 @@ def command_count(flags: int) -> int:
     return (flags >> 16) & 0xFF
 
 
-def _head(kind: int) -> tuple[Field, ...]:
+def _head(kind: int, version: int = 1) -> tuple[Field, ...]:
     """Return the first fields of telemetry, echo and debug configuration after their magic."""
     return (
         Field("type", "B", "kind of frame", constant=kind),
-        Field("version", "B", "of the layout", constant=1),
+        Field("version", "B", "of the layout", constant=version),
         Field("length", "H", "bytes between the header and the CRC"),
         Field("sequence", "H", "counts frames, modulo 2¹⁶"),
     )
@@ -270,6 +281,17 @@ COMMAND = Layout(
     ),
     tail=b"\xbb",
 )
+COMMAND_2 = Layout(
+    "command of thrusters and other actuators",
+    ThrusterCommand,
+    magic=b"\xac\xca",
+    header=_head(2, 2)[:3],
+    payload=(
+        Field("enable", "?", "0: motors off and other actuators at their `off`, regardless of the rest"),
+        COMMAND.payload[1],
+        Field("setpoints", "f", "per other actuator [rad, m³ or m]; limited to its travel", values=OTHERS),
+    ),
+)
 TELEMETRY = Layout(
     "telemetry",
     Telemetry,
@@ -287,6 +309,17 @@ TELEMETRY = Layout(
         ),
     ),
     optional="motor_rpm",
+)
+TELEMETRY_2 = Layout(
+    "telemetry with other actuators",
+    Telemetry,
+    magic=b"\xa5\x5a",
+    header=(*_head(1, 2), _MCU_MS),
+    payload=(
+        *TELEMETRY.payload[:-1],
+        TELEMETRY.payload[-1]._replace(meaning="shaft speed per motor output [rpm]"),
+        Field("actuators", "f", "value per other actuator [rad, m³ or m]", values=OTHERS),
+    ),
 )
 ECHO = Layout(
     "command echo",
@@ -334,12 +367,12 @@ NAVIGATION = Layout(
         Field("std", "f", "of a position per axis [m] and of its yaw [rad]; 0: not known", values=2),
     ),
 )
-LAYOUTS = (COMMAND, TELEMETRY, ECHO, NAVIGATION, DEBUG_CONFIG)
-"""Every kind of frame: the first and the last go to the motor controller, the others come from it."""
+LAYOUTS = (COMMAND, COMMAND_2, TELEMETRY, TELEMETRY_2, ECHO, NAVIGATION, DEBUG_CONFIG)
+"""Every kind of frame: commands and the last go to the motor controller, the others come from it."""
 
 
 def encode_command(command: ThrusterCommand) -> bytes:
-    """Frame of a command, 5 + 4 n bytes for n motor outputs: 37 for eight.
+    """Frame of a command, 5 + 4 n bytes for n motor outputs: 37 for eight; with m setpoints 9 + 4 (n + m), version 2.
 
     Raises:
         LinkError: A value is not finite or beyond [-1, 1].
@@ -349,18 +382,21 @@ def encode_command(command: ThrusterCommand) -> bytes:
             f"thruster command: normalised is {command.normalised}, expected numbers from -1 to 1: "
             "limit the force before it becomes a command"
         )
-    return forms(COMMAND, _outputs(command.normalised))[0].encode(command)
+    layout = COMMAND_2 if command.setpoints else COMMAND
+    return forms(layout, _outputs(command.normalised), len(command.setpoints))[0].encode(command)
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Return the frame of a snapshot, 66 + 4 n bytes, or 66 where `motor_rpm` is None.
+    """Return the frame of a snapshot, 66 + 4 n bytes, or 66 where `motor_rpm` is None; with m other actuators it is of
+    version 2, 66 + 4 (n + m).
 
     Raises:
         LinkError: See `TelemetryLayout.encode`.
     """
     if telemetry.motor_rpm is None:
         return forms(TELEMETRY, 0)[1].encode(telemetry)
-    return forms(TELEMETRY, _outputs(telemetry.motor_rpm))[0].encode(telemetry)
+    layout = TELEMETRY_2 if telemetry.actuators else TELEMETRY
+    return forms(layout, _outputs(telemetry.motor_rpm), len(telemetry.actuators))[0].encode(telemetry)
 
 
 def encode_echo(echo: CommandEcho) -> bytes:
@@ -387,9 +423,9 @@ def _outputs(values: Sequence[float]) -> int:
 # Frames from a stream of bytes: complete or in parts, with garbage between them, and never a wrong one.
 
 
-HOST = (TELEMETRY, ECHO, NAVIGATION)
+HOST = (TELEMETRY, TELEMETRY_2, ECHO, NAVIGATION)
 """Frames that the robot's computer reads."""
-MCU = (COMMAND, DEBUG_CONFIG)
+MCU = (COMMAND, COMMAND_2, DEBUG_CONFIG)
 """Frames that the motor controller reads."""
 
 _HEADER = 6
@@ -408,16 +444,17 @@ class Decoder:
         what looked like a beginning, `not_finite` frames, and `skipped_bytes` outside of frames with a right CRC.
     """
 
-    def __init__(self, kinds: Iterable[Layout] = HOST, outputs: int = 8) -> None:
+    def __init__(self, kinds: Iterable[Layout] = HOST, outputs: int = 8, others: int = 0) -> None:
         """Args:
         kinds: Layouts to decode, `HOST` or `MCU`.
         outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).
+        others: Actuators of the vehicle besides thrusters.
         """
         self.accepted: Counter[str] = Counter()
         self.refused: Counter[str] = Counter(bad_crc=0, bad_length=0, unknown_type=0, not_finite=0)
         self.skipped_bytes = 0
         self._rest = b""
-        all_forms = [form for layout in kinds for form in forms(layout, outputs)]
+        all_forms = [form for layout in kinds for form in forms(layout, outputs, others)]
         self.longest = max(form.size for form in all_forms)
         self._plain = {f.layout.magic[0]: f for f in all_forms if len(f.prefix) < _HEADER}
         self._headed = {f.prefix: f for f in all_forms if len(f.prefix) >= _HEADER}
@@ -489,11 +526,12 @@ class McuLink:
 
     peer = "motor controller"
 
-    def __init__(self, outputs: int) -> None:
+    def __init__(self, outputs: int, others: int = 0) -> None:
         """Args:
         outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).
+        others: Actuators of the vehicle besides thrusters.
         """
-        self._decoder = Decoder(outputs=outputs)
+        self._decoder = Decoder(outputs=outputs, others=others)
 
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]."""
