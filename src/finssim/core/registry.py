@@ -243,6 +243,8 @@ TASKS = Family(
         "t2": "finssim.tasks.trajectory_tracking:TrajectoryTracking",
         "t3": "finssim.tasks.moving_target:MovingTarget",
         "docking": "finssim.tasks.docking:Docking",
+        "path": "finssim.tasks.path:PathFollowing",
+        "waypoints": "finssim.tasks.path:WaypointTour",
     },
     check="finssim.tasks.catalogue:check_registered",
 )

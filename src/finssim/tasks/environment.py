@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.control import ControlError
 from finssim.control.course import CourseData, course_data, order_of, steer
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.physics.plant import VehicleCommand
@@ -191,8 +192,7 @@ class Environment:
             self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
         if MODES[self.action_mode].course:
             self.arrays.steering = wp.zeros((worlds, len(vehicles)), dtype=vec8, device=self.device)
-            names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
-            self._steering = course_data(models, names, task.control_step, self.device)
+            self._steering = self._autopilots()
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()
         self.randomization = randomization
@@ -228,6 +228,14 @@ class Environment:
         """The world that the vehicle sees, and its pictures; None of a task that does not see."""
         self._build()
         self.reset(seed=self.seed)
+
+    def _autopilots(self) -> CourseData:
+        """Return the autopilots of the nominal vehicles, which carry out orders of a mode by course."""
+        names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
+        try:
+            return course_data(models, names, self.task.control_step, self.device)
+        except ControlError as error:
+            raise EnvironmentSetupError(f"action mode '{self.action_mode}': {error}") from error
 
     def _sight(self) -> Any:
         """The world that the vehicle sees, with the sensors that the task observes."""

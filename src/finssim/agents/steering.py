@@ -1,0 +1,67 @@
+"""Baselines of tasks for vehicles that must move to steer: classical guidance, by orders to the autopilot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.agents.baselines import PERIOD, Rows
+from finssim.control.course import STEEPEST, WIDEST
+from finssim.control.path_following import LineOfSight, PathErrors
+from finssim.core.rotations import cross
+from finssim.tasks.path import ERROR_SCALE, Cruise
+from finssim.vehicles import Vehicle
+
+Array = NDArray[np.float64]
+
+LOOK_AHEAD_TIME = 1.5
+"""Time at cruising speed to the point ahead on the path [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathPilot:
+    """Line of sight with integral action along a path, seen from the observation."""
+
+    cruise: Cruise
+    guide: LineOfSight
+    period: float = PERIOD
+    """Time between two actions [s]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> PathPilot:
+        """Return the baseline for the speed of a vehicle."""
+        cruise = Cruise.of(vehicle)
+        return cls(
+            cruise=cruise, guide=LineOfSight(LOOK_AHEAD_TIME * cruise.speed, gain=0.1, steepest=STEEPEST)
+        )
+
+    def reset(self, n: int) -> Array:
+        """Return empty integrals [m s], (n, 2)."""
+        return self.guide.reset(n)
+
+    def act(self, memory: Array, observation: Rows) -> tuple[Rows, Array]:
+        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        o = np.asarray(observation, float)
+        up, velocity, ahead = o[:, 17:20], o[:, 11:14], o[:, 5:8]
+        across, above = (ERROR_SCALE * self.cruise.size * o[:, i] for i in (0, 1))
+        slope = -np.arcsin(np.clip((ahead * up).sum(axis=1), -1.0, 1.0))
+        nothing = np.zeros(len(o))
+        errors = PathErrors(level_angle(velocity, ahead, up), slope, nothing, across, above, nothing)
+        (turn, pitch), after = self.guide.aim(memory, errors, self.period)
+        action = np.column_stack([nothing, turn / WIDEST, pitch / STEEPEST])
+        return np.clip(action, -1.0, 1.0).astype(np.float32), after
+
+
+def level_angle(start: Array, end: Array, up: Array) -> Array:
+    """Return the angle about the vertical from one direction to another, counter-clockwise from above [rad], (n,).
+
+    Args:
+        start: Body frame [-], (n, 3).
+        end: Body frame [-], (n, 3).
+        up: World's up, body frame [-], (n, 3).
+    """
+    across = (cross(start, end) * up).sum(axis=1)
+    along = (start * end).sum(axis=1) - (start * up).sum(axis=1) * (end * up).sum(axis=1)
+    return np.asarray(np.arctan2(across, along))

@@ -1,0 +1,423 @@
+"""Tasks along a path in space, for vehicles that must move to steer: a winding path, and a tour of waypoints."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from finssim.control.course import course_speeds
+from finssim.control.path_following import Waypoints
+from finssim.physics.types import vec6
+from finssim.sim import RectangularPool
+from finssim.sim.state import State
+from finssim.tasks.arrays import PathTable, TaskArrays, allocated
+from finssim.tasks.environment import Environment, EnvironmentSetupError
+from finssim.tasks.task import Task
+from finssim.tasks.terms import (
+    End,
+    ObservationPart,
+    RewardTerm,
+    Terms,
+    Total,
+    action_costs,
+    tilted,
+    turn_rates,
+    world_up,
+    world_velocity,
+)
+from finssim.vehicles import Vehicle
+
+ERROR_SCALE = 3.0
+"""Errors beside the path are divided by this in the observation, in proportion to the vehicle's speed [m]."""
+AHEAD = (0.0, 1.0, 3.0)
+"""The direction of the path is seen where the vehicle is, and this much later at cruising speed [s]."""
+PACE = 1.5
+"""Cruising speed of a vehicle for which lengths are as they are stated [m/s]."""
+
+
+# Where a vehicle is beside the legs of a path.
+
+
+@wp.func
+def leg_direction(path: PathTable, w: int, k: int) -> wp.vec3:
+    """Unit vector along a leg, world frame."""
+    return wp.normalize(path.points[w, k + 1] - path.points[w, k])
+
+
+@wp.func
+def beside_leg(path: PathTable, w: int, x: wp.vec3) -> wp.vec4:
+    """Return where a point [m] is beside the leg that is followed: the numbers of `Waypoints.errors`.
+
+    Returns:
+        Way along the leg, distance to its left, distance above it, and way that remains of it [m].
+    """
+    k = path.leg[w]
+    e = leg_direction(path, w, k)
+    left = wp.normalize(wp.vec3(-e[1], e[0], 0.0))
+    off = x - path.points[w, k]
+    along = wp.dot(off, e)
+    whole = wp.length(path.points[w, k + 1] - path.points[w, k])
+    return wp.vec4(along, wp.dot(off, left), wp.dot(off, wp.cross(e, left)), whole - along)
+
+
+@wp.func
+def leg_is_done(path: PathTable, w: int, x: wp.vec3, radius: float) -> bool:
+    """Return whether a point [m] is within a radius [m] of the end of the leg, or beyond it."""
+    end = path.points[w, path.leg[w] + 1]
+    return wp.length(end - x) <= radius or beside_leg(path, w, x)[3] <= 0.0
+
+
+@wp.func
+def change_legs(state: State, arrays: TaskArrays, p: Any, w: int):
+    """Go on to the leg after those that are done."""
+    x = state.position[w, 0]
+    for _i in range(4):
+        if arrays.path.leg[w] < p.legs - 1 and leg_is_done(arrays.path, w, x, p.fit.size * p.radius):
+            arrays.path.leg[w] = arrays.path.leg[w] + 1
+
+
+# What is seen, rewarded and counted.
+
+
+@wp.func
+def measured_errors(arrays: TaskArrays, p: Any, w: int) -> wp.vec2:
+    """Distances to the left of the leg and above it [m], for a vehicle that cruises at `PACE`."""
+    found = beside_leg(arrays.path, w, arrays.position[w, 0])
+    return wp.vec2(found[1], found[2]) / p.fit.size
+
+
+@wp.func
+def path_direction(arrays: TaskArrays, p: Any, w: int, k: int) -> wp.vec3:
+    """Direction of the path as far ahead as cruising takes in the k-th time of `AHEAD`, body frame."""
+    leg = int(arrays.path.leg[w])
+    way = float(p.fit.speed * p.ahead[k] - beside_leg(arrays.path, w, arrays.position[w, 0])[3])
+    while way > 0.0 and leg < p.legs - 1:
+        leg += 1
+        way -= wp.length(arrays.path.points[w, leg + 1] - arrays.path.points[w, leg])
+    return wp.quat_rotate_inv(arrays.quaternion[w, 0], leg_direction(arrays.path, w, leg))
+
+
+@wp.func
+def ground_velocity(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
+    """Measured velocity as a part of cruising speed, body frame."""
+    nu = arrays.velocity[w, 0]
+    return wp.vec3(nu[0], nu[1], nu[2]) / p.fit.speed
+
+
+@wp.func
+def path_error(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
+    """Distance to the path [m]."""
+    found = beside_leg(arrays.path, w, state.position[w, 0])
+    return wp.sqrt(found[1] * found[1] + found[2] * found[2])
+
+
+@wp.func
+def on_path(p: Any, e: float) -> float:
+    """Return 1 on the path, 1/e at an error `e` [m] of `reward.track_scale`, in proportion to the vehicle's speed."""
+    return wp.exp(-e / (p.fit.size * p.reward.track_scale))
+
+
+@wp.func
+def path_advance(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
+    """Speed along the path as a part of cruising speed, at most 1."""
+    e = leg_direction(arrays.path, w, arrays.path.leg[w])
+    return wp.min(wp.dot(world_velocity(state, w, 0), e) / p.fit.speed, 1.0)
+
+
+@wp.func
+def has_finished(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
+    """The last leg is done."""
+    last = arrays.path.leg[w] >= p.legs - 1
+    return last and leg_is_done(arrays.path, w, state.position[w, 0], p.fit.size * p.radius)
+
+
+@wp.func
+def has_left(p: Any, e: float) -> bool:
+    """Farther than `corridor` from the path, in proportion to the vehicle's speed. The error `e` is in [m]."""
+    return e > p.fit.size * p.corridor
+
+
+@wp.func
+def mean_square(arrays: TaskArrays, p: Any, e: float, w: int, was: float) -> float:
+    """Mean of the squared distance to the path after `settle` [m²]."""
+    k = wp.floor((arrays.time[w] - p.settle) / p.control_step + 0.5)
+    return wp.where(k >= 1.0, was + (e * e - was) / wp.max(k, 1.0), was)
+
+
+# The start of an episode.
+
+
+@wp.func
+def winding(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
+    """Write a path whose curvature and slope change smoothly, from phases that are drawn."""
+    pi = 3.14159265
+    course = float(wp.randf(rng, -pi, pi))
+    first = wp.randf(rng, -pi, pi)
+    second = wp.randf(rng, -pi, pi)
+    third = wp.randf(rng, -pi, pi)
+    wave = p.fit.size * wp.randf(rng, p.wave[0], p.wave[1])
+    spacing = p.fit.size * p.spacing
+    x = wp.vec3(0.0, 0.0, p.fit.size * p.depth)
+    for k in range(p.legs + 1):
+        arrays.path.points[w, k] = x
+        s = 2.0 * pi * float(k) * spacing / wave
+        bend = 0.5 * (wp.sin(s + first) + wp.sin(1.7 * s + second))
+        course += bend * spacing / (p.fit.size * p.bend_radius)
+        slope = p.slope * wp.sin(0.8 * s + third)
+        x += spacing * wp.vec3(wp.cos(slope) * wp.cos(course), wp.cos(slope) * wp.sin(course), -wp.sin(slope))
+
+
+@wp.func
+def touring(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
+    """Write waypoints: lengths, turns and slopes of the legs are drawn."""
+    pi = 3.14159265
+    course = float(wp.randf(rng, -pi, pi))
+    x = wp.vec3(0.0, 0.0, p.fit.size * p.depth)
+    for k in range(p.legs + 1):
+        arrays.path.points[w, k] = x
+        slope = wp.randf(rng, -p.slope, p.slope)
+        # Back towards the depth of the start, so that the surface is not reached.
+        slope = wp.where((x[2] - p.fit.size * p.depth) * slope < 0.0, -slope, slope)
+        way = p.fit.size * wp.randf(rng, p.leg[0], p.leg[1])
+        x += way * wp.vec3(wp.cos(slope) * wp.cos(course), wp.cos(slope) * wp.sin(course), -wp.sin(slope))
+        course += wp.randf(rng, -p.turn, p.turn)
+
+
+@wp.func
+def start_beside(state: State, arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
+    """Put the vehicle near the start of the path, about along it, at cruising speed through the water."""
+    arrays.path.leg[w] = 0
+    e = leg_direction(arrays.path, w, 0)
+    away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
+    state.position[w, 0] = arrays.path.points[w, 0] + p.fit.size * p.offset * away
+    yaw = wp.atan2(e[1], e[0]) + wp.randf(rng, -p.yaw, p.yaw)
+    state.quaternion[w, 0] = tilted(0.0, 0.0, yaw)
+    state.velocity[w, 0] = vec6(p.fit.speed, 0.0, 0.0, 0.0, 0.0, 0.0)
+    arrays.goal_position[w] = arrays.path.points[w, p.legs]
+    arrays.goal_quaternion[w] = wp.quat_identity()
+
+
+@wp.func
+def start_path(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """A winding path, unless one is given, and a start beside it."""
+    if arrays.path.given[w] == 0:
+        winding(arrays, p, wp.rand_init(key, 4 * w), w)
+    start_beside(state, arrays, p, wp.rand_init(key, 4 * w + 1), w)
+
+
+@wp.func
+def start_tour(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
+    """Waypoints, unless some are given, and a start beside the first leg."""
+    if arrays.path.given[w] == 0:
+        touring(arrays, p, wp.rand_init(key, 4 * w), w)
+    start_beside(state, arrays, p, wp.rand_init(key, 4 * w + 1), w)
+
+
+OBSERVATION = (
+    ObservationPart(
+        "distances to the left of the path and above it",
+        2,
+        "m",
+        ERROR_SCALE,
+        3.0,
+        measured_errors,
+        errors=(0, 1),
+    ),
+    *(
+        ObservationPart(f"direction of the path in {t:g} s, body frame", 3, "1", term=path_direction, index=k)
+        for k, t in enumerate(AHEAD)
+    ),
+    ObservationPart(
+        "velocity over ground by cruising speed, body frame", 3, "1", clip=3.0, term=ground_velocity
+    ),
+    ObservationPart("angular velocity, body frame", 3, "rad/s", clip=2.0, term=turn_rates),
+    ObservationPart("world up, body frame", 3, "1", term=world_up),
+)
+
+
+@dataclass(frozen=True)
+class Cruise:
+    """Cruising speed of a vehicle, and the factor on lengths that follows from it."""
+
+    speed: float = PACE
+    """[m/s]"""
+    size: float = 1.0
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> "Cruise":
+        """Return the speed in the middle of what the autopilot can ask for: action 0 of mode `course`."""
+        speeds = course_speeds(vehicle)
+        speed = 0.5 * float(speeds[0] + speeds[-1])
+        return cls(speed, speed / PACE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathReward:
+    """Weights of the reward; each term has one reason.
+
+    r = track · exp(-e / track_scale)            on the path: centimetres count
+      - distance · e                             a slope everywhere: a far path is returned to
+      + advance · (speed along the path)         do not stop: it costs more than an error
+      - action · mean(a²) - change · mean(Δa²)   orders that a vehicle can follow, no chatter
+      + finish, - loss                           once, at the end of the path, and on leaving it
+    """
+
+    track: float = 1.0
+    track_scale: float = 0.4
+    distance: float = 0.3
+    advance: float = 0.5
+    action: float = 0.01
+    change: float = 0.1
+    finish: float = 5.0
+    loss: float = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathFollowing(Task):
+    """Follow a winding path in space, in whatever current there is, by orders to the autopilot.
+
+    Lengths in metres, angles in radians, times in seconds. Lengths are as stated for a vehicle that cruises at 1.5 m/s,
+    and in proportion to the speed for others.
+    """
+
+    succeeds: ClassVar[str] = "finished"
+    title: ClassVar[str] = "follow a path in space"
+    action: ClassVar[str] = "course_pitch"
+    pool: ClassVar[RectangularPool | None] = None
+    baselines: ClassVar = {"line-of-sight": "finssim.agents.steering:PathPilot"}
+    name: str = "path"
+    observation: tuple[ObservationPart, ...] = OBSERVATION
+    time_limit: float = 80.0
+    fit: Cruise = Cruise()
+    """Speed of the vehicle; the environment sets it."""
+    ahead: tuple[float, float, float] = AHEAD
+    """Times of the directions that are seen [s]."""
+    legs: int = 90
+    """Number of legs."""
+    spacing: float = 1.0
+    """Length of a leg [m]."""
+    radius: float = 0.01
+    """A leg is done this close to its end, or beyond it [m]."""
+    wave: tuple[float, float] = (30.0, 60.0)
+    """Length of the waves of the path's curvature and slope, drawn from this range [m]."""
+    bend_radius: float = 12.0
+    """Least radius of the path's bends [m]."""
+    slope: float = math.radians(12.0)
+    """Steepest part of the path [rad]."""
+    depth: float = -15.0
+    """Height of its start [m]."""
+    offset: float = 1.0
+    """Largest distance of the start from that of the path, per axis [m]."""
+    yaw: float = math.radians(20.0)
+    """Largest angle between the heading and the path at the start [rad]."""
+    corridor: float = 2.5
+    """Farther than this from the path the episode ends [m]."""
+    settle: float = 10.0
+    """The error of an episode is counted from here [s]."""
+    reward: PathReward = field(default_factory=PathReward)
+
+    begins: ClassVar[Any] = start_path
+    """Term of the start."""
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "PathFollowing":
+        """Return the task for the speed of the vehicle."""
+        return replace(self, fit=Cruise.of(vehicles[0]))
+
+    def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
+        """Room for every world's path."""
+        arrays.path = allocated(PathTable, worlds, device, points=self.legs + 1)
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"the end of the path, never more than {self.fit.size * self.corridor:.3g} m from it"
+
+    def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
+        """Return every task's measures, and the error: RMS distance to the path after `settle` [m].
+
+        The error is not a number where the episode was shorter.
+        """
+        measured = super().metrics(arrays)
+        squared = measured.pop("squared_error")
+        long = measured["length"] * self.control_step > self.settle + 0.5 * self.control_step
+        return {**measured, "error": np.where(long, np.sqrt(squared), np.nan)}
+
+    def terms(self) -> Terms:
+        """See `PathReward`."""
+        r = self.reward
+        return Terms(
+            start=self.begins,
+            advance=change_legs,
+            shared={"e": path_error},
+            meanings={"track": f"1 on the path, 1/e at {self.fit.size * r.track_scale:.3g} m from it."},
+            rewards=(
+                RewardTerm("track", on_path, r.track),
+                RewardTerm("distance", "e", -r.distance / self.fit.size),
+                RewardTerm("advance", path_advance, r.advance),
+                *action_costs(r.action, r.change),
+            ),
+            ends=(End("finished", has_finished, r.finish), End("left", has_left, -r.loss)),
+            totals=(Total("squared_error", mean_square),),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaypointTour(PathFollowing):
+    """Pass a number of waypoints, one after the other, within a radius of acceptance.
+
+    Lengths as for `PathFollowing`.
+    """
+
+    title: ClassVar[str] = "pass waypoints one after the other"
+    baselines: ClassVar = {"line-of-sight": "finssim.agents.steering:PathPilot"}
+    name: str = "waypoints"
+    time_limit: float = 100.0
+    legs: int = 4
+    radius: float = 2.0
+    leg: tuple[float, float] = (20.0, 30.0)
+    """Length of a leg, drawn from this range [m]."""
+    turn: float = math.radians(100.0)
+    """Largest turn from leg to leg [rad]."""
+    offset: float = 3.0
+    yaw: float = math.radians(90.0)
+    corridor: float = 15.0
+
+    begins: ClassVar[Any] = start_tour
+
+    def success_rule(self) -> str:
+        """See `Task`."""
+        return f"every waypoint passed within {self.fit.size * self.radius:.3g} m, or beside it beyond its leg's end"
+
+
+def follow_path(environment: Environment, paths: Sequence[Waypoints]) -> NDArray[np.float32]:
+    """Start an episode in every world beside the first leg of its path; world i follows paths[i] from then on.
+
+    Args:
+        environment: Of a task along a path, such as `WaypointTour`, with as many legs.
+        paths: One per world; the radius of acceptance is the task's.
+
+    Returns:
+        Observations [-], (worlds, size).
+
+    Raises:
+        EnvironmentSetupError: Another number of paths, or of legs.
+    """
+    table = environment.arrays.path
+    if len(paths) != environment.worlds or table.points is None:
+        raise EnvironmentSetupError(
+            f"{len(paths)} paths for {environment.worlds} worlds of task '{environment.task.name}': give one for "
+            "each world of a task along a path, such as waypoints"
+        )
+    legs = environment.task.legs
+    if any(path.legs != legs for path in paths):
+        counts = ", ".join(map(str, sorted({path.legs for path in paths})))
+        raise EnvironmentSetupError(
+            f"paths have {counts} legs, expected {legs}: make the task with legs={counts}"
+        )
+    table.points.assign(np.stack([path.points for path in paths]).astype(np.float32))
+    table.given.fill_(1)
+    observation: NDArray[np.float32] = environment.reset()
+    return observation
