@@ -1,6 +1,7 @@
 """The record: what was put in comes out, in any reader; what is written stays readable when the process dies."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from finssim.robot.pictures import picture_of
 from finssim.robot.reading import Reading
 from finssim.robot.record_messages import TOPICS
 from finssim.vehicles import load_vehicle
+from reference.finned import torpedo
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
@@ -288,3 +290,27 @@ def test_shaft_speeds_need_the_output_of_every_thruster():
     assert messages.shafts(0, RPM[:-1]) is None
     unknown = VEHICLE.replace({"thrusters.V_LF.motor_index": None})
     assert Messages(unknown).shafts(0, RPM) is None
+
+
+def test_actuators_besides_thrusters_are_joints(tmp_path):
+    """Values as measured at their stamp, and as requested; `record info` lists both topics."""
+    ours = torpedo()
+    with Recorder(tmp_path / "run.mcap", ours) as recorder:
+        snapshot = Telemetry(1, 10, (0.0, 0.0, 0.0, 1.0), (0.1,) * 3, (0.0, 0.0, 9.8), 1.0, 1e5, 7, (60.0,))
+        recorder.telemetry(0.02, replace(snapshot, actuators=(0.1, -0.2, 3e-4, 0.01)), time=0.01)
+        recorder.command(0.03, [5.0, 0.2, -0.3, 4e-4, 0.02], "pilot")
+        recorder.command(0.04, [5.0], "pilot")
+    with open_record(tmp_path / "run.mcap") as record:
+        found = {
+            topic: list(record.messages([topic]))
+            for topic in ("actuator_states", "actuator_cmd", "thruster_cmd")
+        }
+        rows = describe_record(record)["topics"]
+    states, asked = found["actuator_states"], found["actuator_cmd"]
+    assert len(states) == len(asked) == 1 and len(found["thruster_cmd"]) == 2
+    assert states[0].message.name == ["rudder", "elevator", "engine", "battery"]
+    assert states[0].message.header.stamp.nanosec == 10_000_000
+    np.testing.assert_allclose(states[0].message.position, [0.1, -0.2, 3e-4, 0.01])
+    np.testing.assert_allclose(asked[0].message.position, [0.2, -0.3, 4e-4, 0.02])
+    assert found["thruster_cmd"][0].message.force.tolist() == [5.0]
+    assert rows["/torpedo/actuator_states"]["type"] == "sensor_msgs/msg/JointState"

@@ -121,6 +121,11 @@ TOPICS = {
         "snapshot of the motor controller, as it came"),
     "shafts": Topic("joint_states", "sensor_msgs/msg/JointState", STREAM, "base_link", "hardware_bridge",
         "shafts' speeds"),
+    "actuators": Topic("actuator_states", "sensor_msgs/msg/JointState", STREAM, "base_link", "hardware_bridge, sim",
+        "values of actuators besides thrusters as position: fin and gimbal [rad], moving mass [m], buoyancy [m³]"),
+    "setpoints": Topic("actuator_cmd", "sensor_msgs/msg/JointState", COMMAND, "base_link", "controller, you",
+        "requested values of these actuators as position; they act with the next thruster_cmd, and are ignored when "
+        "stale"),
     "odometry": Topic("odom", "nav_msgs/msg/Odometry", STREAM, "map", "state_estimation, sim",
         "state: pose in map, twist in base_link (`child_frame_id`)"),
     "estimator": Topic("estimator_status", "finssim_msgs/msg/EstimatorStatus", STREAM, "map", "state_estimation, sim",
@@ -305,7 +310,7 @@ class Messages:
         self._prefix = prefix
         self.types = types()
         self._of = self.types.types
-        self.names = list(vehicle.thruster_names)
+        self.names, self.others = list(vehicle.thruster_names), list(vehicle.actuators)
         imu = vehicle.sensors.imu
         q_body_imu = np.array([0.0, 0.0, 0.0, 1.0]) if imu is None else np.array(imu.orientation)
         self._R_body_imu = quat_to_matrix(q_body_imu)
@@ -408,6 +413,13 @@ class Messages:
             return None
         speed, none = np.asarray(motor_rpm, float)[self._outputs] * self._rad_per_s, np.zeros(0)
         return self._of["sensor_msgs/msg/JointState"](self.header(stamp, BASE), self.names, none, speed, none)
+
+    def actuators(self, stamp: int, values: npt.ArrayLike) -> Any:
+        """Values of the actuators besides thrusters, in the vehicle file's order [rad, m³ or m]."""
+        none = np.zeros(0)
+        return self._of["sensor_msgs/msg/JointState"](
+            self.header(stamp, BASE), self.others, np.asarray(values, float), none, none
+        )
 
     def odometry(self, stamp: int, reading: Reading) -> Any:
         """Pose in the map, velocity in body axes; covariances of one reading's standard deviations, all numbers.

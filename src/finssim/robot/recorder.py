@@ -286,7 +286,7 @@ class Recorder:
         return self._sink.dropped
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float | None = None) -> None:
-        """A snapshot of the motor controller: raw, and as Imu, FluidPressure and shaft speeds.
+        """A snapshot of the motor controller: raw, and as Imu, FluidPressure, shaft speeds and other actuators' values.
 
         Args:
             now: When it came [s].
@@ -301,6 +301,8 @@ class Recorder:
         shafts = None if telemetry.motor_rpm is None else make.shafts(stamp, telemetry.motor_rpm)
         if shafts is not None:
             self._put("shafts", received, shafts)
+        if telemetry.actuators:
+            self._put("actuators", received, make.actuators(stamp, telemetry.actuators))
 
     def reading(self, now: float, reading: Reading) -> None:
         """The estimate, as Odometry, transform and EstimatorStatus.
@@ -317,16 +319,20 @@ class Recorder:
             self._put("transform", at, make.transform(stamp, reading))
 
     def command(self, now: float, force: npt.ArrayLike, source: str = "", wrench: Any = None) -> None:
-        """Thrusts that a controller asks for, and the wrench behind them.
+        """Thrusts that a controller asks for, values of other actuators, and the wrench of the thrusts.
 
         Args:
             now: [s]
-            force: Along the thrusters' axes, canonical order [N], (n,).
+            force: Along the thrusters' axes, canonical order [N], (n,), or these and the values of the other actuators
+                [rad, m³ or m], (n + m,).
             source: Who asks.
             wrench: Body axes [N, N m], (6,); None where there is none.
         """
         at = self._ns(now)
-        self._put("command", at, self._messages.command(at, force, source))
+        channels, n = np.asarray(force, float), len(self._vehicle.thrusters)
+        self._put("command", at, self._messages.command(at, channels[:n], source))
+        if channels.size > n:
+            self._put("setpoints", at, self._messages.actuators(at, channels[n:]))
         if wrench is not None:
             self._put("wrench", at, self._messages.wrench(at, wrench))
 

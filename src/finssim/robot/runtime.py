@@ -415,9 +415,9 @@ class Runtime:
             goal = self.guide.at(now - self.started)
             self.recorder.goal(now, goal.position, float(goal.yaw))
             thrust = force[: self.force.size]
-            self.recorder.command(now, thrust, self.pilot.name, self.vehicle.control_matrix @ thrust)
+            self.recorder.command(now, force, self.pilot.name, self.vehicle.control_matrix @ thrust)
             self.recorder.policy(
-                now, self.pilot.name, period=self.pilot.period, missed=self.counters.missed, force=force,
+                now, self.pilot.name, period=self.pilot.period, missed=self.counters.missed, force=thrust,
                 observation=getattr(self.pilot, "observation", ()), action=getattr(self.pilot, "action", ()),
                 vehicle_sha256=self.vehicle.sha256,
             )  # fmt: skip

@@ -17,6 +17,7 @@ from finssim.trials.importers import import_trials
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.inputs import drive
 from finssim.vehicles import load_vehicle
+from reference.finned import torpedo
 
 VEHICLE = load_vehicle("finsrov")
 RAD_PER_S = 2.0 * np.pi / 60.0
@@ -187,3 +188,24 @@ def test_a_vehicle_that_a_record_names_is_of_the_catalogue(tmp_path, monkeypatch
     (trial,) = read_trials([tmp_path / "run.mcap"])
     assert trial.header.vehicle is None
     assert any(one.values == {"vehicle": "mine.yaml"} for one in trial.findings)
+
+
+def test_values_of_fins_are_channels(tmp_path):
+    """Measured values by actuator, of joints; what was requested of them is no channel."""
+    ours = torpedo()
+    with Recorder(tmp_path / "run.mcap", ours) as recorder:
+        for i in range(200):
+            t = 0.01 * i
+            values = (0.1 * np.sin(t), -0.2, 3e-4, 0.01)
+            q, accel = (0.0, 0.0, 0.0, 1.0), (0.0, -0.1 * t, 9.81)
+            snapshot = Telemetry(i, 10 * i, q, (0.1 * t, 0.0, 0.0), accel, 1.0, 2e5, 0, (600.0,), values)
+            recorder.telemetry(t, snapshot, time=t)
+            recorder.reading(t, reading(t))
+            recorder.command(t, [5.0, 0.3, 0.3, 0.0, 0.0], "pilot")
+    (trial,) = read_trials([tmp_path / "run.mcap"])
+    assert [n for n in trial.channels if n.startswith("actuator_")] == [
+        f"actuator_{n}" for n in ours.actuators
+    ]
+    t, rudder = sampled(trial, "actuator_rudder")
+    np.testing.assert_allclose(rudder, 0.1 * np.sin(t), atol=2e-3)
+    np.testing.assert_allclose(sampled(trial, "actuator_engine")[1], 3e-4)

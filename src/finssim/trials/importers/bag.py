@@ -335,7 +335,7 @@ def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSou
     """Columns that the first message of a topic names."""
     connections = [c for c in reader.connections if c.topic == topic]
     for _, message in _messages(reader, connections):
-        return finssim_record.thruster_columns(kind, message)
+        return finssim_record.thruster_columns(topic, kind, message)
     return {}
 
 

@@ -18,7 +18,19 @@ from finssim.vehicles import VehicleError, catalogue_vehicle
 NATIVE = "finssim_msgs/msg/"
 """Prefix of the types in our own bags."""
 
-TRIAL_TOPICS = ("odom", "imu", "joint_states", "thruster_state", "thruster_cmd", "telemetry", "pressure")
+ACTUATORS = "actuator_states"
+"""Last part of the topic with the values of actuators besides thrusters, as positions of joints."""
+
+TRIAL_TOPICS = (
+    "odom",
+    "imu",
+    "joint_states",
+    ACTUATORS,
+    "thruster_state",
+    "thruster_cmd",
+    "telemetry",
+    "pressure",
+)
 """Last parts of the topics of a trial; the wanted wrench and the goal do not describe what happened."""
 
 COMPASS = "/compass/imu"
@@ -50,12 +62,16 @@ def native_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
     }
 
 
-def thruster_columns(kind: str, message: Any) -> dict[str, ColumnSource]:
-    """Columns that a message holds by the names of thrusters; lists that it leaves empty hold none."""
+def thruster_columns(topic: str, kind: str, message: Any) -> dict[str, ColumnSource]:
+    """Columns that a message holds by the names of thrusters or other actuators; lists that it leaves empty hold
+    none."""
     names = names_of(message)
+    lists = THRUSTERS.get(kind, {})
+    if topic.rsplit("/", 1)[-1] == ACTUATORS:
+        lists = {"actuator_": ("position", "-")}
     return {
         f"{prefix}{name}": ColumnSource(column=f"{field}[{name}]", unit=unit)
-        for prefix, (field, unit) in THRUSTERS.get(kind, {}).items()
+        for prefix, (field, unit) in lists.items()
         if len(getattr(message, field)) == len(names)
         for name in names
     }

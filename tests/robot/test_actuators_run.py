@@ -1,0 +1,100 @@
+"""A torpedo through the whole stack: pilot, bridge, wire, firmware, plant, telemetry, record."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("rosbags")
+
+from finssim.control.guidance import Station
+from finssim.pool import VirtualPool, draw_plant
+from finssim.pool.drawn_plant import site_of
+from finssim.robot.bridge import Bridge
+from finssim.robot.lockstep import run_lockstep
+from finssim.robot.messages import Delivery
+from finssim.robot.perception import Perception
+from finssim.robot.record_reader import open_record
+from finssim.robot.recorder import Recorder
+from finssim.robot.runtime import Runtime
+from finssim.vehicles.defaults import vehicle_at
+from reference.finned import torpedo
+
+TORPEDO = vehicle_at("open-water", torpedo())
+START = (0.0, 0.0, -8.0)
+AHEAD = Station(START, 0.0, name="ahead")
+
+
+class Scripted:
+    """Ahead with the propeller; after a while with a rudder that turns to starboard."""
+
+    name, period, needs_state = "script", 0.1, True
+
+    def describe(self):
+        return {"name": self.name}
+
+    def reset(self):
+        pass
+
+    def act(self, reading, guide, t):
+        return np.array([25.0, 0.2 if t > 3.0 else 0.0, 0.0, 2e-4, 0.0])
+
+
+def robot(recorder=None):
+    perception = Perception(TORPEDO, None, let_in=START[:2])
+    return Runtime(
+        TORPEDO, None, Scripted(), AHEAD, arm=True, perception=perception, bridge=Bridge(TORPEDO), recorder=recorder
+    )  # fmt: skip
+
+
+def water():
+    spec = site_of("open-water", draw_plant(TORPEDO, 1, "nominal"))
+    return VirtualPool(TORPEDO, spec, start=(START, (0.0, 0.0, 0.0, 1.0)))
+
+
+@pytest.mark.slow
+def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
+    """The bow goes to starboard, values follow requests, and after the end fins are at 0 and the engine stays."""
+    world = water()
+    with Recorder(tmp_path / "run.mcap", TORPEDO) as recorder:
+        runtime = robot(recorder)
+        run_lockstep(runtime, world, 8.0)
+    assert runtime.bridge.reason == "" and world.plant.nu[0] > 1.0 and world.plant.nu[5] < -0.1
+    world.exchange(world.time + 0.4)  # less than the firmware's own timeout: this was the bridge
+    np.testing.assert_allclose(world.plant.values, [0.0, 0.0, 2e-4, 0.0], atol=0.01)
+    assert world.plant.values[2] == pytest.approx(2e-4, rel=1e-3)
+    with open_record(tmp_path / "run.mcap") as record:
+        asked, states = (
+            [m.message.position for m in record.messages([n])] for n in ("actuator_cmd", "actuator_states")
+        )
+    np.testing.assert_allclose(asked[-1], [0.2, 0.0, 2e-4, 0.0])
+    assert np.array(states)[:, 0].max() == pytest.approx(0.196, abs=1e-3)  # less its play
+
+
+@pytest.mark.slow
+def test_a_robot_does_not_arm_on_a_controller_of_version_1():
+    """Its telemetry has no actuators: one sentence, and no thruster turns."""
+    world = water()
+
+    class Old:
+        """The same water behind a firmware of version 1."""
+
+        def exchange(self, until, sent):
+            telemetry, world.firmware.telemetry = world.firmware.telemetry, old
+            try:
+                return Delivery(until, world.exchange(until, sent).frames)
+            finally:
+                world.firmware.telemetry = telemetry
+
+    measured = world.firmware.telemetry
+
+    def old(*args):
+        newest = measured(*args)
+        return None if newest is None else replace(newest, actuators=())
+
+    runtime = robot()
+    run_lockstep(runtime, Old(), 3.0)
+    assert "uses version 1 of the protocol, which has thrusters alone: rudder, elevator" in runtime.refusal
+    assert math.isnan(runtime.started) and not world.plant.shaft_speed.any()
