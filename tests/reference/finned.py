@@ -1,5 +1,10 @@
 """A torpedo with every kind of actuator: REMUS 100's hull with rudder, elevator, buoyancy engine and moving mass."""
 
+import json
+from pathlib import Path
+
+import yaml
+
 from finssim.vehicles import Vehicle, load_vehicle
 
 FIN = {
@@ -24,3 +29,15 @@ def torpedo(**actuators: dict) -> Vehicle:
     values = {**load_vehicle("remus100").values(), "actuators": actuators or ACTUATORS}
     values["thrusters"]["propeller"] |= {"diameter": 0.14, "inflow": {"thrust_loss": 0.03}}
     return Vehicle(**values, name="torpedo")
+
+
+def torpedo_file(folder: Path) -> Path:
+    """Write the torpedo as a vehicle file into a folder; return its path."""
+    values = torpedo().values()
+    parts = {name: values[name] for name in ("thrusters", "actuators")}
+    about = {"extends": "remus100", "title": "torpedo", "origin": "guessed"}
+    file = folder / "torpedo.yaml"
+    file.write_text(
+        yaml.safe_dump(json.loads(json.dumps({**about, **parts})), sort_keys=False), encoding="utf-8"
+    )
+    return file

@@ -20,6 +20,7 @@ from finssim.extensions.ros2.nodes.conversions import (
     nanoseconds,
     reading_of,
     ros_type,
+    setpoints_of,
     station_of_pose,
     tags_of,
     telemetry_of,
@@ -38,6 +39,7 @@ from finssim.robot.messages import (
 )
 from finssim.robot.reading import Reading
 from finssim.vehicles import load_vehicle
+from reference.finned import torpedo
 
 VEHICLE = load_vehicle("finsrov")
 MAKE = RosMessages(VEHICLE)
@@ -302,3 +304,16 @@ def test_every_topic_of_the_table_has_its_type():
     """Each can be imported as rclpy's classes are."""
     for topic in TOPICS.values():
         assert ros_type(topic.type)
+
+
+def test_values_of_other_actuators_are_matched_by_name():
+    """Joints in whatever order; another name, and a number that is none, are refused in words."""
+    make = RosMessages(torpedo())
+    message = wire(make.actuators(STAMP, [0.1, -0.2, 3e-4, 0.01]))
+    assert setpoints_of(message, make.others).tolist() == [0.1, -0.2, 3e-4, 0.01]
+    message.name, message.position = make.others[::-1], [0.01, 3e-4, -0.2, 0.1]
+    assert setpoints_of(message, make.others).tolist() == [0.1, -0.2, 3e-4, 0.01]
+    message.position = [0.01, math.nan, -0.2, 0.1]
+    assert setpoints_of(message, make.others) == "it holds a position that is not finite"
+    message.name = ["rudder"]
+    assert "names the actuators rudder, expected rudder, elevator" in setpoints_of(message, make.others)

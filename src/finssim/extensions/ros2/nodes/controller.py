@@ -132,6 +132,7 @@ class ControllerNode(RobotNode):
     def __init__(self) -> None:
         super().__init__("controller")
         self.sends("command", "path", "policy", "event", "diagnostics")
+        self.sends(*["setpoints"] * bool(self.vehicle.actuators))
         safety = self.vehicle.safety
         policy, task = self.parameter("policy", "pid"), self.parameter("task", "")
         self.modes = Modes(self, policy, task)

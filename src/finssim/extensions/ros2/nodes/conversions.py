@@ -98,14 +98,24 @@ def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | st
 
 def force_of(message: Any, names: Sequence[str]) -> Array | str:
     """The thrusts of a ThrusterCommand in canonical order [N], or why it cannot be used."""
-    named, force = list(message.names), [float(f) for f in message.force]
+    return _in_order(message.names, message.force, names, "thruster", "thrust")
+
+
+def setpoints_of(message: Any, names: Sequence[str]) -> Array | str:
+    """The positions of a JointState in the order of the names [rad, m³ or m], or why it cannot be used."""
+    return _in_order(message.name, message.position, names, "actuator", "position")
+
+
+def _in_order(
+    named: Sequence[str], values: Sequence[float], names: Sequence[str], kind: str, word: str
+) -> Array | str:
     if sorted(named) != sorted(names):
-        return f"it names the thrusters {', '.join(named) or 'none'}, expected {', '.join(names)}, each once"
-    if len(force) != len(named):
-        return f"it has {len(force)} thrusts for {len(named)} thrusters"
-    by_name = dict(zip(named, force, strict=True))
+        return f"it names the {kind}s {', '.join(named) or 'none'}, expected {', '.join(names)}, each once"
+    if len(values) != len(named):
+        return f"it has {len(values)} {word}s for {len(named)} {kind}s"
+    by_name = dict(zip(named, map(float, values), strict=True))
     ordered = np.array([by_name[name] for name in names])
-    return ordered if np.isfinite(ordered).all() else "it holds a thrust that is not finite"
+    return ordered if np.isfinite(ordered).all() else f"it holds a {word} that is not finite"
 
 
 def wrench_of(message: Any, frame: str = "base_link") -> Array | None:

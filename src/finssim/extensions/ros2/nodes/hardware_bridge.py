@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from finssim.extensions.ros2.nodes.conversions import force_of, ros_type
+from finssim.extensions.ros2.nodes.conversions import force_of, ros_type, setpoints_of
 from finssim.extensions.ros2.nodes.remote import RemoteReadings
 from finssim.extensions.ros2.nodes.robot_node import RobotNode, matched_callbacks
 from finssim.extensions.ros2.topics import SERVICES
@@ -37,7 +37,10 @@ class BridgeTopics:
         self._node, self._bridge = node, bridge
         self._publishers = self._matched = 0
         self._label = ""
+        self._setpoints, self._set_at = np.zeros(0), -math.inf
         node.sends("thrusters", "event", "diagnostics")
+        if node.vehicle.actuators:
+            node.hears("setpoints", self._on_setpoints)
         matched = matched_callbacks(self._on_match)
         self._tells = matched is not None
         self._commands = node.hears("command", self._on_command, event_callbacks=matched)
@@ -86,9 +89,18 @@ class BridgeTopics:
             self._bridge.log.repeat(now, "command refused", f"{source}: {force}")
             return
         stamp = self._node.seconds(message.header.stamp)
+        if now - self._set_at <= self._node.vehicle.safety.command_timeout:
+            force = np.append(force, self._setpoints)
         # Who commands is a node; what it names after a slash, its mode, may change.
         self._bridge.command(now, force, source.partition("/")[0], stamp=stamp)
         self._label = source
+
+    def _on_setpoints(self, message: Any) -> None:
+        values, now = setpoints_of(message, self._node.make.others), self._node.now()
+        if isinstance(values, str):
+            self._bridge.log.repeat(now, "command refused", f"{self._node.topic('setpoints')}: {values}")
+            return
+        self._setpoints, self._set_at = values, now
 
     def _on_reading(self, reading: Reading) -> None:
         self._bridge.reading(self._node.now(), reading)
@@ -139,6 +151,7 @@ class HardwareBridge(RobotNode):
         self.counters, self.shafts = Counters(), np.zeros(0)
         self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self, link)
         self.sends("imu", "pressure", "telemetry", "shafts", "echo", "positioning", "dvl", "compass")
+        self.sends(*["actuators"] * bool(self.vehicle.actuators))
         self.topics = BridgeTopics(self, self.bridge)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
         self.create_timer(1.0, self._tell)
@@ -159,6 +172,8 @@ class HardwareBridge(RobotNode):
         if self.heard("pressure"):
             self.send("pressure", self.make.pressure(stamp, telemetry))
         self.send("shafts", self._speeds(stamp, telemetry.motor_rpm))
+        if telemetry.actuators:
+            self.send("actuators", self.make.actuators(stamp, telemetry.actuators))
 
     def echo(self, now: float, echo: CommandEcho) -> None:
         """Publish a command as executed by the motor controller. `now` is the time [s]."""

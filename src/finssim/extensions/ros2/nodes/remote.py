@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -69,7 +68,7 @@ class RemoteState:
             oldest: Age at which a reading may not be acted on any more [s].
         """
         # `robot.runtime.Intake` wants to know the frames of a motor controller; here none comes.
-        self.vehicle = node.vehicle if node.vehicle.mcu else SimpleNamespace(mcu=SimpleNamespace(outputs=8))
+        self.vehicle = node.vehicle
         self._oldest = oldest
         nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
         self._newest = Reading(-math.inf, *nothing, False, "uninitialized", "the estimator is silent")
@@ -141,9 +140,14 @@ class RemoteBridge:
         self._node.send("acknowledge", ros_type("std_msgs/msg/Empty")())
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
-        """Ask for thrusts along the thrusters' axes, canonical order [N], (n,)."""
-        requested, source = np.asarray(force, float), source if self._source is None else self._source()
-        self._node.send("command", self._node.make.command(self._node.ns(now), requested, source))
+        """Ask for thrusts along the thrusters' axes, canonical order [N], (n,), and for values of the other actuators
+        that follow them; return the thrusts."""
+        node, source = self._node, source if self._source is None else self._source()
+        channels, stamp = np.asarray(force, float), node.ns(now)
+        requested, others = np.split(channels, [len(node.make.names)])
+        if others.size:
+            node.send("setpoints", node.make.actuators(stamp, others))
+        node.send("command", node.make.command(stamp, requested, source))
         return requested
 
     def reading(self, now: float, reading: Reading) -> None:

@@ -146,6 +146,7 @@ class Sim(RobotNode):
         super().__init__("sim")
         self.base, self.time = 0, 0.0
         self.sends("odometry", "estimator", "imu", "pressure", "event", "diagnostics")
+        self.sends(*["actuators"] * bool(self.vehicle.actuators))
         hydrodynamics, seed = self.parameter("hydrodynamics", "calibrated"), self.parameter("seed", 1)
         self.sim = Simulator(
             self.vehicle, hydrodynamics=hydrodynamics, control_step=STEP, substeps=SUBSTEPS, seed=seed
@@ -197,7 +198,7 @@ class Sim(RobotNode):
     def _step(self) -> None:
         self.bridge.reading(self.time, self._reading())
         command = self.bridge.tick(self.time)
-        self.sim.set_thrust(self.bridge.force)
+        self.sim.set_actuators([*self.bridge.force, *self.bridge.setpoints])
         self.sim.step()
         self.time += STEP
         self._publish(command.normalised)
@@ -212,6 +213,9 @@ class Sim(RobotNode):
         sample = self.sensors.sample(reading, STEP)
         self.send("imu", make.imu(stamp, sample))
         self.send("pressure", make.pressure(stamp, sample))
+        if self.vehicle.actuators:
+            channels = self.sim.numpy("thrust")[0, 0, : len(self.vehicle.channel_names)]
+            self.send("actuators", make.actuators(stamp, channels[len(self.vehicle.thrusters) :]))
         self.topics.tell(self.time, normalised=normalised)
 
     def _reading(self) -> Reading:
