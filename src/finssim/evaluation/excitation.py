@@ -35,6 +35,7 @@ from finssim.evaluation.robot_trials import (
     session,
     take_folder,
 )
+from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres, write_manoeuvre
 from finssim.identification.programme import Programme, programmes, write_programme
 from finssim.identification.synthetic import simulate_programme
 from finssim.pool import draw_plant
@@ -529,7 +530,8 @@ def excite(
         axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (DIR): Directory of the programmes or trials.
-        kind (KIND): published (steps, dive-and-coast, pulses), validation, or multisine.
+        kind (KIND): published (steps, dive-and-coast, pulses), validation, multisine, or manoeuvres (speed runs,
+            zig-zags, circles, dives) of a vehicle that must move to steer, for which axes is all.
         levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
         repeats: Repeats of every programme.
         simulate: Run them in the simulator and write the trials.
@@ -565,6 +567,14 @@ def excite(
         return folders
     start_warp()
     body, pool_vehicle, severity = load_vehicle(vehicle), pool_vehicle or vehicle, severity or "realistic"
+    if kind == MANOEUVRES:
+        if axes != "all" or levels or repeats > 1 or pool is not None:
+            raise CalibrationError(
+                f"--kind {MANOEUVRES} takes axes all, without --levels, --repeats and --pool"
+            )
+        folders = _excite_by_course(body, Path(out), simulate=simulate, seed=seed)
+        print_folders(folders, as_json)
+        return folders
     played = programmes(axes, body, seed=seed, **plan)
     with atomic_directory(out, replaces=PLAN_FILE) as folder:
         if pool is not None:
@@ -584,6 +594,29 @@ def excite(
     folders = [Path(out) / programme.name for programme in played]
     print_folders(folders, as_json)
     return folders
+
+
+MANOEUVRES = "manoeuvres"
+"""Kind of excitation of vehicles with fins."""
+
+
+def _excite_by_course(vehicle: Vehicle, out: Path, *, simulate: bool, seed: int) -> list[Path]:
+    """Write the manoeuvres of a vehicle as tables of orders, or run them in the simulator and write the trials."""
+    chosen = manoeuvres(vehicle)
+    trials = simulate_manoeuvres(chosen, vehicle, seed=seed) if simulate else []
+    with atomic_directory(out, replaces=PLAN_FILE) as folder:
+        about: dict[str, Any] = {
+            "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
+            "kind": MANOEUVRES,
+            "manoeuvres": [one.name for one in chosen],
+            "simulated": simulate,
+        }
+        take_folder(folder / PLAN_FILE, about)
+        for trial in trials:
+            write_trial(trial, folder / trial.name)
+        for one in () if simulate else chosen:
+            write_manoeuvre(one, folder / one.name)
+    return [out / one.name for one in chosen]
 
 
 def _levels(texts: Sequence[str]) -> dict[str, list[float]] | list[float] | None:

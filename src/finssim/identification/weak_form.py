@@ -85,8 +85,8 @@ def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Map
         variance = SHARED * float(np.mean(weight * size**2))
         prior = np.array([LATE_STD**-2 if n == "late" else 0.0 for n in names])
     values = {**dict(zip(names, theta.tolist(), strict=True)), **known}
-    # Roll and pitch follow the other axes too, which this form leaves out.
-    known_force = pushed > 0.0 and i not in (3, 4) and values["m_eff"] > 0.0
+    # Roll and pitch follow the other axes too, and what moves fast all axes: this form leaves that out.
+    known_force = pushed > 0.0 and i not in (3, 4) and values["m_eff"] > 0.0 and not vehicle.actuators
     loud = size > max(JOLT * std, PART * pushed) if known_force else np.zeros(len(y), bool)
     jolts, row = list[tuple[int, float, float]](), 0
     for g, matrix, _, at in parts:

@@ -495,6 +495,14 @@ def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Fi
     return findings
 
 
+def acting(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
+    """Return the inputs that acted at given times [s], (m,) -> (m, k); behind the motors where they were commanded."""
+    if drive.commanded:
+        motors = channel_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
+        return delivered(motors, drive.t, drive.force, t)
+    return drive.at(t)
+
+
 def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
     """Wrench that acted, about the body origin, body frame [N, N m].
 
@@ -509,12 +517,7 @@ def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
     Returns:
         Wrench [N, N m], (m, 6); NaN outside the recorded inputs and inside their gaps.
     """
-    if drive.commanded:
-        motors = channel_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
-        force = delivered(motors, drive.t, drive.force, t)
-    else:
-        force = drive.at(t)
-    tau = force @ drive.B.T
+    tau = acting(drive, vehicle, t) @ drive.B.T
     slack = 0.5 * float(np.median(np.diff(drive.t)))
     covered = np.any((t >= drive.spans[:, :1] - slack) & (t <= drive.spans[:, 1:] + slack), axis=0)
     tau[~covered] = np.nan

@@ -22,9 +22,10 @@ from finssim.core.rotations import (
     quat_multiply,
     quat_rotate,
 )
+from finssim.physics.terms.composed import actuator_wrenches
 from finssim.trials.conversion import EULER, QUATERNION
 from finssim.trials.findings import Finding, finding
-from finssim.trials.inputs import InputForces, applied_wrench, drive
+from finssim.trials.inputs import InputForces, acting, applied_wrench, drive
 from finssim.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle
 
@@ -353,6 +354,9 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
     found = velocities(trial, vehicle, t, attitude)
     found["findings"] = (*inputs.findings, *found["findings"])
     tau = applied_wrench(inputs, vehicle, t)
+    if inputs.thrusters and vehicle.actuators:
+        nu, up = np.nan_to_num(found["nu"]), np.nan_to_num(up_in_body(attitude.quaternion))
+        tau = tau + actuator_wrenches(vehicle, nu, up, 10.0, acting(inputs, vehicle, t))
     return Motion(
         t=t,
         rate=rate,

@@ -29,10 +29,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.registry import TERMS
 from finssim.physics.lanes import LaneRow, lane_function, zero_of
-from finssim.physics.types import mat66, vec6, vec8, vec9
-from finssim.vehicles.actuators import Actuator, ActuatorKind, InstalledActuator
+from finssim.physics.types import MAX_THRUSTERS, mat66, vec6, vec8, vec9
+from finssim.vehicles.actuators import Actuator, ActuatorKind, InstalledActuator, installed
 from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.terms import Term
+from finssim.vehicles.vehicle import Vehicle
 
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float, "thrust": vec8}
 """Arguments that a term's functions may take besides its parameters."""
@@ -204,7 +205,7 @@ def row_length(terms: tuple[Item, ...]) -> int:
     return PIECE * max(1, -(-sum(slot.size for slot in layout(terms)) // PIECE))
 
 
-def parameter_row(terms: tuple[Term, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
+def parameter_row(terms: tuple[Item, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
     """Return the row of parameters by path, each in the unit of its term, zero where one is not given,
     (`row_length`,)."""
     row = np.zeros(row_length(terms))
@@ -260,8 +261,8 @@ def _read(slot: Slot) -> str:
 
 
 @cache
-def _sampler(terms: tuple[Term, ...]) -> wp.Kernel:
-    added_wrench = composed(terms, "wrench")
+def _sampler(terms: tuple[Item, ...], role: str) -> wp.Kernel:
+    added_wrench = composed(terms, role)
 
     @wp.kernel(enable_backward=False, module="unique")
     def sample(
@@ -269,41 +270,81 @@ def _sampler(terms: tuple[Term, ...]) -> wp.Kernel:
         nu_r: wp.array(dtype=vec6),
         up: wp.array(dtype=wp.vec3),
         depth: wp.array(dtype=float),
+        thrust: wp.array(dtype=vec8),
         density: float,
         tau: wp.array2d(dtype=vec6),
     ):
         i, k = wp.tid()
-        tau[i, k] = added_wrench(x, k, 0, nu_r[i], up[i], depth[i], density, vec8())
+        tau[i, k] = added_wrench(x, k, 0, nu_r[i], up[i], depth[i], density, thrust[i])
 
     return sample
 
 
 def term_wrenches(
-    terms: tuple[Term, ...], rows: ArrayLike, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, density: float
+    terms: tuple[Item, ...],
+    rows: ArrayLike,
+    nu_r: ArrayLike,
+    up: ArrayLike,
+    depth: ArrayLike,
+    density: float,
+    channels: ArrayLike = (0.0,) * MAX_THRUSTERS,
 ) -> NDArray[np.float64]:
-    """The wrench of terms in given motions, by the functions that simulations run.
+    """The wrench of terms, or of actuators, in given motions, by the functions that simulations run.
 
     Args:
-        terms: The terms.
+        terms: Terms alone, or actuators alone.
         rows: Their parameters in the units of the terms, in several versions, (k, `row_length`).
-        nu_r: Relative to the water at the reference point, body frame [m/s, rad/s], (n, 6).
+        nu_r: Relative to the water at the reference point of terms, or at the body origin for actuators, body frame
+            [m/s, rad/s], (n, 6).
         up: World z in the body frame, unit vectors, (n, 3).
         depth: Of the body origin [m], (n,) or one number.
         density: Of the water [kg/m³].
+        channels: Value of each channel [N, rad, m³ or m], (n, 8), or (8,) for all.
 
     Returns:
-        About the reference point, body frame [N, N m], (n, k, 6).
+        About the same point, body frame [N, N m], (n, k, 6).
     """
     n, k = len(np.asarray(nu_r)), len(np.asarray(rows))
     x = np.ascontiguousarray(np.asarray(rows, np.float32)[:, None])
-    single = [
-        np.ascontiguousarray(np.broadcast_to(np.asarray(a, np.float32), shape))
-        for a, shape in ((nu_r, (n, 6)), (up, (n, 3)), (depth, (n,)))
-    ]
+    shapes = ((nu_r, (n, 6)), (up, (n, 3)), (depth, (n,)), (channels, (n, MAX_THRUSTERS)))
+    single = [np.ascontiguousarray(np.broadcast_to(np.asarray(a, np.float32), shape)) for a, shape in shapes]
     tau = np.zeros((n, k, 6), np.float32)
+    kinds = (float, vec6, wp.vec3, float, vec8, vec6)
     arrays: list[Any] = [
         wp.array(a, dtype=kind, device="cpu", copy=False)
-        for a, kind in zip((x, *single, tau), (float, vec6, wp.vec3, float, vec6), strict=True)
+        for a, kind in zip((x, *single, tau), kinds, strict=True)
     ]
-    wp.launch(_sampler(terms), dim=(n, k), inputs=[*arrays[:4], float(density), arrays[4]], device="cpu")
+    role = "push" if isinstance(terms[0], InstalledActuator) else "wrench"
+    wp.launch(
+        _sampler(terms, role), dim=(n, k), inputs=[*arrays[:5], float(density), arrays[5]], device="cpu"
+    )
     return tau.astype(float)
+
+
+def actuator_wrenches(
+    vehicle: Vehicle, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, channels: ArrayLike
+) -> NDArray[np.float64]:
+    """Wrench of a vehicle's actuators beyond the static thrust of its propellers, submerged.
+
+    It is that of fins, buoyancy engines and gimbals, and what a flow takes from propellers; the weight of moved masses
+    is not in it.
+
+    Args:
+        vehicle: The vehicle.
+        nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s], (n, 6).
+        up: World z in the body frame, unit vectors, (n, 3).
+        depth: Of the body origin [m], (n,) or one number.
+        channels: Value of each channel, in the order of `Vehicle.channel_names` [N, rad, m³ or m], (n, c).
+
+    Returns:
+        About the body origin, body frame [N, N m], (n, 6).
+    """
+    found = {item: part for item, part in installed(vehicle).items() if item.kind.wrench is not None}
+    values = np.asarray(channels, float)
+    if not found:
+        return np.zeros((len(values), 6))
+    items = tuple(sorted(found, key=lambda item: item.name))
+    numbers = {path: x for item in items for path, x in item.numbers(found[item], vehicle).items()}
+    padded = np.pad(values, ((0, 0), (0, MAX_THRUSTERS - values.shape[1])))
+    row = parameter_row(items, numbers)
+    return term_wrenches(items, [row], nu_r, up, depth, vehicle.water.density, padded)[:, 0]

@@ -1,0 +1,75 @@
+"""Manoeuvres of vehicles with fins, and what a fit finds in them."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from finssim.evaluation.excitation import excite
+from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
+from finssim.identification.simulation_error import fit_by_simulation
+from finssim.trials.findings import CalibrationError
+from reference.torpedo import FIN, hull
+
+TAIL = {**FIN, "area": 0.05, "position": [-0.6, 0.0, 0.0], "time_constant": 0.1, "rate_limit": 1.0}
+TORPEDO = hull({"rudder": TAIL, "stern": {**TAIL, "span": [0.0, 1.0, 0.0]}})
+TURN = Manoeuvre(
+    name="turn",
+    axes=("surge", "sway", "yaw"),
+    orders=(
+        Order(duration=8.0, speed=1.5),
+        Order(duration=6.0, speed=1.5, course=0.4),
+        Order(duration=6.0, speed=1.5, course=-0.4),
+        Order(duration=6.0, speed=1.0, course=0.4, depth=1.0),
+        Order(duration=6.0, speed=2.0, course=-0.2),
+    ),
+)
+
+
+def test_an_order_holds_until_the_next():
+    """By the time since the start; the last one stays."""
+    assert TURN.duration == 32.0
+    assert [TURN.at(t).course for t in (0.0, 8.0, 13.99, 14.0, 40.0)] == [0.0, 0.4, 0.4, -0.4, -0.2]
+
+
+def test_the_set_excites_every_axis_but_roll():
+    """Each manoeuvre says which; none asks for more than the autopilot's fastest."""
+    chosen = manoeuvres(TORPEDO)
+    assert {axis for one in chosen for axis in one.axes} == {"surge", "sway", "heave", "pitch", "yaw"}
+    assert len({one.name for one in chosen}) == len(chosen)
+
+
+def test_tables_for_another_autopilot(tmp_path):
+    """`excite --kind manoeuvres` writes the orders; what belongs to other kinds is refused."""
+    file = tmp_path / "torpedo.yaml"
+    file.write_text("extends: remus100\n", encoding="utf-8")
+    folders = excite("all", vehicle=str(file), kind="manoeuvres", out=tmp_path / "plan")
+    with (folders[1] / "programme.csv").open(encoding="utf-8") as table:
+        rows = list(csv.DictReader(table))
+    assert list(rows[0]) == ["t", "speed", "course", "depth", "turn"]
+    assert {float(row["course"]) for row in rows} == {0.0, 20.0, -20.0}
+    with pytest.raises(CalibrationError, match="axes all"):
+        excite("surge", vehicle=str(file), kind="manoeuvres", out=tmp_path / "other")
+
+
+@pytest.mark.slow
+def test_a_fit_finds_what_is_true():
+    """Without noise, from numbers that are 15 to 40 % off: drag, added mass and the slope of the fins within 3 %."""
+    base = "hydrodynamics.calibrated"
+    file = TORPEDO.replace(
+        {
+            "actuators.*.lift_slope": 2.2, f"{base}.added_mass": [1.0, 22.0, 30.0, 0.1, 4.0, 3.2],
+            f"{base}.quadratic_damping": [7.5, 130.0, 100.0, 0.2, 9.0, 9.0],
+        }
+    )  # fmt: skip
+    trials = simulate_manoeuvres([TURN], file, truth=TORPEDO, noise="none", seed=1)
+    fit = fit_by_simulation(
+        trials, file, axes=("surge", "sway", "yaw"), damping="both", estimate=("fin.lift_slope",)
+    )
+    found = {name: estimate.estimate for name, estimate in fit.estimates.items()}
+    drag = [found[f"surge.d{k}"] for k in (1, 2)] @ np.array([1.5, 1.5**2])
+    np.testing.assert_allclose(drag, 2.0 * 1.5 + 6.0 * 1.5**2, rtol=0.03)
+    np.testing.assert_allclose(found["sway.added_mass"], 30.0, rtol=0.03)
+    np.testing.assert_allclose(found["yaw.m_eff"], 4.0 + TORPEDO.rigid_body_mass_matrix()[5, 5], rtol=0.03)
+    np.testing.assert_allclose(found["fin.lift_slope"], 3.0 / 2.2, rtol=0.03)
+    np.testing.assert_allclose(fit.changes["actuators.rudder.lift_slope"], 3.0, rtol=0.03)
