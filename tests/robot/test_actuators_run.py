@@ -10,6 +10,7 @@ pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
 from finssim.control.guidance import Station
+from finssim.extensions.viewer.sources import RecordSource
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.drawn_plant import site_of
 from finssim.robot.bridge import Bridge
@@ -20,7 +21,7 @@ from finssim.robot.record_reader import open_record
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.vehicles.defaults import vehicle_at
-from reference.finned import torpedo
+from reference.finned import torpedo, torpedo_file
 
 TORPEDO = vehicle_at("open-water", torpedo())
 START = (0.0, 0.0, -8.0)
@@ -69,6 +70,8 @@ def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
         asked, states = (
             [m.message.position for m in record.messages([n])] for n in ("actuator_cmd", "actuator_states")
         )
+    source = RecordSource(tmp_path / "run.mcap", vehicle=str(torpedo_file(tmp_path)))
+    assert source.frame(6.0).values[0] == pytest.approx(0.196, abs=1e-3)
     np.testing.assert_allclose(asked[-1], [0.2, 0.0, 2e-4, 0.0])
     assert np.array(states)[:, 0].max() == pytest.approx(0.196, abs=1e-3)  # less its play
 

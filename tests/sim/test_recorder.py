@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from finssim.sim import Simulator, SimulatorError, StateRecorder, read_run
+from reference.finned import torpedo
 
 
 def run(folder: Path, steps: int, chunk: int, worlds: list[int] | None = None) -> Simulator:
@@ -81,3 +82,19 @@ def test_a_used_folder_and_a_missing_world_are_refused(tmp_path: Path) -> None:
         StateRecorder(simulator, tmp_path / "new", worlds=[5])
     with pytest.raises(SimulatorError, match="no recorded run"):
         read_run(tmp_path / "used")
+
+
+def test_other_actuators_have_columns_too(tmp_path: Path) -> None:
+    """Commands of all channels, thrust of thrusters, values of the others."""
+    simulator = Simulator(torpedo(), control_step=0.1)
+    simulator.place(position=(0.0, 0.0, -5.0))
+    simulator.set_actuators([5.0, 0.2, 0.0, 1e-4, 0.0])
+    with StateRecorder(simulator, tmp_path / "run") as recorder:
+        for _ in range(12):
+            simulator.step()
+        recorder.record()
+    last = read_run(tmp_path / "run").iloc[-1]
+    assert last["command_rudder"] == pytest.approx(0.2) and last["actuator_rudder"] == pytest.approx(
+        0.196, abs=1e-3
+    )
+    assert last["actuator_engine"] == pytest.approx(1e-4) and last["thrust_propeller"] > 1.0

@@ -11,6 +11,7 @@ from finssim.cli.commands import app
 from finssim.vehicles import HydrodynamicSet, VehicleError, catalogue, load_vehicle
 from finssim.vehicles.export import export_vehicle
 from finssim.vehicles.importers.draft import read_foreign
+from reference.finned import torpedo
 from reference.gz_sim import HEAVY, Origin, write
 from vehicles.minnow import MINNOW
 
@@ -101,3 +102,27 @@ def test_the_command_lists_what_is_not_held(tmp_path, monkeypatch, capsys):
     assert "expected .sdf, as the format" in capsys.readouterr().err
     with pytest.raises(VehicleError, match="the set 'mesh' is of a mesh"):
         export_vehicle(load_vehicle("finsrov"), tmp_path / "rov.sdf", "sdf", "mesh")
+
+
+@pytest.mark.parametrize("kind", ["sdf", "urdf"])
+def test_fins_are_joints_with_their_travel(tmp_path, kind):
+    """One revolute joint each, about the span at its position, with a plate of its area; the body keeps its mass."""
+    vehicle = torpedo()
+    lost = export_vehicle(vehicle, tmp_path / f"rov.{kind}", kind)
+    root = ElementTree.parse(tmp_path / f"rov.{kind}").getroot()
+    joint = root.find(".//joint[@name='rudder']")
+    link = root.find(".//link[@name='rudder_fin']")
+    axis, limit = joint.find("axis"), joint.find(".//limit")
+    xyz = axis.findtext("xyz") or axis.get("xyz")
+    ends = [limit.findtext(k) or limit.get(k) for k in ("lower", "upper")]
+    box = link.find("visual/geometry/box")
+    size = np.array((box.findtext("size") or box.get("size")).split(), float)
+    assert joint.get("type") == "revolute" and xyz == "0.0 0.0 1.0" and ends == ["-0.35", "0.35"]
+    assert size[0] * size[1] == pytest.approx(0.0133)
+    assert returned(tmp_path, vehicle, kind).body.mass == pytest.approx(vehicle.body.mass)
+    assert {
+        "force of fin rudder, which is a joint with a plate",
+        "buoyancy engine",
+        "moving_mass battery",
+    } <= set(lost)
+    assert "inflow of propeller" in lost

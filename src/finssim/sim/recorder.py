@@ -68,10 +68,12 @@ class StateRecorder:
         self._rows: list[NDArray[Any]] = []
         self._waiting = 0
         self._parts = 0
-        names = max((v.thruster_names for v in simulator.vehicles), key=len)
-        self._thrusters = len(names)
+        most = max(simulator.vehicles, key=lambda v: len(v.channel_names))
+        self._channels = len(most.channel_names)
         self.columns = ["world", "vehicle", "t", *(c for group in STATE_COLUMNS.values() for c in group)]
-        self.columns += [f"command_{name}" for name in names] + [f"thrust_{name}" for name in names]
+        self.columns += [f"command_{name}" for name in most.channel_names]
+        self.columns += [f"thrust_{name}" for name in most.thrusters]
+        self.columns += [f"actuator_{name}" for name in most.actuators]
         with atomic_write(self.folder / ABOUT) as temporary:
             temporary.write_text(json.dumps(self._about(), indent=2) + "\n", encoding="utf-8")
 
@@ -96,7 +98,7 @@ class StateRecorder:
         world = np.broadcast_to(chosen[:, None], shape)
         vehicle = np.broadcast_to(np.arange(shape[1]), shape)
         t = np.broadcast_to(s.numpy("steps")[chosen, None] * s.control_step, shape)
-        n = self._thrusters
+        n = self._channels
         command = s.command.thrust.numpy()[chosen][..., :n]
         parts = [world[..., None], vehicle[..., None], t[..., None]]
         parts += [s.numpy(name)[chosen] for name in STATE_COLUMNS]

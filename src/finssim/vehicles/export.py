@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.files import atomic_write
+from finssim.core.rotations import matrix_to_quat, quat_to_euler
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.importers.rigid import combined
 from finssim.vehicles.part import VehicleError
@@ -25,7 +26,9 @@ __all__ = ["export_vehicle"]
 DIAMETER = 0.1
 """Diameter of every propeller [m]; only its product with the thrust coefficient acts."""
 PROPELLER = 1e-4
-"""Mass of a propeller as a share of the vehicle's, from whose body it is taken."""
+"""Mass of a propeller or fin as a share of the vehicle's, from whose body it is taken."""
+EFFORT, FASTEST = 100.0, 10.0
+"""Torque [N m] of a fin's joint, and its rate [rad/s] where the file limits none."""
 SECTIONS = ("sensors", "perception", "tags", "mcu", "autopilot", "safety", "calibrations")
 """Sections of a vehicle file that these formats do not hold."""
 
@@ -52,6 +55,9 @@ def export_vehicle(
     lost = [f"section {name}" for name in SECTIONS if name in vehicle.model_fields_set]
     lost += [f"hydrodynamic set {name}" for name in vehicle.hydrodynamics if name != hydrodynamics]
     lost += [f"hydrodynamic term {name}" for name in chosen.terms]
+    lost += [f"force of fin {name}, which is a joint with a plate" for name in fins_of(vehicle)]
+    lost += [f"{a.kind} {name}" for name, a in vehicle.actuators.items() if a.kind != "fin"]
+    lost += [f"inflow of {name}" for name, thruster in vehicle.thrusters.items() if thruster.inflow]
     lost += ["lag, delay and rate limit of thrusters: the thrust of gz-sim follows at once"]
     lost += [
         "shape of the hull, which is a box of the displaced volume, and the layer in which buoyancy fades"
@@ -74,6 +80,33 @@ def export_vehicle(
     return lost
 
 
+def fins_of(vehicle: Vehicle) -> dict[str, Any]:
+    """Return the fins of a vehicle by name."""
+    return {name: part for name, part in vehicle.actuators.items() if part.kind == "fin"}
+
+
+def fin_joint(name: str, fin: Any, origin: NDArray[np.float64]) -> Element:
+    """Return the joint of a fin in URDF, of which the angle is its deflection; its link is NAME_fin.
+
+    Args:
+        name: Of the fin.
+        fin: Its section.
+        origin: Of the link of the body, body frame [m], (3,).
+    """
+    fastest = fin.rate_limit if np.isfinite(fin.rate_limit) else FASTEST
+    limit = _x("limit", lower=fin.minimum, upper=fin.maximum, effort=EFFORT, velocity=fastest)
+    ends = _x("parent", link="base_link"), _x("child", link=f"{name}_fin")
+    place = _x("origin", xyz=fin.position - origin, rpy="0 0 0")
+    return _x("joint", *ends, place, _x("axis", xyz=fin.span), limit, name=name, type="revolute")
+
+
+def fin_plate(fin: Any) -> tuple[NDArray[np.float64], Element]:
+    """Return roll, pitch and yaw of a fin's plate in its link [rad], (3,), and the box that is drawn, in URDF."""
+    axes = np.column_stack([fin.chord, fin.span, np.cross(fin.chord, fin.span)])
+    box = _x("geometry", _x("box", size=[*fin.sides, 0.1 * fin.sides[0]]))
+    return np.asarray(quat_to_euler(matrix_to_quat(axes))), box
+
+
 def _numbers(values: Any) -> str:
     return " ".join(repr(float(x)) for x in np.ravel(values))
 
@@ -94,10 +127,11 @@ def _links(
 ) -> dict[str, tuple[float, Any, Any, dict[str, float]]]:
     """Return link -> mass [kg], place in the body [m], centre of gravity in the link [m], inertia by word [kg m²].
 
-    The body's mass is less by those of the propellers, so that all together have that of the vehicle.
+    The body's mass is less by those of propellers and fins, so that all together have that of the vehicle.
     """
     body, mass = vehicle.body, vehicle.body.mass * PROPELLER
     places = {f"{name}_propeller": thruster.position - origin for name, thruster in vehicle.thrusters.items()}
+    places |= {f"{name}_fin": fin.position - origin for name, fin in fins_of(vehicle).items()}
     tensor, count = mass * 1e-4 * np.eye(3), len(places)
     centres = [body.center_of_gravity - origin, *places.values()]
     base = combined([body.mass, *[-mass] * count], centres, [body.inertia, *[-tensor] * count])
@@ -150,14 +184,23 @@ def _sdf(vehicle: Vehicle, chosen: HydrodynamicSet) -> Element:
         "fluid_added_mass", *(_x("xyzpqr"[i] + "xyzpqr"[j], chosen.added_mass[i, j]) for i, j in pairs)
     )
     hull = [_x(kind, _x("pose", [*buoyant, *level]), box, name="hull") for kind in ("collision", "visual")]
+    plates = {}
+    for name, fin in fins_of(vehicle).items():
+        size = _x("size", [*fin.sides, 0.1 * fin.sides[0]])
+        pose = _x("pose", [0.0, 0.0, 0.0, *fin_plate(fin)[0]])
+        plates[f"{name}_fin"] = [_x("visual", pose, _x("geometry", _x("box", size)), name="plate")]
     for name, (mass, place, centre, words) in _links(vehicle, origin).items():
         inertia = _x("inertia", *(_x(word, x) for word, x in words.items()))
-        fluid, shapes = ([added], hull) if name == "base_link" else ([], [])
+        fluid, shapes = ([added], hull) if name == "base_link" else ([], plates.get(name, []))
         inertial = _x("inertial", _x("pose", [*centre, *level]), _x("mass", mass), inertia, *fluid)
         parts.append(_x("link", _x("pose", [*place, *level]), inertial, *shapes, name=name))
     for name, thruster in vehicle.thrusters.items():
         ends = _x("parent", "base_link"), _x("child", f"{name}_propeller")
         parts.append(_x("joint", *ends, _x("axis", _x("xyz", thruster.axis)), name=name, type="revolute"))
+    for name, fin in fins_of(vehicle).items():
+        ends = _x("parent", "base_link"), _x("child", f"{name}_fin")
+        limit = _x("limit", _x("lower", fin.minimum), _x("upper", fin.maximum))
+        parts.append(_x("joint", *ends, _x("axis", _x("xyz", fin.span), limit), name=name, type="revolute"))
     model = _x("model", *parts, *_plugins(vehicle, chosen, added=False), name=vehicle.name)
     gravity = _x("gravity", [0.0, 0.0, -vehicle.water.gravity])
     engine = [_plugin(kind) for kind in ("Physics", "UserCommands", "SceneBroadcaster")]
@@ -169,15 +212,19 @@ def _urdf(vehicle: Vehicle, chosen: HydrodynamicSet) -> Element:
     origin, parts = chosen.reference_point, []
     box = _x("geometry", _x("box", size=_geometry(vehicle)))
     buoyant = _x("origin", xyz=vehicle.body.center_of_buoyancy - origin, rpy="0 0 0")
-    links = _links(vehicle, origin)
+    links, fins = _links(vehicle, origin), {f"{name}_fin": fin for name, fin in fins_of(vehicle).items()}
     for name, (mass, _, centre, words) in links.items():
         inertial = _x(
             "inertial", _x("origin", xyz=centre, rpy="0 0 0"), _x("mass", value=mass), _x("inertia", **words)
         )
         shapes = [_x(kind, buoyant, box) for kind in ("collision", "visual")] if name == "base_link" else []
+        if name in fins:
+            turned, plate = fin_plate(fins[name])
+            shapes = [_x("visual", _x("origin", xyz="0 0 0", rpy=turned), plate)]
         parts.append(_x("link", inertial, *shapes, name=name))
     for name, thruster in vehicle.thrusters.items():
         ends = _x("parent", link="base_link"), _x("child", link=f"{name}_propeller")
         place = _x("origin", xyz=links[f"{name}_propeller"][1], rpy="0 0 0")
         parts.append(_x("joint", *ends, place, _x("axis", xyz=thruster.axis), name=name, type="continuous"))
+    parts += [fin_joint(name, fin, origin) for name, fin in fins_of(vehicle).items()]
     return _x("robot", *parts, _x("gazebo", *_plugins(vehicle, chosen, added=True)), name=vehicle.name)

@@ -9,6 +9,7 @@ from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.extensions.ros2.nodes.frames import mounts, urdf_of
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.loader import catalogue
+from reference.finned import torpedo
 
 
 def numbers(element, name):
@@ -38,6 +39,20 @@ def test_every_vehicle_is_a_tree_of_fixed_joints(name):
         assert hull.get("filename") == f"file://{vehicle.hull.file.resolve()}"
     else:
         assert numbers(hull, "size") == pytest.approx(vehicle.body.size)
+
+
+def test_fins_turn_about_their_span():
+    """A revolute joint of the fin's name, with its travel; the angle is the deflection."""
+    vehicle = torpedo()
+    robot = ElementTree.fromstring(urdf_of(vehicle))
+    joint = robot.find("joint[@name='elevator']")
+    assert joint.get("type") == "revolute" and joint.find("child").get("link") == "elevator_fin"
+    assert numbers(joint.find("axis"), "xyz") == pytest.approx([0.0, 1.0, 0.0])
+    assert numbers(joint.find("origin"), "xyz") == pytest.approx([-0.638, 0.0, 0.0])
+    limit = joint.find("limit")
+    assert [float(limit.get(k)) for k in ("lower", "upper", "velocity")] == [-0.35, 0.35, 1.0]
+    length, width, _ = numbers(robot.find("link[@name='elevator_fin']/visual/geometry/box"), "size")
+    assert length * width == pytest.approx(0.0133)
 
 
 @pytest.mark.slow

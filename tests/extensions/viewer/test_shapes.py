@@ -3,12 +3,22 @@
 import numpy as np
 import pytest
 
-from finssim.core.rotations import quat_from_yaw
+from finssim.core.rotations import quat_from_yaw, quat_to_matrix
 from finssim.extensions.viewer.app import FIRST, LINE, blank, draw_picture, legend_of, plots_of
 from finssim.extensions.viewer.frame import BodyPose, LatestPicture, PlotLine
-from finssim.extensions.viewer.shapes import ARROW, force_arrows, hull_of, line_of, tag_plates, wall_mesh
+from finssim.extensions.viewer.shapes import (
+    ARROW,
+    fin_attitude,
+    fin_plates,
+    force_arrows,
+    hull_of,
+    line_of,
+    tag_plates,
+    wall_mesh,
+)
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import load_vehicle
+from reference.finned import torpedo
 
 FINSROV = load_vehicle("finsrov")
 
@@ -108,3 +118,15 @@ def test_a_plot_begins_where_all_its_curves_have_values():
     data = plot.data(0.0)
     assert [column[0] for column in data] == [1.0, 1.0, 1.0, 2.0, 2.0]
     assert all(len(column) == 3 for column in data)
+
+
+def test_fins_are_plates_that_turn_with_their_deflection():
+    """Of the fin's area, in the plane of chord and span; a positive deflection turns it about the span."""
+    vehicle = torpedo()
+    plates = fin_plates(vehicle)
+    assert list(plates) == [0, 1]
+    rudder = vehicle.actuators["rudder"]
+    length, height = np.ptp(plates[0].vertices, axis=0)[[0, 2]]
+    assert length * height == pytest.approx(rudder.area)
+    edge = quat_to_matrix(fin_attitude(rudder, 0.3)) @ rudder.chord
+    assert edge == pytest.approx([np.cos(0.3), np.sin(0.3), 0.0])

@@ -31,6 +31,8 @@ from finssim.extensions.viewer.frame import (
 )
 from finssim.extensions.viewer.shapes import (
     box_edges,
+    fin_attitude,
+    fin_plates,
     force_arrows,
     hull_of,
     line_of,
@@ -74,6 +76,7 @@ class StageScene:
         self._scene.set_up_direction("+z")
         self._scene.configure_default_lights(True, cast_shadow=False)
         self._water()
+        self._fins: list[tuple[int, Any]] = []
         self._bodies = {name: self._vehicle(name) for name in ("truth", "estimate")}
         size = float(np.max(stage.vehicle.body.size))
         self._goal = self._scene.add_frame(
@@ -112,6 +115,9 @@ class StageScene:
         self._place("truth", frame.truth, ghost=False)
         self._place("estimate", frame.estimate, ghost=frame.truth is not None)
         self._show(self._goal, frame.goal)
+        fins = list(self.stage.vehicle.actuators.values())
+        for k, plate in self._fins if len(frame.values) else ():
+            plate.wxyz = wxyz(fin_attitude(fins[k], float(frame.values[k])))
         pose = frame.truth or frame.estimate
         arrows = force_arrows(self.stage.vehicle, frame.force, pose) if pose else np.zeros((0, 2, 3))
         _set_points(self._arrows, arrows)
@@ -145,6 +151,13 @@ class StageScene:
             self._scene.add_mesh_simple(
                 f"/{name}/{part}", plate.vertices, plate.faces, color=colour, side="double"
             )
+        fins = list(vehicle.actuators.values())
+        for k, plate in fin_plates(vehicle).items():
+            node = self._scene.add_mesh_simple(
+                f"/{name}/fins/{k}", plate.vertices, plate.faces, color=COLOURS[name], flat_shading=True,
+                side="double", position=tuple(fins[k].position),
+            )  # fmt: skip
+            self._fins.append((k, node))
         nose = np.array([[[0.0, 0.0, 0.0], [0.75 * float(vehicle.body.size[0]), 0.0, 0.0]]])
         self._line(f"/{name}/nose", nose, name, 3.0)
         return body, hull

@@ -91,6 +91,8 @@ class ViewFrame:
     goal: BodyPose | None = None
     force: Array = field(default_factory=lambda: np.zeros(0))
     """Forces of the thrusters, canonical order [N], (n,), or none."""
+    values: Array = field(default_factory=lambda: np.zeros(0))
+    """Values of the other actuators, in the vehicle file's order [rad, m³ or m], (m,), or none."""
     trail: Array = field(default_factory=nowhere)
     """Recent positions of the vehicle, world frame [m], (k, 3)."""
     picture: LatestPicture | None = None

@@ -11,6 +11,7 @@ from finssim.core.rotations import quat_to_matrix
 from finssim.core.sonar_fan import fan_picture
 from finssim.extensions.perception.layout import Shape, WorldLayout
 from finssim.extensions.viewer.frame import BodyPose, FixedBody
+from finssim.physics.actuators.fin import Fin
 from finssim.robot.messages import Picture
 from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
@@ -65,6 +66,24 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
         )
         for size, lift in ((1.3, 0.0), (0.9, 0.002))
     )
+
+
+def fin_plates(vehicle: Vehicle) -> dict[int, Mesh]:
+    """Return the plate of each fin about its position at deflection 0, in body axes, by its index among the actuators
+    besides thrusters."""
+    plates = {}
+    for k, fin in enumerate(vehicle.actuators.values()):
+        if isinstance(fin, Fin):
+            half = 0.5 * np.array([*fin.sides, 0.1 * fin.sides[0]])
+            box = _box(-half, half)
+            axes = np.column_stack([fin.chord, fin.span, np.cross(fin.chord, fin.span)])
+            plates[k] = Mesh(box.vertices @ axes.T, box.faces)
+    return plates
+
+
+def fin_attitude(fin: Fin, deflection: float) -> Array:
+    """Return the rotation of a fin's plate at a deflection [rad], xyzw, (4,)."""
+    return np.array([*(np.sin(0.5 * deflection) * fin.span), np.cos(0.5 * deflection)])
 
 
 def wall_mesh(lower: Array, upper: Array) -> Mesh:

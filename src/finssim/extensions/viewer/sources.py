@@ -151,6 +151,7 @@ class PoolSource:
             estimate=self._estimate(),
             goal=self._goal(),
             force=np.array(plant.thrust, float),
+            values=np.array(plant.values, float),
             trail=self._errors.trail,
             picture=self._picture,
             pictures={name: image for name, image in self._own.items() if isinstance(image, np.ndarray)},
@@ -283,13 +284,14 @@ class SimulatorSource:
             time=now,
             truth=pose,
             goal=goal,
-            force=self._thrust(),
+            force=self._channels()[: self._n],
+            values=self._channels()[self._n :],
             trail=self._errors.trail,
             status={
                 "controller": self._pilot.name,
                 "to the goal": self._errors.to_goal,
                 "progress": f"{100.0 * float(self._guide.at(now).progress):.0f} %",
-                "thrust [N]": " ".join(f"{f:.1f}" for f in self._thrust()),
+                "thrust [N]": " ".join(f"{f:.1f}" for f in self._channels()[: self._n]),
             },
         )
 
@@ -306,7 +308,8 @@ class SimulatorSource:
             pose = self._pose()
             nu = s.numpy("velocity")[0, 0].astype(float)
             reading = Reading(now, pose.position, pose.quaternion, nu, ready=True)
-            s.set_thrust(self._pilot.act(reading, self._guide, now))
+            asked = self._pilot.act(reading, self._guide, now)
+            (s.set_thrust if len(asked) == self._n else s.set_actuators)(asked)
             self._decided = now
         s.step()
         self._steps += 1
@@ -316,8 +319,9 @@ class SimulatorSource:
         s = self._simulator
         return BodyPose(s.numpy("position")[0, 0].astype(float), s.numpy("quaternion")[0, 0].astype(float))
 
-    def _thrust(self) -> np.ndarray:
-        return np.asarray(self._simulator.numpy("thrust")[0, 0, : self._n], float)
+    def _channels(self) -> np.ndarray:
+        channels = self._simulator.vehicles[0].channel_names
+        return np.asarray(self._simulator.numpy("thrust")[0, 0, : len(channels)], float)
 
 
 def _basin(way: np.ndarray, length: float) -> tuple[float, float, float]:
@@ -335,6 +339,7 @@ TOPICS = (
     "goal",
     "thruster_state",
     "joint_states",
+    "actuator_states",
     "camera/image/compressed",
     "camera/tags",
     "events",
@@ -411,6 +416,7 @@ class RecordSource:
         at = self.begin + time
         thrusters = self._thrusters.at(at)
         force = np.zeros(0) if thrusters is None else np.asarray(thrusters.force, float)
+        values = self._values.at(at)
         poses = self._truth if self._truth is not None else self._odom
         return ViewFrame(
             time=time,
@@ -418,6 +424,7 @@ class RecordSource:
             estimate=self._odom.at(at),
             goal=self._goal.at(at),
             force=force,
+            values=np.zeros(0) if values is None else np.asarray(values.position, float),
             trail=poses.trail(at),
             picture=self._picture(at),
             pictures={name: image for name in self._eyes if (image := self._own(name, at)) is not None},
@@ -458,6 +465,7 @@ class RecordSource:
         self._health = TimeSeries(times["estimator_status"], by_name["estimator_status"])
         self._thrusters = TimeSeries(times["thruster_state"], by_name["thruster_state"])
         self._shafts = TimeSeries(times["joint_states"], by_name["joint_states"])
+        self._values = TimeSeries(times["actuator_states"], by_name["actuator_states"])
         self._pictures = TimeSeries(times["camera/image/compressed"], by_name["camera/image/compressed"])
         self._tags = TimeSeries(times["camera/tags"], by_name["camera/tags"])
         self._eyes, self._ranges = (
@@ -614,13 +622,15 @@ class RunSource:
             rows[["x", "y", "z"]].to_numpy(float),
             rows[["qx", "qy", "qz", "qw"]].to_numpy(float),
         )
-        names = [f"thrust_{name}" for name in ours.thruster_names]
+        names = [f"thrust_{name}" for name in ours.thrusters]
+        names += [f"actuator_{name}" for name in ours.actuators]
         missing = sorted(set(names) - set(rows.columns))
         if missing:
             raise ViewError(
                 f"{folder}: has no {missing[0]}: it was not recorded of {ours.name}; give --vehicle"
             )
-        self._thrust = TimeSeries(time - time[0], rows[names].to_numpy(float))
+        self._n = len(ours.thrusters)
+        self._channels = TimeSeries(time - time[0], rows[names].to_numpy(float))
         speed = np.linalg.norm(rows[["u", "v", "w"]].to_numpy(float), axis=1)
         self._curves = [PlotLine("speed [m/s]", "through the water", time - time[0], speed)]
         self.duration = float(time[-1] - time[0])
@@ -630,12 +640,15 @@ class RunSource:
 
     def frame(self, time: float) -> ViewFrame:
         """The moment at a time since the run's beginning [s]."""
-        force = self._thrust.at(time)
-        status = {} if force is None else {"thrust [N]": " ".join(f"{f:.1f}" for f in force)}
+        channels = self._channels.at(time)
+        channels = np.zeros(0) if channels is None else channels
+        force = channels[: self._n]
+        status = {"thrust [N]": " ".join(f"{f:.1f}" for f in force)} if len(force) else {}
         return ViewFrame(
             time=time,
             truth=self._poses.at(time),
-            force=np.zeros(0) if force is None else force,
+            force=force,
+            values=channels[self._n :],
             trail=self._poses.trail(time),
             status=status,
         )

@@ -54,6 +54,13 @@ class Fin(Actuator):
     """Name of a thruster in whose wake the fin is -> part of the wake's momentum that reaches it, up to 1 at the disc's
     exit [-]; the thruster needs a `diameter`."""
 
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Return length along the chord and along the span of a plate of this area, twice as wide as long, to be drawn
+        [m]."""
+        length = float(np.sqrt(0.5 * self.area))
+        return length, 2.0 * length
+
     @model_validator(mode="after")
     def _possible(self) -> Fin:
         if abs(float(self.span @ self.chord)) > 1e-6:

@@ -28,6 +28,7 @@ from finssim.robot.reading import Reading
 from finssim.robot.record_messages import own_kind
 from finssim.vehicles import Vehicle
 from finssim.vehicles.device_files import device_of
+from finssim.vehicles.export import fin_joint, fin_plate, fins_of
 
 Array = npt.NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
 
 
 def urdf_of(vehicle: Vehicle) -> str:
-    """URDF of a vehicle: mass and inertia without water, hull or envelope, and its `mounts` as fixed joints."""
+    """URDF of a vehicle: mass and inertia without water, hull or envelope, `mounts` as fixed joints, fins that turn."""
     robot, body = ElementTree.Element("robot", name=vehicle.name), vehicle.body
     base = ElementTree.SubElement(robot, "link", name=BASE)
     inertial = ElementTree.SubElement(base, "inertial")
@@ -90,6 +91,12 @@ def urdf_of(vehicle: Vehicle) -> str:
         ElementTree.SubElement(joint, "child", link=name)
         rpy = _numbers(quat_to_euler(orientation))
         ElementTree.SubElement(joint, "origin", xyz=_numbers(position), rpy=rpy)
+    for name, fin in fins_of(vehicle).items():
+        turned, plate = fin_plate(fin)
+        shape = ElementTree.SubElement(ElementTree.SubElement(robot, "link", name=f"{name}_fin"), "visual")
+        ElementTree.SubElement(shape, "origin", xyz="0 0 0", rpy=_numbers(turned))
+        shape.append(plate)
+        robot.append(fin_joint(name, fin, np.zeros(3)))
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, encoding="unicode")
 
