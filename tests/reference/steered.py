@@ -26,7 +26,7 @@ class Sailed(NamedTuple):
 
 
 def sailed(vehicle, orders, seconds, *, depth=10.0, speed=1.5, water=None, pilot=None):
-    """Return the motion of one vehicle per row of orders, from level motion along x at a speed [m/s].
+    """Return the motion of one vehicle per row of orders, from level motion along x at a speed through the water [m/s].
 
     Args:
         vehicle: The vehicle.
@@ -50,6 +50,8 @@ def sailed(vehicle, orders, seconds, *, depth=10.0, speed=1.5, water=None, pilot
     sim.place(position=(0.0, 0.0, -depth), quaternion=quat_from_yaw(0.0))
     start = np.zeros((n, 1, 6), np.float32)
     start[..., 0] = speed
+    if water is not None:
+        start[..., :3] += np.asarray(water.current)
     sim.state.velocity.assign(start)
     memory, rows = pilot.reset(n), []
     for _ in range(round(seconds / PERIOD)):

@@ -104,4 +104,4 @@ def test_the_baseline_follows_in_a_current(kind, tail):
             values[first] = measured[name][first]
         memory, observation = restarted(memory, player.reset(n), ended), step.observation
     assert found["success"].mean() > 0.95
-    assert found["error"].mean() < (0.35 if kind is PathFollowing else 1.8)
+    assert found["error"].mean() < (0.25 if kind is PathFollowing else 1.2)

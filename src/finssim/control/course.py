@@ -12,8 +12,9 @@ bounded allocation of `finssim.control.allocation` then gives the channels neare
 the fins and the limits of thrust, for a cruciform tail, an X tail or any other. Between the speeds of the model
 everything is interpolated. An integral rests while the channels cannot follow it.
 
-In a current the course over ground differs from the heading by the crab angle. The heading answers at once and is
-controlled; the crab angle is followed slowly: wanted heading = wanted course - crab angle.
+In a current the course over ground differs from the heading. An observer with the model's sway through the water takes
+what is left of the measured one for the current, constant in the world. Fed back is the sway through the water, and the
+heading, whose wanted value makes good the current for the wanted course.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator,index"
 
@@ -53,18 +54,24 @@ STEEPEST = math.radians(25.0)
 """Greatest pitch that is asked for [rad]."""
 WIDEST = math.radians(60.0)
 """Greatest error of the heading that is acted on [rad]."""
-CRAB_TIME = 4.0
-"""Time constant with which the crab angle is followed [s]."""
-TURNING = 0.1
-"""Yaw rate at which the crab angle is followed half as fast [rad/s]."""
+CURRENT_TIME, SWAY_TIME = 3.0, 1.0
+"""Time constants with which the observer follows the current, and the sway through the water [s]."""
+TURNING = 0.15
+"""Yaw rate at which it follows the current half as fast, for the model of a turn is not exact [rad/s]."""
+LEAST_DAMPING = 0.3
+"""Rate at which the observer's sway dies out at least [1/s]; cross-flow drag is not in a linear model."""
+MOST_CRAB = math.radians(45.0)
+"""Greatest angle between heading and course that makes good a current [rad]."""
 INDEPENDENT = 0.2
 """Part of an axis' wrench that has to be left without the others, for the axis to be controlled [-]."""
+CAUTION = 1.0
+"""Part of an axis' limit that an error of heading, depth or pitch may ask for; the rest is for an unstable hull [-]."""
 SHORT = 0.02
 """Part of an axis' limit by which a wrench falls short if its integral rests [-]."""
 SHORTEST_LAG = 0.05
 """Time constant of an actuator that states less [s]."""
 
-SLOWEST, FASTEST, SPEEDS = 0.25, 0.95, 8
+SLOWEST, FASTEST, SPEEDS = 0.5, 0.95, 6
 """Speeds of the gains, as shares of top speed, and their number; the least and the greatest that an action asks for."""
 USUAL_TOP = 2.0
 """Top speed of a vehicle whose model states none [m/s]."""
@@ -72,6 +79,7 @@ FARTHEST = 5.0
 """Change of depth that an action of 1 asks for [m]."""
 
 STATES = 13
+Memory = wp.types.vector(length=10, dtype=float)
 Row = wp.types.vector(length=STATES + len(AXES), dtype=float)
 Wrench4 = wp.types.vector(length=len(AXES), dtype=float)
 
@@ -115,6 +123,8 @@ class CourseData:
     """Step between speeds [m/s]."""
     gains: wp.array3d(dtype=Row)
     """Feedback of the state and of the wrench on its way, by axis: for depth, then for pitch, (vehicles, 2 n, 4)."""
+    sway: wp.array2d(dtype=Row)
+    """Acceleration of sway by the state and the wrench on its way [m/s² per their units], (vehicles, n)."""
     reach: wp.array2d(dtype=Wrench4)
     """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
     slack: wp.array2d(dtype=Wrench4)
@@ -152,9 +162,9 @@ class CourseAnswer:
 
     channels: vec8
     """Commands, in the units of the channels."""
-    memory: vec8
-    """Integrals of speed [m], of heading [rad s], and of depth [m s] or pitch [rad s]; the crab angle [rad]; and the
-    wrench on its way [N, N m]."""
+    memory: Memory
+    """Integrals of speed [m], of course [rad s], and of depth [m s] or pitch [rad s]; the wrench on its way [N, N m];
+    sway through the water [m/s], and the current, world x and y [m/s]."""
 
 
 @wp.func
@@ -164,25 +174,16 @@ def between(low: Any, high: Any, share: float):
 
 
 @wp.func
-def crab_angle(q: wp.quat, nu: vec6, least: float) -> float:
-    """Course over ground less heading [rad]; 0 below a speed ahead of `least` [m/s].
-
-    Args:
-        q: Attitude, body to world.
-        nu: Velocity over ground, body frame [m/s, rad/s].
-        least: Speed below which the course is not known [m/s].
-    """
-    bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
-    v = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
-    ahead = bow[0] * v[0] + bow[1] * v[1]
-    if ahead < least * wp.sqrt(bow[0] * bow[0] + bow[1] * bow[1]):
-        return 0.0
-    return wp.atan2(bow[0] * v[1] - bow[1] * v[0], ahead)
+def nothing_known() -> Memory:
+    """Return the memory at the start [m, rad s, N, N m, m/s]: no current is known."""
+    memory = Memory()
+    memory[8] = wp.nan
+    return memory
 
 
 @wp.func
 def steer(
-    order: CourseOrder, q: wp.quat, nu: vec6, memory: vec8, vehicle: int, data: CourseData
+    order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
 ) -> CourseAnswer:
     """Return the channels that carry out an order, and the memory for the next.
 
@@ -190,26 +191,44 @@ def steer(
         order: What is wanted.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
-        memory: From the command before, as in `CourseAnswer` [m, rad s, rad, N, N m]; zeros at the start.
+        memory: From the command before [m, rad s, N, N m, m/s]; `nothing_known` at the start.
         vehicle: First index into `data`.
         data: From `course_data`.
     """
+    # Velocity over ground, level, along the heading and to the left of it; and the current.
+    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
+    bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    heading = wp.atan2(bow[1], bow[0])
+    ahead = wp.vec2(wp.cos(heading), wp.sin(heading))
+    left = wp.vec2(-ahead[1], ahead[0])
+    ground = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
+    way = wp.vec2(ground[0], ground[1])
+    current = wp.vec2(memory[8], memory[9])
+    if wp.isnan(memory[8]):
+        across = wp.dot(way, left)
+        current = wp.vec2(across * left[0], across * left[1])
+    surge = nu[0] - wp.dot(current, ahead)
+
     count = data.trim.shape[1]
-    place = wp.clamp((nu[0] - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
+    place = wp.clamp((surge - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
     k = wp.min(int(place), count - 2)
     s = place - float(k)
     goal = wp.clamp((order.speed - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
     k_goal = wp.min(int(goal), count - 2)
     row = k + order.by_pitch * count
 
-    up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    crab = crab_angle(q, nu, 0.5 * data.first[vehicle])
-    off = memory[3] - crab - order.turn
+    course = float(heading)
+    if wp.dot(way, ahead) > 0.5 * data.first[vehicle]:
+        course = wp.atan2(way[1], way[0])
+    course += order.turn
+    drift = wp.dot(current, wp.vec2(-wp.sin(course), wp.cos(course))) / wp.max(surge, data.first[vehicle])
+    greatest = wp.static(math.sin(MOST_CRAB))
+    off = heading - course + wp.asin(wp.clamp(drift, -greatest, greatest))
     reach = between(data.reach[vehicle, row], data.reach[vehicle, row + 1], s)
     x = Row()
     for i in range(1, 6):
         x[i] = nu[i]
-    x[1] = nu[1] - memory[3] * nu[0]  # through the water: a current carries the vehicle along
+    x[1] = nu[1] - wp.dot(current, left)
     x[0] = wp.clamp(nu[0] - order.speed, -reach[0], reach[0])
     x[6] = wp.atan2(up[1], up[2])
     x[7] = wp.clamp(wp.asin(wp.clamp(-up[0], -1.0, 1.0)) - order.pitch, -reach[1], reach[1])
@@ -218,7 +237,7 @@ def steer(
     for i in range(3):
         x[10 + i] = memory[i]
     for i in range(4):
-        x[13 + i] = memory[4 + i]
+        x[13 + i] = memory[3 + i]
 
     wrench = Wrench4()
     for i in range(4):
@@ -238,21 +257,25 @@ def steer(
     answer = CourseAnswer()
     answer.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
     after = memory
+    errors = wp.vec3(x[0], wp.clamp(-order.turn, -reach[2], reach[2]), x[9 - 2 * order.by_pitch])
+    bounds = wp.vec3(reach[0], reach[2], reach[3 - 2 * order.by_pitch])
     for i in range(3):
         axis = wp.where(i == 0, 0, wp.where(i == 1, 3, 2))
-        state = wp.where(i == 0, 0, wp.where(i == 1, 8, 9 - 2 * order.by_pitch))
-        bound = reach[wp.where(i == 0, 0, wp.where(i == 1, 2, 3 - 2 * order.by_pitch))]
-        step = data.period * x[state]
-        push = -data.gains[vehicle, row, axis][10 + i] * step
+        push = -data.gains[vehicle, row, axis][10 + i] * errors[i]
         short = wrench[axis] - achieved[axis]
-        if wp.abs(x[state]) < bound and not (
-            short * push > 0.0 and wp.abs(short) > data.slack[vehicle, k][axis]
-        ):
-            after[i] = memory[i] + step
-    turning = nu[5] / wp.static(TURNING)  # while it turns, it slips sideways through the water
-    after[3] = memory[3] + data.period / wp.static(CRAB_TIME) / (1.0 + turning * turning) * (crab - memory[3])
+        follows = short * push <= 0.0 or wp.abs(short) <= data.slack[vehicle, k][axis]
+        if follows and wp.abs(errors[i]) < bounds[i]:
+            after[i] = memory[i] + data.period * errors[i]
     for i in range(4):
-        after[4 + i] = between(memory[4 + i], achieved[i], data.share[vehicle][i])
+        after[3 + i] = between(memory[3 + i], achieved[i], data.share[vehicle][i])
+    x[1] = memory[7]
+    more = wp.dot(way, left) - memory[7] - wp.dot(current, left)
+    after[7] += data.period * wp.dot(between(data.sway[vehicle, k], data.sway[vehicle, k + 1], s), x)
+    after[7] += data.period / wp.static(SWAY_TIME) * more
+    turning = nu[5] / wp.static(TURNING)
+    current += data.period / wp.static(CURRENT_TIME) / (1.0 + turning * turning) * more * left
+    after[8] = current[0]
+    after[9] = current[1]
     answer.memory = after
     return answer
 
@@ -288,10 +311,10 @@ def steer_rows(
     orders: wp.array(dtype=CourseOrder),
     q: wp.array(dtype=wp.quat),
     nu: wp.array(dtype=vec6),
-    memory: wp.array(dtype=vec8),
+    memory: wp.array(dtype=Memory),
     data: CourseData,
     channels: wp.array(dtype=vec8),
-    after: wp.array(dtype=vec8),
+    after: wp.array(dtype=Memory),
 ):
     """`steer` for the first vehicle, row by row.
 
@@ -299,10 +322,10 @@ def steer_rows(
         orders: What is wanted, (N,).
         q: Attitudes, body to world, (N,).
         nu: Velocities over ground, body frame [m/s, rad/s], (N,).
-        memory: From the command before, as in `CourseAnswer` [m, rad s, rad, N, N m], (N,).
+        memory: From the command before [m, rad s, N, N m, m/s], (N,).
         data: From `course_data`.
         channels: Written: commands, in the units of the channels [N, rad, m³, m], (N,).
-        after: Written: memory for the next command, in the units of `memory` [m, rad s, rad, N, N m], (N,).
+        after: Written: memory for the next command [m, rad s, N, N m, m/s], (N,).
     """
     i = wp.tid()
     answer = steer(orders[i], q[i], nu[i], memory[i], 0, data)
@@ -329,6 +352,8 @@ class Tuning(NamedTuple):
 
     gains: Array
     """Feedback of the state [N or N m per its unit], for depth and then for pitch, (2 n, 4, 17)."""
+    sway: Array
+    """Acceleration of sway by the state and the wrench on its way [m/s² per their units], (n, 17)."""
     reach: Array
     """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (2 n, 4)."""
     columns: Array
@@ -368,19 +393,20 @@ def tuned(model: LinearModel, name: str) -> Tuning:
     )
     weights = np.zeros((len(columns), 6))
     weights[:, AXES] = np.divide(1.0, limits, out=np.zeros_like(limits), where=limits > 0.0)
+    n = len(columns)
     rows = [
         _regulator(model, i, weights[i], limits[i], lag, by_pitch, name)
         for by_pitch in (False, True)
-        for i in range(len(columns))
+        for i in range(n)
     ]
-    gains = np.stack(rows)
-    n = len(columns)
+    gains, sway = (np.stack(part) for part in zip(*rows, strict=True))
     reach = np.full((2 * n, 4), np.inf)
     reach[:, 0] = 2.0 * SCALES[0]
-    reach[:, 1] = STEEPEST
-    reach[:, 2] = np.minimum(WIDEST, 1.0 * limits[np.arange(2 * n) % n, 3] / np.abs(gains[:, 3, 8]))
-    reach[:n, 3] = STEEPEST * np.abs(gains[:n, 2, 7] / gains[:n, 2, 9])
-    return Tuning(gains, reach, columns, limits, weights, lag)
+    turning, diving = (CAUTION * np.tile(limits[:, axis], 2) for axis in (3, 2))
+    reach[:, 2] = np.minimum(WIDEST, turning / np.abs(gains[:, 3, 8]))
+    reach[:, 1] = np.minimum(STEEPEST, diving / np.abs(gains[:, 2, 7]))
+    reach[:n, 3] = (reach[:, 1] * np.abs(gains[:, 2, 7]))[:n] / np.abs(gains[:n, 2, 9])
+    return Tuning(gains, sway[:n], reach, columns, limits, weights, lag)
 
 
 def _authority(wrench: Array) -> Array:
@@ -402,8 +428,8 @@ def _authority(wrench: Array) -> Array:
 
 def _regulator(
     model: LinearModel, i: int, weights: Array, limits: Array, lag: Array, by_pitch: bool, name: str
-) -> Array:
-    """Return the gains at one speed [N or N m per unit of the state], (4, 17)."""
+) -> tuple[Array, Array]:
+    """Return the gains at one speed [N or N m per unit of the state], (4, 17), and the row of sway, (17,)."""
     from scipy.linalg import solve_continuous_are
 
     n = STATES
@@ -411,17 +437,22 @@ def _regulator(
     mix = model.travel[:, None] * np.linalg.pinv(weighted, rcond=1e-6)[:, AXES] * weights[list(AXES)]
     A, B, Q = np.zeros((n + 4, n + 4)), np.zeros((n + 4, 4)), np.zeros(n + 4)
     A[:8, :8] = model.A[i]
+    A[0, 1:8] = A[1:8, 0] = 0.0  # the speed is for the thrust, the rest for the fins
     A[8, 5] = 1.0
     A[9, 2], A[9, 7] = 1.0, -model.speeds[i]
     A[[10, 11, 12], [0, 8, 7 if by_pitch else 9]] = 1.0
     A[:8, n:] = model.B[i] @ mix
+    A[0, n + 1 :] = A[1:8, n] = 0.0
     A[n:, n:], B[n:] = -np.diag(1.0 / lag), np.diag(1.0 / lag)
     for state, scale in SCALES.items():
         Q[state] = scale**-2
     for k, state in ((10, 0), (11, 8), (12, 7 if by_pitch else 9)):
         Q[k] = (SCALES[state] * INTEGRAL_TIME) ** -2
     driven = np.flatnonzero(limits > 0.0)
-    kept = np.array([k for k in range(n + 4) if not (k == 9 and by_pitch) and (k < n or k - n in driven)])
+    dropped = {n + k for k in range(4) if k not in driven} | ({9} if by_pitch else set())
+    if 1 not in driven:
+        dropped |= {3, 6}  # roll is left to the water
+    kept = np.array([k for k in range(n + 4) if k not in dropped])
     a, b, r = A[np.ix_(kept, kept)], B[np.ix_(kept, driven)], np.diag(limits[driven] ** -2)
     try:
         P = solve_continuous_are(a, b, np.diag(Q[kept]), r)
@@ -431,7 +462,8 @@ def _regulator(
         ) from error
     gains = np.zeros((4, n + 4))
     gains[np.ix_(driven, kept)] = np.linalg.solve(r, b.T @ P)
-    return gains
+    A[1, 1] = min(A[1, 1], -LEAST_DAMPING)
+    return gains, A[1]
 
 
 def course_data(
@@ -460,6 +492,7 @@ def course_data(
     data.first = stored([model.speeds[0] for model in models], float)
     data.spacing = stored([model.speeds[1] - model.speeds[0] for model in models], float)
     data.gains = stored([one.gains for one in found], Row)
+    data.sway = stored([one.sway for one in found], Row)
     data.reach = stored([np.minimum(one.reach, 1e6) for one in found], Wrench4)
     data.slack = stored([SHORT * one.limits for one in found], Wrench4)
     data.hold = stored(
@@ -505,8 +538,10 @@ class CoursePilot:
         self.data = course_data([model], [name], period)
 
     def reset(self, n: int = 1) -> Array:
-        """Return the memory of n vehicles at the start [m, rad s, rad, N, N m], (n, 8)."""
-        return np.zeros((n, 8))
+        """Return the memory of n vehicles at the start [m, rad s, N, N m, m/s], (n, 10)."""
+        memory = np.zeros((n, 10))
+        memory[:, 8] = np.nan
+        return memory
 
     def command(
         self,
@@ -518,10 +553,10 @@ class CoursePilot:
         depth: npt.ArrayLike | None = None,
         pitch: npt.ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
-        """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 8).
+        """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 10).
 
         Args:
-            memory: From `reset` or the command before [m, rad s, rad, N, N m], (n, 8).
+            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 10).
             measured: The vehicles' states, with n rows.
             speed: Wanted surge [m/s], (n,).
             course: Wanted course over ground, counter-clockwise from the world's x axis [rad], (n,).
@@ -544,10 +579,10 @@ class CoursePilot:
             orders["by_pitch"] = 1
         else:
             orders["rise"] = -np.asarray(depth, float) - np.atleast_2d(measured.position)[:, 2]
-        rows = ((q, wp.quat), (nu, vec6), (memory, vec8))
+        rows = ((q, wp.quat), (nu, vec6), (memory, Memory))
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=kind, device="cpu") for x, kind in rows]
         given.insert(0, wp.array(orders, dtype=CourseOrder, device="cpu"))
-        out = [wp.zeros(n, dtype=vec8, device="cpu") for _ in range(2)]
+        out = [wp.zeros(n, dtype=kind, device="cpu") for kind in (vec8, Memory)]
         wp.launch(steer_rows, n, [*given, self.data, *out], device="cpu")
         channels, after = (array.numpy().astype(float) for array in out)
         return channels[:, : self.model.trim.shape[1]], after

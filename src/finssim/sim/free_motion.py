@@ -50,7 +50,7 @@ def linear_model(
     """Return a vehicle about level motion over its speed, with the columns of its channels, by central differences.
 
     The channels that hold a speed are the least thrusts for it, with every other actuator at 0; what else it takes to
-    stay level is left to the integrals of a controller.
+    stay level is left to the integrals of a controller. A fin's travel ends at its stall, beyond which it gives less.
 
     Args:
         vehicle: The vehicle.
@@ -61,7 +61,9 @@ def linear_model(
         SimulatorError: No thruster drives it ahead.
     """
     model = hydrodynamics or coefficients_of(vehicle)
-    lower, upper = (np.asarray(limit, float) for limit in vehicle.channel_limits)
+    stall = [getattr(part, "stall", math.inf) for part in vehicle.actuators.values()]
+    most = np.array([math.inf] * len(vehicle.thrusters) + stall)
+    lower, upper = (np.clip(limit, -most, most) for limit in vehicle.channel_limits)
     surge = course_speeds(vehicle) if speeds is None else np.asarray(speeds, float)
     eta, nu = np.zeros((len(surge), 6)), np.zeros((len(surge), 6))
     eta[:, 2], nu[:, 0] = DEPTH, surge

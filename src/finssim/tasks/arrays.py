@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from finssim.control.course import Memory
 from finssim.physics.funnel import Funnel
-from finssim.physics.types import vec6, vec8
+from finssim.physics.types import vec6
 
 
 @wp.struct
@@ -122,10 +123,11 @@ class TaskArrays:
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
+    current: wp.array(dtype=wp.vec3)  # of the water at the surface, world frame [m/s]: the simulator's
     path: PathTable  # of tasks along a path in space
     target: TargetMotion  # of tasks whose goal moves
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
-    steering: wp.array2d(dtype=vec8)  # (worlds, vehicles): memory of autopilots [m, rad, N, N m]
+    steering: wp.array2d(dtype=Memory)  # (worlds, vehicles): memory of autopilots [m, rad, N, N m, m/s]
     messages: MessageTable  # of tasks whose agents talk to each other
     net: NetTable  # of tasks whose agents hold a net
     answers: Answers  # of tasks in plain torch

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
-from finssim.control.course import CourseData, course_data, order_of, steer
+from finssim.control.course import CourseData, Memory, course_data, order_of, steer
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
@@ -186,12 +186,13 @@ class Environment:
         self.action_size = len(MODES[self.action_mode].labels(vehicles[0]))
         """Numbers in the action of an agent."""
         self.arrays = task.arrays(worlds, self.action_size, self.device)
+        self.arrays.current = self.simulator.water.current
         if self.simulator.dock is not None:
             # The dock is the goal: the same memory.
             self.arrays.funnel = funnel = self.simulator.funnel
             self.arrays.goal_position, self.arrays.goal_quaternion = funnel.position, funnel.quaternion
         if MODES[self.action_mode].course:
-            self.arrays.steering = wp.zeros((worlds, len(vehicles)), dtype=vec8, device=self.device)
+            self.arrays.steering = wp.zeros((worlds, len(vehicles)), dtype=Memory, device=self.device)
             self._steering = self._autopilots()
         self.wrench_scale = np.broadcast_to(np.asarray(wrench_scale, dtype=float), (6,))
         self.noise = noise or MeasurementNoise()

@@ -195,8 +195,10 @@ def start_beside(state: State, arrays: TaskArrays, p: Any, rng: wp.uint32, w: in
     away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
     state.position[w, 0] = arrays.path.points[w, 0] + p.fit.size * p.offset * away
     yaw = wp.atan2(e[1], e[0]) + wp.randf(rng, -p.yaw, p.yaw)
-    state.quaternion[w, 0] = tilted(0.0, 0.0, yaw)
-    state.velocity[w, 0] = vec6(p.fit.speed, 0.0, 0.0, 0.0, 0.0, 0.0)
+    q = tilted(0.0, 0.0, yaw)
+    v = wp.quat_rotate_inv(q, arrays.current[w]) + wp.vec3(p.fit.speed, 0.0, 0.0)
+    state.quaternion[w, 0] = q
+    state.velocity[w, 0] = vec6(v[0], v[1], v[2], 0.0, 0.0, 0.0)
     arrays.goal_position[w] = arrays.path.points[w, p.legs]
     arrays.goal_quaternion[w] = wp.quat_identity()
 
