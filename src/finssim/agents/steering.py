@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from finssim.agents.baselines import PERIOD, Rows
 from finssim.control.course import STEEPEST, WIDEST
-from finssim.control.path_following import LineOfSight, PathErrors
+from finssim.control.path_following import LineOfSight, PathErrors, SeabedFollower
 from finssim.core.rotations import cross
 from finssim.tasks.path import ERROR_SCALE, Cruise
+from finssim.tasks.terrain import TerrainFollowing
 from finssim.vehicles import Vehicle
 
 Array = NDArray[np.float64]
@@ -65,3 +66,42 @@ def level_angle(start: Array, end: Array, up: Array) -> Array:
     across = (cross(start, end) * up).sum(axis=1)
     along = (start * end).sum(axis=1) - (start * up).sum(axis=1) * (end * up).sum(axis=1)
     return np.asarray(np.arctan2(across, along))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainPilot:
+    """The depth that keeps the altitude, from the beams' estimate of the seabed, and line of sight along the line."""
+
+    cruise: Cruise
+    guide: LineOfSight
+    follower: SeabedFollower
+    period: float = PERIOD
+    """Time between two actions [s]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> TerrainPilot:
+        """Return the baseline for the speed of a vehicle."""
+        cruise = Cruise.of(vehicle)
+        guide = LineOfSight(LOOK_AHEAD_TIME * cruise.speed, gain=0.1, steepest=STEEPEST)
+        follower = SeabedFollower(TerrainFollowing().altitude * cruise.size, time_constant=0.5, ahead=1.0)
+        return cls(cruise=cruise, guide=guide, follower=follower)
+
+    def reset(self, n: int) -> tuple[Array, Array]:
+        """Return empty integrals [m s], (n, 2), and an unknown seabed [m, m/s], (n, 2)."""
+        return self.guide.reset(n), self.follower.reset(n)
+
+    def act(self, memory: tuple[Array, Array], observation: Rows) -> tuple[Rows, tuple[Array, Array]]:
+        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        o = np.asarray(observation, float)
+        size = self.cruise.size
+        line, velocity, up = o[:, 4:7], o[:, 7:10], o[:, 13:16]
+        depth = 10.0 * size * o[:, 2]
+        altitude = 5.0 * size * o[:, 0] * up[:, 2]  # the beam points down in the body
+        wanted, rate, seabed = self.follower.depth(memory[1], depth, altitude, self.period)
+        slope = np.arcsin(np.clip(rate / self.cruise.speed, -1.0, 1.0))
+        nothing = np.zeros(len(o))
+        across = ERROR_SCALE * size * o[:, 3]
+        errors = PathErrors(level_angle(velocity, line, up), slope, nothing, across, wanted - depth, nothing)
+        (turn, pitch), integrals = self.guide.aim(memory[0], errors, self.period)
+        action = np.column_stack([nothing, turn / WIDEST, pitch / STEEPEST])
+        return np.clip(action, -1.0, 1.0).astype(np.float32), (integrals, seabed)

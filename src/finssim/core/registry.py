@@ -245,6 +245,7 @@ TASKS = Family(
         "docking": "finssim.tasks.docking:Docking",
         "path": "finssim.tasks.path:PathFollowing",
         "waypoints": "finssim.tasks.path:WaypointTour",
+        "terrain": "finssim.tasks.terrain:TerrainFollowing",
     },
     check="finssim.tasks.catalogue:check_registered",
 )

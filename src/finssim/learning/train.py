@@ -45,7 +45,7 @@ class TrainingSettings:
     task's own if not given."""
     randomize: str | Path | None = None
     """(FILE) Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
-    open_water, no_thruster_dynamics, or a file."""
+    open_water, cruise, no_thruster_dynamics, or a file."""
     observe: str = "training"
     """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, through a
     filter), a file of other fixes, estimator (about what localization is off by) or truth."""
@@ -131,8 +131,8 @@ def train(
 
     Args:
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking, path,
-            waypoints, pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a sonar
-            net; or your own, FILE.py:CLASS.
+            waypoints, terrain, pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or gate, with a
+            sonar net; or your own, FILE.py:CLASS.
         settings: What it is trained with.
         out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
         resume: Resume a killed training from its last checkpoint.

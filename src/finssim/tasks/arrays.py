@@ -124,6 +124,10 @@ class TaskArrays:
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
     reference: ReferenceTable  # of tasks that follow one
     current: wp.array(dtype=wp.vec3)  # of the water at the surface, world frame [m/s]: the simulator's
+    seabed: wp.array2d(
+        dtype=wp.vec4
+    )  # (worlds, ripples) of tasks over a seabed: height [m], wave number [rad/m],
+    # direction [rad] and phase [rad] of each
     path: PathTable  # of tasks along a path in space
     target: TargetMotion  # of tasks whose goal moves
     funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
