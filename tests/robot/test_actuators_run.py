@@ -1,5 +1,6 @@
 """A torpedo through the whole stack: pilot, bridge, wire, firmware, plant, telemetry, record."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -9,19 +10,27 @@ import pytest
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
+from finssim.cli import boundary
+from finssim.cli.commands import app
 from finssim.control.guidance import Station
+from finssim.control.path_following import Waypoints
+from finssim.control.trajectories import load_trajectory
 from finssim.extensions.viewer.sources import RecordSource
-from finssim.pool import VirtualPool, draw_plant
+from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.drawn_plant import site_of
 from finssim.robot.bridge import Bridge
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery
 from finssim.robot.perception import Perception
+from finssim.robot.pilots import AgentPilot
+from finssim.robot.reading import Reading
 from finssim.robot.record_reader import open_record
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
+from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 from reference.finned import torpedo, torpedo_file
+from reference.pools import lockstep_pool
 
 TORPEDO = vehicle_at("open-water", torpedo())
 START = (0.0, 0.0, -8.0)
@@ -74,6 +83,67 @@ def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
     assert source.frame(6.0).values[0] == pytest.approx(0.196, abs=1e-3)
     np.testing.assert_allclose(asked[-1], [0.2, 0.0, 2e-4, 0.0])
     assert np.array(states)[:, 0].max() == pytest.approx(0.196, abs=1e-3)  # less its play
+
+
+@pytest.mark.slow
+def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
+    """`finssim run` by line of sight, autopilot, wire and fins: within half a metre of a way that turns and dives."""
+    file, way, truth = torpedo_file(tmp_path), tmp_path / "way.csv", tmp_path / "truth"
+    way.write_text("t,x,y,z\n0,0,0,-8\n20,30,0,-8\n40,55,15,-10\n", encoding="utf-8")
+    words = [
+        "run",
+        "--vehicle",
+        file,
+        "--site",
+        "open-water",
+        "--pool-file",
+        "none",
+        "--let-in",
+        "0,0",
+        "--lockstep",
+    ]
+    words += [
+        "--policy",
+        "line-of-sight",
+        "--task",
+        "path",
+        "--trajectory",
+        way,
+        "--duration",
+        30,
+        "--arm",
+        "--json",
+    ]
+    with lockstep_pool(load_vehicle(file), None, site="open-water", position=START, truth=truth) as wiring:
+        status = boundary.run(app, [*map(str, words), "--robot", wiring.robot])
+    report = json.loads(capsys.readouterr().out)
+    assert status == 0 and report["state"] == "armed" and report["faults"] == []
+    path, leg = Waypoints.along(load_trajectory(way)), np.zeros(1, dtype=int)
+    true, worst = read_truth(truth), 0.0
+    for x in true.position[true.time > 8.0]:
+        errors, leg, _ = path.errors(leg, x)
+        worst = max(worst, abs(errors.across[0]), abs(errors.above[0]))
+    assert true.position[-1, 0] > 40.0 and worst < 0.5
+
+
+def test_an_agent_of_all_channels_commands_them():
+    """Mode `surfaces`: parts of the limits of propeller, fins, engine and mass."""
+
+    class Agent:
+        name, period, action, wrench_scale = "agent", 0.1, "surfaces", 1.0
+
+        def reset(self, n):
+            return None
+
+        def act(self, memory, reading, goal):
+            return np.array([[0.5, 1.0, -1.0, 0.1, 0.0]]), memory
+
+    pilot = AgentPilot(Agent(), TORPEDO)
+    reading = Reading(0.0, np.array(START), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), True)
+    channels = pilot.act(reading, AHEAD, 0.0)
+    np.testing.assert_allclose(
+        channels, [0.5 * TORPEDO.force_limits[1][0], 0.35, -0.35, 1e-4, 0.0], rtol=1e-5
+    )
 
 
 @pytest.mark.slow

@@ -564,21 +564,47 @@ class CoursePilot:
             pitch: Wanted pitch, positive with the bow down [rad], (n,); with a depth, slope of the way.
         """
         q, nu = (np.atleast_2d(np.asarray(x, float)) for x in (measured.quaternion, measured.nu))
-        n = len(q)
         ground = quat_rotate(q, nu[:, :3])
         bow = quat_rotate(q, [1.0, 0.0, 0.0])
         known = (ground[:, :2] * bow[:, :2]).sum(axis=1) >= 0.5 * self.model.speeds[0] * np.hypot(
             *bow[:, :2].T
         )
         way = np.where(known[:, None], ground, bow)
-        struct: Any = CourseOrder
-        orders = np.zeros(n, dtype=struct.numpy_dtype())
+        orders = self._orders(len(q))
         orders["speed"], orders["pitch"] = speed, pitch
         orders["turn"] = np.asarray(course) - np.arctan2(way[:, 1], way[:, 0])
         if depth is None:
             orders["by_pitch"] = 1
         else:
             orders["rise"] = -np.asarray(depth, float) - np.atleast_2d(measured.position)[:, 2]
+        return self._carry_out(orders, measured, memory)
+
+    def act(
+        self, memory: Array, measured: Measured, action: npt.ArrayLike, *, by_pitch: bool
+    ) -> tuple[Array, Array]:
+        """Return channels and memory as `command` does, for actions of mode `course` or `course_pitch`.
+
+        Args:
+            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 10).
+            measured: The vehicles' states, with n rows.
+            action: Speed, change of course, and dive, as of `order_of` [-], (n, 3).
+            by_pitch: Whether the third is pitch; else depth.
+        """
+        speed, turn, dive = np.clip(np.atleast_2d(np.asarray(action, float)), -1.0, 1.0).T
+        orders = self._orders(len(speed))
+        low, high = self.model.speeds[0], self.model.speeds[-1]
+        orders["speed"], orders["turn"] = low + 0.5 * (1.0 + speed) * (high - low), WIDEST * turn
+        orders["by_pitch"] = int(by_pitch)
+        orders["pitch" if by_pitch else "rise"] = STEEPEST * dive if by_pitch else -FARTHEST * dive
+        return self._carry_out(orders, measured, memory)
+
+    def _orders(self, n: int) -> Any:
+        struct: Any = CourseOrder
+        return np.zeros(n, dtype=struct.numpy_dtype())
+
+    def _carry_out(self, orders: Any, measured: Measured, memory: Array) -> tuple[Array, Array]:
+        q, nu = (np.atleast_2d(np.asarray(x, float)) for x in (measured.quaternion, measured.nu))
+        n = len(q)
         rows = ((q, wp.quat), (nu, vec6), (memory, Memory))
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=kind, device="cpu") for x, kind in rows]
         given.insert(0, wp.array(orders, dtype=CourseOrder, device="cpu"))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
-from finssim.control.trajectories import Trajectory
+from finssim.control.guidance import Guide
 from finssim.core.rotations import wrap_angle
 
 Array = npt.NDArray[np.float64]
@@ -64,8 +64,8 @@ class Waypoints:
         object.__setattr__(self, "points", points)
 
     @classmethod
-    def along(cls, trajectory: Trajectory, spacing: float = 1.0) -> Waypoints:
-        """Return the path of a trajectory, without its times, as legs of about a `spacing` [m].
+    def along(cls, trajectory: Guide, spacing: float = 1.0) -> Waypoints:
+        """Return the path of a guide with an end, without its times, as legs of about a `spacing` [m].
 
         The radius of acceptance is so small that legs are left at their ends.
         """

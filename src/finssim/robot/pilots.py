@@ -14,8 +14,9 @@ import numpy.typing as npt
 from finssim.agents.controllers import CONTROLLERS
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
+from finssim.control.course import CoursePilot
 from finssim.control.guidance import Goal, Guide, Known, Measured, Track, goal_at
-from finssim.control.modes import action_mode, mode_from_dict
+from finssim.control.modes import MODES, action_mode, mode_from_dict
 from finssim.control.policy import PolicyError, read_description
 from finssim.core.rotations import quat_from_yaw, quat_multiply
 from finssim.robot.pictures import resized
@@ -111,6 +112,12 @@ class AgentPilot:
                 )
         self.agent, self.observer, self.period, self.name = agent, observer, agent.period, agent.name
         self.mode = action_mode(agent.action, vehicle, agent.wrench_scale)
+        self._course = MODES[self.mode.name].course
+        self._steersman: CoursePilot | None = None
+        if self._course:
+            from finssim.sim.free_motion import linear_model
+
+            self._steersman = CoursePilot(linear_model(vehicle), vehicle.name, self.period)
         reach = task.approach * task.fit.size if hasattr(task, "approach") else math.inf
         self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
         """Goals farther away than this are shown so far ahead on the way to them [m]."""
@@ -135,6 +142,7 @@ class AgentPilot:
     def reset(self) -> None:
         """Forget what was seen and done."""
         self._memory = self.agent.reset(1)
+        self._steering = None if self._steersman is None else self._steersman.reset()
         self.observation = self.action = np.zeros(0, np.float32)
         self._random = np.random.default_rng(round(self._input_noise.get("seed", 0)))
         if self.observer is not None:
@@ -155,7 +163,7 @@ class AgentPilot:
         self.reset()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
+        """Wanted thrusts in canonical order [N], (n,), or values of all channels, as of `Pilot`."""
         pictures = {
             name: resized(reading.pictures[name].image, shape)[None]  # type: ignore[attr-defined]
             for name, shape in self.pictures.items()
@@ -181,7 +189,12 @@ class AgentPilot:
         )
         self.took = time.perf_counter() - began
         self.action = np.clip(action[0], -1.0, 1.0)
-        return self.mode.to_thrusters(self.action)
+        if self._steersman is None:
+            return self.mode.to_thrusters(self.action)
+        channels, self._steering = self._steersman.act(
+            self._steering, reading, self.action, by_pitch=self._course == "pitch"
+        )
+        return channels[0]
 
 
 class WrenchPilot:

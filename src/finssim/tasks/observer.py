@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import MODES
+from finssim.control.path_following import Waypoints
 from finssim.control.policy import ObservationSchema
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
 from finssim.physics.types import vec6
@@ -22,6 +23,7 @@ from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.catalogue import task_named
 from finssim.tasks.given import EnvironmentSetupError, crew
+from finssim.tasks.path import WaypointTour
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.trajectory_tracking import fill_table
 from finssim.vehicles import Vehicle
@@ -91,6 +93,8 @@ class Observer:
         mode = action or task.action
         self._action_size = len(MODES[mode].labels(crew(vehicle, task, mode)[0]))
         self._guide: Guide | None = None
+        self._path: Waypoints | None = None
+        self._leg = np.zeros(1, dtype=np.int64)
         self._build(task)
 
     @property
@@ -134,6 +138,10 @@ class Observer:
             self._guide = guide
             self._arrays.action.zero_()
             self._aim(guide)
+            self._follow(guide, np.asarray(reading.position, float))
+        if self._path is not None:
+            _, self._leg, _ = self._path.errors(self._leg, reading.position)
+            self._arrays.path.leg.numpy()[0] = self._leg[0]
         a, now = self._arrays, guide.at(t)
         self._remember(np.zeros(self._action_size) if previous is None else np.asarray(previous, float))
         a.time.numpy()[0] = t
@@ -185,6 +193,24 @@ class Observer:
             self.task = replace(self.task, time_limit=guide.duration)
             self._build(self.task)
         fill_table(self._arrays.reference, [guide])
+
+    def _follow(self, guide: Guide, here: Array) -> None:
+        """Lay the path of a task along that of a guide, from point to point for waypoints, or straight to a station."""
+        if self._arrays.path.points is None:
+            return
+        task: Any = self.task
+        knots = getattr(guide, "knots", None) if isinstance(task, WaypointTour) else None
+        if knots is not None:
+            path = Waypoints(np.asarray(guide.at(knots).position, float))
+        elif math.isfinite(guide.duration):
+            path = Waypoints.along(guide, task.fit.size)
+        else:
+            path = Waypoints(np.stack([here, np.asarray(guide.at(0.0).position, float)]))
+        self._path = path = replace(path, radius=task.fit.size * task.radius)
+        self._leg = path.reset()
+        self.task = replace(task, legs=path.legs)
+        self._build(self.task)
+        self._arrays.path.points.numpy()[0] = path.points
 
     def _put(self, v: int, position: ArrayLike, quaternion: ArrayLike, nu: ArrayLike) -> None:
         """Write the measurements of a vehicle."""
