@@ -14,7 +14,9 @@ from finssim.tasks.observer import Observer
 from finssim.tasks.task import Batch
 from finssim.vehicles import load_vehicle
 
-NUMERIC = numeric_tasks()
+ALONG_A_PATH = ("path", "waypoints", "terrain")
+"""Tasks that a robot does not observe: it is given poses and trajectories, and no path or seabed."""
+NUMERIC = [name for name in numeric_tasks() if name not in ALONG_A_PATH]
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -214,3 +216,11 @@ def test_a_heading_out_of_reach_is_seen_on_the_way_to_it():
     )
     np.testing.assert_allclose(half, edge, atol=1e-6)
     assert not np.allclose(near, edge, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ALONG_A_PATH)
+def test_a_task_along_a_path_is_refused_on_a_robot(name):
+    with pytest.raises(
+        ControlError, match=f"task '{name}' cannot be observed on a robot: it follows legs of a path"
+    ):
+        Observer(name, FINSROV)
