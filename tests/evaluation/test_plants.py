@@ -17,6 +17,8 @@ from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, 
 from finssim.vehicles import VehicleError, load_vehicle
 
 FINSROV = load_vehicle("finsrov")
+OPEN_LOOP = [name for name, kind in MODES.items() if not kind.pilot and not kind.course]
+"""Modes of any vehicle whose commands do not depend on how it moves."""
 
 
 def test_the_plants_of_the_protocol_ship():
@@ -236,7 +238,7 @@ def commanded_and_delivered(mode, plant):
     return simulator.command.thrust.numpy()[:, 0, :n], simulator.numpy("thrust")[:, 0, :n]
 
 
-@pytest.mark.parametrize("mode", [name for name in MODES if not MODES[name].pilot])
+@pytest.mark.parametrize("mode", OPEN_LOOP)
 def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
     """Half the limits: the commands are those of the nominal plant bit for bit, what is delivered is cut."""
     plant = thruster_limits(0.5)
@@ -249,7 +251,7 @@ def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
     np.testing.assert_allclose(delivered, expected, rtol=1e-5, atol=1e-5 * upper.max())
 
 
-@pytest.mark.parametrize("mode", [name for name in MODES if not MODES[name].pilot])
+@pytest.mark.parametrize("mode", OPEN_LOOP)
 def test_what_is_drawn_of_thrusters_does_not_change_what_is_asked(mode):
     """Ranges scale the thrust that comes of a command; nothing they draw is a limit by which actions are scaled."""
     asked, nominal = commanded_and_delivered(mode, load_plant("nominal"))
