@@ -7,6 +7,7 @@ import pytest
 
 from finssim.control import ControlError
 from finssim.control.guidance import Reference, Station, Track
+from finssim.control.path_following import PathGuide
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.core.rotations import quat_from_yaw, quat_rotate, quat_yaw
 from finssim.tasks import Environment, follow, numeric_tasks, task_named
@@ -31,19 +32,6 @@ class Moment:
 
     def at(self, t):
         return self.now
-
-
-class Way:
-    """A guide from point to point, one a second."""
-
-    name = "way"
-
-    def __init__(self, points):
-        self.points, self.knots, self.duration = points, np.arange(len(points)), len(points) - 1.0
-
-    def at(self, t):
-        position = np.stack([np.interp(t, self.knots, self.points[:, i]) for i in range(3)], axis=-1)
-        return Reference(position, np.zeros_like(position), np.zeros(np.shape(t)), np.zeros(np.shape(t)))
 
 
 def track(env, w, v):
@@ -75,7 +63,7 @@ def with_tracks(reading, tracks):
 
 @pytest.mark.parametrize("name", [*NUMERIC, *OWN])
 def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
-    """Random actions, measurement noise, every agent; goals are exact poses on both sides, paths nearly."""
+    """Random actions, measurement noise, every agent; goals are exact poses on both sides."""
     task = task_named(name, time_limit=200.0) if name == "t2" else task_named(name)
     env = Environment(task, worlds=4, seed=3, noise=task.training_noise)
     if name == "t2":
@@ -102,13 +90,11 @@ def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
             if name == "t2":
                 guide = TRAJECTORIES[("circle", "helix", "lemniscate", "lemniscate")[w]]
             if env.arrays.path.points is not None:
-                guide = Way(env.arrays.path.points.numpy()[w].astype(float))
+                guide = PathGuide(env.arrays.path.points.numpy()[w].astype(float))
             for a, observer in enumerate(observers):
                 reading = with_tracks(track(env, w, a), tracks)
                 given = observer.observe(reading, guide, float(np.float32(steps[w]) * np.float32(0.1)))
-                # A path is laid along that of the guide, whose corners are cut by millimetres.
-                tolerance = 5e-3 if env.arrays.path.points is not None else 0.0
-                np.testing.assert_allclose(given, seen[w, a], rtol=0.0, atol=tolerance)
+                np.testing.assert_array_equal(given, seen[w, a])
 
 
 def test_the_prey_of_a_pursuit_without_a_track_is_where_the_guide_is():

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control import ControlError
-from finssim.control.guidance import Guide
+from finssim.control.guidance import Guide, Reference
 from finssim.core.rotations import wrap_angle
 
 Array = npt.NDArray[np.float64]
@@ -113,6 +113,29 @@ class Waypoints:
         across = off[:, 1] * np.cos(course) - off[:, 0] * np.sin(course)
         above = ahead * np.sin(slope) + off[:, 2] * np.cos(slope)
         return PathErrors(course, slope, along, across, above, np.linalg.norm(way, axis=1) - along)
+
+
+@dataclass(frozen=True)
+class PathGuide:
+    """Straight legs from point to point as a guide, each in a second: for those who follow the path without its
+    times."""
+
+    points: Array
+    """World frame [m], (k, 3)."""
+    name: str = "path"
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return float(len(self.points) - 1)
+
+    def at(self, t: npt.ArrayLike) -> Reference:
+        """Return the place at times since the start [s], (...), with the world's x axis for a heading."""
+        time = np.clip(np.asarray(t, float), 0.0, self.duration)
+        k = np.minimum(time.astype(int), len(self.points) - 2)
+        way = self.points[k + 1] - self.points[k]
+        position = self.points[k] + (time - k)[..., None] * way
+        return Reference(position, way, np.zeros(time.shape), time / self.duration)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import action_mode
+from finssim.control.path_following import PathGuide
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_yaw
 from finssim.localization.overhead_camera import Pool
 from finssim.pool.drawn_plant import positioning_of
@@ -319,6 +320,12 @@ class _Goal:
         return Reference(*rows, np.full(shape, yaw), np.zeros(shape))
 
 
+def _goal(referee: Referee) -> Guide:
+    """Return the guide of an episode: its path, or where its goal is."""
+    points = referee.arrays.path.points
+    return _Goal(referee) if points is None else PathGuide(points.numpy()[0].astype(float))
+
+
 class TaskSite(Fleet):
     """One episode of a task in the virtual site, with everybody by place.
 
@@ -373,7 +380,7 @@ class TaskSite(Fleet):
                 f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory, in a pool "
                 "without --task"
             )
-        self.task, goal = referee.task, guide or _Goal(referee)
+        self.task, goal = referee.task, guide or _goal(referee)
         names = self.task.vehicles
         worlds = {
             name: VirtualPool(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.control import ControlError
 from finssim.control.guidance import Guide, Measured, Reference, Track
 from finssim.control.modes import MODES
-from finssim.control.path_following import Waypoints
+from finssim.control.path_following import PathGuide, Waypoints
 from finssim.control.policy import ObservationSchema
 from finssim.core.rotations import quat_from_yaw, quat_inverse_rotate, quat_rotate, quat_yaw
 from finssim.physics.types import vec6
@@ -205,7 +205,9 @@ class Observer:
             return
         task: Any = self.task
         knots = getattr(guide, "knots", None) if isinstance(task, WaypointTour) else None
-        if knots is not None:
+        if isinstance(guide, PathGuide):
+            path = Waypoints(guide.points)
+        elif knots is not None:
             path = Waypoints(np.asarray(guide.at(knots).position, float))
         elif math.isfinite(guide.duration):
             path = Waypoints.along(guide, task.fit.size)
