@@ -3,11 +3,14 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 import finssim as fs
 from finssim.core.registry import ACTUATORS
 from finssim.physics.actuators.fin import DRAG_MAX
+from finssim.physics.terms.composed import composed, parameter_row
+from finssim.physics.types import vec6, vec8
 from finssim.sim import SimulatorError, Water
 from finssim.sim.ranges_file import Ranges
 from finssim.vehicles import VehicleError
@@ -263,6 +266,31 @@ def test_a_gimbal_turns_the_thrust():
     np.testing.assert_allclose(tau, [T * np.cos(d), T * np.sin(d), 0, 0, 0, -0.7 * T * np.sin(d)], atol=2e-3)
 
 
+def test_a_fins_slope_is_twice_its_damping_ahead():
+    """-d tau_i/d nu_i of each axis alone by central differences of the wrench, straight ahead at 2 m/s: half of it."""
+    fin = {**FIN, "drag": [0.02, 0.0, 0.0], "incidence": 0.8}
+    vehicle = hull({"rudder": fin})
+    items = {item: section for item, section in installed(vehicle).items() if item.kind.name == "fin"}
+    ((item, section),) = items.items()
+    function = composed((item,), "yield")
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def sample(x: wp.array3d(dtype=float), out: wp.array(dtype=vec6)):
+        nu = vec6(2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        out[0] = function(x, 0, 0, nu, wp.vec3(0.0, 0.0, 1.0), 5.0, 1025.0, vec8())
+
+    row = np.asarray(parameter_row((item,), item.numbers(section, vehicle)), np.float32)[None, None]
+    out = wp.zeros(1, dtype=vec6, device="cpu")
+    wp.launch(sample, dim=1, inputs=[wp.array(row, dtype=float, device="cpu"), out], device="cpu")
+    found, step = out.numpy()[0], 1e-2
+    for i in range(1, 6):
+        pair = [
+            wrench(vehicle, np.array([2.0, 0, 0, 0, 0, 0]) + sign * step * np.eye(6)[i], [0.0, 0.0])
+            for sign in (1, -1)
+        ]
+        assert found[i] == pytest.approx(-(pair[0] - pair[1])[i] / step, rel=0.02, abs=0.05)
+
+
 # Files
 
 
@@ -286,13 +314,13 @@ def test_a_section_that_cannot_be_is_refused(tmp_path, section, words):
     file = tmp_path / "rov.yaml"
     file.write_text(
         yaml.safe_dump(
-            {"extends": "remus100", "title": "x", "origin": "guessed", "actuators": {"rudder": section}}
+            {"extends": "remus100", "title": "x", "origin": "guessed", "actuators": {"flap": section}}
         ),
         encoding="utf-8",
     )
     with pytest.raises(VehicleError, match=words) as error:
         fs.load_vehicle(file)
-    assert "rudder" in str(error.value)
+    assert "flap" in str(error.value)
 
 
 def test_actuators_are_part_of_the_file_and_of_its_digest():

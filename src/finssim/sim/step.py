@@ -180,6 +180,7 @@ def motion_function(
     hydrodynamic_wrench = HYDRODYNAMICS[model]
     term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
     actuator_wrench, mass_shift = composed(terms, "push"), composed(terms, "shift")
+    actuator_slope = composed(terms, "yield")
     added_mass = model != "simplified"
 
     @wp.func
@@ -290,6 +291,9 @@ def motion_function(
                 if wp.static(term_slope is not None):
                     nu_m = twist_at(nu_r, plant[w, v].r_m)
                     falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density, thrust)
+                    out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
+                if wp.static(actuator_slope is not None):
+                    falls = actuator_slope(extra, w, v, nu_r, up, -position[2], water.density, thrust)
                     out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
         return out
 

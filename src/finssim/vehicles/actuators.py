@@ -83,6 +83,9 @@ class ActuatorKind:
     wrench: Any = None
     """`wp.func` -> vec6: wrench about the body origin, body frame [N, N m], in proportion to the wet part of the
     vehicle; see `finssim.physics.terms` for its arguments, of which nu_r is here that of the body origin."""
+    slope: Any = None
+    """`wp.func` of such arguments -> vec6: how fast the wrench falls with the velocity on each axis of the body origin,
+    0 or more [N s/m, N m s]. A stiff damping needs it, for the integrator takes that much implicitly."""
     shift: Any = None
     """`wp.func` -> vec9: change of the body's first moment of mass [kg m] and of its inertia about the body origin
     [kg m²] (xx, yy, zz, xy, xz, yz), body frame."""

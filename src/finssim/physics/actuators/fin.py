@@ -137,6 +137,45 @@ def fin_wrench(
     return join(force, wp.cross(position, force))
 
 
+@wp.func
+def fin_slope(
+    nu_r: vec6,
+    density: float,
+    position: wp.vec3,
+    span: wp.vec3,
+    chord: wp.vec3,
+    area: float,
+    lift_slope: float,
+    drag: wp.vec3,
+    incidence: float,
+) -> vec6:
+    """Return twice ½ρ A V (incidence C_Lα + d0) along the normal, and that times the square of its lever.
+
+    That is the slope of a fin straight ahead; twice, since a fin couples sway and yaw, each of which takes its part.
+
+    Args:
+        nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s].
+        density: Of the water [kg/m³].
+        position: Centre of pressure, body frame [m].
+        span: Axis of the deflection, body frame [-].
+        chord: Direction of the leading edge at deflection 0, body frame [-].
+        area: A [m²].
+        lift_slope: C_Lα [1/rad].
+        drag: Coefficients of C_D over |α|, [-], [1/rad] and [1/rad²].
+        incidence: Part of the flow's angle that counts [-].
+
+    Returns:
+        Slope of the wrench on each axis, body frame [N s/m, N m s/rad].
+    """
+    normal = wp.cross(span, chord)
+    velocity = linear(nu_r) + wp.cross(angular(nu_r), position)
+    u = wp.dot(velocity, chord)
+    w = wp.dot(velocity, normal)
+    size = density * area * wp.sqrt(u * u + w * w) * (incidence * lift_slope + drag[0])
+    lever = wp.cross(position, normal)
+    return size * join(wp.cw_mul(normal, normal), wp.cw_mul(lever, lever))
+
+
 def _numbers(fin: Any, vehicle: Any) -> dict[str, Any]:
     wake = np.zeros(MAX_THRUSTERS)
     for name, part in fin.wake.items():
@@ -162,5 +201,6 @@ FIN = ActuatorKind(
         "wake": "1/m²",
     },
     wrench=fin_wrench,
+    slope=fin_slope,
     numbers=_numbers,
 )

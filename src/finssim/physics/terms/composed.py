@@ -39,8 +39,8 @@ STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density":
 """Arguments that a term's functions may take besides its parameters."""
 VALUE: dict[str, Any] = {**STATE, "value": float}
 """The same of an actuator's functions."""
-ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "shift": vec9}
-"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push` and `shift`."""
+ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "yield": vec6, "shift": vec9}
+"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push`, `yield` (slope) and `shift`."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "vec8": vec8, "mat66": mat66}
 """Types of a parameter."""
 PIECE = 8
@@ -143,7 +143,7 @@ def _require_zero(item: Item, role: str) -> None:
 
 def _functions(item: Item) -> dict[str, Any]:
     if isinstance(item, InstalledActuator):
-        functions = {"push": item.kind.wrench, "shift": item.kind.shift}
+        functions = {"push": item.kind.wrench, "yield": item.kind.slope, "shift": item.kind.shift}
     else:
         functions = {"wrench": item.wrench, "slope": item.slope}
     return {role: function for role, function in functions.items() if function is not None}
