@@ -5,7 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from finssim.core.registry import TERMS
 from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles.loader import checked
 
 load = cache(load_vehicle)
 PAIRS = [(name, model) for name in catalogue() for model in sorted(load(name).hydrodynamics)]
@@ -41,8 +43,30 @@ def disturb(simulator, tau):
     simulator.command.disturbance.assign(np.ascontiguousarray(tau))
 
 
+def plain(vehicle):
+    """The hull by its matrices alone: without fins and other actuators, terms but `surge_damping`, and inflow."""
+    values = vehicle.values()
+    further = [key for chosen in values["hydrodynamics"].values() for key in chosen if key in TERMS]
+    if "actuators" not in values and set(further) <= {"surge_damping"}:
+        return vehicle
+    values.pop("actuators", None)
+    for thruster in values["thrusters"].values():
+        thruster.pop("inflow", None)
+    for chosen in values["hydrodynamics"].values():
+        for key in set(TERMS) & set(chosen) - {"surge_damping"}:
+            del chosen[key]
+    return checked(values, dict(vehicle.provenance), vehicle.name, vehicle.path, vehicle.name)
+
+
+def damped(vehicle, model):
+    """Whether the matrices of linear and quadratic damping resist motion along every axis."""
+    chosen = vehicle.hydrodynamics[model]
+    return bool((np.diag(chosen.linear_damping) + np.diag(chosen.quadratic_damping) > 0.0).all())
+
+
 def undamped(vehicle, model):
-    """The vehicle without any damping."""
+    """The vehicle without any damping, and without fins."""
+    vehicle = plain(vehicle)
     chosen = vehicle.hydrodynamics[model]
     names = [x for x in ("linear_damping", "quadratic_damping", "surge_damping") if hasattr(chosen, x)]
     changes = {f"hydrodynamics.{model}.{x}": np.zeros((6, 6)).tolist() for x in names}

@@ -9,7 +9,7 @@ import pytest
 
 from finssim.physics.types import vec8
 from finssim.sim import Simulator, Water, Wave
-from reference.cases import EVERY_VEHICLE_AND_MODEL, disturb, load, random_states, weightless
+from reference.cases import EVERY_VEHICLE_AND_MODEL, disturb, load, plain, random_states, weightless
 from reference.motion import acceleration, coriolis_size, numbers
 
 
@@ -62,7 +62,7 @@ def test_accelerations_agree_with_the_reference(name, model, moving):
     10⁴ states of FinsROV, 10³ of a mesh and of other vehicles. The unit is eps times the magnitudes of what is summed,
     through |M⁻¹| |M| |M⁻¹|: a dozen roundings of a matrix product, a few more where faces are cut.
     """
-    vehicle = load(name)
+    vehicle = plain(load(name))
     n = 10_000 if name == "finsrov" and model != "mesh" else 1_000
     rng = np.random.default_rng(5)
     length = max(vehicle.body.size)
@@ -101,7 +101,7 @@ def test_accelerations_agree_with_dart(name, model):
 
     DART knows no water: buoyancy equals weight at one point and there is no damping, so that only inertia is left.
     """
-    vehicle = load(name)
+    vehicle = plain(load(name))
     n = 200
     rng = np.random.default_rng(6)
     position, q, nu = random_states(rng, n, depth=(-50.0, -40.0))

@@ -25,7 +25,7 @@ def models():
 
 
 def test_the_columns_of_fins_and_the_trim_in_closed_form(models):
-    """Lift ½ ρ A C_L U² per radian at its lever, and a thrust of the drag of hull and fins."""
+    """Lift ½ ρ A C_L U² per radian at its lever, and a thrust c ω² that in the inflow is the drag of hull and fins."""
     model, U = models["cruciform"], course_speeds(CRUCIFORM)
     wrench = model.inertia @ model.B[:, :6]
     pressure = 0.5 * 1030.0 * 0.00665 * U**2
@@ -38,7 +38,10 @@ def test_the_columns_of_fins_and_the_trim_in_closed_form(models):
     assert (wrench[:, 5, rudder] < 0.0).all(), (
         "a positive deflection of a stern rudder turns the bow to starboard"
     )
-    assert model.trim[:, 0] == pytest.approx(6.109 * U**2 + 4 * 0.01 * pressure, rel=1e-3)
+    drag, propeller = 6.109 * U**2 + 4 * 0.01 * pressure, CRUCIFORM.thrusters["propeller"]
+    loss = propeller.inflow.thrust_loss * (1.0 - propeller.inflow.wake_fraction) * U
+    omega = (loss + np.sqrt(loss**2 + 4.0 * propeller.c_plus * drag)) / (2.0 * propeller.c_plus)
+    assert model.trim[:, 0] == pytest.approx(propeller.c_plus * omega**2, rel=1e-3)
     assert model.lag.tolist() == [1.0, 0.1, 0.1, 0.1, 0.1]
 
 
@@ -132,7 +135,7 @@ def test_integrals_rest_while_the_channels_cannot_follow(models):
     at = Known(None, np.array([0, 0, -9.0]), np.array([0, 0, 0, 1.0]), np.array([0.9, 0, 0, 0, 0, 0]))
     after = pilot.command(pilot.reset(), at, speed=2.4, course=0.01, depth=9.0)[1][0]
     assert after[0] == 0.0 and after[1] == pytest.approx(-0.01 * PERIOD, rel=1e-3)
-    after = pilot.command(pilot.reset(), at, speed=0.95, course=2.0, depth=90.0)[1][0]
+    after = pilot.command(pilot.reset(), at, speed=0.95, course=2.0, depth=2.0)[1][0]
     assert after[0] == pytest.approx(-0.05 * PERIOD, rel=1e-3) and after[1] == after[2] == 0.0
 
 

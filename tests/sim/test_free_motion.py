@@ -16,10 +16,16 @@ from vehicles.minnow import MINNOW
 
 
 def course_matrix(vehicle, u):
-    """A of (sway, yaw rate) at surge u of a vehicle with centre of gravity over the origin (Fossen 2021, eq. 6.104)."""
+    """A of (sway, yaw rate) at surge u of a vehicle with centre of gravity over the origin (Fossen 2021, eq. 6.104).
+
+    Its rudder stands still in the flow: its lift is in proportion to v + x r.
+    """
     chosen, m = vehicle.hydrodynamics["calibrated"], vehicle.body.mass
     A, Du, both = chosen.added_mass, chosen.surge_damping, np.ix_([1, 5], [1, 5])
-    N = u * (Du[both] + [[0.0, m + A[0, 0]], [A[1, 1] - A[0, 0], A[1, 5]]])
+    rudder, a = vehicle.actuators["rudder"], A.diagonal()[:2] - chosen.munk_relief[:2]
+    lift, x = 0.5 * vehicle.water.density * rudder.area * rudder.lift_slope, rudder.position[0]
+    fin = lift * np.array([[1.0, x], [x, x * x]])
+    N = u * (Du[both] + fin + [[0.0, m + a[0]], [a[1] - a[0], A[1, 5]]])
     return -np.linalg.solve(vehicle.mass_matrix()[both], N)
 
 
@@ -68,7 +74,7 @@ def test_an_eigenvalue_in_words():
 def test_show_says_what_a_vehicle_does_without_control(capsys):
     assert boundary.run(app, ["vehicles", "show", "remus100"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "Without control" in text and "unstable above" in text and "grows e-fold in 0.575 s" in text
+    assert "Without control" in text and "unstable above" in text and "grows e-fold in 0.584 s" in text
     assert boundary.run(app, ["vehicles", "show", "finsrov", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["without_control"]
     assert told["roll"][2] is None and 0.1 < told["course"][2] < 0.3

@@ -27,6 +27,11 @@ def returned(folder, vehicle, kind):
     return read_foreign(folder / f"rov.{kind}").vehicle(folder)
 
 
+def unreactive(vehicle):
+    """The vehicle without reaction torque, which gz-sim's plugin does not have."""
+    return vehicle.replace({"thrusters.*.torque_constant": 0.0})
+
+
 @pytest.mark.parametrize("kind", ["sdf", "urdf"])
 @pytest.mark.parametrize("name", COEFFICIENTS)
 def test_what_is_held_comes_back(tmp_path, name, kind):
@@ -41,7 +46,7 @@ def test_what_is_held_comes_back(tmp_path, name, kind):
         "displaced_volume": (found.body.displaced_volume, vehicle.body.displaced_volume),
         "center_of_buoyancy": (found.body.center_of_buoyancy, vehicle.body.center_of_buoyancy - point),
         "density": (found.water.density, vehicle.water.density),
-        "thrusters": (found.thruster_matrix(), vehicle.thruster_matrix(point)),
+        "thrusters": (found.thruster_matrix(), unreactive(vehicle).thruster_matrix(point)),
         "limits": (np.array(found.force_limits), np.array(vehicle.force_limits)),
         "added_mass": (read.added_mass, given.added_mass),
         "linear_damping": (read.linear_damping, given.linear_damping),

@@ -55,12 +55,12 @@ def test_kinetic_energy_does_not_depend_on_the_point_it_is_reckoned_from(name):
 
 @EVERY
 def test_power_of_the_thrusters_equals_power_of_their_wrench(name):
-    """sum f_i a_i · v_i = nu · B f, v_i the velocity of each propeller."""
+    """sum f_i (a_i · v_i + q_i a_i · omega) = nu · B f, v_i the velocity of each propeller, q_i its reaction."""
     vehicle = load_vehicle(name)
     generator = np.random.default_rng(2)
     nu, f = generator.standard_normal(6), generator.standard_normal(len(vehicle.thrusters))
     power = sum(
-        force * thruster.axis @ (nu[:3] + np.cross(nu[3:], thruster.position))
+        force * thruster.axis @ (nu[:3] + np.cross(nu[3:], thruster.position) + thruster.reaction * nu[3:])
         for force, thruster in zip(f, vehicle.thrusters.values(), strict=True)
     )
     assert nu @ vehicle.thruster_matrix() @ f == pytest.approx(power, rel=1e-9, abs=1e-12)

@@ -82,6 +82,6 @@ def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel
     return AxisModel(
         inertia=np.diag(moved_to_origin(vehicle.mass_matrix(hydrodynamics), -reference)),
         linear_damping=np.diag(moved_to_origin(np.asarray(chosen.linear_damping), arm)),
-        quadratic_damping=np.diag(np.asarray(chosen.quadratic_damping)),
+        quadratic_damping=chosen.axis_drag,
         stiffness=np.array([0.0, 0.0, 0.0, tilt_stiffness, tilt_stiffness, 0.0]),
     )

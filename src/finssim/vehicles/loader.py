@@ -56,7 +56,8 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
         return name_or_path
     path, label = _locate(name_or_path)
     values, origins = _with_parents(path, label, ())
-    values, origins = _expand_groups(values, origins, label)
+    for noun in ("thruster", "actuator"):
+        values, origins = _expand_groups(values, origins, label, noun)
     vehicle = _with_payloads(checked(values, origins, path.stem, path, label), label)
     if vehicle.hull is not None and vehicle.hull.file is not None:
         try:
@@ -265,34 +266,35 @@ def _forget(path: tuple[str, ...], origins: Origins) -> None:
         del origins[key]
 
 
-def _expand_groups(values: Tree, origins: Origins, label: str) -> tuple[Tree, Origins]:
-    """Give every thruster the numbers of its group; its own come first."""
-    groups = values.pop("thruster_groups", {})
-    thrusters = values.get("thrusters")
+def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tuple[Tree, Origins]:
+    """Give every thruster or actuator, which `noun` says, the numbers of its group; its own come first.
+
+    A thruster keeps the name of its group, by which fits change it.
+    """
+    groups = values.pop(f"{noun}_groups", {})
+    members = values.get(f"{noun}s")
     for group, numbers in groups.items() if isinstance(groups, dict) else [("", groups)]:
         if not isinstance(numbers, dict):
-            raise VehicleError(
-                f"{label}: thruster_groups: {group} is {numbers!r}, expected a section of keys"
-            )
-    if not isinstance(thrusters, dict):
+            raise VehicleError(f"{label}: {noun}_groups: {group} is {numbers!r}, expected a section of keys")
+    if not isinstance(members, dict):
         return values, origins
-    for name, thruster in thrusters.items():
-        if not isinstance(thruster, dict) or "group" not in thruster:
+    for name, member in members.items():
+        if not isinstance(member, dict) or "group" not in member:
             continue
-        group = str(thruster["group"])
+        group = str(member["group"])
         if group not in groups:
             raise VehicleError(
-                f"{label}: thrusters.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
-                f"expected one of {', '.join(groups) or 'thruster_groups, which the file does not give'}"
+                f"{label}: {noun}s.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
+                f"expected one of {', '.join(groups) or f'{noun}_groups, which the file does not give'}"
             )
         for key in groups[group]:
-            if key not in thruster:
-                for source in [o for o in origins if (o + ".").startswith(f"thruster_groups.{group}.{key}.")]:
-                    origins[source.replace(f"thruster_groups.{group}", f"thrusters.{name}", 1)] = origins[
-                        source
-                    ]
-        thrusters[name] = {**groups[group], **thruster}
-    return values, {key: value for key, value in origins.items() if not key.startswith("thruster_groups.")}
+            if key not in member:
+                for source in [o for o in origins if (o + ".").startswith(f"{noun}_groups.{group}.{key}.")]:
+                    origins[source.replace(f"{noun}_groups.{group}", f"{noun}s.{name}", 1)] = origins[source]
+        members[name] = {**groups[group], **member}
+        if noun == "actuator":
+            del members[name]["group"]
+    return values, {key: value for key, value in origins.items() if not key.startswith(f"{noun}_groups.")}
 
 
 def checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
