@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.core.rotations import quat_inverse_rotate, quat_to_euler
+from finssim.core.rotations import quat_from_rotvec, quat_inverse_rotate, quat_multiply, quat_to_euler
 from finssim.trials.conversion import merged
-from finssim.trials.motion import holds_gravity, motion
+from finssim.trials.motion import gyroscope_bias, holds_gravity, motion
 from finssim.trials.trial import Header, Trial, TrialWater
 from finssim.vehicles import load_vehicle
 from identification.moving_body import MovingBody
@@ -223,3 +223,22 @@ def test_phases_and_the_wrench_ride_along():
     ]  # fmt: skip
     np.testing.assert_allclose(m.tau[10], [0.0, 0.0, 2.0, 0.0, -1.0, 0.0])
     assert m.valid[m.t < 7.9].all() and not m.valid[m.t > 8.1].any()
+
+
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.005, -0.003, 0.008)])
+def test_the_bias_of_a_gyroscope_is_its_difference_from_the_attitude(bias):
+    """To 0.3 mrad/s beside noise of both; 0 where noise explains the difference, and without a measured attitude."""
+    rng, t = np.random.default_rng(3), np.arange(3000) * 0.02
+    body = MovingBody(4)
+    columns = body.columns(t, "rates", "quaternion")
+    for name, b in zip("pqr", bias, strict=True):
+        columns[name] = columns[name] + b + 0.002 * rng.standard_normal(len(t))
+    noisy = quat_multiply(
+        np.column_stack([columns[f"q{c}"] for c in "xyzw"]),
+        quat_from_rotvec(0.003 * rng.standard_normal((len(t), 3))),
+    )
+    columns |= {f"q{c}": noisy[:, i] for i, c in enumerate("xyzw")}
+    found = gyroscope_bias(motion(trial(columns, t), VEHICLE))
+    np.testing.assert_allclose(found, bias, atol=3e-4)
+    rates = {name: columns[name] for name in "pqr"}
+    assert not gyroscope_bias(motion(trial(rates, t), VEHICLE)).any()

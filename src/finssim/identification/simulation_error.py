@@ -50,7 +50,7 @@ from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.inputs import require_axes, require_fittable
-from finssim.trials.motion import Motion
+from finssim.trials.motion import Motion, gyroscope_bias
 from finssim.trials.trial import COLUMNS, Trial
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 from finssim.vehicles.actuators import installed
@@ -1266,17 +1266,19 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: boo
     Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
     wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift. An
     axis whose motion does not stand out of its noise is simulated instead, for the noise would shake the others; but
-    not in a free motion, where nothing drives it.
+    not in a free motion, where nothing drives it. Rates move it without the bias of the gyroscope: what they add up to
+    is an attitude.
     """
     held = np.full((segment.steps + 1, 6), np.nan)
     t = segment.t0 + segment.step * np.arange(segment.steps + 1)
     drop = {column for column, rate in DRIFTING.items() if rate in segment.measured}
     inside = (motion.t >= t[0] - 0.1) & (motion.t <= t[-1] + 0.1)
+    bias = np.concatenate([np.zeros(3), gyroscope_bias(motion)])
     for i, axis in enumerate(AXES):
         good = inside & np.isfinite(motion.nu[:, i])
         if axis not in axes and good.sum() >= max(2.0, SEEN * inside.sum()):
             if free or axis in SWINGING or answers(motion, i):
-                held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i])
+                held[:, i] = np.interp(t, motion.t[good], motion.nu[good, i]) - bias[i]
             drop |= {DETERMINED_BY[axis][0]}
     if not np.isnan(held[:, 3:5]).any():
         drop |= {"roll", "pitch"}

@@ -30,8 +30,8 @@ from finssim.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import Vehicle
 
 __all__ = [
-    "AttitudeSignal", "Motion", "Offset", "attitude_samples", "attitude_signal", "holds_gravity", "motion",
-    "offset", "on_grid", "phase_at", "up_in_body",
+    "attitude_samples", "attitude_signal", "AttitudeSignal", "gyroscope_bias", "holds_gravity", "motion", "Motion",
+    "offset", "Offset", "on_grid", "phase_at", "up_in_body",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -366,6 +366,31 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
         valid=_valid(tau, found["nu"]),
         **found,
     )
+
+
+BLOCK, BLOCKS, CLEAR = 1.0, 10, 3.0
+"""Stretch over which a rate and that of the attitude are compared [s], least number of stretches, and standard errors
+from which on their mean difference counts."""
+
+
+def gyroscope_bias(motion: Motion) -> Array:
+    """Mean difference between the angular velocity and that of the measured attitude [rad/s], (3,).
+
+    It is 0 where too little attitude is known, or where noise explains the difference.
+    """
+    q, rates = motion.quaternion, motion.nu[:, 3:]
+    turn = quat_multiply(quat_conjugate(q[:-1]), q[1:])
+    measured = 2.0 * motion.rate * np.sign(turn[:, 3:]) * turn[:, :3]
+    gap = 0.5 * (rates[:-1] + rates[1:]) - measured
+    n = max(1, round(BLOCK * motion.rate))
+    means = gap[: len(gap) // n * n].reshape(-1, n, 3).mean(axis=1)
+    bias = np.zeros(3)
+    for k in range(3):
+        known = means[np.isfinite(means[:, k]), k]
+        if len(known) >= BLOCKS:
+            error = float(known.std(ddof=1)) / np.sqrt(len(known))
+            bias[k] = known.mean() if abs(known.mean()) > CLEAR * error else 0.0
+    return bias
 
 
 def grid_rate(trial: Trial, inputs: InputForces) -> float:
