@@ -43,14 +43,17 @@ class Rig:
 
     def __init__(self, vehicle, **changes):
         self.bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **changes))
-        self.n = len(vehicle.thrusters)
+        self.n, self.values = len(vehicle.thrusters), (0.0,) * len(vehicle.actuators)
         self.now, self.count = 100.0, 5000
         self.frame = None
 
     def step(self, command=None, *, telemetry_=telemetry, reading_=reading, source="pid"):
         """One turn of the loop; returns the frame that is sent."""
         self.now, self.count = self.now + DT, self.count + 1
-        if telemetry_ is not None:
+        if telemetry_ is telemetry:
+            message = telemetry(self.count, self.bridge.motors.outputs, actuators=self.values)
+            self.bridge.telemetry(self.now, message)
+        elif telemetry_ is not None:
             self.bridge.telemetry(self.now, telemetry_(self.count, self.bridge.motors.outputs))
         if reading_ is not None:
             self.bridge.reading(self.now, reading_(self.now))

@@ -33,11 +33,7 @@ def torpedo(**actuators: dict) -> Vehicle:
 
 def torpedo_file(folder: Path) -> Path:
     """Write the torpedo as a vehicle file into a folder; return its path."""
-    values = torpedo().values()
-    parts = {name: values[name] for name in ("thrusters", "actuators")}
-    about = {"extends": "remus100", "title": "torpedo", "origin": "guessed"}
     file = folder / "torpedo.yaml"
-    file.write_text(
-        yaml.safe_dump(json.loads(json.dumps({**about, **parts})), sort_keys=False), encoding="utf-8"
-    )
+    values = {**torpedo().values(), "origin": "guessed"}
+    file.write_text(yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False), encoding="utf-8")
     return file

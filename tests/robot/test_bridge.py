@@ -419,7 +419,7 @@ def test_fins_go_to_zero_and_an_engine_stays_when_the_bridge_is_not_armed(end):
 def test_a_controller_of_version_1_is_refused_where_there_are_other_actuators():
     """One sentence names the actuators; a vehicle of thrusters alone arms as ever."""
     rig = Rig(TORPEDO)
-    rig.run(0.2)
+    rig.run(0.2, telemetry_=lambda k, n: telemetry(k, n))
     reason = rig.bridge.arm(rig.now, "pid")
     assert reason == (
         "the motor controller uses version 1 of the protocol, which has thrusters alone: rudder, elevator, engine, "
