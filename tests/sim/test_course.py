@@ -118,7 +118,7 @@ def test_rows_of_a_batch_are_those_of_one_robot(models):
     seen = Known(
         None, rng.normal(size=(6, 3)) - [0, 0, 9], q, rng.normal(size=(6, 6)) * 0.2 + [1.5, 0, 0, 0, 0, 0]
     )
-    memory = rng.normal(size=(6, 10)) * 0.1
+    memory = rng.normal(size=(6, 11)) * 0.1
     orders = {"speed": rng.uniform(1, 2, 6), "course": rng.uniform(-3, 3, 6), "depth": rng.uniform(5, 12, 6)}
     channels, after = pilot.command(memory, seen, **orders)
     assert np.ptp(channels, axis=0).min() > 0.01

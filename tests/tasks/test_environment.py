@@ -172,7 +172,7 @@ def test_an_order_is_carried_out_as_by_the_autopilot_of_one_robot(name, dive):
         }
         channels, memory = pilot.command(memory, Known(None, x, q, nu), **order)
         np.testing.assert_allclose(env.simulator.command.thrust.numpy()[:, 0], channels, atol=2e-3)
-    assert env.arrays.steering.numpy()[:, 0, 8] == pytest.approx(memory[:, 8], abs=1e-3)
+    assert env.arrays.steering.numpy()[:, 0, 9] == pytest.approx(memory[:, 9], abs=1e-3)
     env.reset()
     np.testing.assert_array_equal(env.arrays.steering.numpy()[:, 0], pilot.reset(6))
 

@@ -12,9 +12,9 @@ bounded allocation of `finssim.control.allocation` then gives the channels neare
 the fins and the limits of thrust, for a cruciform tail, an X tail or any other. Between the speeds of the model
 everything is interpolated. An integral rests while the channels cannot follow it.
 
-In a current the course over ground differs from the heading. An observer with the model's sway through the water takes
-what is left of the measured one for the current, constant in the world. Fed back is the sway through the water, and the
-heading, whose wanted value makes good the current for the wanted course.
+A current moves the vehicle over the ground, not through the water. Sway and heave through the water, which are fed
+back, are therefore the model's own, driven by the measured rates and the commands. What they leave of the measured sway
+is taken for the current, constant in the world; the wanted heading makes it good for the wanted course over ground.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator,index"
 
@@ -44,8 +44,8 @@ SCALES = {
     0: 0.3,
     6: math.radians(30.0),
     7: math.radians(20.0),
-    8: math.radians(25.0),
-    9: 1.5,
+    8: math.radians(15.0),
+    9: 1.0,
 }
 """State -> its error whose cost equals that of a whole limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
 INTEGRAL_TIME = 6.0
@@ -54,12 +54,12 @@ STEEPEST = math.radians(25.0)
 """Greatest pitch that is asked for [rad]."""
 WIDEST = math.radians(60.0)
 """Greatest error of the heading that is acted on [rad]."""
-CURRENT_TIME, SWAY_TIME = 3.0, 1.0
-"""Time constants with which the observer follows the current, and the sway through the water [s]."""
+CURRENT_TIME = 3.0
+"""Time constant with which the current is followed [s]."""
 TURNING = 0.15
-"""Yaw rate at which it follows the current half as fast, for the model of a turn is not exact [rad/s]."""
+"""Yaw rate at which it is followed half as fast, since the model of a turn is not exact [rad/s]."""
 LEAST_DAMPING = 0.3
-"""Rate at which the observer's sway dies out at least [1/s]; cross-flow drag is not in a linear model."""
+"""Rate at which the model's sway and heave die out at least [1/s]; cross-flow drag is not in a linear model."""
 MOST_CRAB = math.radians(45.0)
 """Greatest angle between heading and course that makes good a current [rad]."""
 INDEPENDENT = 0.2
@@ -79,7 +79,7 @@ FARTHEST = 5.0
 """Change of depth that an action of 1 asks for [m]."""
 
 STATES = 13
-Memory = wp.types.vector(length=10, dtype=float)
+Memory = wp.types.vector(length=11, dtype=float)
 Row = wp.types.vector(length=STATES + len(AXES), dtype=float)
 Wrench4 = wp.types.vector(length=len(AXES), dtype=float)
 
@@ -98,6 +98,8 @@ class LinearModel(NamedTuple):
     """Acceleration per unit of a channel [m/s² or rad/s²], (n, 8, c)."""
     trim: Array
     """Channels that hold the speed [N], (n, c); those other than thrusts are 0."""
+    rest: Array
+    """Acceleration that the trim leaves, such as by buoyancy [m/s², rad/s²], (n, 6)."""
     inertia: Array
     """Mass matrix with the added mass, about the body origin [kg, kg m, kg m²], (6, 6)."""
     lower: Array
@@ -123,8 +125,10 @@ class CourseData:
     """Step between speeds [m/s]."""
     gains: wp.array3d(dtype=Row)
     """Feedback of the state and of the wrench on its way, by axis: for depth, then for pitch, (vehicles, 2 n, 4)."""
-    sway: wp.array2d(dtype=Row)
-    """Acceleration of sway by the state and the wrench on its way [m/s² per their units], (vehicles, n)."""
+    slip: wp.array3d(dtype=Row)
+    """Acceleration of sway and heave by state and wrench on its way [m/s² per their units], (vehicles, n, 2)."""
+    rest: wp.array2d(dtype=wp.vec2)
+    """Acceleration of sway and heave that the trim leaves [m/s²], (vehicles, n)."""
     reach: wp.array2d(dtype=Wrench4)
     """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
     slack: wp.array2d(dtype=Wrench4)
@@ -164,7 +168,7 @@ class CourseAnswer:
     """Commands, in the units of the channels."""
     memory: Memory
     """Integrals of speed [m], of course [rad s], and of depth [m s] or pitch [rad s]; the wrench on its way [N, N m];
-    sway through the water [m/s], and the current, world x and y [m/s]."""
+    sway and heave through the water [m/s]; and the current, world x and y [m/s]."""
 
 
 @wp.func
@@ -177,7 +181,7 @@ def between(low: Any, high: Any, share: float):
 def nothing_known() -> Memory:
     """Return the memory at the start [m, rad s, N, N m, m/s]: no current is known."""
     memory = Memory()
-    memory[8] = wp.nan
+    memory[9] = wp.nan
     return memory
 
 
@@ -203,8 +207,8 @@ def steer(
     left = wp.vec2(-ahead[1], ahead[0])
     ground = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
     way = wp.vec2(ground[0], ground[1])
-    current = wp.vec2(memory[8], memory[9])
-    if wp.isnan(memory[8]):
+    current = wp.vec2(memory[9], memory[10])
+    if wp.isnan(memory[9]):
         across = wp.dot(way, left)
         current = wp.vec2(across * left[0], across * left[1])
     surge = nu[0] - wp.dot(current, ahead)
@@ -228,7 +232,8 @@ def steer(
     x = Row()
     for i in range(1, 6):
         x[i] = nu[i]
-    x[1] = nu[1] - wp.dot(current, left)
+    x[1] = memory[7]
+    x[2] = memory[8]
     x[0] = wp.clamp(nu[0] - order.speed, -reach[0], reach[0])
     x[6] = wp.atan2(up[1], up[2])
     x[7] = wp.clamp(wp.asin(wp.clamp(-up[0], -1.0, 1.0)) - order.pitch, -reach[1], reach[1])
@@ -268,14 +273,15 @@ def steer(
             after[i] = memory[i] + data.period * errors[i]
     for i in range(4):
         after[3 + i] = between(memory[3 + i], achieved[i], data.share[vehicle][i])
-    x[1] = memory[7]
     more = wp.dot(way, left) - memory[7] - wp.dot(current, left)
-    after[7] += data.period * wp.dot(between(data.sway[vehicle, k], data.sway[vehicle, k + 1], s), x)
-    after[7] += data.period / wp.static(SWAY_TIME) * more
+    rest = between(data.rest[vehicle, k], data.rest[vehicle, k + 1], s)
+    for i in range(2):
+        slip = wp.dot(between(data.slip[vehicle, k, i], data.slip[vehicle, k + 1, i], s), x)
+        after[7 + i] += data.period * (slip + rest[i])
     turning = nu[5] / wp.static(TURNING)
     current += data.period / wp.static(CURRENT_TIME) / (1.0 + turning * turning) * more * left
-    after[8] = current[0]
-    after[9] = current[1]
+    after[9] = current[0]
+    after[10] = current[1]
     answer.memory = after
     return answer
 
@@ -352,8 +358,8 @@ class Tuning(NamedTuple):
 
     gains: Array
     """Feedback of the state [N or N m per its unit], for depth and then for pitch, (2 n, 4, 17)."""
-    sway: Array
-    """Acceleration of sway by the state and the wrench on its way [m/s² per their units], (n, 17)."""
+    slip: Array
+    """Acceleration of sway and heave by the state and the wrench on its way [m/s² per their units], (n, 2, 17)."""
     reach: Array
     """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (2 n, 4)."""
     columns: Array
@@ -399,14 +405,14 @@ def tuned(model: LinearModel, name: str) -> Tuning:
         for by_pitch in (False, True)
         for i in range(n)
     ]
-    gains, sway = (np.stack(part) for part in zip(*rows, strict=True))
+    gains, slip = (np.stack(part) for part in zip(*rows, strict=True))
     reach = np.full((2 * n, 4), np.inf)
     reach[:, 0] = 2.0 * SCALES[0]
     turning, diving = (CAUTION * np.tile(limits[:, axis], 2) for axis in (3, 2))
     reach[:, 2] = np.minimum(WIDEST, turning / np.abs(gains[:, 3, 8]))
     reach[:, 1] = np.minimum(STEEPEST, diving / np.abs(gains[:, 2, 7]))
     reach[:n, 3] = (reach[:, 1] * np.abs(gains[:, 2, 7]))[:n] / np.abs(gains[:n, 2, 9])
-    return Tuning(gains, sway[:n], reach, columns, limits, weights, lag)
+    return Tuning(gains, slip[:n], reach, columns, limits, weights, lag)
 
 
 def _authority(wrench: Array) -> Array:
@@ -429,7 +435,7 @@ def _authority(wrench: Array) -> Array:
 def _regulator(
     model: LinearModel, i: int, weights: Array, limits: Array, lag: Array, by_pitch: bool, name: str
 ) -> tuple[Array, Array]:
-    """Return the gains at one speed [N or N m per unit of the state], (4, 17), and the row of sway, (17,)."""
+    """Return the gains at one speed [N or N m per unit of the state], (4, 17), and rows of sway and heave, (2, 17)."""
     from scipy.linalg import solve_continuous_are
 
     n = STATES
@@ -462,8 +468,9 @@ def _regulator(
         ) from error
     gains = np.zeros((4, n + 4))
     gains[np.ix_(driven, kept)] = np.linalg.solve(r, b.T @ P)
-    A[1, 1] = min(A[1, 1], -LEAST_DAMPING)
-    return gains, A[1]
+    for k in (1, 2):
+        A[k, k] = min(A[k, k], -LEAST_DAMPING)
+    return gains, A[1:3]
 
 
 def course_data(
@@ -492,7 +499,8 @@ def course_data(
     data.first = stored([model.speeds[0] for model in models], float)
     data.spacing = stored([model.speeds[1] - model.speeds[0] for model in models], float)
     data.gains = stored([one.gains for one in found], Row)
-    data.sway = stored([one.sway for one in found], Row)
+    data.slip = stored([one.slip for one in found], Row)
+    data.rest = stored([model.rest[:, 1:3] for model in models], wp.vec2)
     data.reach = stored([np.minimum(one.reach, 1e6) for one in found], Wrench4)
     data.slack = stored([SHORT * one.limits for one in found], Wrench4)
     data.hold = stored(
@@ -538,9 +546,9 @@ class CoursePilot:
         self.data = course_data([model], [name], period)
 
     def reset(self, n: int = 1) -> Array:
-        """Return the memory of n vehicles at the start [m, rad s, N, N m, m/s], (n, 10)."""
-        memory = np.zeros((n, 10))
-        memory[:, 8] = np.nan
+        """Return the memory of n vehicles at the start [m, rad s, N, N m, m/s], (n, 11)."""
+        memory = np.zeros((n, 11))
+        memory[:, 9] = np.nan
         return memory
 
     def command(
@@ -553,10 +561,10 @@ class CoursePilot:
         depth: npt.ArrayLike | None = None,
         pitch: npt.ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
-        """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 10).
+        """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 11).
 
         Args:
-            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 10).
+            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 11).
             measured: The vehicles' states, with n rows.
             speed: Wanted surge [m/s], (n,).
             course: Wanted course over ground, counter-clockwise from the world's x axis [rad], (n,).
@@ -585,7 +593,7 @@ class CoursePilot:
         """Return channels and memory as `command` does, for actions of mode `course` or `course_pitch`.
 
         Args:
-            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 10).
+            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 11).
             measured: The vehicles' states, with n rows.
             action: Speed, change of course, and dive, as of `order_of` [-], (n, 3).
             by_pitch: Whether the third is pitch; else depth.

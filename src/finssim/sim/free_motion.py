@@ -80,7 +80,8 @@ def linear_model(
         B[:, :6, k] = (ends[0] - ends[1]) / (2.0 * step)
     lag = [part.time_constant for part in (*vehicle.thrusters.values(), *vehicle.actuators.values())]
     inertia = vehicle.mass_matrix(model)
-    return LinearModel(surge, A, B, trim, inertia, lower, upper, np.asarray(lag, float))
+    rest = acceleration(vehicle, eta, nu, hydrodynamics=model, actuators=trim)
+    return LinearModel(surge, A, B, trim, rest, inertia, lower, upper, np.asarray(lag, float))
 
 
 def _trim(vehicle: Vehicle, eta: Array, nu: Array, model: str) -> Array:

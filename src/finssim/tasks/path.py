@@ -304,9 +304,9 @@ class PathFollowing(Task):
     """Length of a leg [m]."""
     radius: float = 0.01
     """A leg is done this close to its end, or beyond it [m]."""
-    wave: tuple[float, float] = (30.0, 60.0)
+    wave: tuple[float, float] = (40.0, 80.0)
     """Length of the waves of the path's curvature and slope, drawn from this range [m]."""
-    bend_radius: float = 12.0
+    bend_radius: float = 18.0
     """Least radius of the path's bends [m]."""
     slope: float = math.radians(12.0)
     """Steepest part of the path [rad]."""
