@@ -18,7 +18,8 @@ from finssim.control.allocation import (
 )
 from finssim.control.modes import action_mode
 from finssim.physics.types import vec6, vec8
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import load_vehicle
+from reference.cases import THRUSTED
 
 
 def allocator(layout, regularisation=1e-4):
@@ -73,7 +74,7 @@ def test_a_hundred_thousand_allocations_carry_a_certificate_of_optimality(layout
     assert 0.2 < saturated.any(1).mean() < 0.95  # both branches are in the sample
 
 
-@pytest.mark.parametrize("name", catalogue())
+@pytest.mark.parametrize("name", THRUSTED)
 def test_allocations_of_every_catalogue_vehicle_are_optimal(finsrov, name):
     vehicle = load_vehicle(name)
     craft = type(finsrov)(name, vehicle.control_matrix, *vehicle.force_limits, vehicle.wrench_limits)

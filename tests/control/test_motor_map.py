@@ -10,12 +10,13 @@ from scipy.signal import lfilter
 
 from finssim.control import ControlError
 from finssim.control.motor_map import SHORTEST_PULSE, MotorMap
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import load_vehicle
+from reference.cases import THRUSTED
 
 DT = 1.0 / 60.0
 FINE = 16  # steps of the independent motor per command
 RPM = 2.0 * np.pi / 60.0
-VEHICLES = {name: load_vehicle(name) for name in catalogue()}
+VEHICLES = {name: load_vehicle(name) for name in THRUSTED}
 WITH_DEAD_ZONE = [
     name
     for name, vehicle in VEHICLES.items()

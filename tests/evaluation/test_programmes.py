@@ -5,12 +5,13 @@ import pytest
 
 from finssim.control.axis_model import axis_model
 from finssim.studies.demo import FULL, SHARE, STEADY, matched
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import level_speed, terminal_speed
 from finssim.vehicles.defaults import room
+from reference.cases import THRUSTED
 
 
-@pytest.mark.parametrize("name", catalogue())
+@pytest.mark.parametrize("name", THRUSTED)
 def test_a_vehicle_is_driven_as_fast_as_finsrov_or_as_fast_as_it_stays_upright(name):
     """In its own lengths, on the axes that it controls, within its limits; yaw at FinsROV's rate."""
     vehicle, finsrov = load_vehicle(name), load_vehicle("finsrov")

@@ -10,6 +10,8 @@ from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.loader import checked
 
 load = cache(load_vehicle)
+THRUSTED = [name for name in catalogue() if load(name).thrusters]
+"""Vehicles with thrusters: all but gliders."""
 PAIRS = [(name, model) for name in catalogue() for model in sorted(load(name).hydrodynamics)]
 
 
@@ -44,12 +46,12 @@ def disturb(simulator, tau):
 
 
 def plain(vehicle):
-    """The hull by its matrices alone: without fins and other actuators, terms but `surge_damping`, and inflow."""
+    """The hull by its matrices alone: no term but `surge_damping`, no inflow, no actuator but volumes, which are 0."""
     values = vehicle.values()
     further = [key for chosen in values["hydrodynamics"].values() for key in chosen if key in TERMS]
     if "actuators" not in values and set(further) <= {"surge_damping"}:
         return vehicle
-    values.pop("actuators", None)
+    values["actuators"] = {k: a for k, a in values.get("actuators", {}).items() if a["kind"] == "buoyancy"}
     for thruster in values["thrusters"].values():
         thruster.pop("inflow", None)
     for chosen in values["hydrodynamics"].values():

@@ -7,8 +7,9 @@ import pytest
 
 from finssim.robot.bridge import Bridge, BridgeError, BridgeSettings
 from finssim.robot.links.frames import StatusFlag
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import load_vehicle
 from reference.bridge_rig import DT, Rig, echo, moves, quiet, reading, telemetry
+from reference.cases import THRUSTED
 from reference.finned import torpedo
 
 FINSROV = load_vehicle("finsrov")
@@ -21,7 +22,7 @@ def rig():
     return Rig(FINSROV)
 
 
-@pytest.mark.parametrize("name", catalogue())
+@pytest.mark.parametrize("name", THRUSTED)
 def test_every_vehicle_runs_once_armed_and_not_before(name):
     """With or without an mcu and a safety section: zeros until armed, thrust after it, zeros when disarmed."""
     vehicle = load_vehicle(name)

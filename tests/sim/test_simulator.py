@@ -16,9 +16,9 @@ FIELDS = ("position", "quaternion", "velocity", "acceleration", "thrust")
 
 @EVERY_VEHICLE_AND_MODEL
 def test_every_vehicle_moves_in_every_model_it_has(name, model):
-    """A pool-free world with the vehicle at full throttle for a second: it moves, and the state is finite."""
+    """A pool-free world with all its actuators at their ends for a second: it moves, and the state is finite."""
     simulator = Simulator(name, hydrodynamics=model)
-    simulator.set_thrust(load(name).force_limits[1])
+    simulator.set_actuators(load(name).channel_limits[1])
     for _ in range(10):
         simulator.step()
     assert simulator.frozen_worlds().tolist() == []

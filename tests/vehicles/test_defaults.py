@@ -36,7 +36,7 @@ def test_tags_lie_on_the_top_and_face_up(name):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in catalogue() if name not in ("eca_a9", "lauv", "remus100", "torpedo")]
+    "name", [name for name in catalogue() if name not in ("eca_a9", "lauv", "remus100", "slocum", "torpedo")]
 )
 def test_every_vehicle_that_hovers_has_a_pool(name):
     """A plant and a camera, a basin that the hull fits in, and a workspace as large as the basin."""

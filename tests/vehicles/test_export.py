@@ -8,17 +8,16 @@ import pytest
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.vehicles import HydrodynamicSet, VehicleError, catalogue, load_vehicle
+from finssim.vehicles import HydrodynamicSet, VehicleError, load_vehicle
 from finssim.vehicles.export import export_vehicle
 from finssim.vehicles.importers.draft import read_foreign
+from reference.cases import THRUSTED
 from reference.finned import torpedo
 from reference.gz_sim import HEAVY, Origin, write
 from vehicles.minnow import MINNOW
 
 COEFFICIENTS = [
-    name
-    for name in catalogue()
-    if isinstance(load_vehicle(name).hydrodynamics["calibrated"], HydrodynamicSet)
+    name for name in THRUSTED if isinstance(load_vehicle(name).hydrodynamics["calibrated"], HydrodynamicSet)
 ]
 
 

@@ -345,7 +345,12 @@ class Allocator:
         """Allocator about `vehicle.wrench_reference`, weighing each axis by its wrench limit.
 
         `regularisation` is a weight.
+
+        Raises:
+            ControlError: The vehicle has no thrusters.
         """
+        if not vehicle.thrusters:
+            raise ControlError(f"{vehicle.name} has no thrusters: command its actuators instead of a wrench")
         lower, upper = vehicle.force_limits
         return cls(vehicle.control_matrix, lower, upper, axis_weights(vehicle.wrench_limits), regularisation)
 

@@ -66,10 +66,15 @@ def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel
     """The diagonal of a vehicle's model at its wrench reference.
 
     Raises:
-        ControlError: The set has no coefficients (it is a mesh).
+        ControlError: The set has no coefficients (it is a mesh), or the vehicle has no thrusters.
         VehicleError: The vehicle has no set of that name.
     """
     chosen = vehicle.hydrodynamic_set(hydrodynamics)
+    if not vehicle.thrusters:
+        raise ControlError(
+            f"{vehicle.name} has no thrusters to control its axes with: command its other actuators, or take a "
+            "vehicle with thrusters"
+        )
     if not isinstance(chosen, HydrodynamicSet):
         raise ControlError(
             f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients to place poles with: "

@@ -143,7 +143,7 @@ class MotorMap:
         Raises:
             ControlError: Outputs that do not exist or are used twice.
         """
-        if len(set(index)) != len(index) or min(index) < 0 or max(index) >= outputs:
+        if len(set(index)) != len(index) or any(not 0 <= k < outputs for k in index):
             raise ControlError(
                 f"motor outputs {list(index)} must differ and lie in 0 to {outputs - 1}: correct motor_index"
             )

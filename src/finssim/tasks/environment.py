@@ -15,7 +15,7 @@ from finssim.control.course import CourseData, Memory, course_data, order_of, st
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
-from finssim.sim import RectangularPool, Simulator, TetherLine, Water
+from finssim.sim import RectangularPool, Simulator, SimulatorError, TetherLine, Water
 from finssim.sim.free_motion import linear_model
 from finssim.sim.launch import KernelSequence
 from finssim.sim.randomize import Draws, Randomization
@@ -232,10 +232,10 @@ class Environment:
 
     def _autopilots(self) -> CourseData:
         """Return the autopilots of the nominal vehicles, which carry out orders of a mode by course."""
-        names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
         try:
+            names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
             return course_data(models, names, self.task.control_step, self.device)
-        except ControlError as error:
+        except (ControlError, SimulatorError) as error:
             raise EnvironmentSetupError(f"action mode '{self.action_mode}': {error}") from error
 
     def _sight(self) -> Any:

@@ -32,7 +32,13 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
         if missing:
             raise EnvironmentSetupError(
                 f"vehicle '{vehicle_or_name.name}' does not control {', '.join(missing)}, which task '{task.name}' "
-                f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes)}; take another vehicle"
+                f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes) or 'no axis'}; take another "
+                "vehicle"
+            )
+        if not vehicle_or_name.thrusters and mode != "surfaces" and not mode.startswith("course"):
+            raise EnvironmentSetupError(
+                f"vehicle '{vehicle_or_name.name}' does not control any axis by thrusters, as action mode '{mode}' "
+                "does: take mode surfaces, or another vehicle"
             )
     if mode not in ("wrench6", "wrench4", "pilot6") and task.others:
         raise EnvironmentSetupError(

@@ -261,6 +261,8 @@ def trim(vehicle: Vehicle) -> Trim:
     wrench = -np.concatenate([force, moment])
     rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
     lower, upper = vehicle.force_limits
+    if not rows:
+        return Trim(wrench=wrench, forces=np.zeros(len(lower)))
     result = lsq_linear(vehicle.control_matrix[rows], wrench[rows], bounds=(lower, upper), method="bvls")
     missing = np.abs(vehicle.control_matrix[rows] @ result.x - wrench[rows]).max()
     return Trim(wrench=wrench, forces=result.x if missing < 1e-6 * max(1.0, vehicle.weight) else None)

@@ -45,7 +45,7 @@ def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
     return [
         *_mass_matrices(vehicle),
         *_damping(vehicle),
-        _allocation(vehicle),
+        *([_allocation(vehicle)] if vehicle.thrusters else []),
         *_thrust_curves(vehicle),
         _trim(vehicle),
         _stability(vehicle),
@@ -156,7 +156,9 @@ def _trim(vehicle: Vehicle) -> CheckResult:
     if uncontrolled:
         sentence += f"; {', '.join(uncontrolled)} is not controlled and left to the water"
     lower, upper = vehicle.force_limits
-    share = float(np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower)))
+    share = float(
+        np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower), initial=0.0)
+    )
     return CheckResult(
         "trim", share < 1.0, f"{sentence}; the hardest thruster gives {100.0 * share:.2g} % of its limit"
     )

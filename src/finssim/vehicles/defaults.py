@@ -195,7 +195,7 @@ def default_mcu(values: Mapping[str, Any]) -> Mcu:
     """Outputs enough for the motors that the thrusters name, or for one each."""
     thrusters = values["thrusters"].values()
     named = [t.motor_index + 1 for t in thrusters if t.motor_index is not None]
-    fastest = max(max(t.rpm_max, -t.rpm_min) for t in thrusters)
+    fastest = max((max(t.rpm_max, -t.rpm_min) for t in thrusters), default=1.0)
     return Mcu(rpm_full_scale=fastest, command_timeout=0.5, outputs=max(len(thrusters), *named, 1))
 
 

@@ -232,8 +232,9 @@ class Vehicle(Part):
 
     @field_validator("controlled_axes", mode="before")
     @classmethod
-    def _as_tuple(cls, value: Any) -> Any:
-        if not isinstance(value, (list, tuple)) or not set(map(str, value)) <= set(AXES) or not value:
+    def _as_tuple(cls, value: Any, info: ValidationInfo) -> Any:
+        empty = isinstance(value, (list, tuple)) and not value and bool(info.data.get("thrusters", True))
+        if not isinstance(value, (list, tuple)) or not set(map(str, value)) <= set(AXES) or empty:
             raise refuse_value(f"is {value!r}, expected a list drawn from {', '.join(AXES)}")
         return tuple(axis for axis in AXES if axis in value)
 
@@ -250,7 +251,7 @@ class Vehicle(Part):
                 raise refuse_section(f"'{name}' is the name of something else of a robot: take another")
         return value
 
-    @field_validator("hydrodynamics", "thrusters")
+    @field_validator("hydrodynamics")
     @classmethod
     def _not_empty(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         if not value:
@@ -274,6 +275,12 @@ class Vehicle(Part):
 
     @model_validator(mode="after")
     def _channels(self) -> Vehicle:
+        if not self.thrusters and not self.actuators:
+            raise refuse_section("thrusters is empty, expected at least one entry, or other actuators")
+        if not self.thrusters and self.controlled_axes:
+            raise refuse_section(
+                f"controlled_axes is {list(self.controlled_axes)}, expected [] of a vehicle without thrusters"
+            )
         for name, actuator in self.actuators.items():
             if name in self.thrusters:
                 raise refuse_section(f"actuators: '{name}' is the name of a thruster: take another")
@@ -353,8 +360,10 @@ class Vehicle(Part):
         Returns:
             Body frame, [-] and [m], (6, n).
         """
-        axes = np.array([thruster.axis for thruster in self.thrusters.values()])
-        arms = np.array([thruster.position for thruster in self.thrusters.values()]) - np.asarray(point)
+        axes = np.reshape([thruster.axis for thruster in self.thrusters.values()], (-1, 3))
+        arms = np.reshape([thruster.position for thruster in self.thrusters.values()], (-1, 3)) - np.asarray(
+            point
+        )
         reactions = np.array([thruster.reaction for thruster in self.thrusters.values()])
         return np.vstack([axes.T, np.cross(arms, axes).T + reactions * axes.T])
 

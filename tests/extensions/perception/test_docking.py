@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from finssim.tasks import Environment, make
 from finssim.tasks.docking import Docking, HullNumbers
-from finssim.vehicles import catalogue, load_vehicle
+from finssim.vehicles import load_vehicle
+from reference.cases import THRUSTED
 
 TASK = Docking()
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -151,7 +152,7 @@ def test_episodes_start_before_the_mouth_of_docks_anywhere():
     assert not env.simulator.funnel.impulse.numpy().any()
 
 
-@pytest.mark.parametrize("name", catalogue())
+@pytest.mark.parametrize("name", THRUSTED)
 def test_every_vehicle_gets_a_dock_it_fits_in(name):
     """The tube takes the envelope with room to spare, the block stands in the tank, a gentle press is no crash."""
     task = TASK.fitted([load_vehicle(name)])
