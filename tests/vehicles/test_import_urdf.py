@@ -8,6 +8,7 @@ from xml.etree.ElementTree import fromstring
 import numpy as np
 import pytest
 
+from finssim import acceleration
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.core import mesh
@@ -18,7 +19,7 @@ from finssim.vehicles.importers.urdf import read_urdf
 from finssim.vehicles.importers.xacro_file import evaluate, expanded, packages_near
 from reference import gz_sim
 from reference.imported import assert_moves_alike, imported, simulated, unnoticed
-from reference.uuv import LAUV, REXROV, SAGA, Origin, text
+from reference.uuv import LAUV, REXROV, SAGA, Origin, euler, text
 
 
 def write(folder, content, name="robot.xacro"):
@@ -68,6 +69,77 @@ def test_terminal_speeds_and_the_speed_of_floating_up(tmp_path):
     assert [end[0, 0], end[1, 1], end[2, 2], end[3, 5]] == pytest.approx(expected, rel=2e-3)
     up = simulated(light, rest[:1], np.zeros((1, 6)), np.zeros((1, 6)), 20.0)[-1, 0, 2]
     assert up == pytest.approx(9.8 * (1028.0 * SAGA.volume - 10.001) / 31.8678, rel=2e-3)
+
+
+FIN = """<link name="lauv/fin{id}"/>
+<joint name="lauv/fin{id}_joint" type="revolute"><limit effort="0" lower="-0.9" upper="0.8" velocity="0"/>
+  <origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>
+  <parent link="lauv/base_link"/><child link="lauv/fin{id}"/></joint>
+<gazebo><plugin name="fin{id}" filename="libuuv_fin_ros_plugin.so">
+  <dynamics><type>FirstOrder</type><timeConstant>0.2</timeConstant></dynamics><liftdrag>{law}</liftdrag>
+  <current_velocity_topic>current_velocity</current_velocity_topic><fin_id>{id}</fin_id>
+  <link_name>lauv/fin{id}</link_name><joint_name>lauv/fin{id}_joint</joint_name></plugin></gazebo>
+"""
+QUADRATIC = "<type>Quadratic</type><lift_constant>9.87</lift_constant><drag_constant>6.51</drag_constant>"
+LINES = (
+    "<type>TwoLines</type><area>0.04</area><fluid_density>1027</fluid_density><a0>0</a0><alpha_stall>0.6</alpha_stall>"
+    "<cla>3.5</cla><cla_stall>0</cla_stall><cda>0.2</cda><cda_stall>0</cda_stall>"
+)
+
+
+def finned(*fins):
+    parts = "".join(FIN.format(id=i, xyz=xyz, rpy=rpy, law=law) for i, (xyz, rpy, law) in enumerate(fins))
+    return text(LAUV).replace("</robot>", f"{parts}</robot>")
+
+
+def uuv_fin(place, turn, law, nu, deflection):
+    """Wrench of a fin about the base link by FinPlugin.cc and LiftDragModel.cc: in the plane of x and y of its link."""
+    c, s = np.cos(deflection), np.sin(deflection)
+    link = turn @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    v = link.T @ (nu[:3] + np.cross(nu[3:], place))
+    v[2] = 0.0
+    angle, square = np.arctan2(v[1], v[0]), v @ v
+    if law is QUADRATIC:
+        lift, drag = 9.87 * angle * square, 6.51 * angle**2 * square
+    else:
+        lift, drag = (0.5 * 1027 * 0.04 * x * angle * square for x in (3.5, 0.2))
+    ahead = v / np.linalg.norm(v)
+    force = link @ (lift * -np.cross([0.0, 0.0, 1.0], ahead) - drag * ahead)
+    return np.concatenate([force, np.cross(place, force)])
+
+
+def test_fins_act_as_in_uuv_simulator(tmp_path):
+    """At random velocities and deflections below the stall: forces of each model and their moments, to 0.1 %."""
+    places = [("-0.4 0 0.04", "0 0 0", QUADRATIC), ("-0.7 0.08 0.07", "-0.79 -0.1 0.1", LINES)]
+    vehicle = imported(write(tmp_path, finned(*places)))
+    assert list(vehicle.actuators) == ["fin_0", "fin_1"] and vehicle.actuators["fin_0"].time_constant == 0.2
+    assert (vehicle.actuators["fin_1"].minimum, vehicle.actuators["fin_1"].maximum) == (-0.9, 0.8)
+    bare, rng = imported(write(tmp_path, text(LAUV), "bare.xacro")), np.random.default_rng(8)
+    for _ in range(20):
+        nu = np.array([1.5, 0, 0, 0, 0, 0]) + 0.05 * rng.normal(size=6)
+        angles = rng.uniform(0.2, 0.4, 2)  # of one sign: drag of TwoLines has the sign of the angle
+        eta = [0.0, 0.0, -50.0, 0.0, 0.0, 0.0]
+        found = acceleration(vehicle, eta, nu, actuators=[0.0, *-angles]) - acceleration(bare, eta, nu)
+        expected = np.zeros(6)
+        for (xyz, rpy, law), angle in zip(places, angles, strict=True):
+            place, turn = np.array(xyz.split(), float), euler(*map(float, rpy.split()))
+            expected += uuv_fin(place, turn, law, nu, -angle)
+        found = vehicle.mass_matrix() @ found
+        assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("Quadratic", "Cubic", "liftdrag: type is 'Cubic', expected Quadratic or TwoLines"),
+        ("<lift_constant>9.87", "<lift_constant>-9.87", "expected a lift_constant above 0"),
+        ("<fin_id>0", "<fin_id>one", "expected fins of different whole numbers"),
+        ("<joint_name>lauv/fin0_joint", "<joint_name>none", "fin 0: no joint 'none'"),
+    ],
+)
+def test_refusals_of_fins_are_sentences(tmp_path, old, new, sentence):
+    content = finned(("-0.4 0 0.04", "0 0 0", QUADRATIC))
+    assert old in content and sentence in refusal(tmp_path, content.replace(old, new, 1))
 
 
 # Conversions, one by one
@@ -327,9 +399,9 @@ def test_every_word_is_read_refused_or_named(tmp_path):
 
 
 def test_the_command_imports_and_lists(tmp_path, capsys):
-    """Guesses are those of the file, fins and factors are named, and the vehicle loads."""
-    fins = '<gazebo><plugin name="f" filename="libuuv_fin_ros_plugin.so"><a/></plugin></gazebo></robot>'
-    content = text(SAGA).replace("</robot>", fins)
+    """Guesses are those of the file, factors are named, and the vehicle loads with its fin."""
+    fin = FIN.format(id=0, xyz="-0.2 0 0", rpy="0 0 0", law=QUADRATIC).replace("lauv/", "saga/")
+    content = text(SAGA).replace("</robot>", f"{fin}</robot>")
     content = content.replace(
         "<type>fossen</type>", "<type>fossen</type><scaling_damping>2</scaling_damping>"
     )
@@ -338,17 +410,15 @@ def test_the_command_imports_and_lists(tmp_path, capsys):
     report = json.loads(capsys.readouterr().out)
     vehicle = load_vehicle(out)
     guessed = {path for path, provenance in vehicle.provenance.items() if provenance.origin == "guessed"}
-    assert guessed == {"water.gravity"} | {
+    assert guessed == {"water.gravity", "actuators.fin_0.area", "actuators.fin_0.lift_slope"} | {
         f"thrusters.thruster_{i}.{key}_{end}"
         for i in range(3)
         for key in ("force", "rpm")
         for end in ("min", "max")
     }
     rest = " | ".join(report["not read"])
-    assert (
-        "plugin fin (steering by fins comes with actuators)" in rest
-        and "scaling_damping (uuv_simulator" in rest
-    )
+    assert "scaling_damping (uuv_simulator" in rest and "fin" not in rest
+    assert vehicle.actuators["fin_0"].maximum == 0.8
     assert vehicle.title == "saga (uuv_simulator)"
     assert vehicle.body.size.tolist() == [0.448, 0.2384, 0.28066] and vehicle.controlled_axes == (
         "surge",

@@ -66,7 +66,6 @@ def export_vehicle(
         lost.append("reaction torque of propellers")
     if any(t.inflow is not None for t in vehicle.thrusters.values()):
         lost.append("thrust that propellers lose in a flow")
-    lost += [f"{actuator.kind} {name}" for name, actuator in vehicle.actuators.items()]
     if any(t.c_plus != t.c_minus for t in vehicle.thrusters.values()):
         lost += ["thrust coefficient of reverse rotation (c_minus): gz-sim has one for both directions"]
     if np.any(chosen.reference_point):

@@ -100,6 +100,8 @@ def sdf_of(robot: Element, label: str) -> tuple[Element, Counter[str]]:
             and joint.get("type") != "continuous"
         ):
             made.set("still", "true")
+        elif limit is not None and joint.get("type") == "revolute":
+            made.attrib.update({end: limit.get(end, "0") for end in ("lower", "upper")})
         axis = joint.find("axis")
         text(SubElement(made, "axis"), "xyz", "1 0 0" if axis is None else axis.get("xyz"))
     for extension in robot.findall("gazebo"):

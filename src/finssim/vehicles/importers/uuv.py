@@ -1,4 +1,4 @@
-"""Reader of uuv_simulator's plugins: UnderwaterObject with its hydrodynamic models, and Thruster.
+"""Reader of uuv_simulator's plugins: UnderwaterObject with its hydrodynamic models, Thruster and Fin.
 
 Equations as of commit bfb40cb, about the centre of gravity c of the base link and all links fixed to it, in which
 Gazebo applies wrenches, while it takes the velocity at the link's origin; v is in axes forward, right, down:
@@ -6,6 +6,7 @@ Gazebo applies wrenches, while it takes the velocity at the link's origin; v is 
     force = (DLin + u DLinForward + diag(DQuad |v|)) v - Ma v_dot - C_A(Ma v) v     D is negative
     buoyancy = density g volume at c + center_of_buoyancy;  mass g where neutrally_buoyant
     thrust = thrust_efficiency f(propeller_efficiency w), w from gain times the command, along the axis of the joint
+    lift = lift_constant V² a, drag = drag_constant V² a² (or cla, cda of an area) by the angle of attack a of a fin
 
 The factors and offsets of these (`scaling_damping`, `offset_volume`, ...) are set while it runs, not in files.
 """
@@ -13,8 +14,10 @@ The factors and offsets of these (`scaling_damping`, `offset_volume`, ...) are s
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +51,7 @@ __all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv"]
 
 Array = NDArray[np.float64]
 
-OBJECT, THRUSTER = "underwater_object", "thruster"
+OBJECT, THRUSTER, FIN = "underwater_object", "thruster", "fin"
 PLUGINS = tuple(
     f"lib{prefix}{name}{ros}_plugin.so"
     for prefix in ("uuv_", "")  # older versions have no prefix
@@ -80,6 +83,10 @@ WORDS = {
     "thruster": {
         "linkName", "jointName", "thrusterID", "gain", "clampMin", "clampMax", "thrustMin", "thrustMax",
         "thrust_efficiency", "propeller_efficiency", "dynamics", "conversion", "robotNamespace",
+    },
+    "fin": {
+        "dynamics", "liftdrag", "current_velocity_topic", "fin_id", "link_name", "joint_name", "input_topic",
+        "output_topic", "robotNamespace",
     },
 }  # fmt: skip
 """Element -> its words."""
@@ -244,6 +251,80 @@ def _put_thruster(model: Model, plugin: Element, name: str, managed: float | Non
     return joint
 
 
+SLOPE = 3.0
+"""Guessed slope of the lift of a fin whose area the file does not give [1/rad]; both enter by their product."""
+ENDLESS = 1.5
+"""Stall of a fin whose lift grows with the angle up to 90° [rad]."""
+
+
+def _put_fin(model: Model, plugin: Element, draft: Draft) -> str:
+    """Set a fin, whose span and chord are the axes z and x of its link, and return the name of its joint."""
+    name = f"fin_{(plugin.findtext('fin_id') or '').strip()}"
+    where, path = f"{model.label}: {name.replace('_', ' ')}", f"actuators.{name}"
+    if not re.fullmatch(r"fin_\d{1,9}", name) or name in draft.values.get("actuators", {}):
+        raise VehicleError(f"{where}: expected fins of different whole numbers as fin_id: correct it")
+    refuse_unknown(plugin, WORDS["fin"], where)
+    dynamics, law = plugin.find("dynamics"), plugin.find("liftdrag")
+    if dynamics is None or law is None:
+        raise VehicleError(f"{where}: dynamics or liftdrag is missing: add it")
+    joint, link = model.text(plugin, "joint_name"), model.link_of(model.text(plugin, "link_name"))
+    if joint not in model.joints:
+        raise VehicleError(f"{where}: no joint '{joint}': correct it")
+    lag, _, _ = _response(dynamics, f"{where}: dynamics")
+    draft.put(f"{path}.kind", "fin")
+    pose, inertial = model.pose(link), model.links[link].find("inertial")
+    place = pose if inertial is None else model.pose_in(link, inertial, where)
+    draft.put(f"{path}.position", plain(place.place), "derived", "centre of gravity of the fin's link")
+    for key, column in (("span", 2), ("chord", 0)):
+        draft.put(f"{path}.{key}", plain(pose.turn[:, column]), "derived", "axes of the fin's link")
+    low, high = (float(model.joints[joint].get(end, "0")) for end in ("lower", "upper"))
+    if low <= 0.0 <= high and low < high:
+        draft.put(f"{path}.minimum", low)
+        draft.put(f"{path}.maximum", high)
+    else:
+        for key, sign in (("minimum", -1.0), ("maximum", 1.0)):
+            draft.guess(f"{path}.{key}", sign * 0.5, "the joint has no travel around 0 in the file")
+    draft.put(f"{path}.time_constant", 0.0 if lag is None else lag)
+    for key, value, guessed in _lift(law, f"{where}: liftdrag", draft):
+        if guessed:
+            draft.guess(f"{path}.{key}", value, guessed)
+        else:
+            draft.put(f"{path}.{key}", value, "derived", "lift and drag of the fin")
+    return joint
+
+
+def _lift(law: Element, where: str, draft: Draft) -> list[tuple[str, Any, str]]:
+    """Return key of a fin, its value, and how it is guessed if it is, of an element `liftdrag`."""
+    kind, density = (law.findtext("type") or "").strip(), draft.values["water"]["density"]
+
+    def of(word: str) -> float:
+        return number(law, word, where)
+
+    if kind == "Quadratic":
+        refuse_unknown(law, {"type", "lift_constant", "drag_constant"}, where)
+        lift, drag, area = of("lift_constant"), of("drag_constant"), 0.0
+        area = 2.0 * lift / (density * SLOPE)
+        if lift <= 0.0 or drag < 0.0:
+            raise VehicleError(f"{where}: expected a lift_constant above 0 and a drag_constant of 0 or more")
+        how = f"the file has their product alone: a slope of {SLOPE:g}"
+        return [("area", area, how), ("lift_slope", SLOPE, how), ("stall", ENDLESS, ""),
+                ("drag", [0.0, 0.0, 2.0 * drag / (density * area)], "")]  # fmt: skip
+    if kind != "TwoLines":
+        raise VehicleError(f"{where}: type is '{kind}', expected Quadratic or TwoLines: correct it")
+    words = ("area", "fluid_density", "a0", "alpha_stall", "cla", "cla_stall", "cda", "cda_stall")
+    refuse_unknown(law, {"type", *words}, where)
+    ratio, stall = of("fluid_density") / density, of("alpha_stall")
+    if of("area") <= 0.0 or of("cla") * ratio <= 0.0 or stall <= 0.0:
+        raise VehicleError(f"{where}: expected area, fluid_density, alpha_stall and cla above 0")
+    if of("a0"):
+        draft.different.append("a0: a fin has no lift at deflection 0 straight ahead")
+    sentence = "beyond the stall the lift of a fin falls to 0 at 90°, by no cla_stall of the file"
+    if sentence not in draft.different:
+        draft.different.append(sentence)
+    return [("area", of("area"), ""), ("lift_slope", of("cla") * ratio, ""), ("stall", min(stall, ENDLESS), ""),
+            ("drag", [0.0, abs(of("cda")) * ratio, 0.0], "")]  # fmt: skip
+
+
 def _managed(model: Model, base: str) -> float | None:
     """Return the greatest thrust in the thruster manager's file of this robot, near it [N]; None: there is none."""
     robot = base.rpartition("/")[0] or model.element.get("name", "")
@@ -349,6 +430,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
             f"{path}: thrusterID are {', '.join(n[9:] for n in names)}, expected different whole numbers"
         )
     turning = {_put_thruster(model, p, n, managed, draft) for p, n in zip(thrusters, names, strict=True)}
+    turning |= {_put_fin(model, plugin, draft) for plugin in plugins.get(FIN, [])}
     try:
         shapes = shapes_of(model)
     except VehicleError as error:
@@ -363,8 +445,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     else:
         put_envelope(draft, [shape.corners for shape in shapes])
     put_controlled_axes(draft)
-    remarks = {"fin": " (steering by fins comes with actuators)"}
-    note_rest(model, plugins, {OBJECT, THRUSTER}, remarks, turning)
+    note_rest(model, plugins, {OBJECT, THRUSTER, FIN}, {}, turning)
     return draft
 
 
