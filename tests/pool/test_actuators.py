@@ -62,6 +62,15 @@ def test_a_drawn_actuator_is_not_quite_that_of_the_file():
     assert plant.values[1] == pytest.approx(elevator.gain * (-0.15 + elevator.offset), abs=1e-4)
 
 
+def test_the_axes_of_a_slender_hull_are_hardly_tilted():
+    """Tilt, centre and trim are drawn in proportion to beam over length: the rudder is stronger than the added mass."""
+    remus = load_vehicle("remus100")
+    spec, share = draw_plant(remus, 3, "hard"), 0.191 / 1.33
+    assert 0.0 < np.abs(spec.added_mass.tilt_deg).max() < 6.0 * share
+    assert np.linalg.norm(spec.body.center_of_gravity - remus.body.center_of_gravity) < 0.012 * share
+    assert np.abs(draw_plant(load_vehicle("finsrov"), 3, "hard").added_mass.tilt_deg).max() > 6.0 * share
+
+
 def test_a_term_of_a_drawn_plant_is_stronger_or_weaker_than_in_the_file():
     """Its factor scales the wrench: a plant whose damping is the term alone slows down so much faster."""
     spec = draw_plant(TORPEDO, 3, "nominal")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,19 @@ class Spread:
     """[m/√s]"""
     crystal: float
     """[ppm]"""
+
+    def slender(self, share: float) -> Spread:
+        """Return the spread for a hull that is shaped and trimmed to go ahead, beam over length in place of a box's 1.
+
+        Added mass about axes that are tilted by 3° would turn a torpedo harder than its rudder (Munk).
+        """
+        least, most = self.gravity_offset
+        return replace(
+            self,
+            center=share * self.center,
+            tilt_deg=share * self.tilt_deg,
+            gravity_offset=(share * least, share * most),
+        )
 
 
 SPREADS: dict[Severity, Spread] = by_severity(
@@ -259,6 +272,8 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
             "add it to the file to put the vehicle into a pool"
         )
     spread = SPREADS[severity]
+    if hydro.terms or vehicle.actuators:
+        spread = spread.slender(float(vehicle.body.size[1] / vehicle.body.size[0]))
     draw = _Draw(np.random.default_rng([seed, DRAWN]))
     sections: dict[str, Any] = {
         "title": f"{vehicle.name}, {severity} plant {seed}",

@@ -71,7 +71,8 @@ class _Monitor:
     """Observer of a runtime after every step, which decides when the run is over, and reports at the end.
 
     Note:
-        Errors are those of the estimate, which is all that a robot knows.
+        Errors are those of the estimate, which is all that a robot knows: from where the guide is now, or from the path
+        of a task along one.
     """
 
     def __init__(self, runtime: Runtime, duration: float | None, robot: str, console: Console) -> None:
@@ -97,8 +98,11 @@ class _Monitor:
         if located and now >= self._next:
             self._next = now + EVERY - 1e-6
             goal = runtime.guide.at(runtime.t)
-            turn = float(wrap_angle(quat_yaw(reading.quaternion) - goal.yaw))
-            self._errors.append((float(np.linalg.norm(reading.position - goal.position)), turn))
+            observer = getattr(runtime.pilot, "observer", None)
+            distance, yaw = getattr(observer, "beside", None) or (
+                float(np.linalg.norm(reading.position - goal.position)), float(goal.yaw)
+            )  # fmt: skip
+            self._errors.append((distance, float(wrap_angle(quat_yaw(reading.quaternion) - yaw))))
         self._mute_at = now + MUTE if math.isnan(self._mute_at) else self._mute_at
         if now >= self._mute_at and not runtime.counters.telemetry:
             self._mute_at = math.inf

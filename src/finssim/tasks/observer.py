@@ -63,6 +63,8 @@ class Observer:
         task: Fitted to the vehicle.
         agent: Place of this vehicle in the task.
         schema: Which quantity stands where, in which unit and scale.
+        beside: Distance to the path that is followed [m] and its course [rad] at the last observation; None of a task
+            without a path.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class Observer:
         self._action_size = len(MODES[mode].labels(crew(vehicle, task, mode)[0]))
         self._guide: Guide | None = None
         self._path: Waypoints | None = None
+        self.beside: tuple[float, float] | None = None
         self._leg = np.zeros(1, dtype=np.int64)
         self._build(task)
 
@@ -140,7 +143,8 @@ class Observer:
             self._aim(guide)
             self._follow(guide, np.asarray(reading.position, float))
         if self._path is not None:
-            _, self._leg, _ = self._path.errors(self._leg, reading.position)
+            errors, self._leg, _ = self._path.errors(self._leg, reading.position)
+            self.beside = math.hypot(errors.across[0], errors.above[0]), float(errors.course[0])
             self._arrays.path.leg.numpy()[0] = self._leg[0]
         a, now = self._arrays, guide.at(t)
         self._remember(np.zeros(self._action_size) if previous is None else np.asarray(previous, float))
