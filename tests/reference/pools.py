@@ -68,11 +68,12 @@ def lockstep_pool(
         return made
 
     first = LockstepServer(("127.0.0.1", 0))
+    pools = [world()]  # here: while one thread captures launches, another may not copy arrays
 
     def serve():
         server = first
         for number in range(sessions):
-            pool = world()
+            pool = pools.pop() if pools else world()
             server.serve(pool)
             pool.close()
             if number + 1 < sessions:

@@ -87,7 +87,7 @@ def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
-    """`finssim run` by line of sight, autopilot, wire and fins: within half a metre of a way that turns and dives."""
+    """`finssim run` by line of sight, autopilot, wire and fins: at 2 m/s within a metre of a way that dives."""
     file, way, truth = torpedo_file(tmp_path), tmp_path / "way.csv", tmp_path / "truth"
     way.write_text("t,x,y,z\n0,0,0,-8\n20,30,0,-8\n40,55,15,-10\n", encoding="utf-8")
     words = [
@@ -124,7 +124,7 @@ def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
     for x in true.position[true.time > 8.0]:
         errors, leg, _ = path.errors(leg, x)
         worst = max(worst, abs(errors.across[0]), abs(errors.above[0]))
-    assert true.position[-1, 0] > 40.0 and worst < 0.5
+    assert true.position[-1, 0] > 40.0 and worst < 1.0
 
 
 def test_an_agent_of_all_channels_commands_them():

@@ -85,7 +85,7 @@ class Spread:
     """[ppm]"""
 
     def slender(self, share: float) -> Spread:
-        """Return the spread for a hull that is shaped and trimmed to go ahead, beam over length in place of a box's 1.
+        """Return the spread for a hull that is shaped and trimmed to go ahead; the share is its beam over length [-].
 
         Added mass about axes that are tilted by 3° would turn a torpedo harder than its rudder (Munk).
         """
