@@ -147,7 +147,7 @@ def cruise(vehicle: Vehicle) -> tuple[Array, Array]:
         Wrench [N, N m] and velocity [m/s, rad/s], (6,) each; zeros where an axis is not controlled or not damped.
     """
     hydro: Any = vehicle.hydrodynamics["calibrated"]
-    d1, d2 = np.diag(hydro.linear_damping), np.diag(hydro.quadratic_damping)
+    d1, d2 = np.diag(hydro.linear_damping), hydro.axis_drag
     F = CRUISE * np.asarray(vehicle.wrench_limits)
     # d2 v² + d1 v = F, by the root that stays exact without d2.
     root = d1 + np.sqrt(d1 * d1 + 4.0 * d2 * F)
