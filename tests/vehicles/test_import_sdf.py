@@ -7,6 +7,7 @@ from xml.etree.ElementTree import tostring
 import numpy as np
 import pytest
 
+from finssim import acceleration
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.core import mesh
@@ -17,6 +18,7 @@ from finssim.vehicles.importers import sdf
 from finssim.vehicles.importers.draft import check_registered, read_foreign
 from finssim.vehicles.importers.model import pose_of, shape_volume
 from finssim.vehicles.importers.rigid import LinkPose
+from reference import gz_sim
 from reference.gz_sim import BASE, EXPLICIT, HEAVY, TETHYS, Origin, element, euler, tree, write
 from reference.imported import adding, assert_moves_alike, setting, simulated, unnoticed
 
@@ -76,6 +78,105 @@ def test_added_mass_of_the_plugin_is_that_of_the_link_and_its_sign_of_coriolis_i
     nu = np.array([[0.6, 0.2, 0.0, 0.0, 0.0, 0.0]])
     one, two = (Origin(m).rate(np.eye(3)[None], nu, np.zeros((1, 6))) for m in (EXPLICIT, TETHYS))
     assert one[0, 5] > 0.0 > two[0, 5]  # the Munk moment turns the bow away from the flow
+
+
+# Fins
+
+POSE = (-0.97, 0.02, 0.1, 0.3, -0.02, 0.05)
+SURFACE = {
+    "air_density": 1000.0, "cla": 4.13, "cla_stall": -1.1, "cda": 0.2, "cda_stall": 0.03, "alpha_stall": 0.4, "a0": 0.0,
+    "area": 0.0244, "upward": "0 1 0", "forward": "1 0 0", "link_name": "fin", "cp": "0.01 0 0.05",
+}  # fmt: skip
+
+
+def with_fin(axis="0 0 1", kind="revolute", **words):
+    """A change that adds a link with a joint, and a plugin LiftDrag unless words is None."""
+
+    def change(root):
+        model = root.find("world/model")
+        link = element(model, "link", name="fin")
+        element(link, "pose", POSE)
+        element(element(link, "inertial"), "mass", "0.01")
+        joint = element(model, "joint", name="rudder", type=kind)
+        element(joint, "parent", "base_link")
+        element(joint, "child", "fin")
+        turn = element(joint, "axis")
+        element(turn, "xyz", axis)
+        limit = element(turn, "limit")
+        element(limit, "lower", -0.26)
+        element(limit, "upper", 0.3)
+        if words:
+            gz_sim.plugin(model, "LiftDrag", **words)
+
+    return change
+
+
+def lift_drag(nu, angle):
+    """Wrench about the base link by LiftDrag.cc of gz-sim, of a link that the joint has turned about its z axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    turn = euler(*POSE[3:]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    cp = np.array(POSE[:3]) + turn @ [0.01, 0.0, 0.05]
+    forward, upward = turn[:, 0], turn[:, 1]
+    span = np.cross(forward, upward)
+    v = nu[:3] + np.cross(nu[3:], cp)
+    plane = v - (v @ span) * span
+    lift = np.cross(span, plane) / np.linalg.norm(plane)
+    alpha = math.copysign(math.acos(np.clip(lift @ upward, -1.0, 1.0)), lift @ forward)
+    sweep = 1.0 - (span @ v / np.linalg.norm(v)) ** 2
+    q = 0.5 * 1000.0 * (plane @ plane) * 0.0244 * sweep
+    force = q * (4.13 * alpha * lift - 0.2 * abs(alpha) * plane / np.linalg.norm(plane))
+    return np.concatenate([force, np.cross(cp, force)])
+
+
+def test_a_surface_that_a_joint_turns_is_a_fin_with_the_forces_of_gz_sim(tmp_path):
+    """Upright against the axis and along it; at random velocities and angles, to what sweep takes away there."""
+    bare = changed(tmp_path, with_fin(), TETHYS).vehicle(tmp_path)
+    rng, eta = np.random.default_rng(3), [0.0, 0.0, -50.0, 0.0, 0.0, 0.0]
+    for axis, sign in (("0 0 1", 1.0), ("0 0 -2", -1.0)):
+        draft = changed(tmp_path, with_fin(axis, **SURFACE), TETHYS)
+        vehicle = draft.vehicle(tmp_path)
+        fin = vehicle.actuators["rudder"]
+        assert (fin.minimum, fin.maximum) == (-0.26, 0.3) and "LiftDrag" not in " | ".join(draft.not_read)
+        for _ in range(10):
+            nu = np.array([1.2, 0, 0, 0, 0, 0]) + 0.03 * rng.normal(size=6)
+            angle = rng.uniform(0.1, 0.25) * rng.choice([-1.0, 1.0])
+            found = acceleration(vehicle, eta, nu, actuators=[0.0, angle]) - acceleration(bare, eta, nu)
+            found, expected = vehicle.mass_matrix() @ found, lift_drag(nu, sign * angle)
+            assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
+
+
+def test_a_lift_that_an_angle_adds_to_is_a_fin(tmp_path):
+    """control_joint_rad_to_cl: the slope of the angle; the flow's own angle counts as much less as cla is below it."""
+    words = SURFACE | {
+        "link_name": "base_link",
+        "control_joint_name": "rudder",
+        "control_joint_rad_to_cl": 8.26,
+    }
+    fin = changed(tmp_path, with_fin(**words), TETHYS).vehicle(tmp_path).actuators["rudder"]
+    assert fin.lift_slope == pytest.approx(8.26 * 1000.0 / TETHYS.density) and fin.incidence == pytest.approx(
+        0.5
+    )
+    assert fin.span.tolist() == [0.0, 0.0, 1.0] and fin.position == pytest.approx([0.01, 0.0, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ({"forward": "0 1 0"}, "forward and upward of 'fin' are not perpendicular"),
+        ({"cla": -1.0}, "cla of 'fin' is -1, expected above 0"),
+        ({"area": 0.0}, "with an area above 0"),
+        ({"chord": 1.0}, "LiftDrag: unknown element 'chord'"),
+    ],
+)
+def test_refusals_of_fins_are_sentences(tmp_path, words, sentence):
+    with pytest.raises(VehicleError, match=sentence):
+        changed(tmp_path, with_fin(**(SURFACE | words)), TETHYS)
+
+
+@pytest.mark.parametrize("words", [{"axis": "1 0 0"}, {"kind": "fixed"}, {"radial_symmetry": "true"}])
+def test_wings_that_nothing_turns_are_named(tmp_path, words):
+    draft = changed(tmp_path, with_fin(**(SURFACE | words)), TETHYS)
+    assert draft.not_read[sdf.LEFT_OUT] == 1 and "actuators" not in draft.values
 
 
 # Conversions, one by one

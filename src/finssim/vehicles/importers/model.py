@@ -405,7 +405,8 @@ def note_rest(
     for name, joint in model.joints.items():
         unread(joint, {"pose", "parent", "child", "axis"}, "joint", draft)
         for axis in joint.findall("axis"):
-            unread(axis, {"xyz"}, "axis", draft)
+            limited = name in draft.values.get("actuators", {})
+            unread(axis, {"xyz", "limit"} if limited else {"xyz"}, "axis", draft)
         if joint.get("type") != "fixed" and not joint.get("still") and name not in turned:
             held.append(f"'{name}' ({joint.get('type')})")
     if held:

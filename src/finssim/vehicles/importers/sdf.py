@@ -88,7 +88,8 @@ PROPELLER = {"thrust_coefficient": 1.0, "fluid_density": 1000.0, "propeller_diam
 """Words that give the thrust -> gz-sim's number without them [-, kg/m³, m]."""
 CURVES = {"alpha_1", "alpha_2", "wake_fraction"}
 """Words of a thrust coefficient that falls with the speed."""
-WRENCHES = ("LiftDrag", "BuoyancyEngine", "JointPositionController", "AddedMass", "Wind")
+LEFT_OUT = "plugin LiftDrag (its forces are left out)"
+WRENCHES = ("BuoyancyEngine", "JointPositionController", "AddedMass", "Wind")
 """Plugins that act on a vehicle and are not read; others are named as well, without a warning."""
 
 DENSITY = 1000.0
@@ -316,6 +317,94 @@ def _put_thrusters(
             draft.put(f"{path}.dead_rpm_minus", -dead, "derived", "deadband")
 
 
+LIFT_DRAG = {
+    "link_name", "area", "air_density", "a0", "cla", "cda", "cma", "alpha_stall", "cla_stall", "cda_stall", "cma_stall",
+    "cp", "forward", "upward", "radial_symmetry", "control_joint_name", "control_joint_rad_to_cl",
+}  # fmt: skip
+"""Words of LiftDrag."""
+STEEPEST_STALL = 1.5
+"""Stall of a surface that has none below 90° [rad]."""
+
+
+def _put_fins(model: Model, plugins: list[Element], draft: Draft) -> set[str]:
+    """Set the surfaces that a joint turns, or whose lift the angle of a joint adds to; return the joints.
+
+    Lift is area rho/2 V² cla alpha along `upward` where the flow comes along `forward`, in the frame of the link.
+    """
+    joints = set()
+    for plugin in plugins:
+        where = f"{model.label}: LiftDrag"
+        refuse_unknown(plugin, LIFT_DRAG, where)
+        link = (plugin.findtext("link_name") or "").strip()
+        other = (plugin.findtext("control_joint_name") or "").strip()
+        turning = [
+            name
+            for name, joint in model.joints.items()
+            if joint.get("type") == "revolute"
+            and (name == other if other else model.link_of(model.text(joint, "child")) == link)
+        ]
+        if link not in model.links or not turning or flag(plugin, "radial_symmetry", where):
+            draft.not_read[LEFT_OUT] += 1
+            continue
+        name, pose = turning[0], model.pose(link)
+        path = f"actuators.{name}"
+        if name in joints or name in draft.values["thrusters"]:
+            raise VehicleError(f"{where}: joint '{name}' turns two surfaces, expected one: give each its own")
+        forward, upward, cp = (
+            numbers(plugin.findtext(word) or usual, 3, f"{where}: {word}")
+            for word, usual in (("forward", "1 0 0"), ("upward", "0 0 1"), ("cp", "0 0 0"))
+        )
+        across = np.cross(forward, upward)
+        if np.linalg.norm(across) < 1e-6 or abs(forward @ upward) > 1e-3 * np.linalg.norm(across):
+            raise VehicleError(f"{where}: forward and upward of '{link}' are not perpendicular: correct them")
+        axis = numbers(model.joints[name].findtext("axis/xyz") or "0 0 1", 3, f"{where}: axis of '{name}'")
+        span = pose.turn @ (across / np.linalg.norm(across))
+        if not other:
+            turned = axis_of_joint(model.pose(name), axis)
+            if abs(turned @ span) < 1.0 - 1e-6:
+                draft.not_read[LEFT_OUT] += 1
+                continue
+            span = np.sign(turned @ span) * span
+        ratio = number(plugin, "air_density", where, 1.2041) / draft.values["water"]["density"]
+        slope = incident = number(plugin, "cla", where, 1.0)
+        if other:
+            slope = number(plugin, "control_joint_rad_to_cl", where, 4.0)
+            draft.different.append(
+                f"drag of '{name}' goes with its angle too, in gz-sim with the flow's alone"
+            )
+        if not 0.0 <= incident <= slope or slope <= 0.0 or number(plugin, "area", where, 1.0) <= 0.0:
+            raise VehicleError(
+                f"{where}: cla of '{link}' is {incident:g}, expected above 0 and up to control_joint_rad_to_cl, with "
+                "an area above 0"
+            )
+        draft.put(f"{path}.kind", "fin")
+        draft.put(f"{path}.position", plain(pose.place + pose.turn @ cp), "derived", "cp in the link")
+        draft.put(f"{path}.span", plain(span), "derived", "axis of the joint")
+        chord = pose.turn @ (forward / np.linalg.norm(forward))
+        draft.put(f"{path}.chord", plain(chord), "derived", "forward")
+        draft.put(f"{path}.area", number(plugin, "area", where, 1.0))
+        draft.put(f"{path}.lift_slope", slope * ratio, "derived", "cla by the water's density")
+        draft.put(f"{path}.incidence", incident / slope, "derived", "cla")
+        stall = min(number(plugin, "alpha_stall", where, math.pi / 2.0), STEEPEST_STALL)
+        draft.put(f"{path}.stall", stall, "derived", "alpha_stall")
+        drag = abs(number(plugin, "cda", where, 0.01)) * ratio
+        draft.put(f"{path}.drag", [0.0, drag, 0.0], "derived", "cda by the water's density")
+        for key, end, usual in (("minimum", "lower", -0.5), ("maximum", "upper", 0.5)):
+            limit = model.joints[name].findtext(f"axis/limit/{end}")
+            if limit is None or abs(float(numbers(limit, 1, where)[0])) > math.pi:
+                draft.guess(f"{path}.{key}", usual, "the joint has no limit in the file")
+            else:
+                draft.put(f"{path}.{key}", float(numbers(limit, 1, where)[0]))
+        draft.guess(f"{path}.time_constant", LAG, "its controller is not read")
+        sentence = "beyond alpha_stall the lift falls to 0 at 90°, and sweep reduces no lift"
+        if sentence not in draft.different:
+            draft.different.append(sentence)
+        if number(plugin, "a0", where, 0.0):
+            draft.different.append(f"a0 of '{name}' is left out: no lift at angle 0 straight ahead")
+        joints.add(name)
+    return joints
+
+
 def _rpm(force: float, factor: float) -> float:
     return math.sqrt(abs(force) / factor) * 30.0 / math.pi
 
@@ -533,9 +622,10 @@ def read_model(
     put_envelope(draft, [shape.corners for shape in shapes])
     put_controlled_axes(draft)
     turned = {model.text(plugin, "joint_name") for plugin in thrusters}
+    turned |= _put_fins(model, plugins.get("LiftDrag", []), draft)
     acting = dict.fromkeys(WRENCHES, " (its forces are left out)")
     acting["ArduPilotPlugin"] = " but for the ranges of its commands"
-    note_rest(model, plugins, {"Hydrodynamics", "Thruster"}, acting, turned)
+    note_rest(model, plugins, {"Hydrodynamics", "Thruster", "LiftDrag"}, acting, turned)
     for child in () if world is None else world:
         kind = f" {kind_of(child)}" if child.tag == "plugin" else ""
         if child is not element and child.tag != "gravity" and kind != " Buoyancy":
