@@ -176,8 +176,9 @@ def test_surfaces_are_all_channels_in_their_own_units():
     mode = action_mode("surfaces", vehicle)
     assert mode.labels == ("propeller", "fin_0", "fin_1", "fin_2", "fin_3")
     got = mode.to_thrusters([0.5, 1.0, -1.0, 0.2, 0.0])
-    assert got == pytest.approx([0.5 * 41.203, 0.35, -0.35, 0.07, 0.0], rel=1e-6)
-    assert action_mode("thruster8", vehicle).to_thrusters([1.0]) == pytest.approx([41.203])
+    full = vehicle.force_limits[1][0]
+    assert got == pytest.approx([0.5 * full, 0.35, -0.35, 0.07, 0.0], rel=1e-6)
+    assert action_mode("thruster8", vehicle).to_thrusters([1.0]) == pytest.approx([full])
 
 
 def test_modes_by_course_state_what_their_numbers_mean_and_need_the_state():

@@ -32,10 +32,15 @@ def forces(vehicle, n=40, seed=0):
     return 0.5 * np.sin(np.arange(n)[:, None] * 0.02 * rate + phase) * vehicle.force_limits[1]
 
 
+def propelled(name):
+    """A vehicle with its thrusters alone."""
+    return load_vehicle(name).model_copy(update={"actuators": {}})
+
+
 @pytest.fixture(params=["finsrov", "bluerov2", "bluerov2_heavy", "lauv"])
 def vehicle(request):
     """Vehicles of one, six and eight thrusters."""
-    return load_vehicle(request.param)
+    return propelled(request.param)
 
 
 @pytest.mark.parametrize("kind", ["rpm", "force", "tau_cog", "tau_origin", "tau_point"])
@@ -138,7 +143,7 @@ def test_pulse_widths_become_forces_through_the_speed_controller():
 
 def test_inputs_of_another_rate_are_held_or_go_straight():
     """A command holds until the next; a measured force goes in a straight line; `inputs_between` overrides."""
-    vehicle = load_vehicle("lauv")
+    vehicle = propelled("lauv")
     name = vehicle.thruster_names[0]
     sparse = np.where(np.arange(21) % 10 == 0, np.arange(21) / 10.0, np.nan)
     middle = np.array([0.1])
@@ -172,7 +177,7 @@ def test_forces_of_thrusters_sampled_at_different_times_are_brought_together(veh
 
 def test_nothing_is_known_outside_the_inputs_or_in_their_gaps():
     """A measured force is not made up where it was not measured; a command holds while the recording goes on."""
-    vehicle = load_vehicle("lauv")
+    vehicle = propelled("lauv")
     name = vehicle.thruster_names[0]
     t = np.arange(300) * 0.02
     missing = ((t > 2.0) & (t < 4.0)) | (t < 0.5)
