@@ -39,6 +39,16 @@ def simulated(vehicle, R, nu, tau, duration):
     return np.array(out)
 
 
+def driven(vehicle, duration):
+    """Velocity of a free vehicle with its thrusters at full static thrust for a while, from rest, (6,)."""
+    simulator = Simulator(vehicle, control_step=0.05, substeps=10, integrator="rk4")
+    simulator.place(position=(0.0, 0.0, -200.0))
+    simulator.set_thrust(vehicle.force_limits[1])
+    for _ in range(round(duration / 0.05)):
+        simulator.step()
+    return simulator.numpy("velocity")[0, 0].copy()
+
+
 def assert_moves_alike(vehicle, origin, force, duration=4.0, tolerance=0.002, ahead=(0.0, 0.0)):
     """Six steps of force, release at rest, and a decay from a tilt with all velocities, at all times.
 

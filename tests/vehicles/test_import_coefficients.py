@@ -1,15 +1,19 @@
 """Vehicles whose coefficients stand in Python or MATLAB: their motion is that of Fossen's equations."""
 
+import math
+
 import numpy as np
 import pytest
 
+from finssim import acceleration
 from finssim.vehicles import VehicleError, VehicleWarning, load_vehicle
 from finssim.vehicles.importers.assignments import read_assignments
 from finssim.vehicles.importers.coefficients import one_sign, symbol_of
 from finssim.vehicles.importers.draft import read_foreign
 from finssim.vehicles.importers.rigid import flu_of_frd
 from reference.fossen import F, Fossen, Torpedo
-from reference.imported import assert_moves_alike, simulated
+from reference.imported import assert_moves_alike, driven, simulated
+from reference.remus import Remus
 
 HEAVY = """
 clc; clear;                 % BlueROV2 Heavy of von Benzon et al. 2022
@@ -186,11 +190,7 @@ def test_a_torpedo_reaches_the_speeds_of_pythonvehiclesimulator(tmp_path, words)
         assert found[k, axis] == pytest.approx(expected[k, axis], rel=0.01)
     origin.rpm = 1525.0
     top = origin.run(upright[:1], np.zeros((1, 6)), np.zeros((1, 6)), 60.0, step=0.05)[1][-1, 0, 0]
-    push = np.zeros((1, 6))
-    push[0, 0] = vehicle.thrusters["propeller"].force_max
-    assert simulated(vehicle, upright[:1], np.zeros((1, 6)), push, 60.0)[-1, 0, 0] == pytest.approx(
-        top, rel=0.01
-    )
+    assert driven(vehicle, 60.0)[0] == pytest.approx(top, rel=0.01)
 
 
 @pytest.mark.slow
@@ -207,6 +207,32 @@ def test_a_torpedo_goes_straight_where_the_munk_moment_is_left_out(tmp_path):
         scale = np.abs(expected[:, k, axes]).max(axis=0)
         assert (np.abs(found - expected)[:, k, axes] < 0.01 * scale).all()
     assert abs(found[-1, 0, 5]) < 0.1
+
+
+FINS = """
+        S_fin = 0.00665
+        self.CL_delta_r = 0.5; self.CL_delta_s = 0.7
+        self.A_r = 2 * S_fin; self.A_s = 2 * S_fin
+        self.x_r = -a; self.x_s = -a
+        self.T_delta = 0.1; self.deltaMax_r = 15 * math.pi / 180; self.deltaMax_s = 0.2
+"""
+
+
+def test_fins_and_propeller_of_a_torpedo_act_as_in_pythonvehiclesimulator(tmp_path):
+    """Accelerations ahead at 2 m/s and 1525 rpm with deflected fins, without the torque, which is not read."""
+    content = pvs(REMUS).replace("    def dynamics", f"{FINS}    def dynamics")
+    draft, remus = read(tmp_path, content, "remus.py"), Remus()
+    remus.propulsion = lambda U: Remus.propulsion(remus, U) * np.eye(6)[0]
+    vehicle = draft.vehicle(tmp_path)
+    assert [(fin.maximum, fin.time_constant) for fin in vehicle.actuators.values()] == [
+        (pytest.approx(math.radians(15.0)), 0.1), (0.2, 0.1)
+    ]  # fmt: skip
+    assert not any("fins" in text for text in draft.not_read)
+    nu, full = np.array([2.0, 0, 0, 0, 0, 0]), vehicle.thrusters["propeller"].force_max
+    for rudder, plane in ((0.2, 0.0), (0.0, -0.15), (-0.1, 0.2)):
+        found = acceleration(vehicle, [0.0, 0.0, -50.0, 0, 0, 0], nu, actuators=[full, rudder, plane]) * F
+        expected = remus.acceleration(np.zeros(6), nu, [rudder, plane, 1525.0])
+        assert (np.abs(found - expected) < 0.002 * np.abs(expected).max()).all()
 
 
 def test_free_decay_of_a_torpedo_in_roll(tmp_path):

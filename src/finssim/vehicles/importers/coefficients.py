@@ -294,6 +294,12 @@ def _put_hydrodynamics(names: _Names, draft: Draft) -> None:
     words = {key: names.first(key) for key in (*torpedo.PROPELLER, "nMax")} | {"L": names.first("length")}
     if None not in words.values():
         torpedo.put_propeller(draft, words | {"T_n": names.first("T_n")})
+        further = ("A_r", "A_s", "x_r", "x_s", "deltaMax_r", "deltaMax_s", "T_delta")
+        fins = {key: names.first(key) for key in (*torpedo.FINS, *further)}
+        if all(fins[key] for key in torpedo.FINS):
+            torpedo.put_fins(draft, fins | {"L": words["L"]})
+        else:
+            draft.not_read["fins, which turn the vehicle"] += 1
     hull = draft.values["hydrodynamics"]["calibrated"]
     if "cross_flow_drag" not in hull and not any(
         np.any(hull[f"{k}_damping"]) for k in ("linear", "quadratic")

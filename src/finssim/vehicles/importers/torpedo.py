@@ -1,4 +1,4 @@
-"""Hull drag and propeller of the torpedoes of PythonVehicleSimulator and HoloOcean.
+"""Hull drag, propeller and fins of the torpedoes of PythonVehicleSimulator and HoloOcean.
 
 Their equations, x forward, y right, z down, b span, S area of the hull, alpha angle of attack, x_k places of 21 strips:
 
@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from finssim.vehicles.importers.draft import LAG, Draft
 
 __all__ = [
+    "FINS",
     "PROPELLER",
     "guess_thruster",
     "put_cross_flow",
+    "put_fins",
     "put_lift_drag",
     "put_munk_relief",
     "put_propeller",
@@ -34,6 +36,10 @@ SET = "hydrodynamics.calibrated"
 """Path of the hydrodynamic set that importers write."""
 PROPELLER = ("D_prop", "t_prop", "KT_0", "KT_max", "Ja_max")
 """Words of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
+FINS = ("CL_delta_r", "CL_delta_s", "S_fin")
+"""Words of fins: slopes of lift of rudder and stern plane [1/rad], area of one [m²]."""
+TRAVEL = math.radians(15.0)
+"""Travel of the fins of PythonVehicleSimulator [rad]."""
 RHO, WAKE, OSWALD = 1026.0, 0.056, 0.7
 """Density [kg/m³] that the library's drag has, wake fraction and Oswald's efficiency of PythonVehicleSimulator [-]."""
 RPM = 3000.0
@@ -133,30 +139,23 @@ def put_munk_relief(draft: Draft) -> None:
 
 
 def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
-    """Set the propeller at the stern: its thrust is that at its own top speed, as it has no curve of the speed here.
+    """Set the propeller at the stern: its thrust at rest, and what it loses in the flow.
 
     Args:
-        draft: Draft with water and hydrodynamics.
+        draft: Draft with water.
         words: Numbers of `PROPELLER`, `nMax` [rpm], `L` [m] and, where given, `T_n` [s] and `w` [-].
     """
-    n, D = words["nMax"] / 60.0, words["D_prop"]
-    hull = draft.values["hydrodynamics"]["calibrated"]
-    drag = hull["quadratic_damping"][0][0] + hull.get("lift_drag", {}).get("drag", 0.0)
+    omega, D, path = words["nMax"] * math.pi / 30.0, words["D_prop"], "thrusters.propeller"
     scale = (1.0 - words["t_prop"]) * draft.values["water"]["density"] * D**4
-    fall = scale * (words["KT_0"] - words["KT_max"]) / words["Ja_max"] * (1.0 - words.get("w", WAKE)) / D * n
-    rest = scale * words["KT_0"] * n**2
-    top = 2.0 * rest / (fall + math.sqrt(max(fall**2 + 4.0 * drag * rest, 0.0)))  # drag u² = rest - fall u
-    forward, path = rest - fall * top, "thrusters.propeller"
-    how = f"at its top speed of {top:.3g} m/s; at rest it is {rest / forward:.3g} times as much"
-    for end, sign, force, note in (("max", 1.0, forward, how), ("min", -1.0, rest, "as at rest")):
-        draft.put(f"{path}.force_{end}", sign * force, "derived", note)
+    factor = scale * words["KT_0"] / (2.0 * math.pi) ** 2
+    for end, sign, side in (("max", 1.0, "plus"), ("min", -1.0, "minus")):
+        draft.put(f"{path}.force_{end}", sign * factor * omega**2, "derived", "at rest")
         draft.put(f"{path}.rpm_{end}", sign * words["nMax"])
-        draft.put(
-            f"{path}.c_{'plus' if end == 'max' else 'minus'}",
-            force / (2.0 * math.pi * n) ** 2,
-            "derived",
-            note,
-        )
+        draft.put(f"{path}.c_{side}", factor, "derived", "KT_0")
+    loss = scale * (words["KT_0"] - words["KT_max"]) / words["Ja_max"] / (2.0 * math.pi * D)
+    draft.put(f"{path}.inflow.thrust_loss", loss, "derived", "KT_0 and KT_max")
+    draft.put(f"{path}.inflow.wake_fraction", words.get("w", WAKE))
+    draft.put(f"{path}.diameter", D)
     if words.get("T_n") is None:
         draft.guess(f"{path}.time_constant", LAG, "not in the file")
     else:
@@ -164,7 +163,38 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
     draft.put(f"{path}.axis", [1.0, 0.0, 0.0])
     draft.guess(f"{path}.position", [-words["L"] / 2.0, 0.0, 0.0], "at the stern, on the axis")
     draft.values["thrusters"]["propeller"]["domain"] = "speed"
-    draft.not_read["propeller torque and fins, which turn the vehicle"] += 1
+    draft.not_read["torque of the propeller, which rolls the vehicle"] += 1
+
+
+def put_fins(draft: Draft, words: Mapping[str, float | None]) -> None:
+    """Set a rudder and a stern plane, of two fins each, whose lift goes with the deflection alone.
+
+    Args:
+        draft: Draft with a propeller.
+        words: `CL_delta_r` and `CL_delta_s` [1/rad], `S_fin` of one fin [m²], `L` [m] and, where given, `A_r`, `A_s` of
+            a pair [m²], which has drag then, `x_r`, `x_s` [m], `deltaMax_r`, `deltaMax_s` [rad] and `T_delta` [s].
+    """
+    for name, side, span in (("rudder", "r", [0.0, 0.0, 1.0]), ("stern_plane", "s", [0.0, -1.0, 0.0])):
+        path, slope, area = f"actuators.{name}", words[f"CL_delta_{side}"], words.get(f"A_{side}")
+        x, travel, lag = (words.get(key) for key in (f"x_{side}", f"deltaMax_{side}", "T_delta"))
+        draft.put(f"{path}.kind", "fin")
+        place = [-words["L"] / 2.0 if x is None else x, 0.0, 0.0]  # type: ignore[operator]
+        draft.put(f"{path}.position", place, "derived", "both fins together, on the axis")
+        draft.put(f"{path}.span", span, "derived", "a positive angle turns the bow to starboard or down")
+        draft.put(f"{path}.area", area or 2.0 * (words["S_fin"] or 0.0), "derived", "both fins")
+        draft.put(f"{path}.lift_slope", slope)
+        draft.put(f"{path}.drag", [0.0, 0.0, slope if area else 0.0], "derived", "lift times angle")
+        draft.put(f"{path}.incidence", 0.0, "derived", "lift by the deflection alone")
+        draft.guess(f"{path}.stall", 0.7, "lift of the file has no end")
+        for end, sign in (("minimum", -1.0), ("maximum", 1.0)):
+            if travel is None:
+                draft.guess(f"{path}.{end}", sign * TRAVEL, "not in the file: that of PythonVehicleSimulator")
+            else:
+                draft.put(f"{path}.{end}", sign * travel)
+        if lag is None:
+            draft.guess(f"{path}.time_constant", 0.1, "not in the file: that of PythonVehicleSimulator")
+        else:
+            draft.put(f"{path}.time_constant", lag)
 
 
 def guess_thruster(draft: Draft, section: str, name: str, limit: float) -> None:
