@@ -24,6 +24,7 @@ OPEN_LOOP = [name for name, kind in MODES.items() if not kind.pilot and not kind
 def test_the_plants_of_the_protocol_ship():
     """Nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the other two models."""
     expected = [
+        "beyond_cruise",
         "current",
         "foreign",
         "held_out",

@@ -6,17 +6,23 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.control.allocation import Allocator
-    from finssim.control.guidance import Station
+    from finssim.control.course import CoursePilot
+    from finssim.control.guidance import Station, Track
     from finssim.control.modes import action_mode
+    from finssim.control.path_following import LineOfSight, Waypoints
     from finssim.control.policy import Policy
     from finssim.control.trajectories import TRAJECTORIES, load_trajectory
 
 __all__ = [
     "Allocator",
     "ControlError",
+    "CoursePilot",
+    "LineOfSight",
     "Policy",
     "Station",
     "TRAJECTORIES",
+    "Track",
+    "Waypoints",
     "action_mode",
     "load_trajectory",
 ]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
+    from finssim.sim.free_motion import linear_model
     from finssim.sim.plant_arrays import SimulatorError
     from finssim.sim.recorder import StateRecorder, read_run
     from finssim.sim.sensors.batch import SensorBatch
@@ -33,6 +34,7 @@ __all__ = [
     "Water",
     "Wave",
     "add_sensor",
+    "linear_model",
     "load_water",
     "normal",
     "parameters_of",
