@@ -8,6 +8,7 @@ from xml.etree.ElementTree import fromstring, tostring
 import numpy as np
 import pytest
 
+from finssim import acceleration
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.core.mesh import MeshError, load_obj, load_stl, mesh_volume, write_stl
@@ -329,16 +330,58 @@ def test_every_word_of_the_robot_is_read_refused_or_named(tmp_path):
     assert found <= {"nedx", "oceanx", "waterx", "materialx", "hydrodynamicsx", "massx"}
 
 
+RUDDER = """<actuator name="Tail fin" type="rudder"><link name="base"/><origin xyz="-0.5 0.02 0.1" rpy="0.3 0 0.1"/>
+<specs lift_coeff="2.5" drag_coeff="0.8" area="0.02" max_angle="0.4" max_angular_rate="0.9" inverted="{inverted}"/>
+</actuator>
+"""
+
+
+def test_a_rudder_acts_as_in_stonefish(tmp_path):
+    """Lift ½ρ A C_L a V² along -z × v and drag by C_D a² of its own frame, z down, at random speeds and angles."""
+    first, second, third, fourth = (tmp_path / name for name in "abcd")
+    for folder in (first, second, third, fourth):
+        folder.mkdir()
+    bare = read_foreign(write(first)).vehicle(first)
+    path = changed(second, "<world_transform", RUDDER.format(inverted="false") + "<world_transform")
+    vehicle = read_foreign(path).vehicle(tmp_path)
+    fin, rho, rng = vehicle.actuators["Tail_fin"], vehicle.water.density, np.random.default_rng(2)
+    assert (fin.maximum, fin.minimum, fin.rate_limit) == (0.4, -0.4, 0.9)
+    place, turn = np.array([-0.5, 0.02, 0.1]), euler(0.3, 0.0, 0.1)
+    flip = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+    for _ in range(10):
+        nu = np.array([1.4, 0, 0, 0, 0, 0]) + 0.05 * rng.normal(size=6)  # z down
+        angle = rng.uniform(-0.3, 0.3)
+        c, s = np.cos(angle), np.sin(angle)
+        own = turn @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        v = own.T @ (nu[:3] + np.cross(nu[3:], place))
+        v[2] = 0.0  # of the flow along the rudder, which counts there, a part in a thousand
+        attack, q = np.arctan2(v[1], v[0]), 0.5 * rho * 0.02 * (v @ v)
+        ahead = v / np.linalg.norm(v)
+        force = own @ (2.5 * attack * q * np.cross([0.0, 0.0, -1.0], ahead) - 0.8 * attack**2 * q * ahead)
+        expected = np.concatenate([force, np.cross(place, force)])
+        channels = np.zeros(len(vehicle.channel_names))
+        still, eta = channels[:-1].copy(), [0.0, 0.0, -50.0, 0.0, 0.0, 0.0]
+        channels[-1] = angle
+        found = acceleration(vehicle, eta, nu * flip, actuators=channels)
+        found = vehicle.mass_matrix() @ (found - acceleration(bare, eta, nu * flip, actuators=still)) * flip
+        assert np.abs(found - expected).max() < 5e-3 * np.abs(expected).max()
+    path = changed(third, "<world_transform", RUDDER.format(inverted="true") + "<world_transform")
+    assert any("inverted" in sentence for sentence in read_foreign(path).different)
+    path = changed(fourth, "<world_transform", RUDDER.replace('0.02"', '0"') + "<world_transform")
+    with pytest.raises(VehicleError, match="expected lift_coeff, area and max_angle above 0"):
+        read_foreign(path)
+
+
 def test_the_command_imports_and_lists(tmp_path, capsys):
-    """Guesses are those of the file; sensors, rudders and messages of ROS are named."""
-    more = '<sensor name="imu"/><ros_subscriber thrusters="/x"/><actuator name="r" type="rudder"/><world_transform'
+    """Guesses are those of the file; sensors, servos and messages of ROS are named."""
+    more = '<sensor name="imu"/><ros_subscriber thrusters="/x"/><actuator name="r" type="servo"/><world_transform'
     path, out = changed(tmp_path, "<world_transform", more), tmp_path / "rov.yaml"
     assert boundary.run(app, ["vehicles", "import", str(path), "--out", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     guessed = {p for p, provenance in load_vehicle(out).provenance.items() if provenance.origin == "guessed"}
     assert guessed == {"water.gravity", "body.size", "body.surface_half_height"}
     rest = " | ".join(report["not read"])
-    for word in ("sensor of the robot", "robot: ros_subscriber", "actuator rudder (steering by fins"):
+    for word in ("sensor of the robot", "robot: ros_subscriber", "actuator servo"):
         assert word in rest
 
 

@@ -720,6 +720,51 @@ def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> No
         draft.put(f"thrusters.{name}.time_constant", lag, "derived", how)
 
 
+RUDDER = {"specs", "visual", "origin", "link", "watchdog"}
+"""Words of a rudder."""
+ENDLESS = 1.5
+"""Stall of a rudder without a stall angle [rad]."""
+
+
+def _put_rudder(
+    actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
+) -> None:
+    """Set a rudder, which turns about the z axis of its origin: lift is lift_coeff by the angle, drag by its square."""
+    refuse_strange(actuator, RUDDER, where, draft)
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", actuator.get("name", "") or "rudder")[:64]
+    link, specs = word(actuator.find("link"), "name", f"{where}: link"), actuator.find("specs")
+    taken = (*draft.values.get("thrusters", {}), *draft.values.get("actuators", {}))
+    if name in taken or link not in links:
+        raise VehicleError(
+            f"{where}: its name is there twice, or its link '{link}' is not of the robot: correct it"
+        )
+    lift, drag, area, most = (
+        scalar(specs, key, f"{where}: specs", default)
+        for key, default in (("lift_coeff", None), ("drag_coeff", "0"), ("area", None), ("max_angle", None))
+    )
+    if min(lift, area, most) <= 0.0 or drag < 0.0:
+        raise VehicleError(
+            f"{where}: expected lift_coeff, area and max_angle above 0 and drag_coeff of 0 or more"
+        )
+    pose = links[link][0].after(pose_of(actuator.find("origin"), f"{where}: origin"))
+    path = f"actuators.{name}"
+    draft.put(f"{path}.kind", "fin")
+    draft.put(f"{path}.position", plain(flu_of_frd(pose.place)))
+    for key, column in (("span", 2), ("chord", 0)):
+        draft.put(f"{path}.{key}", plain(flu_of_frd(pose.turn[:, column])), "derived", "axes of its origin")
+    draft.put(f"{path}.area", area)
+    draft.put(f"{path}.lift_slope", lift)
+    draft.put(f"{path}.drag", [0.0, 0.0, drag], "derived", "drag_coeff")
+    stall = scalar(specs, "stall_angle", f"{where}: specs", repr(ENDLESS))
+    draft.put(f"{path}.stall", min(stall, ENDLESS), "derived", "stall_angle")
+    draft.put(f"{path}.minimum", -most)
+    draft.put(f"{path}.maximum", most)
+    if specs is not None and specs.get("max_angular_rate"):
+        draft.put(f"{path}.rate_limit", scalar(specs, "max_angular_rate", f"{where}: specs"))
+    if word(specs, "inverted", where, "false").lower() in ("true", "1"):
+        draft.different.append(f"inverted: positive commands of '{name}' turn it about its own z axis here")
+
+
 def _put_thruster(
     actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
 ) -> None:
@@ -816,9 +861,10 @@ def read_stonefish(path: Path, folders: Sequence[Path] = ()) -> Draft:
         where = f"{path}: actuator '{actuator.get('name', '')}'"
         if kind in ("thruster", "simple_thruster", "push"):
             _put_thruster(actuator, links, draft, where)
-        elif kind in ("motor", "servo", "propeller", "rudder", "vbs", "suction_cup"):
-            hint = " (steering by fins comes with actuators)" if kind == "rudder" else ""
-            draft.not_read[f"actuator {kind}{hint}"] += 1
+        elif kind == "rudder":
+            _put_rudder(actuator, links, draft, where)
+        elif kind in ("motor", "servo", "propeller", "vbs", "suction_cup"):
+            draft.not_read[f"actuator {kind}"] += 1
         else:
             raise VehicleError(f"{where}: unknown type '{kind}': correct it")
     if not draft.values.get("thrusters"):
