@@ -18,7 +18,6 @@ from finssim.robot.pilots import AgentPilot
 from finssim.tasks import TASKS, Environment, task_named
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
-from reference.finned import torpedo
 from reference.policies import linear, written
 from reference.programs import study
 from studies import stack
@@ -43,7 +42,7 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
     task = replace(task, time_limit=SHORT.get(name, task.time_limit))
     guide = TRAJECTORIES["lemniscate"] if name == "t2" else None
-    vehicle = torpedo() if name in ("path", "waypoints") else FINSROV
+    vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints") else FINSROV
     site = site_of(task, who, [vehicle] * len(task.vehicles), seed=SEEDS.get(name, 1), guide=guide)
     measured = site.run()
     assert measured["success"] == 1.0
