@@ -385,7 +385,7 @@ class TaskSite(Fleet):
         worlds = {
             name: VirtualPool(
                 vehicle,
-                spec(vehicle),
+                _deep_enough(spec(vehicle), referee.arrays),
                 camera=camera(vehicle) if camera else self._eyes(vehicle, seed),
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
                 start=start,
@@ -523,6 +523,19 @@ class TaskSite(Fleet):
 
     def _positions(self) -> dict[str, Array]:
         return {name: np.asarray(world.plant.position, float) for name, world in self.worlds.items()}
+
+
+BELOW = 10.0
+"""Depth of the water below the deepest point of a path, at least [m]."""
+
+
+def _deep_enough(spec: PlantSpec, arrays: TaskArrays) -> PlantSpec:
+    """Return the plant in water in which the episode's path has room, if it has one."""
+    if arrays.path.points is None:
+        return spec
+    depth = BELOW - float(arrays.path.points.numpy()[0, :, 2].min())
+    basin = spec.basin.model_copy(update={"depth": max(spec.basin.depth, depth)})
+    return spec.model_copy(update={"basin": basin})
 
 
 def _limits(vehicle: Vehicle, basin: Basin) -> BridgeSettings:
