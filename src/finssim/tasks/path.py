@@ -320,6 +320,8 @@ class PathFollowing(Task):
     """Farther than this from the path the episode ends [m]."""
     settle: float = 10.0
     """The error of an episode is counted from here [s]."""
+    tolerance: float = 0.5
+    """A success has no greater error than this [m]."""
     reward: PathReward = field(default_factory=PathReward)
 
     begins: ClassVar[Any] = start_path
@@ -335,7 +337,8 @@ class PathFollowing(Task):
 
     def success_rule(self) -> str:
         """See `Task`."""
-        return f"the end of the path, never more than {self.fit.size * self.corridor:.3g} m from it"
+        lengths = (self.fit.size * length for length in (self.tolerance, self.corridor))
+        return "the end of the path, {:.3g} m from it (RMS), never more than {:.3g} m".format(*lengths)
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
         """Return every task's measures, and the error: RMS distance to the path after `settle` [m].
@@ -345,7 +348,11 @@ class PathFollowing(Task):
         measured = super().metrics(arrays)
         squared = measured.pop("squared_error")
         long = measured["length"] * self.control_step > self.settle + 0.5 * self.control_step
-        return {**measured, "error": np.where(long, np.sqrt(squared), np.nan)}
+        error = np.where(long, np.sqrt(squared), np.nan)
+        good = error <= self.fit.size * self.tolerance
+        measured["success"] = np.where(good, measured["success"], 0.0)
+        measured["success_time"] = np.where(good, measured["success_time"], np.nan)
+        return {**measured, "error": error}
 
     def terms(self) -> Terms:
         """See `PathReward`."""
@@ -386,6 +393,7 @@ class WaypointTour(PathFollowing):
     offset: float = 3.0
     yaw: float = math.radians(90.0)
     corridor: float = 15.0
+    tolerance: float = 15.0
 
     begins: ClassVar[Any] = start_tour
 

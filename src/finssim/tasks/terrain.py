@@ -186,7 +186,10 @@ class TerrainFollowing(PathFollowing):
 
     def success_rule(self) -> str:
         """See `Task`."""
-        return f"the end of the line, never more than {self.fit.size * self.corridor:.3g} m from the altitude"
+        lengths = (self.fit.size * length for length in (self.tolerance, self.corridor))
+        return "the end of the line, {:.3g} m from the altitude (RMS), never more than {:.3g} m".format(
+            *lengths
+        )
 
     def terms(self) -> Terms:
         """See `PathReward`; the error is that of the altitude, and `beside` is the distance to the line."""
