@@ -84,16 +84,12 @@ def test_paths_that_do_not_fit_are_refused(kind):
         follow_path(make("t1", worlds=2), [short, short])
 
 
-@pytest.mark.slow
-@TASKS
-@pytest.mark.parametrize("tail", ["cruciform", "x"])
-def test_the_baseline_follows_in_a_current(kind, tail):
-    """Nearly all of 64 reach the end in 0.4 m/s, a quarter of their speed."""
-    vehicle, n = tailed(tail), 64
-    env = make(kind(), worlds=n, vehicle=vehicle, seed=1, water=Water(current=(0.4, 0.0, 0.0), depth=60.0))
-    player = baseline(kind(), "line-of-sight", vehicle)
+def played(task, vehicle, n=64, current=0.4):
+    """Success, error and whether the end was reached of the first episode of n worlds, by the baseline."""
+    env = make(task, worlds=n, vehicle=vehicle, seed=1, water=Water(current=(current, 0.0, 0.0), depth=60.0))
+    player = baseline(task, "line-of-sight", vehicle)
     memory, observation = player.reset(n), env.reset()
-    found = {"success": np.full(n, np.nan), "error": np.full(n, np.nan)}
+    found = {name: np.full(n, np.nan) for name in ("success", "error", "finished")}
     for _ in range(round(env.task.time_limit / env.task.control_step)):
         action, memory = player.act(memory, observation)
         step = env.step(action)
@@ -103,5 +99,20 @@ def test_the_baseline_follows_in_a_current(kind, tail):
             first = ended & np.isnan(values)
             values[first] = measured[name][first]
         memory, observation = restarted(memory, player.reset(n), ended), step.observation
+    return found
+
+
+@pytest.mark.slow
+@TASKS
+@pytest.mark.parametrize("tail", ["cruciform", "x"])
+def test_the_baseline_follows_in_a_current(kind, tail):
+    """Nearly all of 64 reach the end in 0.4 m/s, a quarter of their speed."""
+    found = played(kind(), tailed(tail))
     assert found["success"].mean() > 0.95
     assert found["error"].mean() < (0.25 if kind is PathFollowing else 1.2)
+
+
+@pytest.mark.slow
+def test_an_end_that_is_reached_beside_the_path_is_no_success():
+    found = played(PathFollowing(tolerance=0.02), VEHICLE, n=16)
+    assert found["finished"].min() == 1.0 and found["success"].max() == 0.0
