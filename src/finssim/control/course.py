@@ -47,7 +47,7 @@ SCALES = {
     8: math.radians(15.0),
     9: 1.0,
 }
-"""State -> its error whose cost equals that of a whole limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
+"""Error of a state whose cost equals that of a whole limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
 INTEGRAL_TIME = 6.0
 """The integral of an error costs as much as the error when that has lasted this long [s]."""
 STEEPEST = math.radians(25.0)
@@ -132,7 +132,7 @@ class CourseData:
     reach: wp.array2d(dtype=Wrench4)
     """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
     slack: wp.array2d(dtype=Wrench4)
-    """Wrench that may be missing while integrals go on [N, N m], (vehicles, n)."""
+    """Wrench that may be missing while integrals grow [N, N m], (vehicles, n)."""
     hold: wp.array2d(dtype=float)
     """Surge force of the trim [N], (vehicles, n)."""
     trim: wp.array2d(dtype=vec8)
@@ -151,7 +151,7 @@ class CourseData:
 
 @wp.struct
 class CourseOrder:
-    """What the autopilot is asked to do now."""
+    """Order to the autopilot."""
 
     speed: float  # wanted surge [m/s]
     turn: float  # wanted course less the present course over ground, counter-clockwise from above [rad]
@@ -162,7 +162,7 @@ class CourseOrder:
 
 @wp.struct
 class CourseAnswer:
-    """What the autopilot commands, and what it remembers."""
+    """Commands of the autopilot, and its memory."""
 
     channels: vec8
     """Commands, in the units of the channels."""
@@ -367,7 +367,7 @@ class Tuning(NamedTuple):
     limits: Array
     """Wrench of each of the four axes at half the travel of the channels, 0 of one not controlled [N, N m], (n, 4)."""
     weights: Array
-    """Of the six axes in the allocation [1/N, 1/(N m)], (n, 6)."""
+    """Weights of the six axes in the allocation [1/N, 1/(N m)], (n, 6)."""
     lag: Array
     """Time constant of each axis [s], (4,)."""
 

@@ -18,7 +18,7 @@ Indices = npt.NDArray[np.int64]
 
 
 class PathErrors(NamedTuple):
-    """Where n vehicles are beside the leg that each follows."""
+    """Places of n vehicles beside the leg that each follows."""
 
     course: Array
     """Direction of the leg, counter-clockwise from the world's x axis [rad], (n,)."""
@@ -186,7 +186,7 @@ class SeabedFollower:
     altitude: float
     """To keep [m]."""
     time_constant: float = 1.5
-    """Of the filter [s]."""
+    """Time constant of the filter [s]."""
     ahead: float = 1.0
     """Time for which the slope is extrapolated [s]."""
 

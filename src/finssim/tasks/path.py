@@ -73,7 +73,7 @@ def leg_is_done(path: PathTable, w: int, x: wp.vec3, radius: float) -> bool:
 
 @wp.func
 def change_legs(state: State, arrays: TaskArrays, p: Any, w: int):
-    """Go on to the leg after those that are done."""
+    """Change to the leg after those that are done."""
     x = state.position[w, 0]
     for _i in range(4):
         if arrays.path.leg[w] < p.legs - 1 and leg_is_done(arrays.path, w, x, p.fit.size * p.radius):
