@@ -350,6 +350,8 @@ class TaskSite(Fleet):
         camera: Callable[[Vehicle], Any] | None = None,
         positioning: str = "none",
         record: Path | None = None,
+        bodies: Sequence[Vehicle] | None = None,
+        let_in: bool = False,
     ) -> None:
         """Put everybody where the task starts.
 
@@ -365,6 +367,8 @@ class TaskSite(Fleet):
             camera: Makes the overhead camera of a vehicle; None: there is none.
             positioning: Fixes on every robot's wire: none, motion-capture or usbl.
             record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
+            bodies: Vehicles around which the plants are drawn, where they are others than the robots know.
+            let_in: Whether robots know their position at the start, for dead reckoning.
 
         Raises:
             ControlError, PlantSpecError: Task, vehicles and guide do not fit, or there is no such positioning.
@@ -382,10 +386,11 @@ class TaskSite(Fleet):
             )
         self.task, goal = referee.task, guide or _goal(referee)
         names = self.task.vehicles
+        starts = dict(zip(names, referee.places(), strict=True))
         worlds = {
             name: VirtualPool(
-                vehicle,
-                _deep_enough(spec(vehicle), referee.arrays),
+                body,
+                _deep_enough(spec(body), referee.arrays),
                 camera=camera(vehicle) if camera else self._eyes(vehicle, seed),
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
                 start=start,
@@ -393,7 +398,9 @@ class TaskSite(Fleet):
                 truth=record / f"{name}.truth" if record is not None and name in steering else None,
                 dock=self.task.dock(),
             )
-            for i, (name, vehicle, start) in enumerate(zip(names, vehicles, referee.places(), strict=True))
+            for i, (name, vehicle, body, start) in enumerate(
+                zip(names, vehicles, bodies or vehicles, starts.values(), strict=True)
+            )
         }
         if self.task.dock() is not None:
             for world in worlds.values():
@@ -426,7 +433,9 @@ class TaskSite(Fleet):
                 pilot,
                 goal,
                 arm=True,
-                perception=Perception(vehicle, pool) if agent else TrueState(world),
+                perception=Perception(vehicle, pool, let_in=starts[name][0][:2] if let_in else None)
+                if agent
+                else TrueState(world),
                 bridge=Bridge(vehicle, _limits(vehicle, world.spec.basin)),
                 team=team if len(names) > 1 else None,
                 recorder=Recorder(record / f"{name}.mcap", vehicle, {"pilot": pilot.describe(), **about})

@@ -35,6 +35,7 @@ from finssim.evaluation.robot_trials import (
     FIRMWARES,
     Attendant,
     OnRobot,
+    RobotError,
     RobotJob,
     firmware_of,
     played_trial,
@@ -51,6 +52,7 @@ from finssim.identification.vehicle_file import all_findings, calibrated, number
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
 from finssim.sim import RectangularPool
+from finssim.studies.demo_course import demo_course
 from finssim.studies.transfer import T1, Spec, transfer_experiment
 from finssim.trials.findings import Finding, sentences
 from finssim.trials.trial_files import load_trials
@@ -499,11 +501,29 @@ def demo(
         "firmware": firmware, "robot": robot is not None,
     }  # fmt: skip
     take_folder(Path(out) / "demo.yaml", about)
+    if must_move(standing):
+        if robot is not None or firmware != "mcu":
+            raise RobotError(
+                f"{standing.name} must move to steer: its demonstration is in the virtual site alone, without --robot "
+                "and --firmware"
+            )
+        tables, report = demo_course(Path(out), standing, seed=seed, steps=steps, console=console)
+        return _shown(tables, report, as_json)
     demonstration = _Demonstration(
         out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
         processes=processes, robot=robot, attendant=attendant, firmware=firmware,
     )  # fmt: skip
-    tables, report = demonstration.run(), Path(out) / REPORT_FILE
+    return _shown(demonstration.run(), Path(out) / REPORT_FILE, as_json)
+
+
+def must_move(vehicle: Vehicle) -> bool:
+    """Return whether a vehicle steers with fins: it does not control yaw by thrusters."""
+    fins = any(actuator.kind == "fin" for actuator in vehicle.actuators.values())
+    return fins and "yaw" not in vehicle.controlled_axes
+
+
+def _shown(tables: list[Table], report: Path, as_json: bool) -> Path:
+    """Print the tables, or one JSON object, and show the report where there is a screen."""
     if as_json:
         rows = [
             {"title": t.title, "heads": list(t.heads), "rows": [list(r) for r in t.rows if r]} for t in tables
