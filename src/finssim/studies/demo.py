@@ -465,6 +465,9 @@ def demo(
     controller, allocation, bridge and the motor controller's protocol. For comparison, `pid` (tuned from the
     identified vehicle) and `pid-paper` run the same setpoints in the same pool.
 
+    A vehicle that must move to steer, such as remus100, is identified from manoeuvres of its autopilot, and follows
+    paths in open water.
+
     Example: finssim demo --vehicle bluerov2_heavy --out demo
 
     Example: finssim demo --vehicle bluerov2_heavy --firmware ardusub --out demo
