@@ -93,7 +93,7 @@ class LinearModel(NamedTuple):
     speeds: Array
     """Surge U, in equal steps [m/s], (n,)."""
     A: Array
-    """Of x' = A x + B (channels - trim), with x = (nu, roll, pitch) [m/s, rad/s, rad], (n, 8, 8)."""
+    """State matrix A of x' = A x + B (channels - trim), with x = (nu, roll, pitch) [m/s, rad/s, rad], (n, 8, 8)."""
     B: Array
     """Acceleration per unit of a channel [m/s² or rad/s²], (n, 8, c)."""
     trim: Array

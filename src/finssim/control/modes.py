@@ -52,8 +52,8 @@ class ModeKind(NamedTuple):
     channels: bool = False
     """True if the components drive all channels: thrusters, then the other actuators."""
     course: Literal["", "depth", "pitch"] = ""
-    """What the third component is if they are speed, course and that, of `finssim.control.course`; empty: they are
-    not."""
+    """Third component, depth or pitch, of actions that are orders to the autopilot of `finssim.control.course`; empty
+    for other actions."""
 
 
 def _axes(*axes: int) -> ModeKind:

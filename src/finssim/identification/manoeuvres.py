@@ -40,7 +40,7 @@ PERIOD = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What the autopilot is asked for until the next order."""
+    """Reference of the autopilot until the next order."""
 
     duration: float
     """[s]"""
@@ -51,7 +51,7 @@ class Order:
     depth: float = 0.0
     """Depth below that of the start [m]."""
     turn: float = 0.0
-    """Where not 0, a turning circle: the course asked for is always this much from the present one [rad]."""
+    """Constant difference of the commanded course from the present one, for a turning circle; 0 for none [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,7 @@ from finssim.vehicles.vehicle import Vehicle
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float, "thrust": vec8}
 """Arguments that a term's functions may take besides its parameters."""
 VALUE: dict[str, Any] = {**STATE, "value": float}
-"""The same of an actuator's functions."""
+"""Arguments that an actuator's functions may take besides its parameters."""
 ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "yield": vec6, "shift": vec9}
 """Role -> what its function returns: terms give `wrench` and `slope`, actuators `push`, `yield` (slope) and `shift`."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "vec8": vec8, "mat66": mat66}
@@ -48,7 +48,7 @@ PIECE = 8
 
 
 Item = Term | InstalledActuator
-"""What has parameters in a row and functions of them."""
+"""Terms and installed actuators: both have parameters in a row and functions of them."""
 
 
 class TermError(ValueError):
