@@ -9,6 +9,7 @@ import pytest
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.cli.tasks_show import attribute_docs, describe_task
+from finssim.control.course import course_speeds
 from finssim.tasks import TASKS, make, numeric_tasks
 from finssim.tasks.station_keeping import StationKeeping
 
@@ -50,8 +51,13 @@ def test_what_is_told_is_what_the_environment_has(name):
     assert told["action"]["size"] == env.action_size and len(told["agents"]) == env.agents
     assert told["title"] and told["success"] != "as metrics tells" and told["baselines"]
     assert len(told["reward"]["weights"]) > 4 and "\n" in told["reward"]["told"]
+    first = told["action"]["components"][0]
+    if told["action"]["mode"].startswith("course"):
+        speeds = course_speeds(env.simulator.vehicles[0])
+        assert first == {"name": "speed", "low": speeds[0], "high": speeds[-1], "unit": "m/s"}
+        return
     surge = env.simulator.vehicles[0].wrench_limits[0]
-    assert told["action"]["components"][0] == {"name": "surge", "low": -surge, "high": surge, "unit": "N"}
+    assert first == {"name": "surge", "low": -surge, "high": surge, "unit": "N"}
 
 
 def test_a_task_is_shown_for_a_vehicle(capsys):

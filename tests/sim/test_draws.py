@@ -9,7 +9,7 @@ from finssim.sim import TetherLine, Water, Wave
 from finssim.sim.measured import SENSORS, MeasurementErrors
 from finssim.sim.packed import Packed
 from finssim.sim.ranges_file import AXES, available, load_ranges
-from finssim.sim.ranges_table import ENTRIES, INDEX, drawn_entries
+from finssim.sim.ranges_table import ENTRIES, INDEX, WORLD_END, drawn_entries
 from finssim.vehicles import load_vehicle
 from reference.draws import again, column, draw
 
@@ -83,7 +83,9 @@ def expected_plant(x, vehicle):
 
 
 VEHICLE_ENTRIES = [
-    e.name for e in ENTRIES if not e.world and not e.name.startswith(("sensors.", "tether.", "mesh_drag"))
+    e.name
+    for e in ENTRIES[:WORLD_END]  # those of terms and actuators come after
+    if not e.world and not e.name.startswith(("sensors.", "tether.", "mesh_drag"))
 ]
 
 

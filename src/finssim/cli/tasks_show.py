@@ -13,7 +13,8 @@ from itertools import pairwise
 from typing import Any
 
 from finssim.agents.catalogue import baselines_of
-from finssim.control.modes import AXES, action_mode
+from finssim.control.modes import AXES, ActionMode, action_mode
+from finssim.core.registry import ACTUATORS
 from finssim.evaluation.tables import Table
 from finssim.tasks import TASKS
 from finssim.tasks.catalogue import task_named
@@ -115,10 +116,23 @@ def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
     """Return the meaning of 1 and -1 of every component."""
     chosen = action_mode(mode, vehicle)
     components = [
-        {"name": label, "low": low, "high": high, "unit": "N m" if label in AXES[3:] else "N"}
+        {"name": label, "low": low, "high": high, "unit": _unit(label, chosen, vehicle)}
         for label, low, high in zip(chosen.labels, *(x.tolist() for x in chosen.ends), strict=True)
     ]
     return {"mode": mode, "size": len(components), "components": components}
+
+
+ORDERS = {"speed": "m/s", "course": "rad", "depth": "m", "pitch": "rad"}
+"""Unit of each order to the autopilot of course."""
+
+
+def _unit(label: str, mode: ActionMode, vehicle: Vehicle) -> str:
+    """Return the unit of a component of an action."""
+    if label in vehicle.actuators:
+        return str(ACTUATORS[vehicle.actuators[label].kind].unit)
+    if mode.labels[0] == "speed":
+        return ORDERS[label]
+    return "N m" if label in AXES[3:] else "N"
 
 
 def _reward(task: Task) -> dict[str, Any]:

@@ -337,8 +337,8 @@ def evaluate_in_plants(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. That of the policy or of the record if
             not given, and finsrov of a controller that has none.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), current, foreign, held_out, lag, mesh,
-            noise, randomised, sensors, simplified, waves, or a file. May be repeated.
+        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), beyond_cruise, current, foreign,
+            held_out, lag, mesh, noise, randomised, sensors, simplified, waves, or a file. May be repeated.
         observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
             says if not given.
         trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
