@@ -15,7 +15,6 @@ from finssim.cli.commands import app
 from finssim.control.guidance import Station
 from finssim.control.path_following import Waypoints
 from finssim.control.trajectories import load_trajectory
-from finssim.extensions.viewer.sources import RecordSource
 from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.drawn_plant import site_of
 from finssim.robot.bridge import Bridge
@@ -79,7 +78,8 @@ def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
         asked, states = (
             [m.message.position for m in record.messages([n])] for n in ("actuator_cmd", "actuator_states")
         )
-    source = RecordSource(tmp_path / "run.mcap", vehicle=str(torpedo_file(tmp_path)))
+    viewer = pytest.importorskip("finssim.extensions.viewer.sources")
+    source = viewer.RecordSource(tmp_path / "run.mcap", vehicle=str(torpedo_file(tmp_path)))
     assert source.frame(6.0).values[0] == pytest.approx(0.196, abs=1e-3)
     np.testing.assert_allclose(asked[-1], [0.2, 0.0, 2e-4, 0.0])
     assert np.array(states)[:, 0].max() == pytest.approx(0.196, abs=1e-3)  # less its play
