@@ -19,35 +19,20 @@ import numpy as np
 
 from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres
 from finssim.identification.simulation_error import fit_by_simulation
+from finssim.studies.demo_course import drawn_body
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-SET = "hydrodynamics.calibrated"
 FITTED = ("surge", "sway", "heave", "pitch", "yaw")
-SPREAD = 0.18
-"""Standard deviation of the logarithm of a factor."""
 RATE = 20.0
 """Rows of the trials [Hz]."""
 LIMIT = 0.1
 """Relative error that is asked for."""
 
 
-def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float]:
-    """A vehicle, and the factor on the slope of its fins' lift."""
-    chosen, changes = vehicle.hydrodynamics["calibrated"], {}
-    for key in ("added_mass", "linear_damping", "quadratic_damping"):
-        root = np.exp(0.5 * SPREAD * rng.standard_normal(6))
-        changes[f"{SET}.{key}"] = (getattr(chosen, key) * np.outer(root, root)).tolist()
-    slope = float(np.exp(SPREAD * rng.standard_normal()))
-    for name, actuator in vehicle.actuators.items():
-        if actuator.kind == "fin":
-            changes[f"actuators.{name}.lift_slope"] = slope * actuator.lift_slope
-    return vehicle.replace(changes), slope
-
-
 def draw(vehicle: Vehicle, number: int) -> dict:
     """One draw: parameter -> truth, estimate and interval."""
     start = time.process_time()
-    truth, slope = drawn(vehicle, np.random.default_rng([35, number]))
+    truth, slope = drawn_body(vehicle, number)
     trials = simulate_manoeuvres(manoeuvres(vehicle), vehicle, truth=truth, seed=number, rate=RATE)
     fit = fit_by_simulation(trials, vehicle, axes=FITTED, estimate=("fin.lift_slope",))
     M, chosen, rows = truth.mass_matrix(), truth.hydrodynamics["calibrated"], {}

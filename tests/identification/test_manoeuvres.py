@@ -7,7 +7,7 @@ import pytest
 
 from finssim.evaluation.excitation import excite
 from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
-from finssim.identification.simulation_error import fit_by_simulation
+from finssim.identification.simulation_error import actuator_fields, fit_by_simulation, scaled_actuators
 from finssim.trials.findings import CalibrationError
 from reference.torpedo import FIN, hull
 
@@ -50,6 +50,18 @@ def test_tables_for_another_autopilot(tmp_path):
     assert {float(row["course"]) for row in rows} == {0.0, 20.0, -20.0}
     with pytest.raises(CalibrationError, match="axes all"):
         excite("surge", vehicle=str(file), kind="manoeuvres", out=tmp_path / "other")
+
+
+def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():
+    """What a fit may move, fins and the inflow of propellers, and what it then writes to the file."""
+    tail = {"rudder": TAIL, "stern": {**TAIL, "lift_slope": 2.0}}
+    vehicle = hull(tail, propeller={"inflow": {"thrust_loss": 0.01}})
+    fields = actuator_fields(vehicle)
+    assert fields["fin.lift_slope"] == {"actuators.fin_1.lift_slope": 3.0, "actuators.fin_2.lift_slope": 2.0}
+    assert fields["propeller.thrust_loss"] == {"actuators.propeller_0.thrust_loss": 0.01}
+    for name, before in (("fin.lift_slope", [3.0, 2.0]), ("propeller.thrust_loss", [0.01])):
+        changed = vehicle.replace(scaled_actuators(vehicle, name, 1.5))
+        np.testing.assert_allclose(list(actuator_fields(changed)[name].values()), 1.5 * np.array(before))
 
 
 @pytest.mark.slow
