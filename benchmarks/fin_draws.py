@@ -4,8 +4,9 @@
 
 Every draw is the vehicle with an added mass and a drag of its own and another slope of the lift of its fins (factors
 of about 1.2 either way), run through the manoeuvres by the autopilot of its file, and measured with the noise and bias
-of its own gyroscopes, a velocity to 1 cm/s (DVL) and an attitude to 5 mrad. The fit starts from the file. With --json,
-every finished draw is written to the file, and draws that it already has are not repeated.
+of its own gyroscopes, a velocity to 1 cm/s (DVL) and an attitude to 5 mrad. The fit starts from the file. A draw that
+the autopilot does not hold is left out and counted. With --json, every finished draw is written to the file, and draws
+that it already has are not repeated.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.studies.demo_course import drawn_body
+from finssim.trials.findings import CalibrationError
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "pitch", "yaw")
@@ -33,7 +35,10 @@ def draw(vehicle: Vehicle, number: int) -> dict:
     """One draw: parameter -> truth, estimate and interval."""
     start = time.process_time()
     truth, slope = drawn_body(vehicle, number)
-    trials = simulate_manoeuvres(manoeuvres(vehicle), vehicle, truth=truth, seed=number, rate=RATE)
+    try:
+        trials = simulate_manoeuvres(manoeuvres(vehicle), vehicle, truth=truth, seed=number, rate=RATE)
+    except CalibrationError as error:
+        return {"draw": number, "lost": str(error)}
     fit = fit_by_simulation(trials, vehicle, axes=FITTED, estimate=("fin.lift_slope",))
     M, chosen, rows = truth.mass_matrix(), truth.hydrodynamics["calibrated"], {}
 
@@ -53,6 +58,9 @@ def draw(vehicle: Vehicle, number: int) -> dict:
 
 def summary(draws: list[dict]) -> None:
     """Print how near and how honest the estimates are."""
+    lost = [d["draw"] for d in draws if "lost" in d]
+    print(f"not held by the autopilot: {lost or 'none'}")
+    draws = [d for d in draws if "lost" not in d]
     print(f"{len(draws)} draws, {np.mean([d['seconds'] for d in draws]):.0f} processor-seconds each")
     print(f"{'':16s} {'median |error|':>14s} {'within 10 %':>12s} {'in interval':>12s} {'half width':>11s}")
     for name in draws[0]["numbers"]:
@@ -85,7 +93,7 @@ def main() -> None:
         if number in have:
             continue
         done.append(draw(vehicle, number))
-        print(f"draw {number}: {done[-1]['seconds']:.0f} s", flush=True)
+        print(f"draw {number}: {done[-1].get('lost') or round(done[-1]['seconds'])}", flush=True)
         if options.json:
             options.json.write_text(json.dumps(done, indent=1) + "\n", encoding="utf-8")
     summary(done)

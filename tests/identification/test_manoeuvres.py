@@ -9,6 +9,7 @@ from finssim.evaluation.excitation import excite
 from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
 from finssim.identification.simulation_error import actuator_fields, fit_by_simulation, scaled_actuators
 from finssim.trials.findings import CalibrationError
+from finssim.vehicles import load_vehicle
 from reference.torpedo import FIN, hull
 
 TAIL = {**FIN, "area": 0.05, "position": [-0.6, 0.0, 0.0], "time_constant": 0.1, "rate_limit": 1.0}
@@ -47,7 +48,8 @@ def test_tables_for_another_autopilot(tmp_path):
     with (folders[1] / "programme.csv").open(encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     assert list(rows[0]) == ["t", "speed", "course", "depth", "turn"]
-    assert {float(row["course"]) for row in rows} == {0.0, 20.0, -20.0}
+    assert {float(row["course"]) for row in rows} == {0.0, 60.0, -60.0}
+    assert [float(row["speed"]) for row in rows[-2:]] == [0.0, 0.0]  # the stop, and its end
     with pytest.raises(CalibrationError, match="axes all"):
         excite("surge", vehicle=str(file), kind="manoeuvres", out=tmp_path / "other")
 
@@ -62,6 +64,37 @@ def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():
     for name, before in (("fin.lift_slope", [3.0, 2.0]), ("propeller.thrust_loss", [0.01])):
         changed = vehicle.replace(scaled_actuators(vehicle, name, 1.5))
         np.testing.assert_allclose(list(actuator_fields(changed)[name].values()), 1.5 * np.array(before))
+
+
+@pytest.mark.slow
+def test_a_manoeuvre_begins_at_speed_and_ends_in_a_stop():
+    """At the speed of the first order; while the propeller stands still, the fins stay where they were."""
+    stop = Manoeuvre(
+        name="stop",
+        axes=("surge", "yaw"),
+        orders=(
+            Order(duration=2.0, speed=1.5),
+            Order(duration=2.0, speed=1.5, course=1.0),
+            Order(duration=3.0, speed=0.0),
+        ),
+    )
+    (trial,) = simulate_manoeuvres([stop], TORPEDO, noise="none", seed=1)
+    u, rudder, t = trial.channels["u"], trial.channels["actuator_rudder"], trial.t
+    assert 1.4 < u[0] < 1.6
+    stopped = t > 4.5
+    np.testing.assert_allclose(trial.channels["rpm_propeller"][t > 6.0], 0.0, atol=5.0)
+    np.testing.assert_allclose(rudder[stopped], rudder[-1], atol=0.02)
+    assert abs(rudder[-1]) > 0.1
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_turns_over_gives_no_trial():
+    """REMUS with a third of its lift cannot be held by the autopilot of its file."""
+    vehicle = load_vehicle("remus100")
+    weak = vehicle.replace({f"actuators.{name}.lift_slope": 1.0 for name in vehicle.actuators})
+    (dive,) = (one for one in manoeuvres(vehicle) if one.name == "dives_slow")
+    with pytest.raises(CalibrationError, match="dives_slow: the vehicle turned over"):
+        simulate_manoeuvres([dive], vehicle, truth=weak, seed=1)
 
 
 @pytest.mark.slow

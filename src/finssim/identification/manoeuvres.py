@@ -24,6 +24,7 @@ from finssim.identification.programme import RATE, Programme
 from finssim.identification.synthetic import STEP, simulate_programme
 from finssim.sim import Simulator
 from finssim.sim.free_motion import linear_model
+from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Trial
 from finssim.vehicles import Vehicle
 from finssim.vehicles.vehicle import Axis
@@ -36,6 +37,12 @@ SETTLE = 10.0
 """Straight way at the start of each manoeuvre [s]."""
 PERIOD = 0.1
 """Time between two commands of the autopilot [s]."""
+DIVE = 0.75
+"""Step of depth, in lengths of the vehicle."""
+HARD, STOP, FAR = 3.0, 15.0, 4.0
+"""Time of the last, hard order of a manoeuvre, of the stop after it [s], and change of depth of a hard dive [m]."""
+LOST = math.radians(60.0)
+"""Pitch at which the autopilot has lost the vehicle: it turns over [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +52,7 @@ class Order:
     duration: float
     """[s]"""
     speed: float
-    """Surge [m/s]."""
+    """Surge [m/s]; 0: the propellers stop, and the fins stay where they are."""
     course: float = 0.0
     """Course from that of the start, counter-clockwise from above [rad]."""
     depth: float = 0.0
@@ -80,52 +87,55 @@ class Manoeuvre:
 def manoeuvres(vehicle: Vehicle) -> list[Manoeuvre]:
     """Return speed runs, zig-zags at two speeds, turning circles, depth steps, and both together.
 
-    Each step lasts as long as the vehicle takes for ten of its lengths, at least 5 s.
+    Each step lasts as long as the vehicle takes for ten of its lengths, at least 5 s. The speeds and the steps of depth
+    leave the fins a reserve for a hull that is less stable than the file says; such a hull slips little. Each manoeuvre
+    but the speed runs therefore ends with a stop out of a hard turn or dive: the hull turns broadside to its way, and
+    shows its drag in sway, heave, pitch and yaw.
 
     Args:
         vehicle: With an autopilot of course (`finssim.control.course`).
     """
-    slow, middle, fast = np.quantile(course_speeds(vehicle), (0.25, 0.6, 1.0))
+    slow, middle, fast = np.quantile(course_speeds(vehicle), (0.4, 0.6, 1.0)).tolist()
+    dive = DIVE * float(vehicle.body.size[0])
 
     def step(speed: float) -> float:
         return max(5.0, 10.0 * float(vehicle.body.size[0]) / speed)
 
-    def zigzag(speed: float, angle: float, legs: int) -> tuple[Order, ...]:
-        way = [angle * (-1.0) ** k for k in range(legs)]
-        return (
-            Order(duration=SETTLE, speed=speed),
-            *(Order(duration=step(speed), speed=speed, course=x) for x in way),
-        )
+    def trial(name: str, axes: tuple[Axis, ...], speed: float, *orders: Order, **last: float) -> Manoeuvre:
+        """Return straight way, the orders, a last one as hard as the autopilot acts, and the stop after it."""
+        hard = Order(duration=HARD, speed=speed, **last)
+        straight, stop = Order(duration=SETTLE, speed=speed), Order(duration=STOP, speed=0.0)
+        return Manoeuvre(name=name, axes=axes, orders=(straight, *orders, hard, stop))
 
-    def dives(speed: float, depth: float, legs: int) -> tuple[Order, ...]:
-        return (
-            Order(duration=SETTLE, speed=speed),
-            *(Order(duration=step(speed), speed=speed, depth=depth * (k % 2)) for k in range(1, legs + 1)),
-        )
+    def zigzag(speed: float, legs: int) -> list[Order]:
+        return [
+            Order(duration=step(speed), speed=speed, course=math.radians(60.0) * (-1.0) ** k)
+            for k in range(legs)
+        ]
 
-    def circles(speed: float) -> tuple[Order, ...]:
-        turns = (Order(duration=3.0 * step(speed), speed=speed, turn=x) for x in (0.8, -0.8))
-        return (Order(duration=SETTLE, speed=speed), *turns)
+    def dives(speed: float, legs: int) -> list[Order]:
+        return [Order(duration=step(speed), speed=speed, depth=dive * (k % 2)) for k in range(1, legs + 1)]
 
-    def corkscrew(speed: float) -> tuple[Order, ...]:
-        return tuple(
-            Order(duration=step(speed), speed=speed, course=0.35 * (-1.0) ** (k // 2), depth=1.5 * (k % 2))
+    def circles(speed: float) -> list[Order]:
+        return [Order(duration=3.0 * step(speed), speed=speed, turn=x) for x in (0.8, -0.8)]
+
+    def corkscrew(speed: float) -> list[Order]:
+        return [
+            Order(duration=step(speed), speed=speed, course=0.7 * (-1.0) ** (k // 2), depth=dive * (k % 2))
             for k in range(8)
-        )
+        ]
 
-    runs = tuple(Order(duration=15.0, speed=float(x)) for x in (slow, fast, middle, fast, slow, middle))
+    runs = tuple(Order(duration=15.0, speed=x) for x in (slow, fast, middle, fast, slow, middle))
     lateral: tuple[Axis, ...] = ("surge", "sway", "yaw")
     upright: tuple[Axis, ...] = ("surge", "heave", "pitch")
     return [
         Manoeuvre(name="speeds", axes=("surge",), orders=runs),
-        Manoeuvre(name="zigzag_slow", axes=lateral, orders=zigzag(float(middle), math.radians(20.0), 8)),
-        Manoeuvre(name="zigzag_fast", axes=lateral, orders=zigzag(float(fast), math.radians(20.0), 10)),
-        Manoeuvre(name="circles", axes=lateral, orders=circles(float(middle))),
-        Manoeuvre(name="dives_slow", axes=upright, orders=dives(float(middle), 2.0, 8)),
-        Manoeuvre(name="dives_fast", axes=upright, orders=dives(float(fast), 2.0, 10)),
-        Manoeuvre(
-            name="corkscrew", axes=("surge", "sway", "heave", "pitch", "yaw"), orders=corkscrew(float(fast))
-        ),
+        trial("zigzag_slow", lateral, middle, *zigzag(middle, 8), turn=0.8),
+        trial("zigzag_fast", lateral, fast, *zigzag(fast, 10), turn=-0.8),
+        trial("circles", lateral, middle, *circles(middle), turn=-0.8),
+        trial("dives_slow", upright, middle, *dives(middle, 8), depth=FAR),
+        trial("dives_fast", upright, fast, *dives(fast, 10), depth=-FAR),
+        trial("corkscrew", (*lateral, "heave", "pitch"), fast, *corkscrew(fast), turn=0.8, depth=FAR),
     ]
 
 
@@ -161,7 +171,9 @@ class _Helm:
         self.memory = self.pilot.reset(len(chosen))
         self.channels = np.zeros((len(chosen), len(vehicle.channel_names)))
         self.start: tuple[Array, Array] | None = None
-        self.steps = 0
+        self.steps, self.propellers = 0, len(vehicle.thrusters)
+        self.pitch = np.zeros(len(chosen))
+        """Greatest pitch of each manoeuvre so far, up or down [rad]."""
 
     def __call__(self, simulator: Simulator) -> None:
         if self.steps % round(PERIOD / STEP) == 0:
@@ -174,22 +186,26 @@ class _Helm:
         position, quaternion, nu = (
             simulator.numpy(name)[:, 0].astype(float) for name in ("position", "quaternion", "velocity")
         )
-        heading = np.asarray(quat_to_euler(quaternion)[2])
+        _, pitch, heading = (np.asarray(angle) for angle in quat_to_euler(quaternion))
         if self.start is None:
             self.start = (heading, -position[:, 2])
         course, depth = self.start
         orders = [manoeuvre.at(self.steps * STEP) for manoeuvre in self.chosen]
+        driven = np.array([order.speed > 0.0 for order in orders])
+        self.pitch = np.maximum(self.pitch, np.where(driven, np.abs(pitch), 0.0))
         wanted = [
             now + order.turn if order.turn else first + order.course
             for now, first, order in zip(heading, course, orders, strict=True)
         ]
-        self.channels, self.memory = self.pilot.command(
+        channels, self.memory = self.pilot.command(
             self.memory,
             Track(position=position, quaternion=quaternion, nu=nu),
             speed=[order.speed for order in orders],
             course=wanted,
             depth=depth + [order.depth for order in orders],
         )
+        self.channels = np.where(driven[:, None], channels, self.channels)
+        self.channels[~driven, : self.propellers] = 0.0
 
 
 def simulate_manoeuvres(
@@ -202,6 +218,8 @@ def simulate_manoeuvres(
 ) -> list[Trial]:
     """Return a trial of each manoeuvre, run by the vehicle's autopilot in the simulator and measured with noise.
 
+    It starts with the speed of the first order: at rest, no fin would hold an unstable hull, or one that floats.
+
     Args:
         chosen: What to run.
         vehicle: The vehicle file: the autopilot is tuned to it, and the trials name it.
@@ -210,7 +228,8 @@ def simulate_manoeuvres(
         options: Further arguments of `finssim.identification.synthetic.simulate_programme`.
 
     Raises:
-        CalibrationError: A motion does not stay finite, or an option cannot be.
+        CalibrationError: A motion does not stay finite, the autopilot does not hold the vehicle, or an option cannot
+            be.
         ControlError: The vehicle cannot be steered by course.
     """
     programmes = []
@@ -225,7 +244,13 @@ def simulate_manoeuvres(
                 phase=np.full(n, "excitation"),
             )
         )
+    given = {"inputs": ("rpm",), "speed": [one.orders[0].speed for one in chosen]} | options
     helm = _Helm(chosen, vehicle)
-    return simulate_programme(
-        programmes, truth or vehicle, seed=seed, each_step=helm, **({"inputs": ("rpm",)} | options)
-    )
+    trials = simulate_programme(programmes, truth or vehicle, seed=seed, each_step=helm, **given)
+    lost = [one.name for one, pitch in zip(chosen, helm.pitch, strict=True) if pitch > LOST]
+    if lost:
+        raise CalibrationError(
+            f"{', '.join(lost)}: the vehicle turned over, for the autopilot, tuned to the file, does not hold it: "
+            "give a vehicle nearer to the file, or orders of less depth and more speed"
+        )
+    return trials

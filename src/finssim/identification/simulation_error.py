@@ -826,7 +826,7 @@ class Shooting:
         streams: Names of the streams in use; each may lag the inputs.
         offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
         free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
-            heading and place where some segment knows them.
+            heading and place where some segment knows them and they matter.
         edges: First sample of each segment, and N, (S + 1,).
         low: Least theta, (P,).
         high: Largest theta, (P,).
@@ -860,7 +860,13 @@ class Shooting:
         self.measured = Residuals(segments, channels)
         names = self.measured.names
         known = np.stack([s.known for s in segments])
-        self.free = np.concatenate([np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0))])
+        # Heading and place are free where something that is compared depends on them.
+        flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
+        turned = flat or "yaw" in names or any(s.current.any() for s in segments)
+        felt = [turned, "x" in names, "y" in names, {"z", "depth"} & set(names) or not deep]
+        self.free = np.concatenate(
+            [np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0) & [bool(x) for x in felt])]
+        )
         seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
         unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
         states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]

@@ -78,6 +78,7 @@ def record(
     water: Water | None = None,
     tether: TetherLine | None = None,
     depth: float = 20.0,
+    speed: ArrayLike = 0.0,
     spread: float = 1.0,
     each_step: Callable[[Simulator], None] | None = None,
 ) -> Recording:
@@ -94,8 +95,9 @@ def record(
         water: Currents and waves; still water if None.
         tether: None if None.
         depth: Of the body origin at the start [m].
-        spread: Scales the initial conditions, which are at rest and level at 0: at 1, standard deviations of 0.02 m/s,
-            0.02 rad/s, 0.01 rad of roll and pitch, and any heading.
+        speed: Mean surge at the start [m/s], one number or (W,).
+        spread: Scales the scatter of the initial conditions around that, level and without another velocity: at 1,
+            standard deviations of 0.02 m/s, 0.02 rad/s, 0.01 rad of roll and pitch, and any heading.
         each_step: Called before every step, for what the engine does not have: it may read the simulator's state and
             write `command.thrust`, `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
 
@@ -121,7 +123,7 @@ def record(
     )
     _override(simulator, plant or {})
     simulator.command.disturbance.numpy()[:, 0] = np.asarray(disturbance)
-    _start(simulator, depth, spread, seed)
+    _start(simulator, depth, speed, spread, seed)
     command = np.repeat(_commands(programmes, vehicle), per_command, axis=0)
     n, thrusters, k = len(command) + 1, len(vehicle.thrusters), len(vehicle.channel_names)
     told = np.zeros((n, worlds, k), dtype=np.float32)
@@ -167,12 +169,13 @@ def _override(simulator: Simulator, plant: Mapping[str, ArrayLike]) -> None:
     simulator.refresh()
 
 
-def _start(simulator: Simulator, depth: float, spread: float, seed: int) -> None:
+def _start(simulator: Simulator, depth: float, speed: ArrayLike, spread: float, seed: int) -> None:
     rng = np.random.default_rng([seed, 1])
     worlds = simulator.worlds
     tilt = 0.01 * spread * rng.standard_normal((2, worlds))
     yaw = spread * rng.uniform(-np.pi, np.pi, worlds)
     velocity = 0.02 * spread * rng.standard_normal((worlds, 6))
+    velocity[:, 0] += speed
     simulator.place(
         position=(0.0, 0.0, -depth),
         quaternion=quat_from_euler(tilt[0], tilt[1], yaw)[:, None],
@@ -404,7 +407,7 @@ def simulate_programme(
         vehicle: The vehicle, whose file says what it believes of itself.
         seed: Of initial conditions and noise; equal seeds give equal trials.
         options: Arguments of `trials_of` (noise, rate, columns, inputs) and of `record` (hydrodynamics,
-            plant, disturbance, water, tether, depth, spread).
+            plant, disturbance, water, tether, depth, speed, spread).
 
     Raises:
         CalibrationError: An argument that cannot be.
