@@ -185,50 +185,95 @@ def nothing_known() -> Memory:
     return memory
 
 
+@wp.struct
+class LevelMotion:
+    """Motion of a vehicle over ground, in the level."""
+
+    heading: float  # of the bow [rad]
+    ahead: wp.vec2  # unit vector along the heading
+    left: wp.vec2  # unit vector to the left of it
+    way: wp.vec2  # velocity over ground, world x and y [m/s]
+    current: wp.vec2  # of the water, world x and y [m/s]
+    surge: float  # speed ahead through the water [m/s]
+
+
+@wp.struct
+class Place:
+    """Place of a vehicle among the speeds of its model."""
+
+    k: int  # number of the speed below
+    s: float  # part of the way from there to the next [-]
+    row: int  # row of the gains of the speed below, for depth or for pitch
+    reach: Wrench4  # greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m]
+
+
 @wp.func
-def steer(
-    order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
-) -> CourseAnswer:
-    """Return the channels that carry out an order, and the memory for the next.
+def level_motion(q: wp.quat, nu: vec6, memory: Memory) -> LevelMotion:
+    """Return the motion in the level, from the twist over ground nu, body frame [m/s, rad/s], and the memory of
+    `steer`."""
+    bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    ground = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
+    found = LevelMotion()
+    found.heading = wp.atan2(bow[1], bow[0])
+    ahead = wp.vec2(wp.cos(found.heading), wp.sin(found.heading))
+    left = wp.vec2(-ahead[1], ahead[0])
+    found.ahead = ahead
+    found.left = left
+    found.way = wp.vec2(ground[0], ground[1])
+    found.current = wp.vec2(memory[9], memory[10])
+    if wp.isnan(memory[9]):
+        across = wp.dot(found.way, left)
+        found.current = wp.vec2(across * left[0], across * left[1])
+    found.surge = nu[0] - wp.dot(found.current, ahead)
+    return found
+
+
+@wp.func
+def among_speeds(speed: float, vehicle: int, data: CourseData) -> float:
+    """Return the place of a speed [m/s] among those of a vehicle's model: 0 is the least, 1 the next [-]."""
+    count = data.trim.shape[1]
+    return wp.clamp((speed - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
+
+
+@wp.func
+def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Place:
+    """Return the place of a speed through the water [m/s]; `by_pitch` is 1 where the pitch is held, else 0."""
+    count = data.trim.shape[1]
+    place = among_speeds(surge, vehicle, data)
+    found = Place()
+    found.k = wp.min(int(place), count - 2)
+    found.s = place - float(found.k)
+    found.row = found.k + by_pitch * count
+    found.reach = between(data.reach[vehicle, found.row], data.reach[vehicle, found.row + 1], found.s)
+    return found
+
+
+@wp.func
+def heading_error(order: CourseOrder, level: LevelMotion, vehicle: int, data: CourseData) -> float:
+    """Return the heading less that which gives the wanted course in the current [rad]; not wrapped."""
+    least = data.first[vehicle]
+    course = float(level.heading)
+    if wp.dot(level.way, level.ahead) > 0.5 * least:
+        course = wp.atan2(level.way[1], level.way[0])
+    course += order.turn
+    drift = wp.dot(level.current, wp.vec2(-wp.sin(course), wp.cos(course))) / wp.max(level.surge, least)
+    greatest = wp.static(math.sin(MOST_CRAB))
+    return level.heading - course + wp.asin(wp.clamp(drift, -greatest, greatest))
+
+
+@wp.func
+def errors_of(order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4) -> Row:
+    """Return the state that is fed back, and the wrench on its way [m/s, rad/s, rad, m, N, N m].
 
     Args:
-        order: What is wanted.
+        order: As of `steer`, like the next three.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
-        memory: From the command before [m, rad s, N, N m, m/s]; `nothing_known` at the start.
-        vehicle: First index into `data`.
-        data: From `course_data`.
+        memory: From the command before [m, rad s, N, N m, m/s].
+        off: Error of the heading [rad].
+        reach: Greatest errors that are acted on [m/s, rad, rad, m].
     """
-    # Velocity over ground, level, along the heading and to the left of it; and the current.
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
-    bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
-    heading = wp.atan2(bow[1], bow[0])
-    ahead = wp.vec2(wp.cos(heading), wp.sin(heading))
-    left = wp.vec2(-ahead[1], ahead[0])
-    ground = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
-    way = wp.vec2(ground[0], ground[1])
-    current = wp.vec2(memory[9], memory[10])
-    if wp.isnan(memory[9]):
-        across = wp.dot(way, left)
-        current = wp.vec2(across * left[0], across * left[1])
-    surge = nu[0] - wp.dot(current, ahead)
-
-    count = data.trim.shape[1]
-    place = wp.clamp((surge - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
-    k = wp.min(int(place), count - 2)
-    s = place - float(k)
-    goal = wp.clamp((order.speed - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
-    k_goal = wp.min(int(goal), count - 2)
-    row = k + order.by_pitch * count
-
-    course = float(heading)
-    if wp.dot(way, ahead) > 0.5 * data.first[vehicle]:
-        course = wp.atan2(way[1], way[0])
-    course += order.turn
-    drift = wp.dot(current, wp.vec2(-wp.sin(course), wp.cos(course))) / wp.max(surge, data.first[vehicle])
-    greatest = wp.static(math.sin(MOST_CRAB))
-    off = heading - course + wp.asin(wp.clamp(drift, -greatest, greatest))
-    reach = between(data.reach[vehicle, row], data.reach[vehicle, row + 1], s)
     x = Row()
     for i in range(1, 6):
         x[i] = nu[i]
@@ -243,17 +288,69 @@ def steer(
         x[10 + i] = memory[i]
     for i in range(4):
         x[13 + i] = memory[3 + i]
+    return x
 
+
+@wp.func
+def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) -> Wrench4:
+    """Return the wrench (X, K, M, N) that is wanted [N, N m]; the wanted surge `speed` is in [m/s]."""
+    k = at.k
+    goal = among_speeds(speed, vehicle, data)
+    k_goal = wp.min(int(goal), data.trim.shape[1] - 2)
     wrench = Wrench4()
     for i in range(4):
-        wrench[i] = -wp.dot(between(data.gains[vehicle, row, i], data.gains[vehicle, row + 1, i], s), x)
+        gains = between(data.gains[vehicle, at.row, i], data.gains[vehicle, at.row + 1, i], at.s)
+        wrench[i] = -wp.dot(gains, x)
     wrench[0] += between(data.hold[vehicle, k_goal], data.hold[vehicle, k_goal + 1], goal - float(k_goal))
-    wrench[0] -= between(data.hold[vehicle, k], data.hold[vehicle, k + 1], s)
+    wrench[0] -= between(data.hold[vehicle, k], data.hold[vehicle, k + 1], at.s)
+    return wrench
+
+
+@wp.func
+def grown_integrals(
+    order: CourseOrder, x: Row, short: Wrench4, memory: Memory, at: Place, vehicle: int, data: CourseData
+) -> Memory:
+    """Return the memory with the errors added to its integrals, each unless the channels cannot follow it.
+
+    The wrench that falls `short` is in [N, N m]; `x` as of `errors_of`; the memory is that of `steer`.
+    """
+    after = memory
+    reach = at.reach
+    errors = wp.vec3(x[0], wp.clamp(-order.turn, -reach[2], reach[2]), x[9 - 2 * order.by_pitch])
+    bounds = wp.vec3(reach[0], reach[2], reach[3 - 2 * order.by_pitch])
+    for i in range(3):
+        axis = wp.where(i == 0, 0, wp.where(i == 1, 3, 2))
+        push = -data.gains[vehicle, at.row, axis][10 + i] * errors[i]
+        follows = short[axis] * push <= 0.0 or wp.abs(short[axis]) <= data.slack[vehicle, at.k][axis]
+        if follows and wp.abs(errors[i]) < bounds[i]:
+            after[i] = memory[i] + data.period * errors[i]
+    return after
+
+
+@wp.func
+def steer(
+    order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
+) -> CourseAnswer:
+    """Return the channels that carry out an order, and the memory for the next.
+
+    Args:
+        order: What is wanted.
+        q: Attitude, body to world.
+        nu: Velocity over ground, body frame [m/s, rad/s].
+        memory: From the command before [m, rad s, N, N m, m/s]; `nothing_known` at the start.
+        vehicle: First index into `data`.
+        data: From `course_data`.
+    """
+    level = level_motion(q, nu, memory)
+    at = place_of(level.surge, order.by_pitch, vehicle, data)
+    k, s = at.k, at.s
+    x = errors_of(order, q, nu, memory, heading_error(order, level, vehicle, data), at.reach)
+    wrench = demanded(order.speed, x, at, vehicle, data)
 
     tau = vec6(wrench[0], 0.0, 0.0, wrench[1], wrench[2], wrench[3])
-    travel = data.travel[vehicle]
-    low = wp.cw_mul(travel, allocate(tau, vehicle * count + k, data.allocation))
-    high = wp.cw_mul(travel, allocate(tau, vehicle * count + k + 1, data.allocation))
+    travel, speeds = data.travel[vehicle], vehicle * data.trim.shape[1]
+    low = wp.cw_mul(travel, allocate(tau, speeds + k, data.allocation))
+    high = wp.cw_mul(travel, allocate(tau, speeds + k + 1, data.allocation))
     achieved = Wrench4()
     for i in range(MAX_THRUSTERS):
         achieved += (1.0 - s) * low[i] * data.columns[vehicle, k, i]
@@ -261,25 +358,17 @@ def steer(
 
     answer = CourseAnswer()
     answer.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
-    after = memory
-    errors = wp.vec3(x[0], wp.clamp(-order.turn, -reach[2], reach[2]), x[9 - 2 * order.by_pitch])
-    bounds = wp.vec3(reach[0], reach[2], reach[3 - 2 * order.by_pitch])
-    for i in range(3):
-        axis = wp.where(i == 0, 0, wp.where(i == 1, 3, 2))
-        push = -data.gains[vehicle, row, axis][10 + i] * errors[i]
-        short = wrench[axis] - achieved[axis]
-        follows = short * push <= 0.0 or wp.abs(short) <= data.slack[vehicle, k][axis]
-        if follows and wp.abs(errors[i]) < bounds[i]:
-            after[i] = memory[i] + data.period * errors[i]
+    after = grown_integrals(order, x, wrench - achieved, memory, at, vehicle, data)
     for i in range(4):
         after[3 + i] = between(memory[3 + i], achieved[i], data.share[vehicle][i])
-    more = wp.dot(way, left) - memory[7] - wp.dot(current, left)
     rest = between(data.rest[vehicle, k], data.rest[vehicle, k + 1], s)
     for i in range(2):
         slip = wp.dot(between(data.slip[vehicle, k, i], data.slip[vehicle, k + 1, i], s), x)
         after[7 + i] += data.period * (slip + rest[i])
+    more = wp.dot(level.way, level.left) - memory[7] - wp.dot(level.current, level.left)
     turning = nu[5] / wp.static(TURNING)
-    current += data.period / wp.static(CURRENT_TIME) / (1.0 + turning * turning) * more * left
+    follow = data.period / wp.static(CURRENT_TIME) / (1.0 + turning * turning)
+    current = level.current + follow * more * level.left
     after[9] = current[0]
     after[10] = current[1]
     answer.memory = after
