@@ -384,9 +384,9 @@ class TaskSite(Fleet):
                 f"task '{referee.task.name}' follows a reference that is known ahead: give a trajectory, in a pool "
                 "without --task"
             )
-        self.task, goal = referee.task, guide or _goal(referee)
-        names = self.task.vehicles
-        starts = dict(zip(names, referee.places(), strict=True))
+        self.task, self._guide = referee.task, guide or _goal(referee)
+        names, kept = self.task.vehicles, {name: record for name in self.task.agents if record is not None}
+        places = list(zip(names, vehicles, bodies or vehicles, referee.places(), strict=True))
         worlds = {
             name: VirtualPool(
                 body,
@@ -395,53 +395,70 @@ class TaskSite(Fleet):
                 positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
                 start=start,
                 seed=seed + i,
-                truth=record / f"{name}.truth" if record is not None and name in steering else None,
+                truth=kept[name] / f"{name}.truth" if name in kept and name in steering else None,
                 dock=self.task.dock(),
             )
-            for i, (name, vehicle, body, start) in enumerate(
-                zip(names, vehicles, bodies or vehicles, starts.values(), strict=True)
-            )
+            for i, (name, vehicle, body, start) in enumerate(places)
         }
-        if self.task.dock() is not None:
-            for world in worlds.values():
-                funnel = world.plant.simulator.funnel
-                funnel.position.assign(referee.arrays.goal_position)
-                funnel.quaternion.assign(referee.arrays.goal_quaternion)
+        self._place_dock(worlds)
         self._goal_is_told = pilots is None and self.task.moving and len(names) == 1
-        site = (SITE,) if self._target() is not None else ()
         super().__init__(worlds)
         self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
         self._actions: dict[str, Array] = {}
-        about = {"command": "python -m studies.stack", "guide": goal.name, "armed": True}
         period = self.task.control_step if communication is None else communication.period
-        for i, (name, vehicle) in enumerate(zip(names, vehicles, strict=True)):
-            world = self.worlds[name]
+        told = ("target",) if self._target() is not None else ()
+        for i, (name, vehicle, _, start) in enumerate(places):
             agent = name in self.task.agents
-            pilot: Pilot
-            if name in steering:
-                pilot = steering[name]
-            elif agent:
+            if agent and name not in steering:
                 continue
-            else:
-                pilot = ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed)
-            others = (*(other for other in names if other != name), *(("target",) if site else ()))
-            team = Team(name, others if agent else (), period=period, turn=period * i / len(names))
-            self.runtimes[name] = Runtime(
+            others = (*(other for other in names if other != name), *told) if agent else ()
+            self.runtimes[name] = self._runtime(
+                name,
                 vehicle,
-                pool,
-                pilot,
-                goal,
-                arm=True,
-                perception=Perception(vehicle, pool, let_in=starts[name][0][:2] if let_in else None)
+                steering.get(name)
+                or ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
+                Perception(vehicle, pool, let_in=start[0][:2] if let_in else None)
                 if agent
-                else TrueState(world),
-                bridge=Bridge(vehicle, _limits(vehicle, world.spec.basin)),
-                team=team if len(names) > 1 else None,
-                recorder=Recorder(record / f"{name}.mcap", vehicle, {"pilot": pilot.describe(), **about})
-                if record is not None and agent
-                else None,
+                else TrueState(self.worlds[name]),
+                pool=pool,
+                team=Team(name, others, period=period, turn=period * i / len(names)) if names[1:] else None,
+                record=kept.get(name),
             )
+
+    def _place_dock(self, worlds: Mapping[str, VirtualPool]) -> None:
+        """Put the dock of a task that has one where its goal is, for the contact forces."""
+        for world in worlds.values() if self.task.dock() is not None else ():
+            funnel = world.plant.simulator.funnel
+            funnel.position.assign(self.referee.arrays.goal_position)
+            funnel.quaternion.assign(self.referee.arrays.goal_quaternion)
+
+    def _runtime(
+        self,
+        name: str,
+        vehicle: Vehicle,
+        pilot: Pilot,
+        perception: Any,
+        *,
+        pool: Pool | None,
+        team: Team | None,
+        record: Path | None,
+    ) -> Runtime:
+        """Return the software of the robot at a place."""
+        about = {"command": "python -m studies.stack", "guide": self._guide.name, "armed": True}
+        return Runtime(
+            vehicle,
+            pool,
+            pilot,
+            self._guide,
+            arm=True,
+            perception=perception,
+            bridge=Bridge(vehicle, _limits(vehicle, self.worlds[name].spec.basin)),
+            team=team,
+            recorder=None
+            if record is None
+            else Recorder(record / f"{name}.mcap", vehicle, {"pilot": pilot.describe(), **about}),
+        )
 
     def _eyes(self, vehicle: Vehicle, seed: int) -> Any:
         """The vehicle's own sensors that the task observes, in the world of its episode."""
