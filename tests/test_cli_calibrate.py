@@ -69,17 +69,8 @@ def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
 @pytest.mark.slow
 def test_hydrodynamics_as_json(capfd, tmp_path, trials):
     """One object with the keys of the contract, and nothing else on standard output."""
-    words = [
-        "calibrate",
-        "hydrodynamics",
-        trials / "fit",
-        "--vehicle",
-        "finsrov",
-        "--axes",
-        "surge",
-        "--json",
-    ]
-    assert finssim(*words, "--out", tmp_path / "v.yaml") == 0
+    words = ["calibrate", "hydrodynamics", trials / "fit" / "surge_plus_12", "--vehicle", "finsrov"]
+    assert finssim(*words, "--axes", "surge", "--json", "--out", tmp_path / "v.yaml") == 0
     found = json.loads(capfd.readouterr().out)
     assert found.keys() >= KEYS and found["method"] == "simulation"
     assert found["parameters"]["surge.d1"].keys() == PARAMETER

@@ -90,7 +90,11 @@ def test_numbers_come_back(name):
     """From coefficients off by factors of two, whatever drives and measures the vehicle."""
     vehicle, axes, options, within = CASES[name]
     vehicle = load_vehicle(vehicle)
-    fit = fit_by_simulation(trials_of(vehicle, axes, **options), wrong(vehicle))
+    plan = programmes(axes, vehicle)
+    if options.get("inputs") != ("command",):  # motors that lag need them all
+        plan = plan[::2]
+    some = simulate_programme(plan, vehicle, seed=3, **options)
+    fit = fit_by_simulation(some, wrong(vehicle))
     assert fit.settings["axes"] == list(axes)
     check(fit, vehicle, axes, within)
     identified = [e for e in fit.estimates.values() if e.name.endswith("m_eff") and e.identifiable]
@@ -334,7 +338,7 @@ def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
     vehicle, some = known_trials.trials("bluerov2_heavy", "heave", "yaw")
     rng = np.random.default_rng(3)
     foreign = []
-    for t in some:
+    for t in some[::2]:
         wander = np.convolve(rng.normal(size=len(t.t) + 100), np.hanning(101) / 20.0, "valid")
         foreign.append(replace(t, channels=t.channels | {"w": wander}))
     fit = fit_by_simulation(without(foreign, "x", "y", "z", "depth", "ax", "ay", "az"), vehicle)

@@ -918,6 +918,7 @@ class Shooting:
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
+        self._latest: tuple[Point, Linearization] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -971,7 +972,15 @@ class Shooting:
         return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
 
     def linearise(self, point: Point) -> Linearization:
-        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add."""
+        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add.
+
+        Those of the latest point are kept, because one solution often begins where another ended.
+        """
+        if self._latest is None or not all(map(np.array_equal, self._latest[0], point)):
+            self._latest = point, self._linearised(point)
+        return self._latest[1]
+
+    def _linearised(self, point: Point) -> Linearization:
         points, wide = self._neighbours(point)
         value, rate = self._predicted(points)
         rise = value[:, 1::2] - value[:, 2::2]
