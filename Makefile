@@ -8,6 +8,9 @@ STRICT := $(wildcard $(addprefix src/finssim/,core physics control localization)
 # Named by content and extras, so that a fresh checkout or another branch with the same requirements installs nothing again.
 STAMP := $(VENV)/.installed-$(shell { echo $(EXTRAS); cat pyproject.toml constraints.txt; } | cksum | cut -d " " -f 1)
 
+# Compiled modules are kept, also where the shell forbids it: hundreds of processes import the same ones.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test quick core check format bench docs clean
 

@@ -128,7 +128,7 @@ def test_until_ends_the_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_between_two_steps(number):
-    """Disarmed, zero frames sent, and the handlers as before."""
+    """Disarmed, zero frames sent, and the handlers as before, the garbage collector too."""
     world, before = Acted(), signal.getsignal(number)
 
     def show(runtime):
@@ -139,7 +139,7 @@ def test_a_signal_ends_the_run_between_two_steps(number):
     world.run(runtime, duration=60.0, show=show)
     assert runtime.counters.steps == 90 and runtime.bridge.state == "disarmed"
     assert [c.enable for c in world.commands()][-3:] == [False] * 3
-    assert signal.getsignal(number) is before and gc.isenabled()
+    assert signal.getsignal(number) is before and gc.isenabled() and gc.get_freeze_count()
 
 
 @pytest.mark.slow

@@ -114,8 +114,8 @@ def run_realtime(
 
 @contextmanager
 def _calm() -> Iterator[None]:
-    """Keep the garbage collector and other threads from holding up the loop."""
-    enabled, interval = gc.isenabled(), sys.getswitchinterval()
+    """Keep the garbage collector and other threads from holding up the loop; what was frozen before stays frozen."""
+    enabled, frozen, interval = gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -124,7 +124,8 @@ def _calm() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(interval)
-        gc.unfreeze()
+        if not frozen:
+            gc.unfreeze()
         if enabled:
             gc.enable()
 
