@@ -192,7 +192,7 @@ def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
     from finssim.identification.synthetic import simulate_programme
 
     truth = fs.load_vehicle("finsrov").replace({"hydrodynamics.calibrated.linear_damping.5.5": 1.2})
-    trials = simulate_programme(programmes(["yaw"], truth), truth, inputs=("rpm",))
+    trials = simulate_programme(programmes(["yaw"], truth)[::3], truth, inputs=("rpm",))
     fit = fs.identify("finsrov", trials, axes=["yaw"])
     assert fit.vehicle.calibrations and fit.before.name == fit.vehicle.name == "finsrov"
     low, high = fit.intervals["yaw.m_eff"]

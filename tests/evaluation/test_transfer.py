@@ -9,14 +9,14 @@ from finssim.evaluation.tables import html_of, markdown_of
 from finssim.learning.train import TrainingSettings
 from finssim.studies.transfer import T1, T2, controllers_of, row_figures, scores, transfer_experiment
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 
 SMALL = {"plants": 1, "seeds": 1, "rows": ("pid",), "targets": ("P01",), "processes": 1}
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """One trial of the tuned PID: its folder and result."""
+def small(brief_t1, tmp_path_factory):
+    """One trial of the tuned PID, as long as `brief_t1` has it: its folder and result."""
     out = tmp_path_factory.mktemp("t1")
     return out, transfer_experiment(T1, out=out, **SMALL)
 

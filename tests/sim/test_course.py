@@ -9,7 +9,7 @@ from finssim.control import ControlError
 from finssim.control.course import STEEPEST, CoursePilot, course_speeds, tuned
 from finssim.control.guidance import Known
 from finssim.core.rotations import quat_from_euler
-from finssim.sim import SeaState, SimulatorError, Water
+from finssim.sim import SeaState, SimulatorError, Water, Wave
 from finssim.sim.free_motion import linear_model
 from finssim.vehicles import load_vehicle
 from reference.steered import PERIOD, sailed
@@ -156,34 +156,36 @@ def test_any_vehicle_with_thrusters_for_surge_pitch_and_yaw_has_an_autopilot():
     assert np.isfinite(gains).all() and (np.abs(gains[:, [0, 2, 3], [0, 7, 8]]) > 0.0).all()
 
 
-HELD = ("remus100", "lauv", "eca_a9")
-"""Vehicles of the catalogue with fins that are to hold course and depth."""
-WAVES = SeaState(spectrum="jonswap", height=0.25, period=5.0)
+SEAS = {
+    "still": (None, 1.0, 0.1),
+    "swell": (
+        Water(
+            current=(0.1, 0.28, 0.0), depth=60.0, waves=(Wave(amplitude=0.2, wavelength=12.0, heading=0.7),)
+        ),
+        3.0,
+        0.3,
+    ),
+    "sea": (
+        Water(
+            current=(0.0, 0.3, 0.0), depth=50.0, waves=SeaState(spectrum="jonswap", height=0.25, period=5.0)
+        ),
+        3.0,
+        0.3,
+    ),
+}
+"""Water, and the error of course [degrees] and of depth [m] in it: waves 0.4 m high, and a sea of 0.25 m."""
 
 
-def held(name, water):
-    """Largest errors of course [rad] and depth [m] after a minute, of four courses at 10 m and at half the speeds."""
-    vehicle = load_vehicle(name)
+@pytest.mark.slow
+@pytest.mark.parametrize("sea", SEAS)
+@pytest.mark.parametrize("name", ["remus100", "lauv", "eca_a9", "torpedo"])
+def test_course_and_depth_are_held(name, sea):
+    """By every vehicle of the catalogue with fins, a minute after steps of both, at half its speeds."""
+    vehicle, (water, turn, deep) = load_vehicle(name), SEAS[sea]
     speed = float(course_speeds(vehicle)[[0, -1]].mean())
-    courses = np.array([0.0, 1.0, -2.0, 0.5])
-    found = sailed(
-        vehicle, {"speed": speed, "course": courses, "depth": 10.0}, 90.0, speed=speed, water=water
-    )
+    orders = {"course": np.array([0.0, 1.0, -2.0, 0.5]), "depth": np.array([10.0, 12.0, 9.0, 10.0])}
+    found = sailed(vehicle, {"speed": speed, **orders}, 90.0, speed=speed, water=water)
     end = found.time > 60.0
-    off = (found.course[end] - courses + math.pi) % (2.0 * math.pi) - math.pi
-    return np.abs(off).max(), np.abs(found.position[end][:, :, 2] + 10.0).max()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", HELD)
-def test_course_and_depth_are_held_in_still_water(name):
-    off, deep = held(name, None)
-    assert off < math.radians(1.0) and deep < 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", HELD)
-def test_course_and_depth_are_held_in_a_current_with_waves(name):
-    """0.3 m/s across the first course, and a sea of 0.25 m with a period of 5 s."""
-    off, deep = held(name, Water(current=(0.0, 0.3, 0.0), waves=WAVES, depth=50.0))
-    assert off < math.radians(3.0) and deep < 0.3
+    off = (found.course[end] - orders["course"] + math.pi) % (2.0 * math.pi) - math.pi
+    assert np.abs(off).max() < math.radians(turn)
+    assert np.abs(found.position[end][:, :, 2] + orders["depth"]).max() < deep

@@ -25,7 +25,7 @@ def _components(a: npt.ArrayLike) -> tuple[Any, ...]:
 
 def _vector(*components: Any) -> Array:
     """The vector, or the batch of vectors, of its components."""
-    if type(components[-1]) is float and all(type(c) is float for c in components):
+    if {*map(type, components)} == {float}:
         return np.array(components)
     shape = np.broadcast(*components).shape
     if not shape:
