@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from finssim import acceleration
 from finssim.vehicles import Vehicle, catalogue, check_vehicle, load_vehicle
+from finssim.vehicles.capability import panel_drag
 
 
 def failed(vehicle: Vehicle) -> dict[str, str]:
@@ -72,3 +74,32 @@ def test_a_hull_of_another_volume_is_found():
 
 def test_a_hull_that_cannot_be_built_is_found():
     assert "does not fit" in failed(load_vehicle("finsrov").replace({"body.size": [0.2, 0.2, 0.2]}))["hull"]
+
+
+def remark(vehicle: Vehicle) -> str | None:
+    (found,) = (finding for finding in check_vehicle(vehicle) if finding.name == "hydrodynamic sets")
+    assert found.passed
+    return found.sentence if found.remark else None
+
+
+def test_sets_of_one_vehicle_that_disagree_are_remarked():
+    """bluerov2_heavy: drag as identified and that of its panels are a factor of 2.5 apart in surge, 1.4 in heave."""
+    heavy = load_vehicle("bluerov2_heavy")
+    assert "127 N of surge give 'calibrated' 0.90, 'mesh' 2." in (remark(heavy) or "")
+    assert "heave" not in (remark(heavy) or "")
+    sets = {"linear_damping": np.zeros(6), "quadratic_damping": np.diag([*panel_drag(heavy), 1.0, 1.0, 1.0])}
+    alike = heavy.replace({f"hydrodynamics.calibrated.{key}": value for key, value in sets.items()})
+    assert remark(alike) is None
+
+
+@pytest.mark.parametrize("name", ["finsrov", "rexrov"])
+def test_drag_of_panels_is_that_of_the_simulated_hull(name):
+    """M dν/dt of a submerged level vehicle, at 1 m/s less at rest, is -d2 along the axis, by either direction."""
+    vehicle = load_vehicle(name)
+    eta, M = [0.0, 0.0, -50.0, 0.0, 0.0, 0.0], vehicle.mass_matrix("mesh")
+    rest = acceleration(vehicle, eta, np.zeros(6), hydrodynamics="mesh")
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            nu = sign * np.eye(6)[axis]
+            force = M @ (acceleration(vehicle, eta, nu, hydrodynamics="mesh") - rest)
+            assert -sign * force[axis] == pytest.approx(panel_drag(vehicle)[axis], rel=2e-3)

@@ -231,7 +231,7 @@ CATALOGUE = Path(__file__).parents[1] / "vehicles/catalogue"
 
 VEHICLES = Family(
     "vehicle",
-    {path.stem: path for path in sorted(CATALOGUE.glob("*.yaml")) if path.stem != "published"},
+    {path.stem: path for path in sorted(CATALOGUE.glob("*.yaml"))},
     check="finssim.vehicles.loader:check_registered",
 )
 """Name -> path of the vehicle file."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.vehicles.hydrodynamics import HydrodynamicSet
+from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Vehicle, moved_to_origin
 
@@ -18,6 +18,7 @@ __all__ = [
     "WrenchCapability",
     "coefficients_of",
     "level_speed",
+    "panel_drag",
     "restoring",
     "terminal_speed",
     "terminal_speeds",
@@ -121,9 +122,8 @@ def terminal_speed(d1: float, d2: float, tau: float) -> float:
     """
     if tau == 0.0:
         return 0.0
-    if d1 == 0.0 and d2 == 0.0:
-        return math.inf
-    return 2.0 * tau / (d1 + math.sqrt(d1 * d1 + 4.0 * d2 * tau))
+    drag = d1 + math.sqrt(d1 * d1 + 4.0 * d2 * tau)
+    return 2.0 * tau / drag if drag > 0.0 else math.inf
 
 
 def coefficients_of(vehicle: Vehicle) -> str:
@@ -145,6 +145,29 @@ def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Arra
     return np.array(
         [terminal_speed(*row) for row in zip(drag, chosen.axis_drag, vehicle.wrench_limits, strict=True)]
     )
+
+
+def panel_drag(vehicle: Vehicle, hydrodynamics: str = "mesh") -> Array:
+    """Return d2 of steady motion along surge, sway and heave by the panels of the hull, where drag is d2 v² [N s²/m²].
+
+    d2 = ρ/2 Σ A [C_form max(μ, 0) + C_skin (1 - μ²)^(3/2)],  μ = n · axis                      (paper, eq. 3-4)
+
+    Args:
+        vehicle: Any vehicle with a hull.
+        hydrodynamics: Its set with `form_drag` and `skin_drag`.
+
+    Returns:
+        (3,)
+    """
+    chosen = vehicle.hydrodynamics[hydrodynamics]
+    assert isinstance(chosen, MeshSet)
+    vertices, faces = vehicle.hull_mesh()
+    a, b, c = np.swapaxes(vertices[faces], 0, 1)
+    normals = np.cross(b - a, c - a) / 2.0  # times area
+    areas = np.linalg.norm(normals, axis=1, keepdims=True)
+    slip = np.clip(areas**2 - normals**2, 0.0, None) ** 1.5 / np.maximum(areas, 1e-300) ** 2
+    panels = chosen.form_drag * np.maximum(normals, 0.0) + chosen.skin_drag * slip
+    return np.asarray(0.5 * vehicle.water.density * panels.sum(axis=0))
 
 
 def _inflow_damping(vehicle: Vehicle) -> Array:

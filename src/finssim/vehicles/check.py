@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -11,17 +13,21 @@ from numpy.typing import NDArray
 
 from finssim.core.registry import CATALOGUE, TERMS
 from finssim.core.yaml_file import read_mapping
-from finssim.vehicles.capability import terminal_speeds, trim, wrench_capability
+from finssim.vehicles.capability import panel_drag, terminal_speeds, trim, wrench_capability
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Vehicle
 
 __all__ = ["CheckResult", "check_vehicle"]
 
+PUBLISHED = Path(__file__).with_name("published.yaml")
+"""Top speeds and bollard pulls of real vehicles, with sources."""
 CURVE_TOLERANCE = 0.01
 """Relative gap accepted between a force limit and the curve at the speed limit."""
-SPEED_TOLERANCE = 0.2
-"""Relative difference of top speed from the published one that needs no reason."""
+PUBLISHED_TOLERANCE = 0.2
+"""Relative difference of top speed or bollard pull from the published one that needs no reason."""
+SETS_RATIO = 1.5
+"""Ratio of the steady speeds of two hydrodynamic sets under the same force from which a remark is made."""
 VOLUME_TOLERANCE = 0.02
 CENTROID_TOLERANCE = 0.02
 """Distance accepted between the hull's centroid and the centre of buoyancy, relative to the longest side."""
@@ -33,14 +39,17 @@ class CheckResult(NamedTuple):
     name: str
     passed: bool
     sentence: str
+    remark: bool = False
+    """Whether a finding that passed needs attention."""
 
 
 def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
     """Check what no single number shows; the loader has already refused what cannot be simulated at all.
 
     Returns:
-        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull, and top
-        speed beside that of the real vehicle, where `catalogue/published.yaml` has it.
+        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull,
+        agreement of the hydrodynamic sets, and top speed and bollard pull beside those of the real vehicle, where
+        `published.yaml` has them.
     """
     return [
         *_mass_matrices(vehicle),
@@ -50,7 +59,8 @@ def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
         _trim(vehicle),
         _stability(vehicle),
         *_hull(vehicle),
-        *_top_speed(vehicle),
+        *_agreement(vehicle),
+        *_published(vehicle),
     ]
 
 
@@ -215,15 +225,44 @@ def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
     )
 
 
-def _top_speed(vehicle: Vehicle) -> Iterator[CheckResult]:
-    published = CATALOGUE / "published.yaml"
+def _agreement(vehicle: Vehicle) -> Iterator[CheckResult]:
+    """Remark on hydrodynamic sets of one vehicle that reach very different speeds under the same force."""
+    speeds = {}
+    with suppress(VehicleError):  # of a hull that another check finds
+        for name, chosen in vehicle.hydrodynamics.items():
+            if isinstance(chosen, HydrodynamicSet):
+                speeds[name] = terminal_speeds(vehicle, name)[:3]
+            else:
+                speeds[name] = np.sqrt(vehicle.wrench_limits[:3] / panel_drag(vehicle, name))
+    if len(speeds) < 2:
+        return
+    apart = []
+    for i, force in enumerate(vehicle.wrench_limits[:3]):
+        ends = [float(speed[i]) for speed in speeds.values()]
+        if min(ends) > 0.0 and max(ends) > SETS_RATIO * min(ends):
+            found = ", ".join(f"'{name}' {speed[i]:.2f}" for name, speed in speeds.items())
+            apart.append(f"{force:.3g} N of {AXES[i]} give {found} m/s")
+    sentence = "; ".join(apart) or f"their steady speeds differ by less than a factor of {SETS_RATIO:g}"
+    advice = ": they are not the same vehicle; choose one by trials" if apart else ""
+    yield CheckResult("hydrodynamic sets", True, sentence + advice, bool(apart))
+
+
+def _published(vehicle: Vehicle) -> Iterator[CheckResult]:
+    """Compare a vehicle of the catalogue with the real one."""
     if vehicle.path is None or vehicle.path.parent != CATALOGUE or "calibrated" not in vehicle.hydrodynamics:
         return
-    row = read_mapping(published, VehicleError, such_as="remus100: {top_speed: 2.5}").get(vehicle.name)
-    if row is not None:
-        speed, real = float(terminal_speeds(vehicle)[0]), row["top_speed"]
-        passed = abs(speed / real - 1.0) <= SPEED_TOLERANCE or "why" in row
-        why = f"; {row['why']}" if "why" in row else ""
-        yield CheckResult(
-            "top speed", passed, f"{speed:.2f} m/s; the real one {real:g} m/s ({row['source']}){why}"
-        )
+    rows = read_mapping(PUBLISHED, VehicleError, such_as="remus100: {top_speed: 2.5}")
+    row = rows.get(vehicle.name, {})
+    ours = {
+        "top_speed": (float(terminal_speeds(vehicle)[0]), "top speed", "m/s"),
+        **{
+            axis: (float(force), f"bollard pull in {axis}", "N")
+            for axis, force in zip(AXES, vehicle.wrench_limits, strict=True)
+        },
+    }
+    for key in (key for key in ours if key in row):
+        (value, name, unit), real = ours[key], row[key]
+        apart = abs(value / real - 1.0) > PUBLISHED_TOLERANCE
+        why = f"; {row['why']}" if apart and "why" in row else ""
+        sentence = f"{value:.3g} {unit}; the real one {real:g} {unit} ({row['source']}){why}"
+        yield CheckResult(name, not apart or "why" in row, sentence, apart)

@@ -163,8 +163,11 @@ def _tables(vehicle: Vehicle) -> Iterator[Table]:
         title = "Defaults (the file does not give these: for the virtual world; measure your own)"
         rows = ((name, escape(DEFAULTS[name])) for name in vehicle.defaults)
         yield _table(title, ("", "what stands for it"), rows, words=True)
-    marks = {True: "[green]pass[/green]", False: "[red]fail[/red]"}
-    found = ((marks[f.passed], f.name, escape(f.sentence)) for f in check_vehicle(vehicle))
+    marks = {(True, False): "[green]pass[/green]", (True, True): "[yellow]note[/yellow]"}
+    found = (
+        (marks.get((f.passed, f.remark), "[red]fail[/red]"), f.name, escape(f.sentence))
+        for f in check_vehicle(vehicle)
+    )
     yield _table("Checks", ("", "check", "finding"), found, words=True)
 
 
