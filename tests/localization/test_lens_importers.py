@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from finssim.core.importer import check_registered
 from finssim.core.registry import IMPORTERS, RegistryError
 from finssim.localization import LocalizationError
-from finssim.localization.camera_file import LensWarning, check_registered, load_camera
+from finssim.localization.camera_file import LensWarning, load_camera
 
 W, H, FX, FY, CX, CY = 1280, 720, 541.0, 541.2, 639.5, 359.5
 K1, K2, P1, P2, K3 = -0.21, 0.041, 0.0012, -0.0007, -0.003
@@ -298,7 +299,7 @@ def test_a_principal_point_far_from_the_middle_is_questioned(tmp_path):
 
 def test_an_importer_of_lenses_is_registered_under_its_name():
     assert {"lens.ros", "lens.opencv", "lens.kalibr", "lens.matlab", "lens.colmap"} <= set(IMPORTERS)
-    with pytest.raises(LocalizationError, match="expected a LensImporter"):
+    with pytest.raises(RegistryError, match="expected an Importer of kind 'lens'"):
         check_registered("lens.own", object())
     with pytest.raises(RegistryError, match="begins with vehicle. or "):
         IMPORTERS["camera.own"] = object()

@@ -200,26 +200,6 @@ def object_at(reference: str) -> Any:
     return value
 
 
-def check_importer(name: str, member: Any) -> None:
-    """Refuse what is no importer, by the check of what it imports.
-
-    Raises:
-        RegistryError: Its name begins with nothing that can be imported.
-        ValueError: It does not fit.
-    """
-    kind = name.partition(".")[0]
-    checks = {
-        "vehicle": "finssim.vehicles.importers.draft:check_registered",
-        "trial": "finssim.trials.importers.log:check_registered",
-        "lens": "finssim.localization.camera_file:check_registered",
-    }
-    if kind not in checks or "." not in name:
-        raise RegistryError(
-            f"importer '{name}': expected a name that begins with {' or '.join(f'{k}.' for k in checks)}"
-        )
-    object_at(checks[kind])(name, member)
-
-
 def _identity(member: Any) -> tuple[str, str] | None:
     """Return module and qualified name of a class or function; None of other objects."""
     name = getattr(member, "__qualname__", None)
@@ -328,10 +308,9 @@ IMPORTERS = Family(
         "lens.colmap": "finssim.localization.importers.reconstruction:COLMAP",
         "lens.opencv": "finssim.localization.importers.calibration:OPENCV",
     },
-    check="finssim.core.registry:check_importer",
+    check="finssim.core.importer:check_registered",
 )
-"""What is imported, a dot, and the format -> the importer: of vehicles a `VehicleImporter`, of logs a `LogImporter`, of
-lenses a `LensImporter`."""
+"""What is imported, a dot, and the format -> the `Importer` of `finssim.core.importer`."""
 
 FAMILIES: tuple[Family, ...] = (
     VEHICLES,

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from finssim.core.files import atomic_write
+from finssim.core.importer import first_bytes, importers, recognised
 from finssim.core.optics import Lens, OpticsError, lens_model
-from finssim.core.registry import IMPORTERS
 from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.localization import LocalizationError
 
-HEAD = 1 << 20
-"""Bytes from which an importer recognises its format."""
 OWN = re.compile(rb"^(lens|camera)\s*:", re.MULTILINE)
 """Beginning of a line of our own camera and pool files."""
 
@@ -128,34 +126,8 @@ class CameraFile:
     """Record of the calibration: estimates, intervals, provenance; empty for another program's file."""
 
 
-@dataclass(frozen=True)
-class LensImporter:
-    """An importer of lenses, registered as `lens.FORMAT` in the family `IMPORTERS`."""
-
-    title: str
-    """Name of the format."""
-    recognises: Callable[[Path, bytes], bool]
-    """Function of a path and the first bytes of its file: whether the file is of this format."""
-    read: Callable[[Path], Lens]
-    """Function that reads a file; it refuses by a `LocalizationError` of one sentence."""
-
-
 class LensWarning(UserWarning):
     """Warning of a lens that is possible, but probably not the one that is meant."""
-
-
-def check_registered(name: str, member: Any) -> None:
-    """Refuse what is no importer of lenses.
-
-    Args:
-        name: Name in the family.
-        member: The object that is registered under it.
-
-    Raises:
-        LocalizationError: It is another object.
-    """
-    if not isinstance(member, LensImporter):
-        raise LocalizationError(f"{name} is {member!r}, expected a LensImporter: register one")
 
 
 def load_camera(path: str | Path) -> CameraFile:
@@ -184,16 +156,13 @@ def load_camera(path: str | Path) -> CameraFile:
 
 
 def _camera_file(path: Path) -> CameraFile:
-    importers = {name: one for name, one in IMPORTERS.usable().items() if name.startswith("lens.")}
     try:
-        with path.open("rb") as opened:
-            head = opened.read(HEAD)
+        path.open("rb").close()
     except OSError as error:
         raise LocalizationError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if OWN.search(head) is None:
-        for importer in importers.values():
-            if importer.recognises(path, head):
-                return CameraFile(importer.read(path))
+    known = importers("lens")
+    if OWN.search(first_bytes(path)) is None and (format := recognised("lens", path)) is not None:
+        return CameraFile(known[format].read(path))
     tree = read_mapping(path, LocalizationError, such_as="lens: {width: 1280, height: 720, fx: 541}")
     top = tree.get("camera")
     if isinstance(top, Mapping) and isinstance(top.get("lens"), Mapping):  # a pool file
@@ -205,7 +174,7 @@ def _camera_file(path: Path) -> CameraFile:
         return CameraFile(
             lens_from(tree["lens"], f"{path}: lens"), record if isinstance(record, Mapping) else {}
         )
-    titles = ", ".join(importer.title for importer in importers.values())
+    titles = ", ".join(importer.title for importer in known.values())
     raise LocalizationError(f"{path}: no camera in a known format; expected FinsSim (lens), {titles}")
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from finssim.core.files import plain_name
-from finssim.core.registry import IMPORTERS, VEHICLES, RegistryError
+from finssim.core.importer import Importer, first_bytes, importers, recognised
+from finssim.core.registry import VEHICLES, RegistryError
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.importers.rigid import combined
 from finssim.vehicles.part import VehicleError, VehicleWarning, did_you_mean, sentence_of
@@ -26,10 +27,6 @@ from finssim.vehicles.vehicle import ORIGINS, Origin, Provenance, Vehicle
 
 GREATEST = 1e12
 """Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
-KIND = "vehicle."
-"""Beginning of the names of importers that read vehicles."""
-HEAD = 1 << 16
-"""Bytes from which an importer recognises its format."""
 OWN = re.compile(rb"(?m)^(title|extends|origin|body|thrusters)\s*:")
 """Beginning of a line of which a vehicle file of FinsSim has one or more."""
 
@@ -123,18 +120,12 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
         raise VehicleError(str(error)) from error
 
 
-def importers() -> dict[str, Any]:
-    """Return the importers of vehicles (`VehicleImporter`) by name."""
-    return {name: IMPORTERS[name] for name in IMPORTERS if name.startswith(KIND)}
-
-
-def importer_of(path: Path) -> Any:
-    """Return the `VehicleImporter` that recognises a file; None for a vehicle file of FinsSim and for other formats."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    if path.suffix in (".yaml", ".yml") and OWN.search(head):
+def importer_of(path: Path) -> Importer | None:
+    """Return the importer that recognises a file; None for a vehicle file of FinsSim and for other formats."""
+    if path.suffix in (".yaml", ".yml") and OWN.search(first_bytes(path)):
         return None
-    return next((member for member in importers().values() if member.recognises(path, head)), None)
+    name = recognised("vehicle", path)
+    return None if name is None else importers("vehicle")[name]
 
 
 @cache
@@ -148,7 +139,9 @@ def _read_foreign(path: Path, extended: bool) -> tuple[Tree, Origins]:
 
     One that another file extends may lack what that file gives.
     """
-    draft = importer_of(path).read(path)
+    importer = importer_of(path)
+    assert importer is not None
+    draft = importer.read(path)
     incomplete = extended and draft.missing
     vehicle = None if incomplete else draft.vehicle(Path(_meshes().name))
     guessed = "; ".join(draft.guesses()) or "nothing"

@@ -7,10 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from finssim.core.importer import importers
 from finssim.core.rotations import quat_from_euler, quat_multiply, quat_rotate, wrap_angle
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
-from finssim.trials.importers.log import importer_of, importers
+from finssim.trials.importers.log import importer_of
 
 N = 200
 T = np.arange(N) * 0.1
@@ -361,7 +362,7 @@ def test_a_px4_log_without_motion_is_refused(tmp_path):
 
 def test_formats_are_recognised_by_content(tmp_path):
     """The names of the family, the special formats before the general ones; an unknown one is named with all known."""
-    assert list(importers())[-1] == "csv"
+    assert list(importers("trial"))[-1] == "csv"
     ulog(tmp_path / "a.bin")
     assert importer_of(tmp_path / "a.bin") == "ulog"
     (tmp_path / "b.txt").write_text(json.dumps(report(0, "1")))
@@ -442,7 +443,7 @@ def test_what_a_trial_has_not_is_named(tmp_path, name):
 
 def test_every_importer_of_logs_has_such_a_test():
     """Bags in `test_mavros.py`, ArduSub logs in `test_ardusub.py`; a new format joins the table above."""
-    assert set(importers()) == {*UNKNOWN, "rosbag", "ardupilot"} - {"npz"}
+    assert set(importers("trial")) == {*UNKNOWN, "rosbag", "ardupilot"} - {"npz"}
 
 
 @pytest.mark.parametrize("name", ["csv", "npz"])

@@ -17,12 +17,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from finssim.core.budget import read_bytes
+from finssim.core.importer import Importer
 from finssim.core.optics import Lens
+from finssim.core.xml_file import read_xml
 from finssim.core.yaml_file import read_mapping
 from finssim.localization import LocalizationError
-from finssim.localization.camera_file import Fields, LensImporter, lens_of, model_of, only
-from finssim.vehicles.importers.xml_file import read_xml
-from finssim.vehicles.part import VehicleError
+from finssim.localization.camera_file import Fields, lens_of, model_of, only
 
 __all__ = ["KALIBR", "MATLAB", "OPENCV", "ROS", "key_in", "read_tree", "refuse_strange"]
 
@@ -328,10 +328,7 @@ def _plain(key: Any) -> str:
 def _opencv_tree(path: Path) -> dict[Any, Any]:
     if path.suffix.lower() != ".xml":
         return read_tree(path)
-    try:
-        return {child.tag: _value(child) for child in read_xml(path)}
-    except VehicleError as error:
-        raise LocalizationError(str(error)) from None
+    return {child.tag: _value(child) for child in read_xml(path, LocalizationError)}
 
 
 def _value(element: Element) -> Any:
@@ -444,7 +441,8 @@ def _refuse_unpacked(data: bytes, path: Path) -> None:
         offset += 8 + size
 
 
-ROS = LensImporter(
+ROS = Importer(
+    "lens",
     "ROS (camera_info, ost.txt)",
     lambda path, head: (
         (key_in(head, "distortion_model") and key_in(head, "camera_matrix", "K", "k"))
@@ -452,12 +450,14 @@ ROS = LensImporter(
     ),
     read_ros,
 )
-KALIBR = LensImporter(
+KALIBR = Importer(
+    "lens",
     "Kalibr (camchain)",
     lambda path, head: key_in(head, "camera_model") and key_in(head, "intrinsics"),
     read_kalibr,
 )
-OPENCV = LensImporter(
+OPENCV = Importer(
+    "lens",
     "OpenCV (YAML, XML)",
     lambda path, head: (
         b"<opencv_storage" in head
@@ -465,7 +465,8 @@ OPENCV = LensImporter(
     ),
     read_opencv,
 )
-MATLAB = LensImporter(
+MATLAB = Importer(
+    "lens",
     "MATLAB (toStruct as .mat or JSON)",
     lambda path, head: head[:7] == b"MATLAB " or key_in(head, "RadialDistortion", "MappingCoefficients"),
     read_matlab,

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from finssim.core.budget import read_bytes
+from finssim.core.importer import Importer
 from finssim.core.optics import Lens
 from finssim.localization import LocalizationError
-from finssim.localization.camera_file import Fields, LensImporter, lens_of
+from finssim.localization.camera_file import Fields, lens_of
 from finssim.localization.importers.calibration import key_in, read_tree, refuse_strange
 
 __all__ = ["COLMAP", "NERFSTUDIO", "ORB_SLAM"]
@@ -232,7 +233,8 @@ def read_orb_slam(path: Path) -> Lens:
     return _lens(TYPES[kind], size, of_lens, label)
 
 
-COLMAP = LensImporter(
+COLMAP = Importer(
+    "lens",
     "COLMAP (cameras.txt, .bin)",
     lambda path, head: (
         path.name.lower().endswith("cameras.bin")
@@ -241,9 +243,12 @@ COLMAP = LensImporter(
     ),
     read_colmap,
 )
-NERFSTUDIO = LensImporter(
-    "nerfstudio (transforms.json)", lambda path, head: key_in(head, "fl_x", "camera_angle_x"), read_nerfstudio
+NERFSTUDIO = Importer(
+    "lens",
+    "nerfstudio (transforms.json)",
+    lambda path, head: key_in(head, "fl_x", "camera_angle_x"),
+    read_nerfstudio,
 )
-ORB_SLAM = LensImporter(
-    "ORB-SLAM (settings)", lambda path, head: key_in(head, "Camera.fx", "Camera1.fx"), read_orb_slam
+ORB_SLAM = Importer(
+    "lens", "ORB-SLAM (settings)", lambda path, head: key_in(head, "Camera.fx", "Camera1.fx"), read_orb_slam
 )

@@ -6,8 +6,7 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.trials.importers.dispatch import import_trials
-    from finssim.trials.importers.log import LogImporter
 
-__all__ = ["LogImporter", "import_trials"]
+__all__ = ["import_trials"]
 
 __getattr__, __dir__ = exports(__name__)

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.ardusub import FULL, NEUTRAL
+from finssim.core.importer import Importer
 from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.conversion import GRAVITY
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import STICK_CHANNELS, mixed_pulses, outputs_of
 from finssim.trials.importers.assemble import ArduSubMap, LogFrame, Stream, in_our_axes
-from finssim.trials.importers.log import LogImporter, Request, TrialStreams
+from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.trial import Array
 from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
@@ -656,6 +657,6 @@ def _recognises(path: Path, head: bytes) -> bool:
     return head.startswith(DATAFLASH) or path.suffix.lower() in (".bin", ".tlog") or without_profile(head)
 
 
-ARDUPILOT = LogImporter(
-    title="an ArduPilot log (.BIN, .tlog, .mcap of BlueOS)", recognises=_recognises, read=read
+ARDUPILOT = Importer(
+    "trial", title="an ArduPilot log (.BIN, .tlog, .mcap of BlueOS)", recognises=_recognises, read=read
 )

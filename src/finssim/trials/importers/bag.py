@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from finssim.core.budget import check_unpacked, limited_memory, packed_with_zstd
+from finssim.core.importer import Importer
 from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers import finssim_record
 from finssim.trials.importers.ardusub import ARMED_FLAG, MANUAL, ArduPilotLog, with_inputs
 from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream, shipped_maps
-from finssim.trials.importers.log import LogImporter, Request, TrialStreams
+from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.table import used_columns
 from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array
@@ -370,6 +371,9 @@ def _recognises(path: Path, head: bytes) -> bool:
     return bool(bag_files(path)) and not without_profile(head)
 
 
-ROSBAG = LogImporter(
-    title="a ROS bag (.mcap, .db3, .bag, the folder of a ROS 2 bag)", recognises=_recognises, read=read
+ROSBAG = Importer(
+    "trial",
+    title="a ROS bag (.mcap, .db3, .bag, the folder of a ROS 2 bag)",
+    recognises=_recognises,
+    read=read,
 )

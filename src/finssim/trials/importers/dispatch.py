@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 from finssim.core.files import plain_name
+from finssim.core.importer import importers
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.assemble import (
     ColumnMap,
@@ -22,7 +23,7 @@ from finssim.trials.importers.assemble import (
     split_table,
     trial_of,
 )
-from finssim.trials.importers.log import Request, TrialStreams, importer_of, importers
+from finssim.trials.importers.log import Request, TrialStreams, importer_of
 from finssim.trials.importers.table import SUFFIXES, read_stream
 from finssim.trials.trial import Trial
 from finssim.trials.trial_files import write_trial
@@ -122,7 +123,7 @@ def _logs(paths: list[Path], request: Request, format: str, has_map: bool) -> li
         if name == "csv" or (mapped and path.suffix.lower() in SUFFIXES):
             tables.append(path)
         else:
-            logs.append((path.stem, importers()[name].read(path, request)))
+            logs.append((path.stem, importers("trial")[name].read(path, request)))
     return logs + _table_logs(tables, request.mapped, has_map)
 
 

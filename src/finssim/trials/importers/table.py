@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.budget import CELLS
+from finssim.core.importer import Importer
 from finssim.core.text_table import decoded, text_table
 from finssim.core.yaml_file import read_mapping
 from finssim.trials.conversion import EULER, factor
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
 from finssim.trials.importers.assemble import SourceMap, Stream, TimeColumn, Validity, in_our_axes, present
-from finssim.trials.importers.log import LogImporter, Request, TrialStreams
+from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.trial import Array, column_of
 from finssim.trials.trial_files import ColumnTable, read_table
 from finssim.vehicles.part import did_you_mean
@@ -317,7 +318,7 @@ def _names(path: Path, head: bytes) -> list[str]:
     return text_table(decoded(head)[0]).names
 
 
-def known_table(file: str) -> LogImporter:
+def known_table(file: str) -> Importer:
     """Return the importer of tables that a shipped file describes: its title, the columns it needs, and its map.
 
     Args:
@@ -333,14 +334,15 @@ def known_table(file: str) -> LogImporter:
         used = present(source, table.columns).model_copy(update={"time": time})
         return TrialStreams([table_stream(table, used, path.name)])
 
-    return LogImporter(known["title"], lambda path, head: needs <= set(_names(path, head)), read)
+    return Importer("trial", known["title"], lambda path, head: needs <= set(_names(path, head)), read)
 
 
 ACOUSTIC = known_table("acoustic.yaml")
 QGROUNDCONTROL = known_table("qgroundcontrol.yaml")
 WATER_LINKED = known_table("water_linked_csv.yaml")
 WATER_LINKED_PERIOD = known_table("water_linked_period_csv.yaml")
-TABLE = LogImporter(
+TABLE = Importer(
+    "trial",
     title="a table (.csv, .txt, .parquet, .npz)",
     recognises=lambda path, head: path.is_file() and path.suffix.lower() in SUFFIXES,
     read=lambda path, request: TrialStreams([read_stream(path, None)]),

@@ -11,10 +11,11 @@ import numpy as np
 
 from finssim.control.ardusub import NEUTRAL
 from finssim.core.budget import TEXT, limited_memory, read_bytes
+from finssim.core.importer import Importer
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.ardusub_outputs import outputs_of
 from finssim.trials.importers.assemble import Stream, present, shipped_maps
-from finssim.trials.importers.log import LogImporter, Request, TrialStreams
+from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array
 
@@ -96,4 +97,6 @@ def _outputs(data: dict[str, Any], t: Array, request: Request) -> Stream:
     return Stream(source="actuator_outputs", t=t, channels=channels, findings=(note,), rank=0)
 
 
-ULOG = LogImporter(title="a PX4 log (.ulg)", recognises=lambda path, head: head.startswith(MAGIC), read=read)
+ULOG = Importer(
+    "trial", title="a PX4 log (.ulg)", recognises=lambda path, head: head.startswith(MAGIC), read=read
+)

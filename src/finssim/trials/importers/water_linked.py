@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from finssim.core.importer import Importer
 from finssim.core.text_table import read_text
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.assemble import TimeColumn, shipped_maps
-from finssim.trials.importers.log import LogImporter, Request, TrialStreams
+from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.table import used_columns
 from finssim.trials.importers.topics import LogTopic, log_of
 
@@ -98,6 +99,6 @@ def _recognises(path: Path, head: bytes) -> bool:
     return head.lstrip().startswith(b"{") and (b'"json_v' in head or b'"velocity_valid"' in head)
 
 
-WATER_LINKED = LogImporter(
-    title="JSON lines of a Water Linked Doppler log", recognises=_recognises, read=read
+WATER_LINKED = Importer(
+    "trial", title="JSON lines of a Water Linked Doppler log", recognises=_recognises, read=read
 )

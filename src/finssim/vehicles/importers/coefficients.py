@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.importer import Importer
 from finssim.vehicles.importers import torpedo
 from finssim.vehicles.importers.assignments import Assignments, read_assignments
-from finssim.vehicles.importers.draft import SHARE, Draft, VehicleImporter, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.draft import SHARE, Draft, put_controlled_axes, put_envelope
 from finssim.vehicles.importers.rigid import flu_of_frd, plain
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, skew
@@ -336,4 +337,6 @@ def _recognises(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in (".py", ".m") and b"agent_type" not in head  # a scenario of HoloOcean
 
 
-COEFFICIENTS = VehicleImporter("coefficients of Fossen's equations (.py, .m)", _recognises, read_coefficients)
+COEFFICIENTS = Importer(
+    "vehicle", "coefficients of Fossen's equations (.py, .m)", _recognises, read_coefficients
+)

@@ -1,12 +1,12 @@
 """Draft of a vehicle, which an importer fills; the class of importers, and the choice of one by content.
 
-An importer is one file with a `VehicleImporter`, registered as `vehicle.FORMAT` in the family `IMPORTERS`.
+An importer is one file with an `Importer`, registered as `vehicle.FORMAT` in the family `IMPORTERS`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.importer import importers
 from finssim.core.mesh import Faces, MeshError, Vertices, write_stl
 from finssim.core.yaml_file import yaml_text
+from finssim.vehicles.importers.elements import Element
 from finssim.vehicles.importers.rigid import plain
-from finssim.vehicles.importers.xml_file import Element
-from finssim.vehicles.loader import KIND, checked, importer_of, importers
+from finssim.vehicles.loader import checked, importer_of
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import AXES, Origin, Provenance, Vehicle
 
 __all__ = [
-    "Draft", "VehicleImporter", "check_registered", "put_controlled_axes", "put_envelope", "read_foreign", "unread",
+    "Draft", "put_controlled_axes", "put_envelope", "read_foreign", "unread",
 ]  # fmt: skip
 
 GRAVITY = 9.8
@@ -118,36 +119,6 @@ class Draft:
         return vehicle
 
 
-@dataclass(frozen=True)
-class VehicleImporter:
-    """An importer of vehicles."""
-
-    title: str
-    """Name of the format."""
-    recognises: Callable[[Path, bytes], bool]
-    """Function of a path and the first bytes of its file: whether the file is of this format."""
-    read: Callable[..., Draft]
-    """Function of a path, and of a list of folders if `folders`, that reads a file; it refuses by a `VehicleError`."""
-    folders: bool = False
-    """Whether its files name others by the name of a package or below a folder that is not in the file."""
-
-
-def check_registered(name: str, member: Any) -> None:
-    """Refuse what is no importer.
-
-    Args:
-        name: Name in the family: what is imported, a dot, and the format.
-        member: The object that is registered under it.
-
-    Raises:
-        VehicleError: The name or the object does not fit.
-    """
-    if not name.startswith(KIND) or not isinstance(member, VehicleImporter):
-        raise VehicleError(
-            f"{name} is {member!r}, expected a VehicleImporter with a name such as {KIND}sdf: register it so"
-        )
-
-
 def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
     """Read the vehicle of another program, by the importer that recognises its file.
 
@@ -160,14 +131,14 @@ def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
     """
     if not path.is_file():
         raise VehicleError(f"{path}: no such file: give the file of a vehicle")
-    importer: VehicleImporter | None = importer_of(path)
+    importer = importer_of(path)
     if importer is not None and folders and not importer.folders:
         raise VehicleError(
             f"{path}: {importer.title} names files below its own folder only: leave out --folder"
         )
     if importer is not None:
         return importer.read(path, folders) if importer.folders else importer.read(path)
-    known = ", ".join(sorted(member.title for member in importers().values()))
+    known = ", ".join(sorted(member.title for member in importers("vehicle").values()))
     raise VehicleError(f"{path}: is of no format that is read, expected one of {known}")
 
 

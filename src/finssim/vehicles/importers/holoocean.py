@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from finssim.core.importer import Importer
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.importers import torpedo
 from finssim.vehicles.importers.assignments import Assignments, read_assignments
 from finssim.vehicles.importers.coefficients import draft_of
-from finssim.vehicles.importers.draft import Draft, VehicleImporter
+from finssim.vehicles.importers.draft import Draft
 from finssim.vehicles.part import VehicleError, did_you_mean
 
 __all__ = ["HOLOOCEAN", "read_holoocean"]
@@ -122,4 +123,4 @@ def _recognises(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in (".json", ".yaml", ".yml", ".py") and b"agent_type" in head
 
 
-HOLOOCEAN = VehicleImporter("scenario of HoloOcean (.json, .yaml, .py)", _recognises, read_holoocean)
+HOLOOCEAN = Importer("vehicle", "scenario of HoloOcean (.json, .yaml, .py)", _recognises, read_holoocean)

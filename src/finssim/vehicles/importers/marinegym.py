@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from finssim.core.importer import Importer
 from finssim.core.yaml_file import read_mapping
-from finssim.vehicles.importers.draft import Draft, VehicleImporter, put_envelope
+from finssim.vehicles.importers.draft import Draft, put_envelope
 from finssim.vehicles.part import VehicleError, did_you_mean
 
 __all__ = ["MARINEGYM", "read_marinegym", "thrust"]
@@ -109,4 +110,4 @@ def _recognises(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in (".yaml", ".yml") and b"rotor_configuration" in head and b"coBM" in head
 
 
-MARINEGYM = VehicleImporter("parameters of MarineGym (.yaml)", _recognises, read_marinegym)
+MARINEGYM = Importer("vehicle", "parameters of MarineGym (.yaml)", _recognises, read_marinegym)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from finssim.core.mesh import MeshError, check_closed, load_stl, mesh_volume
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.vehicles.importers.draft import Draft, unread
+from finssim.vehicles.importers.elements import Element, file_of_model, flag, number, numbers, refuse_unknown
 from finssim.vehicles.importers.rigid import IDENTITY, LinkPose, combined, plain
-from finssim.vehicles.importers.xml_file import Element, file_of_model, flag, number, numbers, refuse_unknown
 from finssim.vehicles.part import VehicleError, did_you_mean
 
 __all__ = [

@@ -20,14 +20,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from finssim.core.importer import Importer
+from finssim.core.xml_file import read_xml
 from finssim.vehicles.importers.draft import (
     GRAVITY,
     LAG,
     SHARE,
     Draft,
-    VehicleImporter,
     put_controlled_axes,
     put_envelope,
+)
+from finssim.vehicles.importers.elements import (
+    Element,
+    flag,
+    number,
+    numbers,
+    refuse_unknown,
 )
 from finssim.vehicles.importers.model import (
     Model,
@@ -39,14 +47,6 @@ from finssim.vehicles.importers.model import (
     shapes_of,
 )
 from finssim.vehicles.importers.rigid import LinkPose, plain
-from finssim.vehicles.importers.xml_file import (
-    Element,
-    flag,
-    number,
-    numbers,
-    read_xml,
-    refuse_unknown,
-)
 from finssim.vehicles.part import VehicleError, did_you_mean
 
 __all__ = [
@@ -563,7 +563,7 @@ def read_sdf(path: Path) -> Draft:
     Raises:
         VehicleError: It cannot be read; the message says where, what was expected and what to do.
     """
-    element, world = _model_of(read_xml(path), path)
+    element, world = _model_of(read_xml(path, VehicleError), path)
     return read_model(element, world, path, "SDF of gz-sim")
 
 
@@ -637,4 +637,4 @@ def _recognises(path: Path, head: bytes) -> bool:
     return b"<sdf" in head or path.suffix.lower() == ".sdf"
 
 
-SDF = VehicleImporter("SDF of gz-sim (.sdf, .world)", _recognises, read_sdf)
+SDF = Importer("vehicle", "SDF of gz-sim (.sdf, .world)", _recognises, read_sdf)

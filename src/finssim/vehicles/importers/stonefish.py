@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.budget import DEPTH, NODES
+from finssim.core.importer import Importer
 from finssim.core.mesh import (
     Faces,
     MeshError,
@@ -36,7 +37,9 @@ from finssim.core.mesh import (
     mesh_volume,
 )
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
-from finssim.vehicles.importers.draft import LAG, Draft, VehicleImporter, put_controlled_axes, put_envelope
+from finssim.core.xml_file import read_xml
+from finssim.vehicles.importers.draft import LAG, Draft, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.elements import Element, numbers, refuse_unknown
 from finssim.vehicles.importers.rigid import IDENTITY, LinkPose, combined, flu_of_frd, plain
 from finssim.vehicles.importers.thrust_curve import (
     dead_zone,
@@ -47,7 +50,6 @@ from finssim.vehicles.importers.thrust_curve import (
     steady_speed,
 )
 from finssim.vehicles.importers.xacro_file import CALLS, CONSTANTS, evaluate, packages_near
-from finssim.vehicles.importers.xml_file import Element, numbers, read_xml, refuse_unknown
 from finssim.vehicles.part import VehicleError
 from finssim.vehicles.vehicle import moved_to_origin
 
@@ -166,7 +168,7 @@ def prepared(root: Element, arguments: Mapping[str, str], where: str) -> None:
 
 def scenario(path: Path, files: ScenarioFiles, draft: Draft) -> list[Element]:
     """Return the elements of a scenario and of the files that it includes."""
-    root = read_xml(path)
+    root = read_xml(path, VehicleError)
     if root.tag != "scenario":
         raise VehicleError(f"{path}: its root is '{root.tag}', expected scenario")
     prepared(root, {}, str(path))
@@ -184,7 +186,7 @@ def scenario(path: Path, files: ScenarioFiles, draft: Draft) -> list[Element]:
             )
         name = word(element, "file", f"{path}: include")
         try:
-            inner = read_xml(files.find(name, f"{path}: include"))
+            inner = read_xml(files.find(name, f"{path}: include"), VehicleError)
         except VehicleError as error:
             draft.not_read[f"include ({str(error).removeprefix(f'{path}: ')})"] += 1
             continue
@@ -935,4 +937,4 @@ def _recognises(path: Path, head: bytes) -> bool:
     return b"<scenario" in head or path.suffix.lower() == ".scn"
 
 
-STONEFISH = VehicleImporter("Stonefish (.scn)", _recognises, read_stonefish, folders=True)
+STONEFISH = Importer("vehicle", "Stonefish (.scn)", _recognises, read_stonefish, folders=True)

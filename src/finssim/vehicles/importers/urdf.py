@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import SubElement
 
-from finssim.vehicles.importers.draft import Draft, VehicleImporter
+from finssim.core.importer import Importer
+from finssim.core.xml_file import read_xml
+from finssim.vehicles.importers.draft import Draft
+from finssim.vehicles.importers.elements import Element
 from finssim.vehicles.importers.sdf import kind_of, read_model
 from finssim.vehicles.importers.uuv import PLUGINS, read_uuv
 from finssim.vehicles.importers.xacro_file import expanded, packages_near
-from finssim.vehicles.importers.xml_file import Element, read_xml
 from finssim.vehicles.part import VehicleError
 
 __all__ = ["URDF", "read_urdf", "sdf_of"]
@@ -126,7 +128,7 @@ def read_urdf(path: Path, folders: Sequence[Path] = ()) -> Draft:
     Raises:
         VehicleError: It cannot be read; the message says where, what was expected and what to do.
     """
-    root, packages = read_xml(path), packages_near(path, folders)
+    root, packages = read_xml(path, VehicleError), packages_near(path, folders)
     texts = [text for e in root.iter() for text in (e.tag, e.text or "", *e.attrib.values())]
     if any(word in text for text in texts for word in ("xacro:", "${", "$(")):
         root = expanded(path, packages)
@@ -151,6 +153,10 @@ def _recognises(path: Path, head: bytes) -> bool:
     return path.suffix.lower() in (".urdf", ".xacro") or (b"<robot" in head and path.suffix.lower() != ".scn")
 
 
-URDF = VehicleImporter(
-    "URDF and xacro (.urdf, .xacro) of uuv_simulator or gz-sim", _recognises, read_urdf, folders=True
+URDF = Importer(
+    "vehicle",
+    "URDF and xacro (.urdf, .xacro) of uuv_simulator or gz-sim",
+    _recognises,
+    read_urdf,
+    folders=True,
 )

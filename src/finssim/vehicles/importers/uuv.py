@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.importers.draft import GRAVITY, LAG, Draft, put_controlled_axes, put_envelope
+from finssim.vehicles.importers.elements import Element, flag, number, numbers, refuse_unknown
 from finssim.vehicles.importers.model import (
     Model,
     note_rest,
@@ -44,7 +45,6 @@ from finssim.vehicles.importers.thrust_curve import (
     scaled,
     steady_speed,
 )
-from finssim.vehicles.importers.xml_file import Element, flag, number, numbers, refuse_unknown
 from finssim.vehicles.part import VehicleError
 
 __all__ = ["PLUGINS", "coefficients", "conversion", "read_uuv"]

@@ -19,7 +19,8 @@ from typing import Any
 from xml.dom import minidom
 
 from finssim.core.budget import read_bytes
-from finssim.vehicles.importers.xml_file import Element, parse_xml
+from finssim.core.xml_file import parse_xml
+from finssim.vehicles.importers.elements import Element
 from finssim.vehicles.part import VehicleError
 
 __all__ = ["evaluate", "expanded", "packages_near"]
@@ -200,7 +201,7 @@ def expanded(path: Path, packages: Mapping[str, Path]) -> Element:
     _restrict(library, path, packages)
     try:
         document = library.process_file(str(path), verbosity=0)
-        return parse_xml(document.documentElement.toxml().encode(), path)
+        return parse_xml(document.documentElement.toxml().encode(), path, VehicleError)
     except RecursionError:
         raise VehicleError(
             f"{path}: its macros call one another too often: expand the file to URDF"
@@ -277,7 +278,7 @@ def _restrict(library: Any, path: Path, packages: Mapping[str, Path]) -> None:
             library.filestack.pop()
             raise library.XacroException(f"includes {filename}, which is not there: add it", exc=OSError())
         data = read_bytes(file, VehicleError, limit=FILE)
-        parse_xml(data, file)
+        parse_xml(data, file, VehicleError)
         return minidom.parseString(data)
 
     def include(filename: str, symbols: Any) -> list[str]:

@@ -1,4 +1,4 @@
-"""Reader of XML from outside: an element of bounded size, and the numbers and words in it."""
+"""Numbers, words and files in the elements of a model."""
 
 from __future__ import annotations
 
@@ -6,52 +6,15 @@ import math
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.budget import NODES, read_bytes
 from finssim.vehicles.loader import GREATEST
 from finssim.vehicles.part import VehicleError, did_you_mean
 
-__all__ = ["Element", "file_of_model", "flag", "number", "numbers", "parse_xml", "read_xml", "refuse_unknown"]
-
-LARGEST = 32 << 20
-"""Greatest size of an XML file [bytes]."""
-
-
-def read_xml(path: Path) -> Element:
-    """Return the root of a file.
-
-    Raises:
-        VehicleError: It is no XML, too large, or defines words of its own.
-    """
-    return parse_xml(read_bytes(path, VehicleError, limit=LARGEST), path)
-
-
-def parse_xml(data: bytes, path: Path) -> Element:
-    """Return the root of the content of a file; see `read_xml`."""
-
-    def refuse_doctype(*_: object) -> None:
-        raise VehicleError(f"{path}: has a DOCTYPE, which may name other files: remove it")
-
-    # As other programs read these files, a prefix such as gz: needs no namespace.
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = refuse_doctype
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    try:
-        parser.Parse(data, True)
-        root = builder.close()
-    except (expat.ExpatError, AssertionError, ValueError, LookupError) as error:
-        raise VehicleError(f"{path}: cannot be read as XML: {error}") from None
-    if sum(1 for _ in root.iter()) > NODES:
-        raise VehicleError(f"{path}: has more than {NODES} elements: make it smaller")
-    return root
+__all__ = ["Element", "file_of_model", "flag", "number", "numbers", "refuse_unknown"]
 
 
 def numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:

@@ -1,0 +1,85 @@
+"""Importers of other programs' files: the class of the members of `IMPORTERS`, and the choice of one by content.
+
+An importer is one file with an `Importer`, registered as `KIND.FORMAT`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from finssim.core.registry import IMPORTERS, RegistryError
+
+__all__ = ["Importer", "check_registered", "first_bytes", "importers", "recognised"]
+
+KINDS = ("vehicle", "trial", "lens")
+"""Kinds of contents that are imported."""
+HEAD = 1 << 20
+"""Bytes from which an importer recognises its format."""
+
+
+@dataclass(frozen=True)
+class Importer:
+    """An importer of the files of one format."""
+
+    kind: str
+    """Kind of content: vehicle, trial or lens."""
+    title: str
+    """Name of the format."""
+    recognises: Callable[[Path, bytes], bool]
+    """Function of a path and the first bytes of its file (none of a folder): whether it is of this format."""
+    read: Callable[..., Any]
+    """Function that reads a file; it refuses by one sentence.
+
+    Of a path, and of a list of folders if `folders`, for a vehicle (returns a `Draft`); of a path and a `Request` for a
+    log (`TrialStreams`); of a path for a lens (`Lens`).
+    """
+    folders: bool = False
+    """Whether its files name others by the name of a package or below a folder that is not in the file."""
+    general: bool = False
+    """Whether more special formats are tried before."""
+
+
+def check_registered(name: str, member: Any) -> None:
+    """Refuse what is no importer.
+
+    Args:
+        name: Name in the family: what is imported, a dot, and the format.
+        member: The object that is registered under it.
+
+    Raises:
+        RegistryError: The name or the object does not fit.
+    """
+    kind, _, format = name.partition(".")
+    if kind not in KINDS or not format:
+        raise RegistryError(
+            f"importer '{name}': expected a name that begins with {' or '.join(f'{one}.' for one in KINDS)}"
+        )
+    if not isinstance(member, Importer) or member.kind != kind:
+        raise RegistryError(f"{name} is {member!r}, expected an Importer of kind '{kind}': register it so")
+
+
+def importers(kind: str) -> dict[str, Importer]:
+    """Return the importers of a kind by format, the general ones last."""
+    usable = {
+        name.partition(".")[2]: member
+        for name, member in IMPORTERS.usable().items()
+        if name.startswith(f"{kind}.")
+    }
+    return dict(sorted(usable.items(), key=lambda item: item[1].general))
+
+
+def first_bytes(path: Path) -> bytes:
+    """Return the bytes of a file from which its format is recognised; none of a folder."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(HEAD)
+
+
+def recognised(kind: str, path: Path) -> str | None:
+    """Return the format of the first importer of a kind that recognises a file or folder; None if none does."""
+    head = first_bytes(path)
+    return next((name for name, one in importers(kind).items() if one.recognises(path, head)), None)
