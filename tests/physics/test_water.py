@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 
 from finssim.physics.water import Flow, WaterArrays, advance_drift, dispersion, flow_at, wave_number
-from finssim.sim import SurroundingsError, Water, Wave
+from finssim.sim import RectangularPool, SeaState, Simulator, SurroundingsError, Water, Wave
+from finssim.sim.water import sea_bands
 from reference.water import flow
 
 wp.set_module_options({"enable_backward": False})
@@ -184,6 +185,31 @@ def test_drift_is_continuous_between_commands():
         assert end is None or start["velocity"] == pytest.approx(end, abs=1e-7)
         end = flow_here(water, point, 0.0, 0.1)["velocity"]
         assert (end - start["velocity"]) / 0.1 == pytest.approx(start["acceleration"], abs=1e-6)
+
+
+def test_waves_without_a_depth_are_those_of_deep_water():
+    """u = A ω e^(kz) with ω² = g k: it fades with depth and has no floor below which it would grow."""
+    wave = Wave(amplitude=0.05, wavelength=3.0)
+    k = 2.0 * math.pi / 3.0
+    z = np.array([0.0, -0.5, -1.0, -2.0, -30.0])
+    found = flow_here(Water(waves=(wave,)), np.stack([0.0 * z, 0.0 * z, z], axis=1), 0.0)
+    expected = 0.05 * math.sqrt(G * k) * np.exp(k * z)
+    np.testing.assert_allclose(found["velocity"][:, 0], expected, rtol=2e-6, atol=1e-9)
+    sea = SeaState(spectrum="jonswap", height=0.2, period=3.0)
+    numbers = 2.0 * math.pi / np.array([one.wavelength for one in Water(waves=sea).components])
+    ratios, _ = sea_bands("jonswap", sea.peak, sea.spread, sea.components)
+    np.testing.assert_allclose(numbers, (ratios * 2.0 * math.pi / 3.0) ** 2 / G, rtol=1e-9)
+
+
+def test_a_pool_gives_its_depth_to_water_that_states_none():
+    """ω² = g k tanh(k h) with h of the pool; a stated depth stays."""
+    wave, k = Wave(amplitude=0.02, wavelength=3.0), 2.0 * math.pi / 3.0
+    for pool, depth, h in ((0.8, None, 0.8), (0.8, 1.5, 1.5)):
+        simulator = Simulator(
+            "finsrov", water=Water(waves=(wave,), depth=depth), pool=RectangularPool(depth=pool)
+        )
+        omega = float(simulator.water.wave_frequency.numpy()[0, 0])
+        assert omega == pytest.approx(math.sqrt(G * k * math.tanh(k * h)), rel=1e-6)
 
 
 @pytest.mark.parametrize(

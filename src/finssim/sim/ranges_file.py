@@ -31,7 +31,7 @@ from finssim.sim.distributions import (
     unknown,
 )
 from finssim.sim.site import SurroundingsError
-from finssim.sim.water import SeaState, Wave
+from finssim.sim.water import DEEP, SeaState, Wave
 from finssim.vehicles.actuators import ActuatorKind
 from finssim.vehicles.terms import Term
 
@@ -41,8 +41,6 @@ MAX_WAVES = 8
 """Most waves that may be drawn for a world: every one costs time in every step."""
 LONGEST = 2.0
 """Longest delay that may be drawn, of a command or of what is seen [s]."""
-DEEP = 1000.0
-"""Depth of deep water [m]."""
 FASTEST_WATER = 10.0
 """[m/s]"""
 

@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +167,8 @@ class Simulator:
         moves: bool,
     ) -> None:
         fluid = shared_water(self.vehicles)
+        if pool is not None and water.depth is None:
+            water = replace(water, depth=pool.depth)
         self.surroundings = (water, pool, tether)
         self.water = water.arrays(self.worlds, fluid.density, fluid.gravity, self.device, max_waves)
         self.water.moving = int(moves or bool(self.water.moving))

@@ -26,6 +26,8 @@ MOST_ROWS = 100_000
 """Most rows of a table of a current."""
 FASTEST = 10.0
 """Greatest speed of a current [m/s]."""
+DEEP = 1e6
+"""Depth of deep water: no wave reaches its floor [m]."""
 COLUMNS = {"depth": "depth", "time": "time", "t": "time", "east": "east", "north": "north", "up": "up"}
 """Column of a table of a current -> its meaning: depth [m], time [s], velocities [m/s]."""
 
@@ -255,8 +257,8 @@ class Water:
     """Its correlation time [s]."""
     waves: Waves = ()
     """Waves, one by one or of a spectrum."""
-    depth: float = 1.0
-    """Still water depth, for the wave dispersion [m]."""
+    depth: float | None = None
+    """Still water depth, for the waves [m]; None is that of the pool, and without a pool deep water."""
     profile: CurrentProfile | None = None
     """Current over depth and time, which adds to `current`."""
 
@@ -269,9 +271,9 @@ class Water:
             profile = given if isinstance(given, CurrentProfile) else read_profile(given)
             object.__setattr__(self, "profile", profile)
             object.__setattr__(self, "current", (0.0, 0.0, 0.0))
-        numbers = (*self.uniform, *self.shear, *self.drift_std, self.drift_time, self.depth)
+        numbers = (*self.uniform, *self.shear, *self.drift_std, self.drift_time, self.still_depth)
         require(all(math.isfinite(x) for x in numbers), "water: every number must be finite")
-        require(self.depth > 0.0, f"water: depth is {self.depth}, expected more than 0 m")
+        require(self.still_depth > 0.0, f"water: depth is {self.depth}, expected more than 0 m")
         require(min(self.drift_std) >= 0.0, "water: drift_std is a standard deviation, expected 0 or more")
         _ = self.components  # refuses a sea that breaks
 
@@ -282,9 +284,14 @@ class Water:
         return self.current
 
     @property
+    def still_depth(self) -> float:
+        """Still water depth, of which deep water has a finite one [m]."""
+        return DEEP if self.depth is None else self.depth
+
+    @property
     def components(self) -> tuple[Wave, ...]:
         """Waves one by one."""
-        return self.waves.waves(self.depth) if isinstance(self.waves, SeaState) else tuple(self.waves)
+        return self.waves.waves(self.still_depth) if isinstance(self.waves, SeaState) else tuple(self.waves)
 
     @property
     def drifting(self) -> bool:
@@ -320,12 +327,12 @@ class Water:
         columns = {
             "wave_amplitude": [w.amplitude for w in waves],
             "wave_number": k,
-            "wave_frequency": dispersion(k, self.depth, gravity),
+            "wave_frequency": dispersion(k, self.still_depth, gravity),
             "wave_heading": [w.heading for w in waves],
             "wave_phase": [w.phase for w in waves],
         }
         out = WaterArrays()
-        out.density, out.gravity, out.depth = density, gravity, self.depth
+        out.density, out.gravity, out.depth = density, gravity, self.still_depth
         out.n_waves, out.moving = n, int(self.moving or max_waves > 0)
         out.current = full(wp.vec3(*self.uniform), wp.vec3)
         out.shear = full(wp.vec3(*self.shear), wp.vec3)
