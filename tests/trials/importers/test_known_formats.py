@@ -6,12 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import yaml
 
 from finssim.core.importer import importers
 from finssim.core.rotations import quat_from_euler, quat_multiply, quat_rotate, wrap_angle
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.importers.log import importer_of
+from finssim.vehicles import load_vehicle
 
 N = 200
 T = np.arange(N) * 0.1
@@ -259,11 +261,15 @@ def message(kind, content):
     return struct.pack("<HB", len(content), ord(kind)) + content
 
 
-def ulog(path, topics=tuple(FORMATS), valid=None):
+def ulog(path, topics=tuple(FORMATS), valid=None, parameters=None):
     """A log of 20 s: our own attitude and motion, turned into forward-right-down and north-east-down."""
     half = np.array([1.0, 0.0, 0.0, 0.0])
     x, y, z, w = quat_multiply(quat_multiply(half, TILT), half)
     out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
+    for name, value in (parameters or {}).items():
+        kind, form = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+        key = f"{kind} {name}".encode()
+        out += message("P", bytes([len(key)]) + key + struct.pack(form, value))
     out += b"".join(message("F", f"{name}:{FORMATS[name][0]}".encode()) for name in topics)
     out += b"".join(message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(topics))
     for k, t in enumerate(T):
@@ -323,6 +329,54 @@ def test_px4_logs_split_by_arming_with_outputs_of_a_map(tmp_path):
     np.testing.assert_allclose(
         trial.series("pwm_T1")[1], (1500.0 - 10.0 * np.arange(50, 150) % 300.0), rtol=1e-6
     )
+
+
+ORDER = ("T8", "T1", "T3", "T2", "T5", "T7", "T6", "T4")
+"""Thrusters of PX4's motors 1 to 8."""
+
+
+def rotors(move=0.0):
+    """Parameters of PX4 of a vehicle as bluerov2_heavy, in forward-right-down; motor 2 is moved forward [m]."""
+    vehicle, found = load_vehicle("bluerov2_heavy"), {"CA_ROTOR_COUNT": 8}
+    for i, name in enumerate(ORDER):
+        thruster = vehicle.thrusters[name]
+        place = (thruster.position - vehicle.body.center_of_gravity) * [1, -1, -1] + [move * (i == 1), 0, 0]
+        turned = -1.0 if i == 1 else 1.0  # motor 2 pushes against the axis of T1
+        for letter, vector in (("P", place), ("A", turned * thruster.axis * [1, -1, -1])):
+            found |= {f"CA_ROTOR{i}_{letter}{axis}": float(x) for axis, x in zip("XYZ", vector, strict=True)}
+    return found
+
+
+@pytest.mark.parametrize("functions", [{}, {"PWM_AUX_FUNC1": 102, "PWM_AUX_FUNC2": 101, "PWM_AUX_REV": 2}])
+def test_rotors_of_px4_assign_the_outputs(tmp_path, functions):
+    """By place and axis, through the functions of the outputs; pulses turn for each reversal."""
+    pytest.importorskip("pyulog")
+    trial = one(ulog(tmp_path / "a.ulg", parameters=rotors() | functions), vehicle="bluerov2_heavy")
+    first, still = 1500.0 + 10.0 * np.arange(N) % 300.0, 1500.0 + 0.0 * T
+    expected = (
+        {"pwm_T1": 3000.0 - first, "pwm_T8": still} if functions else {"pwm_T8": first, "pwm_T1": still}
+    )
+    assert {name for name in trial.channels if name.startswith("pwm_")} == set(expected)
+    for name, pulses in expected.items():
+        np.testing.assert_allclose(trial.series(name)[1], pulses, rtol=1e-6)
+    found = {item.code: item for item in trial.findings}
+    assert not set(found) & {"outputs_unassigned", "rotors_apart", "rotors_unlike"}
+    assert ("C2 -T8" if functions else "C2 -T1") in str(found["outputs_mapped"])
+
+
+def test_rotors_of_px4_are_compared_with_the_vehicle_or_offered(tmp_path):
+    pytest.importorskip("pyulog")
+    path = ulog(tmp_path / "a.ulg", parameters=rotors(move=0.1))
+    found = {item.code: str(item) for item in one(path, vehicle="bluerov2_heavy").findings}
+    assert "place T1 0.1 m from where bluerov2_heavy has it" in found["rotors_apart"]
+    stated = {item.code: str(item) for item in one(path, vehicle=None).findings}["rotors_stated"]
+    lines = yaml.safe_load("{" + stated.partition("gravity: ")[2].partition("; these")[0] + "}")
+    vehicle = load_vehicle("bluerov2_heavy")
+    for i, name in enumerate(ORDER):
+        place = vehicle.thrusters[name].position - vehicle.body.center_of_gravity + [0.1 * (i == 1), 0, 0]
+        np.testing.assert_allclose(lines[f"M{i + 1}"]["position"], place, atol=1e-4)
+    unlike = {item.code for item in one(path, vehicle="bluerov2").findings}
+    assert {"rotors_unlike", "outputs_unassigned"} <= unlike
 
 
 def test_px4_logs_without_a_horizontal_velocity(tmp_path):

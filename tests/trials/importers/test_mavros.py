@@ -22,6 +22,11 @@ TYPES = {
     "mavros_msgs/msg/State": HEADER
     + "bool connected\nbool armed\nbool guided\nbool manual_input\nstring mode\nuint8 system_status",
     "mavros_msgs/msg/VfrHud": HEADER + "float32 airspeed",
+    "mavros_msgs/msg/ParamValue": "int64 integer\nfloat64 real",
+    "mavros_msgs/msg/Param": HEADER
+    + "string param_id\nmavros_msgs/ParamValue value\nuint16 param_index\nuint16 param_count",
+    "mavros_msgs/msg/ParamEvent": HEADER
+    + "string param_id\nrcl_interfaces/ParameterValue value\nuint16 param_index\nuint16 param_count",
     "waterlinked_a50_ros_driver/msg/DVLBeam": BEAM,
     "waterlinked_a50_ros_driver/msg/DVL": HEADER
     + "float64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\nfloat64 altitude\n"
@@ -246,6 +251,63 @@ def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
     assert "/mavros/vfr_hud (mavros_msgs/VfrHud, 100 messages)" in unread
     (armed,) = read_trials([path], vehicle="bluerov2_heavy", split="arming")
     assert armed.duration == pytest.approx(5.8, abs=0.11)
+
+
+@pytest.mark.parametrize("topic", ["/mavros/global_position/raw/fix", "/gnss/fix"])
+def test_fixes_become_metres_from_the_first(bag, tmp_path, topic):
+    """A walk of 20 m north and 10 m east at 45° by the arcs of WGS 84; without a fix there is no position."""
+    north, east = 20.0 * TIMES / TIMES[-1], 10.0 * np.sin(TIMES)
+    lat = 45.0 + np.degrees(north / 6367381.8)  # radius of the meridian at 45°
+    lon = 7.0 + np.degrees(east / (6388838.3 * np.cos(np.radians(45.0))))  # radius of the normal
+    kind = "sensor_msgs/NavSatFix"
+    nothing = {"position_covariance": np.zeros(9), "position_covariance_type": 0, "altitude": 51.0}
+
+    def make(i, t):
+        lost = i % 7 == 3
+        status = bag("sensor_msgs/NavSatStatus", status=-1 if lost else 0, service=1)
+        place = {"latitude": 0.0, "longitude": 0.0} if lost else {"latitude": lat[i], "longitude": lon[i]}
+        return bag(kind, header=bag.header(t), status=status, **place, **nothing)
+
+    trial = one(bag.imu().add(topic, kind, make).write(tmp_path / "a"))
+    good = np.arange(N) % 7 != 3
+    np.testing.assert_allclose(trial.series("x")[1], (east - east[0])[good], atol=1e-3)
+    np.testing.assert_allclose(trial.series("y")[1], north[good], atol=1e-3)
+    (origin,) = [str(item) for item in trial.findings if item.code == "fix_origin"]
+    assert "latitude 45.0000000, longitude 7.0000000" in origin
+
+
+def test_parameters_of_the_autopilot_give_the_directions_of_the_motors(bag, tmp_path):
+    """MOT_n_DIRECTION of /mavros/param: nothing is assumed, and the pulses of a turned motor are turned."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    usual = list(vehicle.autopilot.signs(8))
+    signs = [-sign if i == 2 else sign for i, sign in enumerate(usual)]
+    frame = next(n for n, (name, _) in FRAMES.items() if name == "VECTORED_6DOF")
+    told = [("FRAME_CONFIG", frame), *((f"MOT_{i + 1}_DIRECTION", sign) for i, sign in enumerate(signs))]
+
+    def make(i, t):
+        name, value = told[i % len(told)]
+        if bag.kind == 1:
+            number = bag("mavros_msgs/ParamValue", integer=int(value), real=0.0)
+        else:
+            empty = {k: np.zeros(0) for k in ("byte_array_value", "bool_array_value", "integer_array_value")}
+            number = bag(
+                "rcl_interfaces/ParameterValue", type=2, bool_value=False, integer_value=int(value),
+                double_value=0.0, string_value="", double_array_value=np.zeros(0), string_array_value=[], **empty,
+            )  # fmt: skip
+        more = {"param_index": i % len(told), "param_count": len(told)}
+        kind = "mavros_msgs/Param" if bag.kind == 1 else "mavros_msgs/ParamEvent"
+        return bag(kind, header=bag.header(t), param_id=name, value=number, **more)
+
+    bag.imu().outputs()
+    plain = one(bag.write(tmp_path / "plain"))
+    topic, kind = ("param_value", "Param") if bag.kind == 1 else ("event", "ParamEvent")
+    trial = one(bag.add(f"/mavros/param/{topic}", f"mavros_msgs/{kind}", make).write(tmp_path / "a"))
+    assert "directions_assumed" in codes(plain) and "directions_assumed" not in codes(trial)
+    for name in vehicle.thruster_names:
+        sign = -1.0 if name == "T3" else 1.0
+        pulses = trial.series(f"pwm_{name}")[1] - 1500.0
+        np.testing.assert_allclose(pulses, sign * (plain.series(f"pwm_{name}")[1] - 1500.0))
+    assert not any("param" in str(item) for item in trial.findings)
 
 
 def test_without_a_vehicle_outputs_keep_their_numbers(tmp_path):

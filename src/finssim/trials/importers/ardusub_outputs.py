@@ -14,7 +14,7 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.autopilot import DEMANDS, FRAMES
 from finssim.vehicles.part import did_you_mean
 
-__all__ = ["STICKS", "mixed_pulses", "outputs_of"]
+__all__ = ["STICKS", "mixed_pulses", "outputs_of", "thrusters_of"]
 
 STICKS = tuple(f"stick_{name}" for name in DEMANDS)
 """Demands in the order of the mixer's factors."""
@@ -130,8 +130,6 @@ def _motor(output: int, parameters: Mapping[str, float]) -> int:
 
 
 def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[int, tuple[str, int]], str]:
-    from scipy.optimize import linear_sum_assignment
-
     way_out = "say it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
     config = parameters.get("FRAME_CONFIG")
     if config is None or int(config) not in FRAMES:
@@ -144,30 +142,45 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
             f"the log {lack}, so it is unknown which output drives which thruster: {way_out}"
         )
     frame, factors = FRAMES[int(config)]
-    names = list(vehicle.thrusters)
-    if len(factors) != len(names):
+    if len(factors) != len(vehicle.thrusters):
         raise CalibrationError(
-            f"frame {frame} of the log has {len(factors)} motors, {vehicle.name} has {len(names)} thrusters: {way_out}"
+            f"frame {frame} of the log has {len(factors)} motors, "
+            f"{vehicle.name} has {len(vehicle.thrusters)} thrusters: {way_out}"
         )
     roll, pitch, yaw, up, forward, right = np.array(factors, dtype=float).T
     # ArduSub's "up" is positive against the z axis of its forward-right-down body.
     motors = FROM_FOSSEN.twist(np.stack([forward, right, -up, roll, pitch, yaw], axis=-1))
+    matched = thrusters_of(vehicle, motors)
+    if matched is None:
+        raise CalibrationError(
+            f"frame {frame} of the log does not fit the thrusters of {vehicle.name}: {way_out}"
+        )
+    outputs = {}
+    for motor, (name, sign) in enumerate(matched, start=1):
+        direction = parameters.get(f"MOT_{motor}_DIRECTION")
+        if direction not in (1.0, -1.0):
+            raise CalibrationError(f"the log does not say MOT_{motor}_DIRECTION: {way_out}")
+        outputs[_output_of(motor, parameters)] = (name, int(sign * direction))
+    return outputs, frame
+
+
+def thrusters_of(vehicle: Vehicle, motors: Array) -> list[tuple[str, int]] | None:
+    """Return the thruster of each motor, and -1 where the motor pushes against its axis; None if the motors do not fit.
+
+    Args:
+        vehicle: Whose thrusters they are; as many as the motors.
+        motors: Direction of the wrench of each motor about the centre of gravity, body frame [-, m], (n, 6).
+    """
+    from scipy.optimize import linear_sum_assignment
+
     likeness = np.array(
         [[_likeness(motor, column) for column in vehicle.control_matrix.T] for motor in motors]
     )
     chosen = linear_sum_assignment(-np.abs(likeness))
     if np.abs(likeness[chosen]).min() < LEAST_LIKENESS:
-        raise CalibrationError(
-            f"frame {frame} of the log does not fit the thrusters of {vehicle.name}: {way_out}"
-        )
-    outputs = {}
-    for motor, thruster in zip(*chosen, strict=True):
-        direction = parameters.get(f"MOT_{motor + 1}_DIRECTION")
-        if direction not in (1.0, -1.0):
-            raise CalibrationError(f"the log does not say MOT_{motor + 1}_DIRECTION: {way_out}")
-        sign = int(np.sign(likeness[motor, thruster]) * direction)
-        outputs[_output_of(int(motor) + 1, parameters)] = (names[thruster], sign)
-    return outputs, frame
+        return None
+    signs = np.sign(likeness[chosen]).astype(int)
+    return [(vehicle.thruster_names[k], int(sign)) for k, sign in zip(chosen[1], signs, strict=True)]
 
 
 def _likeness(motor: np.ndarray, column: np.ndarray) -> float:

@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from finssim.core.budget import check_unpacked, limited_memory, packed_with_zstd
 from finssim.core.importer import Importer
 from finssim.core.mcap_files import intact_mcap, without_profile
@@ -37,6 +39,18 @@ INPUTS = {
     "mavros_msgs/msg/OverrideRCIn": ("RC_CHANNELS", "chan{}_raw"),
 }
 """Types whose channels are those of a message of the autopilot, and its fields; the first of one message is used."""
+
+PARAMETERS = {
+    "mavros_msgs/msg/Param": ("value.integer", "value.real"),
+    "mavros_msgs/msg/ParamEvent": ("value.integer_value", "value.double_value"),
+}
+"""Types of a parameter of the autopilot, and the fields of its number, of which the other one is 0."""
+
+FIX = "sensor_msgs/msg/NavSatFix"
+EQUATOR = 6378137.0
+"""Radius of the equator [m]."""
+FLATTENED = 6.69437999014e-3
+"""Square of the eccentricity of the ellipsoid of WGS 84 [-]."""
 
 COMMANDS = re.compile(r"cmd|command|setpoint|goal|target|desired|reference")
 """Parts of the names of topics whose poses and velocities are no measurements."""
@@ -137,6 +151,9 @@ def read(path: Path, request: Request) -> TrialStreams:
                 f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(types)}"
             )
         _collect(reader, sources, findings)
+        _localise(sources, findings)
+        told = [topic for topic, source in sources.items() if source.kind in PARAMETERS]
+        parameters = _parameters(sources)
         logs = [
             topic for topic, source in sources.items() if source.rank >= 0 and _is_dvl(reader, source.kind)
         ]
@@ -145,12 +162,12 @@ def read(path: Path, request: Request) -> TrialStreams:
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
     times = times_of(sources, findings)
     try:
-        events += _inputs(path.name, sources, times, request)
+        events += _inputs(path.name, sources, times, request, parameters)
     except CalibrationError as error:
         if request.mapped.ardusub.outputs:
             raise
         findings.append(finding("topic_unusable", topic="the outputs", messages="all", reason=str(error)))
-    used = {*sources, *(stream.source for stream in events)}
+    used = {*sources, *(stream.source for stream in events), *told}
     unread = [
         f"{topic} ({types[topic].replace('/msg/', '/')}, {counts.get(topic, 0)} messages)"
         for topic in sorted(types)
@@ -208,7 +225,11 @@ def _is_dvl(reader: Any, kind: str) -> bool:
 
 
 def _inputs(
-    label: str, sources: dict[str, LogTopic], times: Mapping[str, Array], request: Request
+    label: str,
+    sources: dict[str, LogTopic],
+    times: Mapping[str, Array],
+    request: Request,
+    parameters: dict[str, float],
 ) -> list[Stream]:
     """Return the streams of the outputs of an ArduSub autopilot, or of the pilot's channels through its mixer.
 
@@ -235,18 +256,58 @@ def _inputs(
     if vehicle is not None and vehicle.autopilot is not None:
         signs = enumerate(vehicle.autopilot.signs(len(vehicle.thrusters)), start=1)
         frame = next((n for n, (name, _) in FRAMES.items() if name == vehicle.autopilot.name), -1)
-        log.parameters.update({"FRAME_CONFIG": frame, **{f"MOT_{i}_DIRECTION": sign for i, sign in signs}})
+        assumed = {"FRAME_CONFIG": frame, **{f"MOT_{i}_DIRECTION": sign for i, sign in signs}}
+        log.parameters.update(assumed | parameters)
     streams = with_inputs(log, request, [])
-    if streams and vehicle is not None and not request.mapped.ardusub.outputs:
+    told = vehicle is None or all(
+        f"MOT_{i + 1}_DIRECTION" in parameters for i in range(len(vehicle.thrusters))
+    )
+    if streams and not told and not request.mapped.ardusub.outputs:
         streams[0] = streams[0].noting(finding("directions_assumed"))
     return [replace(stream, source=named[stream.source], rank=0) for stream in streams]
+
+
+def _parameters(sources: dict[str, LogTopic]) -> dict[str, float]:
+    """Return the parameters of the autopilot in its units, the last value of each; their topics are removed."""
+    found: dict[str, float] = {}
+    for topic in [
+        topic for topic, source in sources.items() if source.kind in PARAMETERS and source.rank >= 0
+    ]:
+        names, *numbers = sources.pop(topic).cells.values()
+        found.update(zip(names, (whole or real for whole, real in zip(*numbers, strict=True)), strict=True))
+    return found
+
+
+def _localise(sources: Mapping[str, LogTopic], findings: list[Finding]) -> None:
+    """Turn degrees of fixes into metres east and north of the first valid one, on the ellipsoid of WGS 84."""
+    for topic, source in sources.items():
+        cells = source.cells
+        if source.kind != FIX or not {"latitude", "longitude"} <= set(cells):
+            continue
+        latitude, longitude = (np.radians(np.array(cells[name], float)) for name in ("latitude", "longitude"))
+        seen = np.array(cells.get("status.status", np.zeros(len(latitude)))) > -0.5
+        seen &= np.isfinite(latitude) & np.isfinite(longitude)
+        if not seen.any():
+            continue
+        first = int(np.argmax(seen))
+        bend = 1.0 - FLATTENED * math.sin(latitude[first]) ** 2
+        east = EQUATOR / math.sqrt(bend) * math.cos(latitude[first])
+        north = EQUATOR * (1.0 - FLATTENED) / bend**1.5
+        turn = (longitude - longitude[first] + math.pi) % (2.0 * math.pi) - math.pi
+        cells["longitude"], cells["latitude"] = east * turn, north * (latitude - latitude[first])
+        origin = np.degrees([latitude[first], longitude[first]])
+        findings.append(finding("fix_origin", topic=topic, latitude=origin[0], longitude=origin[1]))
 
 
 def _collect(reader: Any, sources: dict[str, LogTopic], findings: list[Finding]) -> None:
     """Read the messages of the topics; a message that cannot be read is counted."""
     needed = {topic: used_columns(source.map) for topic, source in sources.items()}
     for topic, names in needed.items():
-        names += ["channels"] if sources[topic].rank >= 0 and sources[topic].kind in INPUTS else []
+        if sources[topic].rank >= 0:
+            names += ["channels"] if sources[topic].kind in INPUTS else []
+            names += (
+                ["param_id", *PARAMETERS[sources[topic].kind]] if sources[topic].kind in PARAMETERS else []
+            )
         sources[topic].cells = {name: [] for name in names}
     connections = [c for c in reader.connections if c.topic in sources]
     try:
