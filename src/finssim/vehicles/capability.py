@@ -148,7 +148,7 @@ def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Arra
 
 
 def panel_drag(vehicle: Vehicle, hydrodynamics: str = "mesh") -> Array:
-    """Return d2 of steady motion along surge, sway and heave by the panels of the hull, where drag is d2 v² [N s²/m²].
+    """Return d2 of steady motion along surge, sway and heave by the panels of the hull, where drag is d2 v².
 
     d2 = ρ/2 Σ A [C_form max(μ, 0) + C_skin (1 - μ²)^(3/2)],  μ = n · axis                      (paper, eq. 3-4)
 
@@ -157,7 +157,7 @@ def panel_drag(vehicle: Vehicle, hydrodynamics: str = "mesh") -> Array:
         hydrodynamics: Its set with `form_drag` and `skin_drag`.
 
     Returns:
-        (3,)
+        d2 [N s²/m²], (3,)
     """
     chosen = vehicle.hydrodynamics[hydrodynamics]
     assert isinstance(chosen, MeshSet)
