@@ -364,6 +364,13 @@ def _autopilot(title: str, ends: str, limit: float, faults: Any, **more: Any) ->
     return _scenario(title, faults, firmware="ardusub", ends=ends, limit=limit, **more)
 
 
+def low_battery(bench: Bench) -> None:
+    """Let the battery fall below the voltage at which the autopilot, as its user set it, disarms."""
+    autopilot: Any = bench.pool.firmware
+    autopilot.parameters |= {"BATT_LOW_VOLT": 12.8, "BATT_FS_LOW_ACT": 2.0}
+    bench.pool.faults.battery_voltage = 9.0
+
+
 SILENT, WAITS = "no fresh telemetry", "held longer than"
 UNARMED = "failsafe|was disarmed"
 AUTOPILOT: Mapping[str, Scenario] = {
@@ -391,8 +398,10 @@ AUTOPILOT: Mapping[str, Scenario] = {
         Fault(begin=pool_fault(dvl_silent=True), end=pool_fault(dvl_silent=False), lasts=10.0),
     ),
     "ap-depth": _autopilot("depth frozen", WAITS, 4.0, pool_fault(freeze_depth=True)),
-    "ap-battery": _autopilot("battery low", UNARMED, 10.5, pool_fault(battery_voltage=9.0)),
-    "ap-leak": _autopilot("leak", UNARMED, 1.0, pool_fault(leak=True)),
+    "ap-battery": _autopilot(
+        "battery low, with its failsafe set to disarm", UNARMED, 10.5, low_battery,
+    ),
+    "ap-leak": _autopilot("leak", "autopilot reports: Leak", 1.0, pool_fault(leak=True)),
     "ap-spoiled": _autopilot(
         "a tenth lost and spoiled", "", math.inf, pool_fault(drop=0.1, corrupt=0.1, drop_commands=0.1)
     ),

@@ -195,7 +195,7 @@ def test_an_unplugged_pad_disarms():
 class SlowAutopilot:
     """Arms when it is asked often enough, and never gives way."""
 
-    peer = "autopilot"
+    peer, watched = "autopilot", (("gyro",),)
 
     def __init__(self, asks):
         self.asks = asks
@@ -205,6 +205,9 @@ class SlowAutopilot:
         return "waiting for it to arm" if self.asks > 0 else ""
 
     def alarm(self, now):
+        return ""
+
+    def pause(self, now):
         return ""
 
 

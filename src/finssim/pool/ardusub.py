@@ -1,16 +1,19 @@
 """An autopilot to try against: what ArduSub 4.5 does on a BlueROV2, with MAVLink 2 in and out.
 
-The messages, their units and the rules of pilot input, arming and failsafes follow ArduSub; the loops that hold
-attitude and depth are simpler than its own. It has one link, which a router shares among ground stations, as on the
+The messages, their units and rates, the rules of pilot input, arming and failsafes, and the answers to commands are
+those recorded from ArduSub 4.5.0 (`tests/data/ardusub_4_5_0`); docs/reference/ardusub_sitl.md names the exceptions. It
+has one link, which a router shares among ground stations, as on the
 vehicle itself. Its axes are forward, right, down in north, east, down; north is our world x.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +23,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.control.ardusub import Mixer
 from finssim.core.frames import TO_FOSSEN
-from finssim.core.rotations import quat_rotate, quat_to_euler, quat_to_matrix, wrap_angle
+from finssim.core.rotations import quat_rotate, quat_to_euler, quat_to_matrix
+from finssim.pool.ardusub_loops import AttitudeLoop, DepthLoop, climb_rate, lean_angles, yaw_rate
 from finssim.pool.firmware import AttitudeFilter, FirmwareSample
 from finssim.pool.plant_spec import PlantSpec
 from finssim.robot.links.water_linked import encode_velocity
@@ -35,34 +39,50 @@ __all__ = ["ALT_HOLD", "MANUAL", "STABILIZE", "SURFACE", "ArduSub"]
 
 Array = NDArray[np.float64]
 
-STABILIZE, ALT_HOLD, SURFACE, MANUAL = 0, 2, 9, 19
+STABILIZE, ACRO, ALT_HOLD, SURFACE, POSHOLD, MANUAL, MOTOR_DETECT, SURFTRAK = 0, 1, 2, 9, 16, 19, 20, 21
 """Modes, by their numbers in HEARTBEAT.custom_mode."""
-VERSION = (4, 5, 0)
+BY_HAND = (MANUAL, STABILIZE, ACRO, MOTOR_DETECT)
+"""Modes whose throttle is the pilot's."""
+DEPTH_MODES = (ALT_HOLD, SURFACE, SURFTRAK)
+VERSIONS = {"4.1": (4, 1, 2), "4.5": (4, 5, 0), "4.7": (4, 7, 0)}
+"""Firmware that is emulated. 4.5 is as recorded; 4.1 knows neither the axes of pitch and roll nor SURFTRAK; 4.7 has
+SURFACE_MAX_THR and other names of its own number and the ground station's."""
+PARAMETERS = Path(__file__).with_name("ardusub_4_5_0.csv")
+"""Name, value and type of every parameter of ArduSub 4.5.0 after its start."""
+RENAMED = {"SYSID_THISMAV": "MAV_SYSID", "SYSID_MYGCS": "MAV_GCS_SYSID"}
+"""Parameters of 4.5 and their names in 4.7."""
 
-ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
+ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
 """Results of commands."""
-CRITICAL, WARNING, INFO = 2, 4, 6
+CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6
 """Severities of texts."""
-CAPABILITIES = 2 | 8 | 8192
-"""Parameters as floats, COMMAND_INT, MAVLink 2."""
+CAPABILITIES = 2 | 8192
+"""Parameters as floats, MAVLink 2."""
 SENSORS = sum(
     getattr(mavlink, f"MAV_SYS_STATUS_{name}")
     for name in ("SENSOR_3D_GYRO", "SENSOR_3D_ACCEL", "SENSOR_ABSOLUTE_PRESSURE", "SENSOR_BATTERY",
                  "SENSOR_MOTOR_OUTPUTS", "AHRS", "PREARM_CHECK")
 )  # fmt: skip
 """Bits of SYS_STATUS of what every vehicle has."""
-WITHOUT_SAMPLE = {"heartbeat", "autopilot_version", "rc_channels", "servo_output_raw", "system_time"}
+WITHOUT_SAMPLE = {
+    "heartbeat",
+    "autopilot_version",
+    "rc_channels",
+    "servo_output_raw",
+    "system_time",
+    "meminfo",
+}
 """Messages that need no instrument."""
 FRD = TO_FOSSEN.A
 """Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]"""
+STANDARD_ATMOSPHERE = 101325.0
+"""Pressure at the surface [Pa]."""
 
 SYSTEM = 1
 NEUTRAL, HALF_RANGE = 1500, 400
 """Pulse width of no demand and how far a full one is from it [µs]."""
-FORCE = 21196.0
-"""Second parameter of an arming command that passes over the checks."""
 PITCH, ROLL, THROTTLE, YAW, FORWARD, LATERAL = range(6)
 """Input channels, from 0."""
 BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
@@ -72,50 +92,60 @@ SPECIFIC_WEIGHT = 9800.0
 METRES_PER_DEGREE = 111319.5
 CALIBRATION, STILL = 1.0, 0.03
 """For so long after the start the gyroscope is averaged [s], unless it turns faster than this [rad/s]."""
+SPOOL_TIME = 0.5
+"""Time after arming in which the limit of the throttle rises from 0 to 1 [s]."""
+GROUND_LOST, WARN_AGAIN = 2.5, 30.0
+"""Silence of the ground station's heartbeat that is a failsafe, and least time between two warnings of it [s]."""
+CALIBRATING = 3.0
+"""Time that the calibration of the gyroscope takes [s]."""
+TEST_LASTS, COOL_DOWN, RETRY = 0.5, 10.0, 2.0
+"""Longest time between two motor tests, and least time after a test, and after a refused one, until the next [s]."""
+FIRST_RELAY = 9
+"""First servo output that DO_SET_SERVO may drive: those before are motors."""
 DEPTH_LAG = 0.4
 """Time constant of the depth estimate [s]."""
-CLIMB_GAIN, CLIMB_INTEGRAL = 1.5, 0.4
-"""Throttle per error of climb rate [s/m] and per error of height [1/m/s] in depth hold."""
 COMPASS_SHARE = 0.05
 """Part of the difference to a heading that one reading of the compass takes away [-]."""
-POSITION_LASTS = 5.0
+BIAS_SHARE, SETTLED = (0.02, 0.0005), 10.0
+"""Part of that difference that the gyroscope's bias takes [1/s], before and after the time since the start [s]."""
+TURNING = 20.0
+"""Time in which the heading turns from magnetic to true north, once there is an origin [s]."""
+POSITION_LASTS = 6.0
 """A position is given so long after the last velocity [s]."""
 
 FTP_NAK, FTP_UNKNOWN = 129, 7
 """Answer to an operation of file transfer, and its reason."""
 
 GROUPS = {
-    "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_pressure2"),
-    "EXT_STAT": (2, "sys_status named_value_float"),
+    "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_imu3 scaled_pressure scaled_pressure2"),
+    "EXT_STAT": (
+        2,
+        "sys_status power_status meminfo mission_current gps_raw_int nav_controller_output named_value_float",
+    ),
     "RC_CHAN": (3, "servo_output_raw rc_channels"),
     "POSITION": (6, "global_position_int local_position_ned"),
-    "EXTRA1": (10, "attitude"),
+    "EXTRA1": (10, "attitude ahrs2"),
     "EXTRA2": (11, "vfr_hud"),
-    "EXTRA3": (12, "system_time battery_status ekf_status_report"),
+    "EXTRA3": (12, "ahrs system_time battery_status ekf_status_report vibration"),
 }
 """Stream groups: name in the parameter SR0_NAME, number in REQUEST_DATA_STREAM, messages."""
 
-INT8, INT16, INT32, REAL32 = 2, 4, 6, 9
-BUTTONS = (0, 5, 7, 6, 4, 1, 3, 21, 48, 23, 22, 42, 43, 33, 32, 0)
-"""BTNn_FUNCTION of a BlueROV2: 1 shift, 3 arm, 4 disarm, 5 to 7 modes, 42 and 43 gain."""
-BUTTON_MODES = {5: MANUAL, 6: STABILIZE, 7: ALT_HOLD}
-
-REALS = {
-    "ACRO_YAW_P": 3.375, "ATC_ANG_PIT_P": 6.0, "ATC_ANG_RLL_P": 6.0, "ATC_ANG_YAW_P": 6.0, "ATC_RAT_PIT_P": 0.135,
-    "ATC_RAT_RLL_P": 0.135, "ATC_RAT_YAW_P": 0.18, "BARO1_GND_PRESS": 101325.0, "BARO_SPEC_GRAV": 1.0,
-    "BATT_ARM_VOLT": 0.0, "BATT_LOW_VOLT": 12.8, "FS_GCS_TIMEOUT": 5.0, "FS_PILOT_TIMEOUT": 3.0,
-    "JS_GAIN_DEFAULT": 0.5, "JS_GAIN_MAX": 1.0, "JS_GAIN_MIN": 0.25, "JS_THR_GAIN": 1.0, "MOT_FV_CPLNG_K": 1.0,
-    "PSC_POSZ_P": 1.0, "RC_OVERRIDE_TIME": 3.0, "SURFACE_DEPTH": -10.0, "SURFACE_MAX_THR": 0.1,
-}  # fmt: skip
-WHOLE = {
-    "ANGLE_MAX": (INT16, 4500), "ARMING_CHECK": (INT32, 1), "BATT_FS_LOW_ACT": (INT8, 2), "BATT_LOW_TIMER": (INT8, 10),
-    "BATT_CAPACITY": (INT32, 18000),
-    "BATT_MONITOR": (INT8, 4), "COMPASS_USE": (INT8, 1), "EK3_ENABLE": (INT8, 1), "EK3_SRC1_POSXY": (INT8, 6),
-    "EK3_SRC1_VELXY": (INT8, 6), "FS_GCS_ENABLE": (INT8, 2), "FS_LEAK_ENABLE": (INT8, 1), "FS_PILOT_INPUT": (INT8, 2),
-    "JS_GAIN_STEPS": (INT8, 4), "PILOT_SPEED_UP": (INT16, 500), "SYSID_MYGCS": (INT16, 255),
-    "SYSID_THISMAV": (INT16, SYSTEM), "THR_DZ": (INT16, 100), "VISO_TYPE": (INT8, 1),
-}  # fmt: skip
-LIMITS = {INT8: 2**7 - 1, INT16: 2**15 - 1, INT32: 2**31 - 1}
+REAL32 = 9
+BUTTON_MODES = {5: MANUAL, 6: STABILIZE, 7: ALT_HOLD, 8: POSHOLD, 12: ACRO, 13: SURFTRAK}
+"""BTNn_FUNCTION -> mode."""
+LIMITS = {2: 2**7 - 1, 4: 2**15 - 1, 6: 2**31 - 1}
+"""Type of a whole parameter -> its greatest value."""
+ANSWERS = {
+    mavlink.MAV_CMD_DO_SET_RELAY: ACCEPTED,
+    mavlink.MAV_CMD_DO_FENCE_ENABLE: ACCEPTED,
+    mavlink.MAV_CMD_DO_CHANGE_SPEED: ACCEPTED,
+    mavlink.MAV_CMD_CONDITION_YAW: ACCEPTED,
+    mavlink.MAV_CMD_RUN_PREARM_CHECKS: ACCEPTED,
+    mavlink.MAV_CMD_SET_EKF_SOURCE_SET: ACCEPTED,
+    mavlink.MAV_CMD_MISSION_START: FAILED,
+    mavlink.MAV_CMD_DO_FLIGHTTERMINATION: FAILED,
+}
+"""Commands without an effect here, and how they are answered."""
 
 
 class ArduSub:
@@ -125,7 +155,7 @@ class ArduSub:
         parameters: By name; they outlive a reboot.
         target: Shaft speeds that its pulses stand for on a full battery, canonical order [rad/s], (n,).
         pulses: Of motors 1, 2, ... [µs], (n,).
-        mode: `MANUAL`, `STABILIZE`, `ALT_HOLD` or `SURFACE`.
+        mode: Its number in HEARTBEAT.custom_mode.
         armed: Whether its motors turn.
         ordered: Whether its frames cannot overtake each other on the wire.
     """
@@ -133,16 +163,17 @@ class ArduSub:
     ordered = True
 
     def __init__(self, vehicle: Vehicle, spec: PlantSpec, *, now: float = 0.0) -> None:
-        """Power on.
+        """Power on at the surface, where the barometer is calibrated.
 
         Args:
             vehicle: Its file: mixer, speed controllers, mounts.
-            spec: Clock, attitude filter and battery.
+            spec: Version, clock, declination, attitude filter and battery.
             now: Time of power-on [s].
 
         Raises:
             ControlError: The vehicle has no `autopilot`, or thrusters without `esc`.
         """
+        self._version = VERSIONS[spec.firmware.version]
         self._mixer, self._spec, self._gravity = Mixer.of(vehicle), spec.firmware, vehicle.water.gravity
         thrusters = list(vehicle.thrusters.values())
         self._motor = np.array(
@@ -155,23 +186,38 @@ class ArduSub:
         self._body_from_imu = quat_to_matrix(imu.orientation)
         self._has_compass, self._key = vehicle.sensors.compass is not None, b""
         self._table = self._default_parameters(vehicle)
+        self._index = {name: i for i, name in enumerate(self._table)}
         self.parameters = {name: value for name, (_, value) in self._table.items()}
         self._faults: Faults | None = None
         self._clock_start = spec.firmware.clock_start
+        self._calibrate_at_start = False
         self._start(now)
 
     def _default_parameters(self, vehicle: Vehicle) -> dict[str, tuple[int, float]]:
-        """Types and values, by name, sorted."""
-        frame = {"VECTORED": 1, "VECTORED_6DOF": 2}.get(self._mixer.autopilot.name, 7)
-        table = {name: (REAL32, value) for name, value in REALS.items()}
-        table |= {name: (kind, float(value)) for name, (kind, value) in WHOLE.items()}
-        table |= {"FRAME_CONFIG": (INT8, frame), "VISO_TYPE": (INT8, float(self._dvl is not None))}
-        for i, function in enumerate(BUTTONS):
-            table |= {f"BTN{i}_FUNCTION": (INT8, function), f"BTN{i}_SFUNCTION": (INT8, 0)}
-        table |= {f"RC{i}_TRIM": (INT16, NEUTRAL) for i in range(1, 9)}
-        for i, direction in enumerate(self._mixer.directions, 1):
-            table |= {f"MOT_{i}_DIRECTION": (INT8, float(direction)), f"SERVO{i}_FUNCTION": (INT16, 32.0 + i)}
-        table |= {f"SR0_{name}": (INT16, 0) for name in GROUPS}
+        """Types and values, by name, sorted: the recorded ones, and what a user sets for this vehicle.
+
+        The vehicle decides the frame, the directions of its motors, the specific gravity of its water and, with a
+        Doppler log, where the autopilot's position comes from.
+        """
+        with PARAMETERS.open(newline="") as file:
+            table = {r["name"]: (int(r["mavlink_type"]), float(r["value"])) for r in csv.DictReader(file)}
+        own: dict[str, float] = {
+            "FRAME_CONFIG": {"VECTORED": 1, "VECTORED_6DOF": 2}.get(self._mixer.autopilot.name, 7),
+            "BARO_SPEC_GRAV": round(vehicle.water.density * vehicle.water.gravity / SPECIFIC_WEIGHT, 3),
+            "BARO1_GND_PRESS": STANDARD_ATMOSPHERE,
+            "BARO2_GND_PRESS": STANDARD_ATMOSPHERE,
+        }
+        if self._dvl is not None:
+            own |= {"VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6}
+        for i in range(12):
+            known = i < len(self._mixer.directions)
+            own[f"MOT_{i + 1}_DIRECTION"] = float(self._mixer.directions[i]) if known else 1.0
+        for i in range(len(self._mixer.directions), 8):
+            own[f"SERVO{i + 1}_FUNCTION"] = 0.0
+        table |= {name: (table[name][0], value) for name, value in own.items()}
+        if self._version >= (4, 7):
+            table = {RENAMED.get(name, name): entry for name, entry in table.items()}
+            table["SURFACE_MAX_THR"] = (REAL32, 0.1)
         return dict(sorted(table.items()))
 
     def _start(self, now: float) -> None:
@@ -184,12 +230,19 @@ class ArduSub:
             self.sign(self._key)
         self.mode, self.armed = MANUAL, False
         self._held: tuple[float, float, float, float] | None = None
+        self._attitude_loop, self._depth_loop = AttitudeLoop(), DepthLoop()
+        self._armed_at = self._ground_warned = -math.inf
+        self._testing, self._tested = False, -math.inf
+        self._test_ended = self._test_refused = -math.inf
+        self._servos: dict[int, int] = {}
+        self._answer_later: list[tuple[float, int, tuple[int, int]]] = []
         self._driven: tuple[float, ...] | None = None
         self.pulses = np.full(len(self._motor), float(NEUTRAL))
         self.target: Array = np.zeros(len(self._motor))
         self._inputs, self._input_times = list(BOOT_INPUTS), [-math.inf] * 18
         self._pilot_seen, self._ground_seen = -math.inf, -math.inf
-        self._failsafes, self._low_since = {"pilot"}, math.inf
+        self._failsafes: set[str] = set()
+        self._low_since = math.inf
         self._gain, self._buttons = self._within("JS_GAIN_DEFAULT", 0.1, 1.0), 0
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
         self._rates_sum, self._rates_count, self._fastest = np.zeros(3), 0, 0.0
@@ -197,11 +250,13 @@ class ArduSub:
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self._rates, self._gyro, self._force = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._altitude = self._climb = self._climb_integral = 0.0
-        self._held_altitude: float | None = None
-        self._held_yaw: float | None = None
+        self._altitude = self._climb = self._lift = 0.0
+        self._surfaced = False
         self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
+        self._aided_since = math.inf
+        self._places: deque[tuple[float, Array, Array]] = deque()
         self._origin: tuple[int, int] | None = None
+        self._origin_at = math.inf
         self._battery, self._used = (0.0, 0.0), 0.0
         self._dvl_time = now
         self._requested_parameters: deque[str] = deque()
@@ -219,10 +274,11 @@ class ArduSub:
     def reboot(self, now: float) -> None:
         """Stop the motors, be silent for the plant's `reboot_time`, then restart everything but the parameters.
 
-        `now` is the time [s].
+        The barometer is calibrated where the vehicle is then: its depth counts from there. `now` is the time [s].
         """
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
+        self._calibrate_at_start = True
 
     def running(self, now: float) -> bool:
         """Return whether it has finished starting. `now` is the time [s]."""
@@ -269,6 +325,10 @@ class ArduSub:
                 self._release(i)
         self._check_pilot(now)
         self._check_ground(now)
+        self._check_test(now)
+        for entry in [entry for entry in self._answer_later if now >= entry[0]]:
+            self._answer_later.remove(entry)
+            self._send("command_ack", entry[1], ACCEPTED, 0, 0, *entry[2])
         self._drive()
 
     def frames(
@@ -288,12 +348,13 @@ class ArduSub:
             return lines
         self._now, self._faults = max(self._now, now), faults
         self._battery = (faults.battery_voltage or float(plant.electric[0]), float(plant.electric[1]))
-        self._used += self._battery[1] * max(now - self._sampled, 0.0) / 3.6
+        before = self._sampled
+        self._used += self._battery[1] * max(now - before, 0.0) / 3.6
         if not faults.freeze_sensors or self._sample is None:
             self._sense(now, sample, aids)
         self._check_battery(now)
         self._check_leak(faults.leak)
-        self._hold()
+        self._hold(now - before)
         for name, due in self._due.items():
             if now >= due - 1e-9:
                 self._due[name] = max(due + self._interval[name], now - self._interval[name])
@@ -311,6 +372,8 @@ class ArduSub:
 
     def _sense(self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid]) -> None:
         dt, self._sampled, self._sample = now - self._sampled, now, sample
+        if self._calibrate_at_start:
+            self._calibrate_barometer()
         gyro, accel = (self._body_from_imu @ np.array(v) for v in (sample.gyro, sample.accel))
         if now - self._boot < CALIBRATION:
             self._rates_sum, self._rates_count = self._rates_sum + gyro, self._rates_count + 1
@@ -322,7 +385,11 @@ class ArduSub:
         velocities = []
         for aid in aids:
             if aid.kind == HEADING and self.parameters["COMPASS_USE"]:
-                self._filter.turn(aid.values[0], COMPASS_SHARE if self._headed else 1.0)
+                # Our angles count to the left; the magnetic heading is short of the true one by the declination.
+                missing = self._spec.declination * (1.0 - self._true_north(now))
+                share, settled = COMPASS_SHARE if self._headed else 1.0, now - self._boot > SETTLED
+                learned = 0.0 if not self._headed else BIAS_SHARE[settled]
+                self._filter.turn(aid.values[0] + missing, share, learned)
                 self._headed = True
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
@@ -337,7 +404,24 @@ class ArduSub:
             self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
             for aid in velocities:
                 over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
+                if now - self._velocity_time > POSITION_LASTS:
+                    self._aided_since = now
                 self._velocity, self._velocity_time = quat_rotate(self._quaternion, over_floor)[:2], now
+            self._places.append((now, self._position.copy(), self._velocity))
+            while now - self._places[0][0] > POSITION_LASTS:
+                self._places.popleft()
+
+    def _true_north(self, now: float) -> float:
+        """Return how far the heading has turned from magnetic to true north [0, 1]."""
+        return min(max((now - self._origin_at) / TURNING, 0.0), 1.0)
+
+    def _calibrate_barometer(self) -> None:
+        """Let depth count from where the vehicle is."""
+        assert self._sample is not None
+        self._calibrate_at_start = False
+        for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):
+            if math.isfinite(self._sample.pressure):
+                self._store(name, self._sample.pressure)
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
         """Height and climb rate from pressure and vertical acceleration [m/s^2]: an observer of two poles."""
@@ -349,6 +433,11 @@ class ArduSub:
         error = measured - self._altitude
         self._altitude += dt * (self._climb + 2.0 / DEPTH_LAG * error)
         self._climb += dt * (acceleration + error / DEPTH_LAG**2)
+        self._lift = acceleration
+        # Above SURFACE_DEPTH; below it again by 5 cm.
+        self._surfaced = (
+            self.armed and measured > 0.01 * self.parameters["SURFACE_DEPTH"] - 0.05 * self._surfaced
+        )
 
     def _dvl_lines(self, now: float, aids: Sequence[NavigationAid], plant: Plant) -> list[bytes]:
         """Reports of the Doppler log: its velocities, and that it has none where it misses more than one."""
@@ -375,50 +464,64 @@ class ArduSub:
 
     # Motors.
 
-    def _hold(self) -> None:
-        """Demands of roll, pitch, yaw and throttle that hold attitude and depth, in the modes that do."""
-        p = self.parameters
-        pitch, roll, throttle, yaw, *_ = self._sticks()
-        if self.mode == MANUAL or not self.armed:
-            self._held, self._held_yaw, self._held_altitude, self._climb_integral = None, None, None, 0.0
-            return
-        turn, lean = _dead(yaw, 0.1), math.radians(0.01 * p["ANGLE_MAX"])
-        if turn or self._held_yaw is None:
-            self._held_yaw = float(self._attitude[2])
-        target = [lean * _dead(roll, 0.075), lean * _dead(pitch, 0.075), self._held_yaw]
-        angles, gains = (
-            np.array([p[f"ATC_{kind}_{axis}_P"] for axis in ("RLL", "PIT", "YAW")]) for kind in ("ANG", "RAT")
-        )
-        rate = angles * wrap_angle(target - self._attitude)
-        rate[2] += turn * math.radians(45.0 * p["ACRO_YAW_P"])
-        turning = np.clip(gains * (rate - self._rates), -1.0, 1.0).tolist()
-        self._held = (*turning, throttle if self.mode == STABILIZE else self._climbing(throttle))
+    def _hold(self, dt: float) -> None:
+        """Set the demands of roll, pitch, yaw and throttle that hold attitude and depth, in the modes that do.
 
-    def _climbing(self, stick: float) -> float:
-        """Return the throttle that climbs by the stick or holds the depth, less near the surface."""
-        p = self.parameters
-        climb = 0.01 * p["PILOT_SPEED_UP"] * _dead(stick, 0.001 * p["THR_DZ"])
-        if self.mode == SURFACE:
-            climb = 0.2
-        if climb or self._held_altitude is None:
-            self._held_altitude, error = self._altitude, 0.0
+        `dt` is the time since the last call [s].
+        """
+        if self.mode in (MANUAL, MOTOR_DETECT) or not self.armed:
+            self._held = None
+            self._attitude_loop, self._depth_loop = AttitudeLoop(), DepthLoop()
+            return
+        if self.mode == SURFACE and self._surfaced:
+            self._set_mode(ALT_HOLD)
+        p, widths = self.parameters, [float(width - NEUTRAL) for width in self._inputs[:6]]
+        turn = yaw_rate(widths[YAW], self._gain, p)
+        if self.mode == ACRO:
+            tilt = np.array([widths[ROLL], widths[PITCH]]) / HALF_RANGE * math.radians(45.0 * p["ACRO_RP_P"])
+            level = self._attitude[:2] * (p["ACRO_BAL_ROLL"], p["ACRO_BAL_PITCH"])
+            turning = self._attitude_loop.track(dt, np.append(tilt - level, turn), self._rates, p)
         else:
-            error = p["PSC_POSZ_P"] * (self._held_altitude - self._altitude)
-            self._climb_integral = max(-1.0, min(1.0, self._climb_integral + CLIMB_INTEGRAL * 0.01 * error))
-        up = CLIMB_GAIN * (climb + error - self._climb) + self._climb_integral
+            lean = lean_angles(widths[ROLL], widths[PITCH], p)
+            state = self._attitude, self._quaternion, self._rates
+            turning = self._attitude_loop.step(dt, lean, turn, *state, p)
+        roll, pitch, yaw = turning
+        self._held = (
+            roll,
+            pitch,
+            yaw,
+            self._climbing(dt) if self.mode in DEPTH_MODES else widths[THROTTLE] / HALF_RANGE,
+        )
+
+    def _climbing(self, dt: float) -> float:
+        """Return the throttle that climbs by the stick, or to the surface, or holds the depth."""
+        p = self.parameters
+        climb = climb_rate(self._inputs[THROTTLE], self._gain, p)
+        if self.mode == SURFACE:
+            climb = 0.01 * min(p["WPNAV_SPEED_UP"], p["PILOT_SPEED_UP"])
+        up = self._depth_loop.step(dt, climb, self._altitude, self._climb, self._lift, self._surfaced, p)
+        if "SURFACE_MAX_THR" not in p:
+            return up
         least, surface = self._within("SURFACE_MAX_THR", 0.0, 1.0), 0.01 * p["SURFACE_DEPTH"]
-        limit = least + (1.0 - least) * max(0.0, min(1.0, surface - self._altitude))
-        return max(-1.0, min(limit, up))
+        return min(least + (1.0 - least) * max(0.0, min(1.0, surface - self._altitude)), up)
 
     def _drive(self) -> None:
         """Pulses of the mixer while armed, else 1500."""
-        demands = self._demands() if self.armed else None
+        if self._testing:
+            return
+        demands = self._demands() if self.armed and self.mode != MOTOR_DETECT else None
         if demands == self._driven:
             return
         self._driven = demands
         pulses = np.full(len(self._motor), float(NEUTRAL))
         if demands is not None:
-            pulses += np.round(self._signs() * (self._mixer.pulses(np.array(demands)) - NEUTRAL))
+            # Whole microseconds, truncated; 1e-3 for what single precision is short of a whole one.
+            offsets = self._signs() * (self._mixer.pulses(np.array(demands)) - NEUTRAL)
+            pulses = np.floor(NEUTRAL + offsets + 1e-3)
+        self._output(pulses)
+
+    def _output(self, pulses: Array) -> None:
+        """Let the motors follow pulses [µs], motors 1, 2, ..., (n,)."""
         self.pulses = pulses
         column = (pulses[self._motor] - (NEUTRAL - HALF_RANGE)).astype(int)
         self.target = self._speeds[np.arange(len(column)), column]
@@ -426,8 +529,10 @@ class ArduSub:
     def _demands(self) -> tuple[float, ...]:
         """Return the demands of the mixer: roll, pitch, yaw, throttle, forward, lateral."""
         pitch, roll, throttle, yaw, forward, lateral = self._sticks()
-        yaw *= self.parameters["ACRO_YAW_P"] / REALS["ACRO_YAW_P"]
-        return (*(self._held or (roll, pitch, yaw, throttle)), forward, lateral)
+        yaw *= self.parameters["ACRO_YAW_P"] / 3.375
+        roll, pitch, yaw, throttle = self._held or (roll, pitch, yaw, throttle)
+        spool = min(max((self._now - self._armed_at) / SPOOL_TIME, 0.0), 1.0)
+        return roll, pitch, yaw, max(-spool, min(spool, throttle)), forward, lateral
 
     def _signs(self) -> Array:
         """Return the signs of the motors that parameters turn against the vehicle file, (n,)."""
@@ -453,7 +558,11 @@ class ArduSub:
 
     def _from_ground(self) -> bool:
         """Return whether the newest message came from the ground station that may steer."""
-        return bool(self._sender[0] == self.parameters["SYSID_MYGCS"])
+        return bool(self._sender[0] == self.parameters[self._named("SYSID_MYGCS")])
+
+    def _named(self, name: str) -> str:
+        """Return the name that a parameter of 4.5 has in this version."""
+        return RENAMED.get(name, name) if self._version >= (4, 7) else name
 
     def _on_heartbeat(self, message: Any) -> None:
         if self._from_ground() and not (self._faults and self._faults.no_ground_heartbeat):
@@ -463,32 +572,37 @@ class ArduSub:
         if not self._from_ground() or message.target != self._id:
             return
         self._pilot_seen = self._ground_seen = self._now
-        pressed, self._buttons = message.buttons & ~self._buttons, message.buttons
-        shifted = any(
-            message.buttons >> i & 1 and self.parameters[f"BTN{i}_FUNCTION"] == 1 for i in range(len(BUTTONS))
-        )
-        for i in range(len(BUTTONS)):
-            if pressed >> i & 1:
-                self._press(int(self.parameters[f"BTN{i}_{'S' * shifted}FUNCTION"]))
-        gain = 0.001 * HALF_RANGE * self._gain
-        for channel, offset in (
-            (PITCH, message.s),
-            (ROLL, message.t),
-            (THROTTLE, 2.0 * gain * self.parameters["JS_THR_GAIN"] * (message.z - 500)),
-            (YAW, gain * message.r),
-            (FORWARD, gain * message.x),
-            (LATERAL, gain * message.y),
+        held, self._buttons = self._buttons, message.buttons
+        down = [i for i in range(16) if message.buttons >> i & 1]
+        shifted = any(self.parameters[f"BTN{i}_FUNCTION"] == 1 for i in down)
+        for i in down:
+            function = int(self.parameters[f"BTN{i}_{'S' * shifted}FUNCTION"])
+            self._press(function, bool(held >> i & 1))
+        scale = 0.4 * self._gain
+        lift = 2.0 * scale * self.parameters["JS_THR_GAIN"]
+        pitch, roll = (message.s, message.t) if self._version >= (4, 5) else (0, 0)
+        # The autopilot computes in whole numbers of 16 bits: pitch and roll can wrap.
+        for channel, width in (
+            (PITCH, _wrapped(NEUTRAL + pitch)),
+            (ROLL, _wrapped(NEUTRAL + roll)),
+            (THROTTLE, int(lift * message.z + (NEUTRAL - 500.0 * lift) + 1e-6)),
+            (YAW, int(NEUTRAL + scale * message.r + 1e-6)),
+            (FORWARD, int(NEUTRAL + scale * message.x + 1e-6)),
+            (LATERAL, int(NEUTRAL + scale * message.y + 1e-6)),
         ):
-            self._override(channel, NEUTRAL + max(-HALF_RANGE, min(HALF_RANGE, offset)))
+            self._override(channel, max(NEUTRAL - HALF_RANGE, min(NEUTRAL + HALF_RANGE, width)))
 
-    def _press(self, function: int) -> None:
-        """Perform the function of a button; those of lights, camera and trim do nothing."""
+    def _press(self, function: int, held: bool) -> None:
+        """Perform the function of a button: of arming and modes in each message, of the gain when it is pressed.
+
+        Those of lights, camera, trim and relays do nothing.
+        """
         if function in (2, 3, 4):
             arm = function == 3 or (function == 2 and not self.armed)
             self._arm() if arm else self._disarm()
         elif function in BUTTON_MODES:
             self._set_mode(BUTTON_MODES[function])
-        elif function in (41, 42, 43):
+        elif function in (41, 42, 43) and not held:
             low, high = self._within("JS_GAIN_MIN", 0.1, 1.0), self._within("JS_GAIN_MAX", 0.1, 1.0)
             step = (high - low) / max(self.parameters["JS_GAIN_STEPS"] - 1.0, 1.0)
             toggled = high if self._gain < high else low
@@ -510,34 +624,44 @@ class ArduSub:
     # Arming, modes, failsafes.
 
     def _unfit(self) -> list[str]:
-        """Return why it must not be armed."""
-        p = self.parameters
+        """Return why it must not be armed; ARMING_CHECK names what is checked beside the button."""
+        p, checks = self.parameters, int(self.parameters["ARMING_CHECK"])
         reasons = []
+        if not any(p[f"BTN{i}_FUNCTION"] in (2, 4) for i in range(16)) and not (
+            any(p[f"BTN{i}_FUNCTION"] == 1 for i in range(16))
+            and any(p[f"BTN{i}_SFUNCTION"] in (2, 4) for i in range(16))
+        ):
+            reasons.append("No button disarms: assign one")
         if self._sample is None or self._now - self._boot < CALIBRATION:
             reasons.append("Gyros still settling")
-        if self._sample is not None and not math.isfinite(self._sample.pressure):
+        if checks & (1 | 2) and self._sample is not None and not math.isfinite(self._sample.pressure):
             reasons.append("Depth sensor not healthy")
-        if not any(p[f"BTN{i}_FUNCTION"] in (2, 4) or p[f"BTN{i}_SFUNCTION"] in (2, 4) for i in range(16)):
-            reasons.append("Disarm button not assigned")
-        if self._battery[0] < max(p["BATT_ARM_VOLT"], p["BATT_LOW_VOLT"]):
+        if checks & (1 | 128 | 256) and self._battery[0] < max(p["BATT_ARM_VOLT"], p["BATT_LOW_VOLT"]):
             reasons.append(f"Battery 1 low voltage {self._battery[0]:.1f}")
         return reasons
 
-    def _arm(self, forced: bool = False) -> bool:
-        reasons = [] if forced or not self.parameters["ARMING_CHECK"] else self._unfit()
+    def _arm(self) -> bool:
+        """Arm, if nothing is against it; forcing does not help."""
+        if self.armed:
+            return True
+        reasons = self._unfit()
         for reason in reasons:
             self._statustext(CRITICAL, f"Arm: {reason}")
         if reasons:
             return False
-        if not self.armed:
-            self.armed = True
-            self._statustext(INFO, "Arming motors")
-            self._heartbeat_now()
+        self.armed, self._armed_at = True, self._now
+        self._statustext(INFO, "Arming motors")
+        self._heartbeat_now()
+        if self._origin is None:
+            self._statustext(WARNING, "No origin: the heading is magnetic")
+            self._statustext(WARNING, "No origin: no world position")
+            # As recorded of later versions and read of this one: it is armed all the same.
+            return not int(self.parameters["ARMING_CHECK"]) & (1 | 32)
         return True
 
     def _disarm(self) -> bool:
         if self.armed:
-            self.armed = False
+            self.armed = self._testing = False
             self._statustext(INFO, "Disarming motors")
             self._heartbeat_now()
         self._drive()
@@ -545,14 +669,22 @@ class ArduSub:
 
     def _set_mode(self, mode: int) -> bool:
         depth = self._sample is not None and math.isfinite(self._sample.pressure)
-        if mode not in (MANUAL, STABILIZE) and not (mode in (ALT_HOLD, SURFACE) and depth):
-            self._statustext(WARNING, "Flight mode change failed")
+        modes = {STABILIZE, ACRO, MANUAL, MOTOR_DETECT}
+        if depth:
+            modes.add(ALT_HOLD)
+            modes |= {SURFTRAK} if self._version >= (4, 5) else set()
+            # Rising needs a position: so do the modes that are not emulated, which are refused even with one.
+            modes |= {SURFACE} if self._has_position or self.mode == SURFACE else set()
+        if mode not in modes:
+            self._statustext(WARNING, "Mode change failed: no position, no depth, or not emulated")
             return False
         if mode != self.mode:
-            if mode == MANUAL:
+            if mode in (MANUAL, ACRO):
                 self._neutral_sticks()
-            self.mode, self._held, self._held_yaw, self._held_altitude = mode, None, None, None
-            self._hold()
+            if mode == SURFTRAK:
+                self._statustext(INFO, "No rangefinder: depth is held")
+            self.mode, self._held = mode, None
+            self._attitude_loop, self._depth_loop = AttitudeLoop(), DepthLoop()
             self._heartbeat_now()
         return True
 
@@ -572,19 +704,27 @@ class ArduSub:
         """Without input for FS_PILOT_TIMEOUT, set the sticks to neutral, and disarm if FS_PILOT_INPUT demands it; once
         a loss."""
         action = self.parameters["FS_PILOT_INPUT"]
-        lost = action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
+        known = self._pilot_seen > -math.inf
+        lost = known and action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
         if self._failsafe("pilot", lost, CRITICAL, "Lost manual control"):
             self._neutral_sticks()
             self._act({2: None}.get(int(action), self.mode))
 
     def _check_ground(self, now: float) -> None:
-        """Without a heartbeat of the ground station for FS_GCS_TIMEOUT, once there was one, do what FS_GCS_ENABLE
-        demands."""
+        """Without a heartbeat of the ground station, once there was one: warn, and do what FS_GCS_ENABLE demands, while
+        armed."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
-        lost = action > 0 and since > -math.inf and now - since > self.parameters["FS_GCS_TIMEOUT"]
-        if self._failsafe(
-            "ground", lost, WARNING, f"MYGCS: {self.parameters['SYSID_MYGCS']:.0f}, heartbeat lost"
-        ):
+        timeout = self.parameters.get("FS_GCS_TIMEOUT", GROUND_LOST)
+        lost = action > 0 and since > -math.inf and now - since > timeout
+        if lost and now - self._ground_warned > WARN_AGAIN:
+            self._ground_warned = now
+            self._statustext(
+                WARNING, f"Ground station {self.parameters[self._named('SYSID_MYGCS')]:.0f}: no heartbeat"
+            )
+        if not lost:
+            self._failsafes.discard("ground")
+        elif self.armed and "ground" not in self._failsafes:
+            self._failsafes.add("ground")
             self._act({2: None, 3: ALT_HOLD, 4: SURFACE}.get(int(action), self.mode))
 
     def _check_battery(self, now: float) -> None:
@@ -595,17 +735,24 @@ class ArduSub:
         if self._failsafe(
             "battery", low, WARNING, f"Battery 1 is low {voltage:.2f}V used {self._used:.0f} mAh"
         ):
-            self._act({2: None, 3: SURFACE}.get(int(p["BATT_FS_LOW_ACT"]), self.mode))
+            self._act({2: None, 3: SURFACE}.get(int(p["BATT_FS_LOW_ACT"]), self.mode), keep=True)
 
     def _check_leak(self, leaking: bool) -> None:
-        """FS_LEAK_ENABLE: 1 warns, 2 surfaces too."""
+        """FS_LEAK_ENABLE: 1 warns, 2 surfaces too; the heartbeat stays as it is."""
         action = self.parameters["FS_LEAK_ENABLE"]
         if self._failsafe("leak", leaking and action > 0, CRITICAL, "Leak Detected"):
-            self._act({2: SURFACE}.get(int(action), self.mode))
+            self._act({2: SURFACE}.get(int(action), self.mode), keep=True)
 
-    def _act(self, mode: int | None) -> None:
-        """Go into a mode; None, or a mode that is refused, disarms."""
-        if self.armed and (mode is None or not self._set_mode(mode)):
+    def _check_test(self, now: float) -> None:
+        """End a motor test that is not repeated, and disarm."""
+        if self._testing and now - self._tested > TEST_LASTS:
+            self._testing, self._test_ended, self._driven = False, now, ()
+            self._statustext(INFO, "Motor test timed out")
+            self._disarm()
+
+    def _act(self, mode: int | None, *, keep: bool = False) -> None:
+        """Go into a mode; None disarms, and so does a mode that is refused, unless `keep`."""
+        if self.armed and (mode is None or not (self._set_mode(mode) or keep)):
             self._disarm()
 
     # Commands.
@@ -621,16 +768,19 @@ class ArduSub:
         self._send("command_ack", mavlink.MAVLINK_MSG_ID_SET_MODE, result)
 
     def _command(self, command: int, values: list[float]) -> None:
-        """Do it or refuse it; one that is not known is unsupported, never met with silence."""
+        """Perform it or refuse it; one that is not known is unsupported, never met with silence."""
         values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN too: no command accepts it
         do = COMMANDS.get(command)
-        result = UNSUPPORTED if do is None else do(self, values)
-        self._send("command_ack", command, result, 0, 0, *self._sender)
+        result = ANSWERS.get(command, UNSUPPORTED) if do is None else do(self, values)
+        if result is None:  # it takes its time
+            self._answer_later.append((self._now + CALIBRATING, command, self._sender))
+        else:
+            self._send("command_ack", command, result, 0, 0, *self._sender)
 
     def _do_arm(self, values: list[float]) -> int:
         if values[0] not in (0.0, 1.0):
             return UNSUPPORTED
-        return _result(self._arm(values[1] == FORCE) if values[0] else self._disarm())
+        return _result(self._arm() if values[0] else self._disarm())
 
     def _do_set_mode(self, values: list[float]) -> int:
         if not int(values[0]) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
@@ -640,7 +790,8 @@ class ArduSub:
     def _do_set_interval(self, values: list[float]) -> int:
         name, interval = _name(values[0]), 1e-6 * values[1]
         if self._reporter(name) is None:
-            return FAILED
+            self._statustext(INFO, f"No message {values[0]:.0f} here")
+            return DENIED
         if interval == 0.0:
             rates = [
                 self.parameters[f"SR0_{group}"]
@@ -651,23 +802,84 @@ class ArduSub:
         self._every(name, interval)
         return ACCEPTED
 
+    def _do_get_interval(self, values: list[float]) -> int:
+        interval = self._interval.get(_name(values[0]), -1e-6)
+        self._send("message_interval", int(values[0]) & 0xFFFF, round(1e6 * interval))
+        return ACCEPTED
+
     def _do_request(self, values: list[float]) -> int:
         return _result(self._report(_name(values[0])))
 
     def _do_request_version(self, values: list[float]) -> int:
         return _result(values[0] == 1.0 and self._report("autopilot_version"))
 
-    def _do_calibrate(self, values: list[float]) -> int:
-        """Gyroscope (first, which the start has done) and ground pressure (third); nothing while armed."""
+    def _do_request_protocol(self, values: list[float]) -> int:
+        self._statustext(INFO, "The protocol's version is not sent")
+        return UNSUPPORTED
+
+    def _do_get_home(self, values: list[float]) -> int:
+        return _result(self._origin is not None and self._report("home_position"))
+
+    def _do_set_home(self, values: list[float]) -> int:
+        return _result(self._has_position)
+
+    def _do_surface(self, values: list[float]) -> int:
+        return _result(self._set_mode(SURFACE))
+
+    def _do_hold_position(self, values: list[float]) -> int:
+        return _result(self._set_mode(POSHOLD))
+
+    def _do_calibrate(self, values: list[float]) -> int | None:
+        """Gyroscope (first), ground pressure (third) or accelerometer (fifth, never here); nothing while armed."""
         if self.armed or self._sample is None:
+            if values[2] == 1.0:
+                self._statustext(NOTICE, "Disarm before calibrating")
             return FAILED
         if values[2] == 1.0:
-            self._store("BARO1_GND_PRESS", self._sample.pressure)
-        return ACCEPTED if 1.0 in (values[0], values[2]) else UNSUPPORTED
+            self._calibrate_barometer()
+            for i in (1, 2):
+                self._statustext(INFO, f"Barometer {i}: calibrating")
+                self._statustext(INFO, f"Barometer {i}: its depth counts from here")
+            return ACCEPTED
+        if values[0] == 1.0:
+            return None
+        return REJECTED if values[4] else UNSUPPORTED
 
-    def _do_refuse(self, values: list[float]) -> int:
-        self._statustext(WARNING, "Motor outputs are the mixer's alone")
-        return FAILED
+    def _do_motor_test(self, values: list[float]) -> int:
+        """Drive one motor (first, from 0) by a pulse or a percentage until it is not repeated, past the mixer."""
+        motor, kind, width, order = int(values[0]), values[1], values[2], values[5]
+        self._tested, refused = self._now, self._now - self._test_refused < RETRY
+        if not self._testing:
+            if refused:
+                return FAILED
+            cooling = self._now - self._test_ended < COOL_DOWN
+            if cooling or not self.armed:
+                self._statustext(
+                    CRITICAL if cooling else WARNING, "Wait" if cooling else "Arm before a motor test"
+                )
+                self._statustext(WARNING, "No motor test")
+                self._test_refused = self._now
+                return FAILED
+            self._testing = True
+            self._output(np.full(len(self._motor), float(NEUTRAL)))
+        if order != 2.0 or kind not in (0.0, 1.0) or not 0 <= motor < len(self._motor):
+            self._statustext(WARNING, "Motor tests are by board order, in per cent or as pulses")
+            return FAILED
+        if kind == 0.0:
+            low, high = self.parameters["RC3_MIN"], self.parameters["RC3_MAX"]
+            width = low + 0.01 * min(max(width, 0.0), 100.0) * (high - low)
+        pulses = self.pulses.copy()
+        pulses[motor] = min(max(int(width), NEUTRAL - HALF_RANGE), NEUTRAL + HALF_RANGE)
+        self._output(pulses)
+        return ACCEPTED
+
+    def _do_set_servo(self, values: list[float]) -> int:
+        """Outputs that are no motors keep the pulse, which nothing here follows."""
+        if not FIRST_RELAY <= values[0] <= 16:
+            self._statustext(INFO, f"Servo {values[0]:.0f} is a motor's")
+            return FAILED
+        self._servos[int(values[0])] = int(min(max(values[1], 0.0), 65535.0))
+        return ACCEPTED
 
     def _do_reboot(self, values: list[float]) -> int:
         self._rebooting = not self.armed and values[0] in (1.0, 3.0)
@@ -677,7 +889,7 @@ class ArduSub:
 
     @property
     def _id(self) -> int:
-        return int(self._within("SYSID_THISMAV", 1, 255))
+        return int(self._within(self._named("SYSID_THISMAV"), 1, 255))
 
     def _within(self, name: str, low: float, high: float) -> float:
         """A parameter, which anybody may have set, within what makes sense."""
@@ -701,14 +913,14 @@ class ArduSub:
     def _store(self, name: str, value: float) -> None:
         kind = self._table[name][0]
         if kind != REAL32:
-            value = float(round(max(-LIMITS[kind], min(LIMITS[kind], value))))
+            value = float(int(max(-LIMITS[kind], min(LIMITS[kind], value))))
         self.parameters[name], self._driven = value, ()
         self._mav.srcSystem = self._id
-        if name.startswith("SR0_"):
+        if name.removeprefix("SR0_") in GROUPS and name.startswith("SR0_"):
             self._stream(name.removeprefix("SR0_"), value)
 
     def _send_parameter(self, name: str) -> None:
-        index, kind = list(self._table).index(name), self._table[name][0]
+        index, kind = self._index[name], self._table[name][0]
         self._send("param_value", name.encode(), self.parameters[name], kind, len(self._table), index)
 
     def _on_request_data_stream(self, message: Any) -> None:
@@ -746,10 +958,6 @@ class ArduSub:
         if message.tc1 == 0:
             self._send("timesync", round(1e9 * (self._now - self._boot)), message.ts1)
 
-    def _on_ping(self, message: Any) -> None:
-        if message.target_system == 0 and message.target_component == 0:
-            self._send("ping", message.time_usec, message.seq, *self._sender)
-
     def _on_setup_signing(self, message: Any) -> None:
         if not self.armed:
             self.sign(bytes(message.secret_key) if any(message.secret_key) else b"")
@@ -760,7 +968,9 @@ class ArduSub:
         signing.secret_key, signing.sign_outgoing, signing.link_id = key or None, bool(key), 1
 
     def _on_set_gps_global_origin(self, message: Any) -> None:
+        self._origin_at = self._now if self._origin is None else self._origin_at
         self._origin = (message.latitude, message.longitude)
+        self._report("gps_global_origin")
 
     # Telemetry.
 
@@ -772,7 +982,7 @@ class ArduSub:
         self._send("statustext", severity, text.encode()[:50])
 
     def _greet(self) -> None:
-        self._statustext(INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*VERSION))
+        self._statustext(INFO, "ArduSub V{}.{}.{} (FinsSim)".format(*self._version))
         self._statustext(INFO, f"Frame: {self._mixer.autopilot.name}")
 
     def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
@@ -810,12 +1020,12 @@ class ArduSub:
             *kind,
             209 if self.armed else 81,
             self.mode,
-            mavlink.MAV_STATE_CRITICAL if self._failsafes else state,
+            mavlink.MAV_STATE_CRITICAL if self._failsafes - {"leak"} else state,
             3,
         )
 
     def _report_autopilot_version(self) -> tuple[Any, ...]:
-        major, minor, patch = VERSION
+        major, minor, patch = self._version
         version = major << 24 | minor << 16 | patch << 8 | 255
         return CAPABILITIES, version, 0, 0, 0, list(b"FinsSim\0"), [0] * 8, [0] * 8, 0, 0, 0
 
@@ -838,29 +1048,75 @@ class ArduSub:
     def _report_scaled_imu2(self) -> tuple[Any, ...]:
         return (self._milliseconds, *self._imu())
 
+    def _report_scaled_imu3(self) -> tuple[Any, ...]:
+        return (self._milliseconds, *self._imu())
+
+    def _report_scaled_pressure(self) -> tuple[Any, ...]:
+        """The barometer of the dry hull."""
+        return self._milliseconds, 0.01 * STANDARD_ATMOSPHERE, 0.0, 3500
+
     def _report_scaled_pressure2(self) -> tuple[Any, ...]:
         assert self._sample is not None
-        return (
-            self._milliseconds,
-            *self._spoiled([0.01 * self._sample.pressure], "depth", "pressure"),
-            0.0,
-            2000,
-        )
+        pressure = self._spoiled([0.01 * self._sample.pressure], "depth", "pressure")
+        return (self._milliseconds, *pressure, 0.0, 2000)
+
+    def _report_ahrs(self) -> tuple[Any, ...]:
+        return (*(FRD @ np.array(self._filter.bias)).tolist(), 0.0, 0.0, 0.0, 0.0)
+
+    def _report_ahrs2(self) -> tuple[Any, ...]:
+        return (*self._spoiled(self._attitude, "quaternion"), self._altitude, *(self._origin or (0, 0)))
+
+    def _report_power_status(self) -> tuple[Any, ...]:
+        return 5000, 0, 0
+
+    def _report_meminfo(self) -> tuple[Any, ...]:
+        return 0, 65535, 100000
+
+    def _report_mission_current(self) -> tuple[Any, ...]:
+        return (0,)
+
+    def _report_gps_raw_int(self) -> tuple[Any, ...]:
+        return 0, 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0  # none under water
+
+    def _report_nav_controller_output(self) -> tuple[Any, ...]:
+        heading = 0.0 if self._attitude_loop.heading is None else math.degrees(self._attitude_loop.heading)
+        height = self._altitude if self._depth_loop.height is None else self._depth_loop.height
+        return 0.0, 0.0, round(heading), 0, 0, height - self._altitude, 0.0, 0.0
+
+    def _report_vibration(self) -> tuple[Any, ...]:
+        return 1000 * self._milliseconds, 0.0, 0.0, 0.0, 0, 0, 0
+
+    def _report_gps_global_origin(self) -> tuple[Any, ...]:
+        return () if self._origin is None else (*self._origin, 0)
+
+    def _report_home_position(self) -> tuple[Any, ...]:
+        if self._origin is None:
+            return ()
+        return (*self._origin, 0, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
 
     def _report_vfr_hud(self) -> tuple[Any, ...]:
-        throttle = round(50.0 + 50.0 * max(-1.0, min(1.0, self._demands()[3]))) if self.armed else 50
+        throttle = int(50.0 + 50.0 * max(-1.0, min(1.0, self._demands()[3]))) if self.armed else 0
         speed = float(np.hypot(*self._velocity)) if self._has_position else 0.0
         altitude = self._spoiled([self._altitude], "depth", "pressure")
         return (0.0, speed, int(math.degrees(self._attitude[2])) % 360, throttle, *altitude, self._climb)
 
     @property
     def _has_position(self) -> bool:
-        return self._origin is not None and self._now - self._velocity_time < POSITION_LASTS
+        aided = self._now - self._aided_since >= self._spec.aiding_delay
+        return self._origin is not None and aided and self._now - self._velocity_time < POSITION_LASTS
+
+    def leap(self, north: float, east: float) -> None:
+        """Move the autopilot's own position, as a reset of its filter does; both are lengths [m]."""
+        self._position = self._position + (north, east)
 
     def _report_local_position_ned(self) -> tuple[Any, ...]:
         if not self._has_position:
             return ()
-        return (self._milliseconds, *self._position, -self._altitude, *self._velocity, -self._climb)
+        lag = self._faults.position_lag if self._faults else 0.0
+        _, position, velocity = next(
+            place for place in self._places if place[0] >= self._sampled - lag - 1e-9
+        )
+        return (self._milliseconds, *position, -self._altitude, *velocity, -self._climb)
 
     def _report_global_position_int(self) -> tuple[Any, ...]:
         latitude, longitude = self._origin or (0, 0)
@@ -908,29 +1164,37 @@ class ArduSub:
         return 0, self._milliseconds
 
     def _report_named_value_float(self) -> tuple[Any, ...]:
-        values = {"PilotGain": self._gain, "InputHold": 0.0, "RollPitch": 0.0, "Lights1": 0.0, "CamTilt": 0.5}
+        values = dict.fromkeys(("TetherTrn", "Lights1", "Lights2", "InputHold", "RollPitch", "RFTarget"), 0.0)
+        values |= {"CamTilt": 0.5, "CamPan": 0.5, "PilotGain": self._gain}
         return tuple((self._milliseconds, name.encode(), value) for name, value in values.items())
 
     def _report_servo_output_raw(self) -> tuple[Any, ...]:
         pulses = [round(pulse) for pulse in self.pulses.tolist()]
-        return (1000 * self._milliseconds & 0xFFFFFFFF, 0, *pulses, *[0] * (16 - len(pulses)))
+        servos = [self._servos.get(i + 1, 0) for i in range(len(pulses), 16)]
+        return (1000 * self._milliseconds & 0xFFFFFFFF, 0, *pulses, *servos)
 
     def _report_rc_channels(self) -> tuple[Any, ...]:
         return (self._milliseconds, 18, *self._inputs, 0)
 
 
-COMMANDS: dict[int, Callable[[ArduSub, list[float]], int]] = {
+COMMANDS: dict[int, Callable[[ArduSub, list[float]], int | None]] = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: ArduSub._do_arm,
     mavlink.MAV_CMD_DO_SET_MODE: ArduSub._do_set_mode,
+    mavlink.MAV_CMD_NAV_LAND: ArduSub._do_surface,
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: ArduSub._do_hold_position,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: ArduSub._do_set_interval,
+    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: ArduSub._do_get_interval,
     mavlink.MAV_CMD_REQUEST_MESSAGE: ArduSub._do_request,
     mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: ArduSub._do_request_version,
+    mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: ArduSub._do_request_protocol,
+    mavlink.MAV_CMD_GET_HOME_POSITION: ArduSub._do_get_home,
+    mavlink.MAV_CMD_DO_SET_HOME: ArduSub._do_set_home,
     mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: ArduSub._do_calibrate,
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: ArduSub._do_reboot,
-    mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_refuse,
-    mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_refuse,
+    mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_motor_test,
+    mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_set_servo,
 }
-"""Commands that are performed or refused; every other is unsupported."""
+"""Commands and what performs them; every other is answered by `ANSWERS`, or as unsupported."""
 
 
 def _result(done: bool) -> int:
@@ -943,9 +1207,9 @@ def _name(number: float) -> str:
     return "" if kind is None else kind.msgname.lower()
 
 
-def _dead(stick: float, zone: float) -> float:
-    """A stick in [-1, 1] with a dead zone in its middle."""
-    return math.copysign(max(abs(stick) - zone, 0.0) / (1.0 - min(zone, 0.99)), stick)
+def _wrapped(value: int) -> int:
+    """Return a whole number as it is in 16 bits."""
+    return (value + 2**15) % 2**16 - 2**15
 
 
 def _int16(value: float) -> int:

@@ -182,7 +182,7 @@ class AttitudeFilter:
         """
         self.gain, self.integral, self.gravity = gain, integral, gravity
         self.bias: Three = (0.0, 0.0, 0.0)
-        """Of the gyroscope, as estimated [rad/s]; its vertical part cannot be seen and stays about 0."""
+        """Of the gyroscope, as estimated [rad/s]; without headings its vertical part stays about 0."""
         self._q: tuple[float, float, float, float] | None = None
 
     @property
@@ -222,18 +222,23 @@ class AttitudeFilter:
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         self._q = (w / norm, x / norm, y / norm, z / norm)
 
-    def turn(self, heading: float, share: float) -> None:
+    def turn(self, heading: float, share: float, learned: float = 0.0) -> None:
         """Turn the estimate about the vertical towards a heading.
 
         Args:
             heading: Of the filter's x axis, left positive from world x [rad].
             share: Part of the difference that is taken away [-].
+            learned: Part of the difference that the bias about the vertical takes [1/s].
         """
         if self._q is None:
             return
         w, x, y, z = self._q
         yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        half = 0.5 * share * math.remainder(heading - yaw, math.tau)
+        missing = math.remainder(heading - yaw, math.tau)
+        up = 2.0 * (x * z - w * y), 2.0 * (w * x + y * z), w * w - x * x - y * y + z * z
+        a, b, c = (bias - learned * missing * u for bias, u in zip(self.bias, up, strict=True))
+        self.bias = a, b, c
+        half = 0.5 * share * missing
         c, s = math.cos(half), math.sin(half)
         self._q = (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -379,6 +380,12 @@ class FirmwareSpec(Section):
     """Reading of its clock when the pool starts [ms]; 0 after a reboot."""
     reboot_time: float = Field(default=1.5, ge=0.0)
     """Silence after a reboot [s]."""
+    version: Literal["4.1", "4.5", "4.7"] = "4.5"
+    """Of ArduSub, where the vehicle has an autopilot."""
+    aiding_delay: float = Field(default=30.0, ge=0.0)
+    """Time of velocities by a Doppler log after which an autopilot has a position [s]; recorded: 28 to 36 s."""
+    declination: float = Field(default=0.0, ge=-math.pi, le=math.pi)
+    """Of the place, east positive [rad]: an autopilot without an origin gives the magnetic heading."""
     attitude_gain: float = Field(default=0.5, ge=0.0)
     """Gain of the accelerometer in the attitude filter [1/s]."""
     attitude_integral: float = Field(default=0.01, ge=0.0)

@@ -549,7 +549,10 @@ class SiteChoice:
     """(NAME) Position fixes on the robot's link: none, motion-capture or usbl."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
     """(NAME) What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot that answers
-    as ArduSub 4.5 does, over MAVLink, with a compass and a Doppler log."""
+    as ArduSub does, over MAVLink, with a compass and a Doppler log."""
+    version: Literal["4.1", "4.5", "4.7"] = "4.5"
+    """(VERSION) Of ArduSub, with ardusub: 4.5 is as recorded; 4.1 has no axes of pitch and roll, 4.7 other names of
+    parameters and SURFACE_MAX_THR."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
 
@@ -588,7 +591,8 @@ class SiteChoice:
             firmware=self.firmware,
             world=self.world,
         )
-        plan = replace(plan, spec=self.wet(plan.spec))
+        firmware = plan.spec.firmware.model_copy(update={"version": self.version})
+        plan = replace(plan, spec=self.wet(plan.spec.model_copy(update={"firmware": firmware})))
         start = self.start
         if start is None and self.world is not None and self.site is None:
             view = described_world(self.world).viewpoint

@@ -214,6 +214,8 @@ class Faults:
     """HEARTBEAT of an `ArduSub` is lost, and nothing else."""
     no_ground_heartbeat: bool = False
     """HEARTBEAT of the ground station is lost on its way to an `ArduSub`."""
+    position_lag: float = 0.0
+    """Age of the own position that an `ArduSub` sends as the present one [s]."""
     leak: bool = False
     """Water at the leak sensor of an `ArduSub`."""
     battery_voltage: float = 0.0

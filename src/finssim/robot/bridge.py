@@ -286,6 +286,8 @@ class Commander:
 
 
 TOLD, FOLLOWS = int(StatusFlag.DIAGNOSTICS), int(StatusFlag.DIRECT_THRUSTERS)
+SENSED = ("quaternion", "gyro", "accel")
+"""Sensors of telemetry whose repetition is noted."""
 REORDERED = 1000
 """A datagram may be overtaken by this much of the controller's clock [ms]; further back is a restart."""
 
@@ -296,13 +298,15 @@ class TelemetryWatch:
     def __init__(self, outputs: int, timeout: float, others: int = 0) -> None:
         self._outputs, self._others = outputs, others
         self._timeout = timeout
+        self.watched: tuple[tuple[str, ...], ...] = (("gyro",), ("accel",))
+        """Groups of sensors: those of one that all repeat their numbers have frozen."""
         self.forget()
 
     def forget(self) -> None:
         """Reset to the state before the first message."""
         self.fresh_since = -math.inf
         self._last: Telemetry | None = None
-        self._changed = {"gyro": math.inf, "accel": math.inf}
+        self._changed = dict.fromkeys(SENSED, math.inf)
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -355,11 +359,12 @@ class TelemetryWatch:
         return ""
 
     def frozen(self, now: float, limit: float) -> str:
-        """Return the sensor that has repeated its exact numbers for longer than `limit` [s]; "" if none has."""
-        for sensor, changed in self._changed.items():
+        """Return the sensors that have repeated their exact numbers for longer than `limit` [s]; "" if none have."""
+        for sensors in self.watched:
+            changed = max(self._changed[sensor] for sensor in sensors)
             # Silence is another watchdog's: what counts is how long messages kept coming with the same numbers.
             if min(now, self.fresh_since) - changed > limit:
-                return sensor
+                return " and ".join(sensors)
         return ""
 
     def _take(self, now: float, message: Telemetry, last: Telemetry | None) -> None:
@@ -741,6 +746,8 @@ class MotorDevice(Protocol):
 
     peer: str
     """Name of the device in messages."""
+    watched: tuple[tuple[str, ...], ...]
+    """Groups of its sensors; those of one that all repeat their numbers have frozen."""
 
     def prepare(self, now: float) -> str:
         """Prepare arming; called by `Bridge.arm` if nothing else prevents it. Return "" once commands count, else the
@@ -751,6 +758,9 @@ class MotorDevice(Protocol):
 
         `now` is the time [s].
         """
+
+    def pause(self, now: float) -> str:
+        """Return why no thrust may be given now, which passes; "" otherwise. `now` is the time [s]."""
 
 
 class Bridge:
@@ -793,6 +803,7 @@ class Bridge:
     @autopilot.setter
     def autopilot(self, autopilot: MotorDevice) -> None:
         self._autopilot, self._watchdogs.peer = autopilot, autopilot.peer
+        self._watchdogs.telemetry.watched = autopilot.watched
 
     # -- what the operator says -------------------------------------------------------------------------------
 
@@ -926,6 +937,10 @@ class Bridge:
         """The newest command before all limits, canonical order [N], (n,)."""
         return self._commander.force
 
+    def note(self, now: float, text: str) -> None:
+        """Add a sentence of the device between us and the motors to the events. `now` is the time [s]."""
+        self.log.repeat(now, "autopilot", text)
+
     def drain(self) -> list[Event]:
         """Events since the last call."""
         return self.log.drain()
@@ -942,9 +957,9 @@ class Bridge:
             return "the clock is not a number"
         if self.state == "fault":
             return f"acknowledge the fault first: {self.reason}"
-        return (
-            self._watchdogs.unfit(now) if self.state == "disarmed" else f"it is in state {self.state} already"
-        )
+        if self.state != "disarmed":
+            return f"it is in state {self.state} already"
+        return self._pause(now) or self._watchdogs.unfit(now)
 
     def _watch(self, now: float) -> None:
         """Let the watchdogs look: fault, hold, or on with it."""
@@ -952,21 +967,26 @@ class Bridge:
         danger = lost or self._watchdogs.danger(now)
         if danger:
             return self._fault(danger)
-        want = "the operator holds" if self._operator else self._watchdogs.want(now, self._armed_at)
+        pause = self._pause(now)
+        want = "the operator holds" if self._operator else pause or self._watchdogs.want(now, self._armed_at)
         if want and self.state == "armed":
             self._hold(want)
         if self.state == "hold":
-            self._wait(now, want)
+            self._wait(now, want, limited=not pause)
 
-    def _wait(self, now: float, want: str) -> None:
-        """In hold: continue with the first command after the condition passed, or give up after the limit."""
+    def _pause(self, now: float) -> str:
+        """Return what the device between us and the motors waits for; "" if nothing."""
+        return self.autopilot.pause(now) if self.autopilot is not None else ""
+
+    def _wait(self, now: float, want: str, *, limited: bool) -> None:
+        """In hold: continue with the first command after the condition passed, or give up after the limit, if any."""
         if want:
             self.reason, self._passed_at = want, None
         elif self._passed_at is None:
             self._passed_at = now
         elif self._commander.received > self._passed_at:
             return self._enter("armed", "", f"resumed after: {self.reason}")
-        if self._operator:
+        if self._operator or not limited:
             self._held_at = now
         elif now - self._held_at > self.settings.hold_limit:
             self._fault(f"held longer than {self.settings.hold_limit:g} s: {self.reason}")

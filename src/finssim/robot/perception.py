@@ -280,7 +280,7 @@ class Unlocated:
     """Replacement of `Perception` without a pool file: never ready, so that no pilot that needs a state acts."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.vehicle = vehicle
+        self.vehicle, self.let_in = vehicle, None
         imu = vehicle.sensors.imu
         self._q_body_imu = np.array(imu.orientation if imu is not None else (0.0, 0.0, 0.0, 1.0))
         self._R_body_imu = quat_to_matrix(self._q_body_imu)
@@ -378,7 +378,9 @@ class Perception:
         self._rate = math.nan
         self._pictures = Stuck(PICTURE_STUCK)
         self._last_picture = -math.inf
-        self._let_in, self._asked_since = let_in, math.nan
+        self.let_in = None if let_in is None else (float(let_in[0]), float(let_in[1]))
+        """x, y of where the vehicle begins, world frame [m]; None: not given."""
+        self._let_in, self._asked_since = self.let_in, math.nan
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
         """Take in what the vehicle sent.
@@ -466,8 +468,8 @@ class Perception:
         return self.estimator.health(self.estimator.estimate())
 
     def _tell_let_in(self, now: float) -> None:
-        """Give the estimator, once, the initial position of the vehicle."""
-        if self._let_in is None:
+        """Give the estimator, once, the initial position of the vehicle: as soon as there is inertial data."""
+        if self._let_in is None or (self.vehicle.sensors.imu is not None and self._omega_time == -math.inf):
             return
         self._asked_since = now if math.isnan(self._asked_since) else self._asked_since
         if now - self._asked_since >= LET_IN_AFTER - 1e-6:

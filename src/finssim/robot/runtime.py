@@ -150,6 +150,13 @@ USED = ("accepted", "initialized", "reacquired")
 class Link(MotorDevice, Protocol):
     """Conversion of the bridge's commands for the other end of the wire: a motor controller or an autopilot."""
 
+    let_in: tuple[float, float] | None
+    """x, y of where the vehicle begins, world frame [m]; None: not given."""
+    calibrate_depth: bool
+    """Whether the device calibrates its barometer, at the surface, before it arms."""
+    notes: list[str]
+    """Sentences for the user since they were last taken."""
+
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
 
@@ -288,6 +295,7 @@ class Runtime:
     def attach(self, link: Link) -> None:
         """Set the link to the other end of the wire: the vehicle's motor controller by default."""
         self.link = self.intake.link = self.bridge.autopilot = link
+        link.let_in = self.perception.let_in
 
     def step(
         self,
@@ -309,6 +317,9 @@ class Runtime:
         """
         self.counters.steps += 1
         self.intake.take(now, frames, pictures)
+        for note in self.link.notes:
+            self.bridge.note(now, note)
+        self.link.notes.clear()
         reading = self.perception.reading(now)
         if self.team is not None:
             self.told = self.team.tell(now, reading)

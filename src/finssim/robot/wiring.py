@@ -149,6 +149,9 @@ class Wiring:
     given."""
     lockstep: bool = False
     """Run in lock-step with finssim pool --lockstep, as fast as possible."""
+    calibrate_depth: bool = False
+    """Calibrate an autopilot's barometer before arming, with the vehicle at the surface: depth then counts from
+    there."""
     messages: str = ""
     """(ADDRESS) Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team the default is
     the port of --robot plus five."""
@@ -212,6 +215,10 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[R
         if not wiring.lockstep:
             _check_clock(wiring.robot)
         link = link_of(wiring.robot, vehicle)
+        if wiring.calibrate_depth:
+            if not wiring.robot.startswith("mavlink"):
+                raise LinkError("--calibrate-depth is for an autopilot: connect with --robot mavlink://...")
+            link.calibrate_depth = True
         if wiring.lockstep:
             world = stack.enter_context(LockstepClient(_lockstep_address(wiring)))
             clock = 0.0

@@ -1,6 +1,7 @@
 """The link to an autopilot, against the emulated ArduSub in lock-step; `studies.faults` tests how it ends."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,20 +28,31 @@ SPEC = site_of("tank", draw_plant(HEAVY, 1, "realistic"))
 START = (0.0, 0.0, -2.0)
 
 
-def drive(seconds, *, arm=True, goal=(0.8, 0.3, -2.2)):
-    """A PID in lock-step with the pool; the runtime, what truly happened, the link and what it sent."""
-    pool = VirtualPool(HEAVY, SPEC, firmware="ardusub", start=(START, (0, 0, 0, 1)), seed=1)
+def drive(
+    seconds, *, arm=True, goal=(0.8, 0.3, -2.2), log=True, meanwhile=None, firmware=None, calibrate=False
+):
+    """A PID in lock-step with the pool; the runtime, what truly happened, the link and what it sent.
+
+    Without `log` the Doppler log reaches the autopilot alone, which has a position after 2 s. `meanwhile` is called
+    with the pool and may return frames of another ground station; `firmware` changes the spec.
+    """
+    spec = SPEC.firmware.model_copy(update={"aiding_delay": 2.0, **(firmware or {})})
+    spec = SPEC.model_copy(update={"firmware": spec})
+    pool = VirtualPool(HEAVY, spec, firmware="ardusub", start=(START, (0, 0, 0, 1)), seed=1)
     perception = Perception(HEAVY, None, mode="error-state", let_in=START[:2])
     runtime = Runtime(
         HEAVY, None, make_pilot("pid", HEAVY), Station(goal, 0.4), arm=arm, perception=perception
     )
     link, sent, rows = MavlinkLink(HEAVY), [], []
+    link.calibrate_depth = calibrate
     runtime.attach(link)
 
     def exchange(until, frames):
         sent.extend(frames)
         rows.append((pool.firmware.armed, float(np.abs(pool.plant.thrust).max())))
-        return pool.exchange(until, frames)
+        others = meanwhile(pool) if meanwhile is not None else ()
+        got = pool.exchange(until, [*frames, *(others or ())])
+        return got if log else replace(got, frames=tuple(f for f in got.frames if f[1][:1] != b"{"))
 
     run_lockstep(runtime, SimpleNamespace(exchange=exchange), seconds)
     return runtime, pool, link, np.array(rows), sent
@@ -127,6 +139,144 @@ def test_its_own_velocity_counts_where_no_log_speaks():
     (aid,) = link.feed(1.1, bytes(moving.pack(auto)))
     assert aid.kind == VELOCITY
     np.testing.assert_allclose(aid.values, (0.4 / math.sqrt(2), 0.4 / math.sqrt(2), 0.0), atol=1e-6)
+
+
+ORIGIN = bytes(
+    mavlink.MAVLink_set_gps_global_origin_message(1, 338103130, -1183938670, 0).pack(
+        mavlink.MAVLink(None, 254, 1)
+    )
+)
+"""Sent by another ground station."""
+
+
+def at(time, frame):
+    """What is sent once, at a time of the pool [s]."""
+    waiting = [frame]
+    return lambda pool: [waiting.pop()] if waiting and pool.time >= time else []
+
+
+def off(pool, goal):
+    """Distance from a goal, horizontal [m]."""
+    return math.hypot(*(np.asarray(pool.plant.position[:2], float) - goal[:2]))
+
+
+@pytest.mark.slow
+def test_by_the_autopilots_own_position_alone():
+    """No Doppler log of ours: to 8 cm of the truth after 35 s, no pause, and 95 % of the velocities accepted."""
+    goal = (0.8, 0.3, -2.2)
+    runtime, pool, link, _, _ = drive(35.0, log=False, meanwhile=at(0.5, ORIGIN))
+    kinds = [event.kind for event in runtime.counters.events]
+    assert kinds.count("armed") == 1 and "hold" not in kinds and "fault" not in kinds
+    assert off(pool, goal) < 0.08 and link.counts["velocity"] == 0
+    velocities = runtime.perception.health().counts["velocity"]
+    assert velocities["accepted"] > 400 and velocities["accepted"] > 0.95 * sum(velocities.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [0.0, 0.25])
+def test_a_reset_of_the_autopilots_position_moves_nothing(lag):
+    """Its filter leaps by 0.7 m at 20 s, with a position that is late or not: noted, and the station is kept."""
+
+    def leap(pool):
+        pool.faults.position_lag = lag
+        if 20.0 <= pool.time < 20.01:
+            pool.firmware.leap(0.5, -0.5)
+        return send(pool)
+
+    send = at(0.5, ORIGIN)
+    runtime, pool, link, _, _ = drive(32.0, log=False, meanwhile=leap)
+    assert link.counts["position reset"] == 1 and runtime.bridge.state == "disarmed"
+    assert off(pool, (0.8, 0.3)) < 0.1
+    assert any("moved its position by 0.7" in event.text for event in runtime.counters.events)
+
+
+@pytest.mark.slow
+def test_an_origin_in_mid_run_turns_no_thrust():
+    """The heading turns by 11.4 degrees over 20 s: thrust pauses at once and resumes in the frame of the start."""
+    rows = []
+
+    def watch(pool):
+        rows.append((pool.time, float(np.abs(pool.plant.thrust).max())))
+        return send(pool)
+
+    send = at(10.0, ORIGIN)
+    declination = {"declination": math.radians(11.4)}
+    runtime, pool, link, _, _ = drive(50.0, meanwhile=watch, firmware=declination)
+    rows = np.array(rows)
+    assert rows[(rows[:, 0] > 11.0) & (rows[:, 0] < 28.0), 1].max() < 0.1
+    kinds = [event.kind for event in runtime.counters.events]
+    assert kinds.count("hold") == 1 and "fault" not in kinds and kinds.count("armed") == 2
+    assert math.degrees(link._north) == pytest.approx(11.4, abs=2.5)
+    # The frame of the start has magnetic north, which lies to the right of the true one.
+    cos, sin = math.cos(math.radians(11.4)), math.sin(math.radians(11.4))
+    assert off(pool, (0.8 * cos + 0.3 * sin, 0.3 * cos - 0.8 * sin)) < 0.12
+
+
+def test_a_quiet_instrument_has_not_frozen():
+    """Whole milli-g repeat for 2 s while attitude and rates go on; those alone, repeated, have frozen."""
+    runtime = Runtime(HEAVY, None, make_pilot("pid", HEAVY), Station(START, 0.0))
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    runtime.attach(link)
+
+    def play(begin, moving):
+        for k in range(100):
+            now = begin + 0.02 * k
+            tilt = 1e-4 * k * moving
+            for message in (
+                mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+                mavlink.MAVLink_scaled_pressure2_message(round(1000 * now), 1200.0 + 0.01 * k, 0, 0),
+                mavlink.MAVLink_attitude_message(round(1000 * now), tilt, 0.0, 0.0, tilt, 0.0, 0.0),
+            ):
+                runtime.step(now, [(now, bytes(message.pack(auto)))])
+        return runtime.bridge._watchdogs.danger(now)
+
+    assert "frozen" not in play(1.0, 1.0)
+    assert "the quaternion and gyro has repeated" in play(3.0, 0.0)
+
+
+def test_a_slow_simulation_is_named():
+    """Half of real time: said as such, and thrust waits."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    for k in range(200):
+        now = 0.04 * k
+        for message in (
+            mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_scaled_pressure2_message(20 * k, 1200.0, 0, 0),
+            mavlink.MAVLink_attitude_message(20 * k, 1e-5 * k, 0.0, 0.0, 0.0, 0.0, 0.0),
+        ):
+            link.feed(now, bytes(message.pack(auto)))
+    assert link.clock_rate == pytest.approx(0.5, abs=0.02) and "0.50 times ours" in link.pause(now)
+
+
+@pytest.mark.slow
+def test_a_robot_that_starts_before_the_firmware_keeps_its_place():
+    """The firmware is silent for the first 4 s: where the vehicle was let in still counts."""
+    begun = []
+
+    def boot(pool):
+        if not begun:
+            begun.append(pool.firmware.reboot(2.5))
+        return ()
+
+    runtime, pool, _, _, _ = drive(20.0, meanwhile=boot)
+    assert runtime.counters.events and off(pool, (0.8, 0.3)) < 0.12
+
+
+@pytest.mark.slow
+def test_depth_is_calibrated_at_the_surface_before_arming():
+    """After a restart at 2 m depth counts from there, which is said; calibrated, the autopilot arms."""
+    begun = []
+
+    def boot(pool):
+        if not begun:
+            begun.append(pool.firmware.reboot(0.0))
+        return ()
+
+    runtime, pool, link, _, _ = drive(6.0, arm=False, meanwhile=boot)
+    assert link.depth_offset == pytest.approx(2.0, abs=0.2)
+    assert any("--calibrate-depth" in event.text for event in runtime.counters.events)
+    runtime, pool, link, _, _ = drive(6.0, calibrate=True)
+    assert pool.firmware.parameters["BARO2_GND_PRESS"] > 1.15e5 and link._calibrated == "done"
 
 
 def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():

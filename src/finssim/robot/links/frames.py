@@ -525,6 +525,7 @@ class McuLink:
     """The motor controller at the other end of a wire, as `Runtime` sees it: frames of thrusts out, telemetry in."""
 
     peer = "motor controller"
+    watched: tuple[tuple[str, ...], ...] = (("gyro",), ("accel",))
 
     def __init__(self, outputs: int, others: int = 0) -> None:
         """Args:
@@ -532,6 +533,9 @@ class McuLink:
         others: Actuators of the vehicle besides thrusters.
         """
         self._decoder = Decoder(outputs=outputs, others=others)
+        self.let_in: tuple[float, float] | None = None
+        self.calibrate_depth = False
+        self.notes: list[str] = []
 
     def feed(self, now: float, data: bytes) -> list[Message]:
         """Messages that bytes complete, which came at a time [s]."""
@@ -546,6 +550,10 @@ class McuLink:
 
         `now` is the time [s].
         """
+        return ""
+
+    def pause(self, now: float) -> str:
+        """Return "": it never asks for a pause. `now` is the time [s]."""
         return ""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:

@@ -21,7 +21,7 @@ from finssim.core.frames import FROM_FOSSEN
 from finssim.core.rotations import quat_from_euler, quat_inverse_rotate
 from finssim.robot.links.frames import LinkError, Message
 from finssim.robot.links.water_linked import decode_line
-from finssim.robot.messages import HEADING, VELOCITY, NavigationAid, Telemetry, ThrusterCommand
+from finssim.robot.messages import HEADING, POSITION, VELOCITY, NavigationAid, Telemetry, ThrusterCommand
 from finssim.vehicles import Vehicle
 
 __all__ = ["MODES", "MavlinkLink"]
@@ -41,8 +41,8 @@ INTERVALS = {
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 0.02,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2: 0.05,
     mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 0.05,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.2,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.5,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.05,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.2,
 }
 """Message -> time between two that is asked for [s]."""
 PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PRESS")
@@ -72,8 +72,30 @@ DVL_FRESH = 1.0
 """Age of a report of the Doppler log up to which the autopilot's own velocity is not used [s]."""
 CRITICAL = 5
 """HEARTBEAT.system_status of a failsafe."""
-AIDED, NOT_AIDED = 2, 128
-"""EKF_STATUS_REPORT.flags: horizontal velocity is known; position is held by assumption."""
+AIDED, PLACED, NOT_AIDED = 2, 8 | 16, 128
+"""EKF_STATUS_REPORT.flags: horizontal velocity is known; position is known, relative or absolute; position is held by
+assumption."""
+AIDED_LASTS = 1.0
+"""Age of the newest EKF_STATUS_REPORT up to which it counts [s]."""
+PLACE_STD = 0.05
+"""Standard deviation of the autopilot's position, per axis [m]."""
+LEAP = 0.1
+"""Step of the autopilot's position, beyond its velocity, that is a reset of its filter [m]."""
+TURN_WINDOW, TURN_LIMIT, TURN_OVER = 6.0, math.radians(2.0), math.radians(0.6)
+"""Span over which heading and gyroscope are compared [s], difference at which the autopilot turns its north, and the
+one below which it has stopped [rad]: an origin turns it by the declination in 20 s; noise stays below half a degree."""
+ALIGNED = math.radians(1.0)
+"""Step of the heading between two messages that a vehicle that is not ours yet may make [rad]."""
+SLOW_WINDOW, SLOWEST = 3.0, 0.8
+"""Span over which the autopilot's clock is compared with ours [s], and the least rate of it [-]."""
+ORIGIN_ASKED = 3.0
+"""Time for which the autopilot is asked for its origin; then it has none [s]."""
+CALIBRATION_LASTS = 5.0
+"""Longest wait for the answer to a calibration of the barometer [s]."""
+DEEPEST = 1e6
+"""A surface pressure beyond this is none [Pa]."""
+SHALLOW = 3000.0
+"""Difference of the surface pressure from the standard atmosphere that weather explains [Pa]."""
 ACCELEROMETER_RANGE = 16000
 """Greatest acceleration of the autopilots' instruments [mg]: of damaged frames one in 65 536 passes, and the estimator
 trusts it."""
@@ -90,9 +112,15 @@ class MavlinkLink:
         mode: Number of the autopilot's mode; None before its first heartbeat.
         armed: Whether the autopilot is armed.
         says: Its newest sentence of a severity that matters.
+        let_in: x, y of the vehicle when the autopilot first has a position, world frame [m]; None: its position is not
+            used.
+        calibrate_depth: Whether the barometer is calibrated before arming: the vehicle is at the surface.
+        notes: Sentences for the user since they were last taken.
     """
 
     peer = "autopilot"
+    # Its accelerations are whole milli-g, which a quiet instrument repeats: attitude and rates are not.
+    watched: tuple[tuple[str, ...], ...] = (("quaternion", "gyro"),)
 
     def __init__(self, vehicle: Vehicle, *, key: bytes = b"") -> None:
         """
@@ -121,14 +149,18 @@ class MavlinkLink:
             self._wire.signing.secret_key, self._wire.signing.sign_outgoing = key, True
             self._wire.signing.allow_unsigned_callback = None
         self.counts: Counter[str] = Counter()
+        self.let_in: tuple[float, float] | None = None
+        self.calibrate_depth = False
+        self.notes: list[str] = []
         self._handlers: dict[str, Callable[[float, Any], list[Message]]] = {
             "HEARTBEAT": self._heartbeat,
             "ATTITUDE": self._attitude,
             "RAW_IMU": self._raw_imu,
             "SCALED_PRESSURE2": self._pressure2,
             "RC_CHANNELS": self._inputs,
-            "LOCAL_POSITION_NED": self._velocity,
+            "LOCAL_POSITION_NED": self._place,
             "EKF_STATUS_REPORT": self._filter,
+            "GPS_GLOBAL_ORIGIN": self._global_origin,
             "PARAM_VALUE": self._parameter,
             "NAMED_VALUE_FLOAT": self._value,
             "AUTOPILOT_VERSION": self._software,
@@ -144,7 +176,17 @@ class MavlinkLink:
         self._alive = self._boot_ms = -math.inf
         self._accel: tuple[float, float, float] | None = None
         self._q = np.array([0.0, 0.0, 0.0, 1.0])
-        self._pressure, self._surface = math.nan, STANDARD_ATMOSPHERE
+        self._pressure, self._surface, self._surface_known = math.nan, STANDARD_ATMOSPHERE, False
+        self._placed_at, self._shift = -math.inf, np.zeros(3)
+        self._world: Any = None
+        self._last_place: tuple[float, Any] | None = None
+        self._origin, self._turn_began = "", -math.inf
+        self._critical = ""
+        # Of the autopilot's north against that of the start: by how much it has turned, and what is compared.
+        self._north, self._turns, self._turning, self._spun = 0.0, deque[tuple[float, float]](), False, 0.0
+        self._soonest = math.inf
+        self._clocks: deque[tuple[float, float]] = deque()
+        self._calibrated = ""
         self._sequence = self._aids = 0
         self._heading_at = self._dvl_at = self._aided_at = -math.inf
         self._parameters: dict[str, float] = {}
@@ -196,9 +238,11 @@ class MavlinkLink:
                 completed += self._handlers[kind](now, message)
         return completed
 
-    def _numbered(self, kind: int, age: float, values: Any) -> NavigationAid:
+    def _numbered(
+        self, kind: int, age: float, values: Any, std: tuple[float, float] = (0.0, 0.0)
+    ) -> NavigationAid:
         self._aids += 1
-        return NavigationAid(self._aids & 0xFFFF, kind, age, values, (0.0, 0.0))
+        return NavigationAid(self._aids & 0xFFFF, kind, age, values, std)
 
     def _heartbeat(self, now: float, m: Any) -> list[Message]:
         self._alive, self.mode = now, int(m.custom_mode)
@@ -215,9 +259,17 @@ class MavlinkLink:
             self._asked.clear()
             self._seen.clear()
             self._gap.clear()
-            self._boot_ms = -math.inf
+            self._clocks.clear()
+            self._turns.clear()
+            self._boot_ms, self._soonest, self._last_place = -math.inf, math.inf, None
+        if m.time_boot_ms == self._boot_ms:  # the same sample again refreshes nothing
+            return []
+        step = 0.001 * (m.time_boot_ms - self._boot_ms)
         self._boot_ms = max(self._boot_ms, m.time_boot_ms)
-        q = self._q = quat_from_euler(m.roll, -m.pitch, -m.yaw)
+        self._soonest = min(self._soonest, now - 0.001 * m.time_boot_ms)
+        self._watch_clock(now, 0.001 * m.time_boot_ms)
+        self._watch_north(m, step)
+        q = self._q = quat_from_euler(m.roll, -m.pitch, -(m.yaw - self._north))
         gyro = FROM_FOSSEN.vector([m.rollspeed, m.pitchspeed, m.yawspeed])
         x, y, z, w = q.tolist()
         self._sequence = self._sequence + 1 & 0xFFFF
@@ -238,8 +290,67 @@ class MavlinkLink:
         ]
         if self.vehicle.sensors.compass is not None and now - self._heading_at >= HEADING_PERIOD:
             self._heading_at = now
-            messages.append(self._numbered(HEADING, 0.0, (-float(m.yaw), 0.0, 0.0)))
+            messages.append(self._numbered(HEADING, 0.0, (self._north - float(m.yaw), 0.0, 0.0)))
         return messages
+
+    def _watch_clock(self, now: float, boot: float) -> None:
+        """Keep pairs of our time and the autopilot's [s] over `SLOW_WINDOW`."""
+        self._clocks.append((now, boot))
+        while now - self._clocks[0][0] > SLOW_WINDOW:
+            self._clocks.popleft()
+
+    def _turn_begins(self, time: float) -> None:
+        self._turning, self._turn_began = True, time
+        self.notes.append("the autopilot turns its north: an origin was set, or its heading was reset")
+
+    def _global_origin(self, now: float, m: Any) -> list[Message]:
+        """An origin that was not there before turns the heading from magnetic to true north."""
+        if self._origin == "none" and math.isfinite(self._boot_ms):
+            self._turn_begins(0.001 * self._boot_ms)
+        self._origin = "set"
+        return []
+
+    @property
+    def clock_rate(self) -> float:
+        """Seconds of the autopilot's clock in one of ours; NaN while it is not known."""
+        if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < 0.5 * SLOW_WINDOW:
+            return math.nan
+        (a, x), (b, y) = self._clocks[0], self._clocks[-1]
+        return (y - x) / (b - a)
+
+    def _watch_north(self, m: Any, step: float) -> None:
+        """Compare the heading with the integrated rates.
+
+        A turn of the autopilot's north is waited for before arming, and taken out of the heading afterwards: the world
+        frame is that of the arming.
+        """
+        if not 0.0 < step < 0.5:
+            self._turns.clear()
+        else:
+            # ψ̇ = (q sin φ + r cos φ) / cos θ (Fossen 2021, Eq. 2.29)
+            up = m.pitchspeed * math.sin(m.roll) + m.yawspeed * math.cos(m.roll)
+            self._spun += step * up / max(math.cos(m.pitch), 0.1)
+        time, turn = 0.001 * m.time_boot_ms, m.yaw - self._spun
+        if self._turns:
+            turn = self._turns[-1][1] + math.remainder(turn - self._turns[-1][1], math.tau)
+            if not self._ours and abs(turn - self._turns[-1][1]) > ALIGNED:
+                self._turns.clear()  # a compass that is read for the first time
+        self._turns.append((time, turn))
+        while time - self._turns[0][0] > TURN_WINDOW:
+            self._turns.popleft()
+        if time - self._turns[0][0] < 0.9 * TURN_WINDOW:
+            return
+        turned = turn - self._turns[0][1]
+        if not self._turning and abs(turned) > TURN_LIMIT:
+            self._north += turned * self._ours
+            self._turn_begins(time)
+        elif self._turning:
+            self._north += (turn - self._turns[-2][1]) * self._ours
+            if abs(turned) < TURN_OVER and time - self._turn_began > TURN_WINDOW:
+                self._turning = False
+                self.notes.append(
+                    f"the autopilot's north has turned by {math.degrees(self._north):.1f} degrees"
+                )
 
     def _raw_imu(self, now: float, m: Any) -> list[Message]:
         if max(abs(m.xacc), abs(m.yacc), abs(m.zacc)) > ACCELEROMETER_RANGE:
@@ -253,6 +364,12 @@ class MavlinkLink:
         self._pressure = 100.0 * m.press_abs
         return []
 
+    def _age(self, now: float, boot_ms: float) -> float:
+        """Time since the autopilot stamped a message, less the least delay of the wire [s]."""
+        return (
+            min(max(now - 0.001 * boot_ms - self._soonest, 0.0), 1.0) if math.isfinite(self._soonest) else 0.0
+        )
+
     def _inputs(self, now: float, m: Any) -> list[Message]:
         """Return a message if the inputs that the autopilot received are another pilot's."""
         if not self._sent or now - self._sent[-1][0] > REMEMBERED:
@@ -265,28 +382,67 @@ class MavlinkLink:
         self._others = self._others or sum(self._strange) >= STRANGERS
         return []
 
-    def _velocity(self, now: float, m: Any) -> list[Message]:
-        """Return the autopilot's own velocity, if it has one and no Doppler log reports."""
-        v = (m.vx, m.vy, m.vz)
-        if now - self._dvl_at < DVL_FRESH or now - self._aided_at > 2.0 or not all(map(math.isfinite, v)):
+    def _place(self, now: float, m: Any) -> list[Message]:
+        """Return the autopilot's own velocity and position, where it has them and no Doppler log reports.
+
+        The position is relative: it begins at `let_in`, and a reset of the autopilot's filter does not move it.
+        """
+        v, p = FROM_FOSSEN.vector([m.vx, m.vy, m.vz]), FROM_FOSSEN.vector([m.x, m.y, m.z])
+        known = now - self._aided_at < AIDED_LASTS and np.isfinite((v, p)).all()
+        if now - self._dvl_at < DVL_FRESH or not known or self._turning:
+            self._last_place = None
             return []
-        return [
-            self._numbered(VELOCITY, 0.0, tuple(quat_inverse_rotate(self._q, FROM_FOSSEN.vector(v)).tolist()))
-        ]
+        cos, sin = math.cos(self._north), math.sin(self._north)
+        level = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        v, p, age = level @ v, level @ p, self._age(now, m.time_boot_ms)
+        own = quat_inverse_rotate(self._q, v).tolist()
+        found: list[Message] = [self._numbered(VELOCITY, age, tuple(own))]
+        if self.let_in is None or now - self._placed_at > AIDED_LASTS:
+            return found
+        time = 0.001 * m.time_boot_ms
+        if (
+            self._last_place is None
+        ):  # the first, or the first after a gap: it continues where the last one was
+            self._shift = (np.array([*self.let_in, 0.0]) if self._world is None else self._world) - p
+        else:
+            before, old = self._last_place
+            leap = p - old - (time - before) * v
+            if np.linalg.norm(leap[:2]) > LEAP:
+                self.counts["position reset"] += 1
+                self.notes.append(
+                    f"the autopilot moved its position by {np.linalg.norm(leap[:2]):.2f} m: ignored"
+                )
+                self._shift = self._shift - leap
+        self._last_place = time, p
+        self._world = p + self._shift
+        x, y, z = self._world.tolist()
+        return [*found, self._numbered(POSITION, age, (x, y, z), (PLACE_STD, 0.0))]
 
     def _filter(self, now: float, m: Any) -> list[Message]:
         if m.flags & AIDED and not m.flags & NOT_AIDED:
             self._aided_at = now
+            self._placed_at = now if m.flags & PLACED else self._placed_at
         return []
 
     def _parameter(self, now: float, m: Any) -> list[Message]:
         if math.isfinite(m.param_value):
             self._parameters[m.param_id] = float(m.param_value)
-        if m.param_id.endswith("_GND_PRESS") and 5e4 < m.param_value < 1.2e5:
+        if m.param_id.endswith("_GND_PRESS") and 5e4 < m.param_value < DEEPEST:
             # The second barometer is the Bar30 where there are two; the first of a vehicle that has one.
             first = "BARO2_GND_PRESS" not in self._parameters or m.param_id == "BARO2_GND_PRESS"
             self._surface = float(m.param_value) if first else self._surface
+            if first and abs(self._surface - STANDARD_ATMOSPHERE) > SHALLOW:
+                self.notes.append(
+                    f"depth counts from {self.depth_offset:.1f} m below the surface, where the barometer was "
+                    "calibrated: bring the vehicle to the surface and give --calibrate-depth"
+                )
         return []
+
+    @property
+    def depth_offset(self) -> float:
+        """Depth of the place where the barometer was calibrated, by the standard atmosphere [m]."""
+        weight = self.vehicle.water.density * self.vehicle.water.gravity
+        return (self._surface - STANDARD_ATMOSPHERE) / weight
 
     def _value(self, now: float, m: Any) -> list[Message]:
         if m.name == "PilotGain" and 0.0 < m.value <= 1.0:
@@ -300,11 +456,20 @@ class MavlinkLink:
     def _answered(self, now: float, m: Any) -> list[Message]:
         if m.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM and m.result != mavlink.MAV_RESULT_ACCEPTED:
             self._refused = self.says or f"result {m.result}"
+        if m.command == mavlink.MAV_CMD_PREFLIGHT_CALIBRATION and not self._calibrated:
+            done = m.result == mavlink.MAV_RESULT_ACCEPTED
+            self._calibrated = (
+                "done" if done else f"the autopilot does not calibrate its barometer: result {m.result}"
+            )
+            for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):  # read again
+                self._parameters.pop(name, None)
+                self._asked.pop(("first", name), None)
         return []
 
     def _said(self, now: float, m: Any) -> list[Message]:
         if m.severity <= mavlink.MAV_SEVERITY_WARNING:
             self.says = " ".join(str(m.text).split())[:100]
+            self._critical = self.says if m.severity <= mavlink.MAV_SEVERITY_CRITICAL else self._critical
         return []
 
     # -- what is asked of it ----------------------------------------------------------------------------------
@@ -320,6 +485,14 @@ class MavlinkLink:
         unknown = self._version is None or "JS_GAIN_DEFAULT" not in self._parameters
         if unknown and now - self._first(now, "known") < PATIENCE:
             return "waiting for the autopilot's version and parameters"
+        if self.calibrate_depth and self._calibrated != "done":
+            self._wanted = now
+            return self._calibrated or "waiting for the barometer's calibration, at the surface"
+        if self.let_in is not None and now - max(self._dvl_at, self._aided_at) > AIDED_LASTS:
+            return (
+                "waiting for the autopilot's velocity: it needs a Doppler log for half a minute, and an origin; or "
+                "connect to the log with ?dvl=HOST"
+            )
         if now - self._released < ASK_AGAIN:  # its heartbeats may be older than what was asked
             return "waiting for it to disarm first"
         if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
@@ -334,7 +507,17 @@ class MavlinkLink:
             return (
                 f"the autopilot does not arm: {self._refused}" if self._refused else "waiting for it to arm"
             )
-        self._wanted, self.says = -math.inf, ""
+        self._wanted, self.says, self._critical = -math.inf, "", ""
+        return ""
+
+    def pause(self, now: float) -> str:
+        """Return why no thrust may be given now, though nothing is lost; "" otherwise. `now` is the time [s]."""
+        if self._turning:
+            return "the autopilot turns its north: the heading is not the one of the start"
+        if self.clock_rate < SLOWEST:
+            return (
+                f"the autopilot's clock runs at {self.clock_rate:.2f} times ours: its simulation is too slow"
+            )
         return ""
 
     def alarm(self, now: float) -> str:
@@ -349,6 +532,8 @@ class MavlinkLink:
             return OTHERS
         if self._failing:
             return f"the autopilot is in failsafe: {self.says or 'it gives no reason'}"
+        if self._critical:
+            return f"the autopilot reports: {self._critical}"
         if not self.armed:
             return f"the autopilot was disarmed: {self.says or 'it gives no reason'}"
         if self.mode != MANUAL:
@@ -383,7 +568,10 @@ class MavlinkLink:
         if running:
             self._ours = True
         elif requested and state == "disarmed":
-            if self.mode != MANUAL:
+            if self.calibrate_depth and not self._calibrated:
+                calibrate = self._command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0.0, 0.0, 1.0)
+                frames += self._ask(now, "calibrate", CALIBRATION_LASTS, calibrate)
+            elif self.mode != MANUAL:
                 custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
                 mode = self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, float(MANUAL))
                 frames += self._ask(now, "mode", ASK_AGAIN, mode)
@@ -437,6 +625,11 @@ class MavlinkLink:
         if self._version is None:
             version = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             frames += self._ask(now, "version", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, version))
+        if not self._origin and now - self._first(now, "origin") < ORIGIN_ASKED:
+            origin = float(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+            frames += self._ask(now, "origin", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, origin))
+        elif not self._origin:
+            self._origin = "none"
         for name in PARAMETERS:
             if name not in self._parameters and now - self._first(now, name) < 10.0:
                 read = mavlink.MAVLink_param_request_read_message(*VEHICLE, name.encode(), -1)
