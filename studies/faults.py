@@ -381,7 +381,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     "ap-our-heartbeat": _autopilot("ours is lost", "", math.inf, pool_fault(no_ground_heartbeat=True)),
     "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, pool_fault(drop=1.0)),
     "ap-deaf": _autopilot(
-        "what is sent is lost", "our frames are lost|was disarmed", 3.5, pool_fault(drop_commands=1.0)
+        "what is sent is lost", "our frames are lost|was disarmed|in failsafe", 3.5, pool_fault(drop_commands=1.0)
     ),
     "ap-joystick": _autopilot(
         "a joystick steers", "manual control", 0.5, another_station("manual_control", 1, 0, 0, 500, 400, 0),

@@ -49,7 +49,7 @@ def _beyond(width: float, dead: float, half: float = 400.0) -> float:
 def lean_angles(roll: float, pitch: float, parameters: Mapping[str, float]) -> tuple[float, float]:
     """Return the roll and pitch [rad] that sticks [µs from the middle] ask for: ANGLE_MAX at most, together.
 
-    `parameters` are the autopilot's.
+    `parameters` are the autopilot's [its own units].
     """
     limit = math.radians(0.01 * min(max(parameters["ANGLE_MAX"], 1000.0), 8000.0))
     r, p = limit * _beyond(roll, parameters["RC2_DZ"]), limit * _beyond(pitch, parameters["RC1_DZ"])
@@ -73,7 +73,7 @@ def climb_rate(throttle: float, gain: float, parameters: Mapping[str, float]) ->
     Args:
         throttle: Input of the throttle [µs].
         gain: Of the pilot [-].
-        parameters: Of the autopilot.
+        parameters: Of the autopilot, by name [its own units].
     """
     low = parameters["RC3_MIN"] + parameters["RC3_DZ"]
     high = parameters["RC3_MAX"]
@@ -122,7 +122,7 @@ class AttitudeLoop:
             attitude: Roll, pitch, yaw [rad], (3,).
             quaternion: The same, x y z w, body to north, east, down, (4,).
             rates: Body rates [rad/s], (3,).
-            parameters: Of the autopilot.
+            parameters: Of the autopilot, by name [its own units].
         """
         yaw = float(attitude[2])
         self.since_turn = 0.0 if turn else self.since_turn + dt
@@ -142,7 +142,7 @@ class AttitudeLoop:
             dt: Since the last step [s].
             rate: Wanted [rad/s], (3,).
             rates: Of the vehicle [rad/s], (3,).
-            parameters: Of the autopilot.
+            parameters: Of the autopilot, by name [its own units].
         """
         error, most = rate - rates, _gains("RAT", "IMAX", parameters)
         self.integral = np.clip(self.integral + _gains("RAT", "I", parameters) * error * dt, -most, most)
@@ -190,7 +190,7 @@ class DepthLoop:
             speed: Upwards [m/s].
             acceleration: Upwards, without gravity [m/s^2].
             surfaced: Whether the vehicle is above SURFACE_DEPTH.
-            parameters: Of the autopilot.
+            parameters: Of the autopilot, by name [its own units].
         """
         p, most = parameters, 0.01 * parameters["PILOT_ACCEL_Z"] * dt
         if self.height is None:

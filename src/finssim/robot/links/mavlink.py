@@ -40,11 +40,12 @@ INTERVALS = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 0.02,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 0.02,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2: 0.05,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 0.05,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: 0.035,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.05,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.2,
 }
-"""Message -> time between two that is asked for [s]."""
+"""Message -> time between two that is asked for [s]. That of the inputs is no multiple of the usual
+period of axes: two pilots take turns, and a report in step with them would show one alone."""
 PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PRESS")
 
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
@@ -81,9 +82,10 @@ PLACE_STD = 0.05
 """Standard deviation of the autopilot's position, per axis [m]."""
 LEAP = 0.1
 """Step of the autopilot's position, beyond its velocity, that is a reset of its filter [m]."""
-TURN_WINDOW, TURN_LIMIT, TURN_OVER = 6.0, math.radians(2.0), math.radians(0.6)
+TURN_WINDOW, TURN_LIMIT, TURN_OVER = 10.0, math.radians(4.0), math.radians(1.0)
 """Span over which heading and gyroscope are compared [s], difference at which the autopilot turns its north, and the
-one below which it has stopped [rad]: an origin turns it by the declination in 20 s; noise stays below half a degree."""
+one below which it has stopped [rad]: an origin turns it by the declination in 20 s; a vehicle that speeds up and turns
+shows up to 3 degrees."""
 ALIGNED = math.radians(1.0)
 """Step of the heading between two messages that a vehicle that is not ours yet may make [rad]."""
 SLOW_WINDOW, SLOWEST = 3.0, 0.8
@@ -312,7 +314,7 @@ class MavlinkLink:
 
     @property
     def clock_rate(self) -> float:
-        """Seconds of the autopilot's clock in one of ours; NaN while it is not known."""
+        """Rate of the autopilot's clock over ours [-]; NaN while it is not known."""
         if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < 0.5 * SLOW_WINDOW:
             return math.nan
         (a, x), (b, y) = self._clocks[0], self._clocks[-1]
@@ -387,14 +389,16 @@ class MavlinkLink:
 
         The position is relative: it begins at `let_in`, and a reset of the autopilot's filter does not move it.
         """
-        v, p = FROM_FOSSEN.vector([m.vx, m.vy, m.vz]), FROM_FOSSEN.vector([m.x, m.y, m.z])
-        known = now - self._aided_at < AIDED_LASTS and np.isfinite((v, p)).all()
+        known = now - self._aided_at < AIDED_LASTS and all(
+            map(math.isfinite, (m.vx, m.vy, m.vz, m.x, m.y, m.z))
+        )
         if now - self._dvl_at < DVL_FRESH or not known or self._turning:
             self._last_place = None
             return []
         cos, sin = math.cos(self._north), math.sin(self._north)
         level = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        v, p, age = level @ v, level @ p, self._age(now, m.time_boot_ms)
+        v = level @ FROM_FOSSEN.vector([m.vx, m.vy, m.vz])
+        p, age = level @ FROM_FOSSEN.vector([m.x, m.y, m.z]), self._age(now, m.time_boot_ms)
         own = quat_inverse_rotate(self._q, v).tolist()
         found: list[Message] = [self._numbered(VELOCITY, age, tuple(own))]
         if self.let_in is None or now - self._placed_at > AIDED_LASTS:
