@@ -11,15 +11,18 @@ from onnx import TensorProto, helper, numpy_helper
 from finssim.agents.controllers import controller
 from finssim.control import ControlError
 from finssim.control.allocation import Allocator
-from finssim.control.guidance import Station, goal_at
+from finssim.control.course import CoursePilot
+from finssim.control.guidance import Station, Track, goal_at
 from finssim.control.modes import action_mode
 from finssim.control.policy import PolicyError
 from finssim.control.trajectories import through_points
 from finssim.core.rotations import quat_from_euler
 from finssim.robot.goals import GoalError, check_reachable, guide_of, station_of
-from finssim.robot.pilots import ModeSwitch, WrenchPilot, make_pilot
+from finssim.robot.pilots import HelmPilot, ModeSwitch, WrenchPilot, make_pilot
 from finssim.robot.reading import Reading
 from finssim.robot.runtime import Ticks
+from finssim.sim import linear_model
+from finssim.sim.model import acceleration
 from finssim.tasks import StationKeeping
 from finssim.tasks.observer import Observer
 from finssim.vehicles import load_vehicle
@@ -33,6 +36,8 @@ READING = Reading(
     np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.1]),
     True,
 )
+LEVEL_ETA = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
+LEVEL = Track(LEVEL_ETA[:3], np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.8, 0.0, 0.0, 0.0, 0.0, 0.0]))
 GAIN = np.random.default_rng(0).normal(0.0, 0.3, (4, 16)).astype(np.float32)
 
 
@@ -296,3 +301,33 @@ def test_the_published_pid_has_a_profile_for_each_task():
     """Stations are kept with one set of gains, trajectories followed with another."""
     t1, t2 = (make_pilot("pid-paper", VEHICLE, task=task).act(READING, STATION, 0.0) for task in ("t1", "t2"))
     assert np.abs(t1 - t2).max() > 0.1
+
+
+@pytest.mark.parametrize(("left", "up"), [(1.0, 0.0), (-0.5, 0.0), (0.0, 1.0), (0.5, -0.5)])
+def test_a_person_moves_fins_by_their_effect(left, up):
+    """Left turns to port and up raises the bow; the propeller follows the forward stick, and nothing else does."""
+    vehicle = load_vehicle("remus100")
+    pilot = HelmPilot(lambda: (0.5, 0.0, up, left), vehicle)
+    channels = pilot.act(LEVEL, Station((0.0, 0.0, 0.0), 0.0), 0.0)
+    lower, upper = vehicle.channel_limits
+    assert channels[0] == pytest.approx(0.5 * upper[0])
+    nu = np.array([2.0, 0, 0, 0, 0, 0])
+    straight = acceleration(vehicle, LEVEL_ETA, nu, np.zeros(6), actuators=channels * [1, 0, 0])
+    turned = acceleration(vehicle, LEVEL_ETA, nu, np.zeros(6), actuators=channels) - straight
+    yaw, pitch = turned[[5, 4]] / np.abs(turned[[5, 4]]).max()
+    assert np.sign(np.round([yaw, pitch], 1)) == pytest.approx([np.sign(left), -np.sign(up)])
+    assert np.abs(channels[1:]) == pytest.approx(np.array([abs(left), abs(up)]) * upper[1:], abs=1e-9)
+
+
+def test_a_person_gives_orders_to_the_autopilot():
+    """The same channels as the action of mode `course_pitch`; without forward everything stands still."""
+    vehicle, hands = load_vehicle("remus100"), [0.75, 0.0, 0.2, -0.4]
+    pilot = HelmPilot(lambda: hands, vehicle, "course_pitch", period=0.1)
+    assert pilot.needs_state
+    autopilot = CoursePilot(linear_model(vehicle), vehicle.name, 0.1)
+    expected, _ = autopilot.act(autopilot.reset(), LEVEL, [[0.5, -0.4, -0.2]], by_pitch=True)
+    assert pilot.act(LEVEL, Station((0.0, 0.0, 0.0), 0.0), 0.0) == pytest.approx(expected[0])
+    hands[0] = 0.0
+    assert not pilot.act(LEVEL, Station((0.0, 0.0, 0.0), 0.0), 0.1).any()
+    with pytest.raises(ControlError, match="unknown action 'wrench4' of a person"):
+        HelmPilot(lambda: hands, vehicle, "wrench4")

@@ -234,6 +234,73 @@ class WrenchPilot:
         return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
 
+class HelmPilot:
+    """A person at the helm of a vehicle with fins: orders to its autopilot, or its propellers and fins themselves.
+
+    Forward sets speed or thrust; without it the propellers stand still. Left and up steer.
+    """
+
+    def __init__(
+        self,
+        deflection: Callable[[], npt.ArrayLike],
+        vehicle: Vehicle,
+        action: str = "surfaces",
+        *,
+        name: str = "teleop",
+        period: float = 0.05,
+    ) -> None:
+        """
+        Args:
+            deflection: Gives surge, sway, heave and yaw, each in [-1, 1], (4,).
+            vehicle: Whose channels are commanded.
+            action: `course_pitch`: speed, change of course and pitch, by the autopilot; `surfaces`: each fin by its
+                effect on yaw and pitch.
+            name: By which the bridge knows who commands.
+            period: Time between two decisions [s].
+
+        Raises:
+            ControlError: There is no such action, or the autopilot cannot steer the vehicle.
+        """
+        from finssim.sim.free_motion import linear_model
+
+        if action not in HELM:
+            raise ControlError(f"unknown action '{action}' of a person; available: {', '.join(HELM)}")
+        self.name, self.period, self.action, self._deflection = name, period, action, deflection
+        model = linear_model(vehicle)
+        self._pilot = CoursePilot(model, vehicle.name, period)
+        self.needs_state = action == "course_pitch"
+        self._thrusters, self._limits = len(vehicle.thrusters), np.asarray(vehicle.channel_limits, float)
+        effect = model.B[len(model.speeds) // 2][[4, 5]] * model.travel  # on pitch and yaw
+        effect[:, : self._thrusters] = 0.0
+        self._share = effect / np.maximum(np.abs(effect).max(axis=1, keepdims=True), 1e-12)
+        self.reset()
+
+    def describe(self) -> dict[str, Any]:
+        """Name, action and rate."""
+        return {"name": self.name, "kind": "teleop", "action": self.action, "period_s": self.period}
+
+    def reset(self) -> None:
+        """Forget the autopilot's integrals."""
+        self._memory = self._pilot.reset()
+
+    def act(self, reading: Measured, guide: Guide, t: float) -> Array:
+        """Wanted values of all channels, as of `Pilot`."""
+        surge, _, heave, yaw = np.asarray(self._deflection(), float)
+        if self.needs_state and surge > 0.0:
+            action = [[2.0 * surge - 1.0, yaw, -heave]]
+            channels, self._memory = self._pilot.act(self._memory, reading, action, by_pitch=True)
+            return channels[0]
+        self.reset()
+        part = np.clip(np.array([-heave, yaw]) @ self._share, -1.0, 1.0) * (not self.needs_state)
+        part[: self._thrusters] = max(surge, 0.0) * (not self.needs_state)
+        lower, upper = self._limits
+        return np.where(part < 0.0, -part * lower, part * upper)
+
+
+HELM = ("surfaces", "course_pitch")
+"""Actions of a person at the helm of a vehicle with fins."""
+
+
 class ModeSwitch:
     """Several pilots of which one steers; itself a pilot."""
 

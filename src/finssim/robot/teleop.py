@@ -25,7 +25,7 @@ from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import check_reachable, station_of
 from finssim.robot.perception import Perception, Unlocated
-from finssim.robot.pilots import ModeSwitch, Pilot, WrenchPilot, make_pilot
+from finssim.robot.pilots import HelmPilot, ModeSwitch, Pilot, WrenchPilot, make_pilot
 from finssim.robot.recorder import Recorder, recording
 from finssim.robot.runtime import Runtime
 from finssim.robot.wiring import RobotDriver, Wiring, connected
@@ -147,6 +147,10 @@ class Operator:
     def wrench(self) -> Array:
         """The wanted wrench, body frame [N, N m], (6,); for `pilots.WrenchPilot`."""
         return self.command.wrench
+
+    def deflection(self) -> Array:
+        """Surge, sway, heave and yaw as parts of the highest gear's [-], (4,); for `pilots.HelmPilot`."""
+        return np.asarray(self.command.wrench[[0, 1, 2, 5]] / GEARS["boost"])
 
     def look(self, now: float) -> TeleopCommand:
         """Return the person's command at a time [s]."""
@@ -484,6 +488,7 @@ def drive(
     recorder: Recorder | None = None,
     other: Pilot | None = None,
     guide: Guide | None = None,
+    action: str | None = None,
     rate: float = 60.0,
     duration: float = math.inf,
     show: Callable[[Runtime, Operator], None] = lambda runtime, operator: None,
@@ -498,6 +503,7 @@ def drive(
         recorder: Takes down everything.
         other: Whom the mode button hands over to; None: nobody.
         guide: Where `other` steers to.
+        action: What the person commands, see `run`; by the vehicle if None.
         rate: Rate of the loop [Hz].
         duration: [s]
         show: Called at every turn.
@@ -508,14 +514,21 @@ def drive(
             switch.select("other" if switch.mode == "person" else "person")
 
     operator = Operator(device, swap=swap)
-    person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
+    action = action or ("surfaces" if vehicle.actuators else "wrench6")
+    person: Pilot
+    if action == "wrench6":
+        person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
+    else:
+        person = HelmPilot(operator.deflection, vehicle, action, period=1.0 / rate)
     switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
     runtime = Runtime(
         vehicle,
         pool,
         switch,
         guide or Station((0.0, 0.0, 0.0), 0.0),
-        perception=Unlocated(vehicle) if pool is None else Perception(vehicle, pool),
+        perception=Unlocated(vehicle)
+        if pool is None and not person.needs_state
+        else Perception(vehicle, pool),
         bridge=Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False)),
         recorder=recorder,
     )
@@ -542,6 +555,7 @@ def run(
     pictures: str | None = None,
     policy: str | None = None,
     goal: str | None = None,
+    action: str | None = None,
     record: Path | None = None,
     key_hold: float = 0.6,
     rate: Annotated[float, (20.0, 200.0)] = 60.0,
@@ -563,13 +577,17 @@ def run(
         policy (DIR|pid): Controller to which SELECT or m hands over: pid, or a policy's directory. Needs
             --pool-file and --goal.
         goal (X,Y,Z,YAW): Goal of the policy, x,y,z,yaw [m, deg].
+        action (MODE): What the sticks or keys command: wrench6, a wrench of the thrusters; of a vehicle with fins also
+            surfaces, propellers and each fin by its effect on yaw and pitch, or course_pitch, speed, course and pitch
+            by the autopilot, while the state is known. By the vehicle if not given: surfaces if it has fins.
         record (FILE): Record of the run to write (.mcap).
         key_hold (S): Time for which a key counts as held after its last press [s].
         rate: Rate of the loop [Hz].
         duration: Duration [s]; until Ctrl-C if not given.
 
     Raises:
-        TeleopError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be used.
+        TeleopError, ControlError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be
+            used.
     """
     body = load_vehicle(vehicle)
     pool = load_pool(pool_file) if pool_file is not None else None
@@ -590,7 +608,7 @@ def run(
         recorder = stack.enter_context(recording(record, body, meta, pool_file=pool_file))
         print(keys, file=sys.stderr)
         drive(
-            body, hands, connection, pool=pool, recorder=recorder, other=other, guide=guide, rate=rate,
+            body, hands, connection, pool=pool, recorder=recorder, other=other, guide=guide, action=action, rate=rate,
             duration=math.inf if duration is None else duration, show=_status_line(),
         )  # fmt: skip
         print(file=sys.stderr)
