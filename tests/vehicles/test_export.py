@@ -124,9 +124,31 @@ def test_fins_are_joints_with_their_travel(tmp_path, kind):
     assert joint.get("type") == "revolute" and xyz == "0.0 0.0 1.0" and ends == ["-0.35", "0.35"]
     assert size[0] * size[1] == pytest.approx(0.0133)
     assert returned(tmp_path, vehicle, kind).body.mass == pytest.approx(vehicle.body.mass)
+    rest = "drag apart from that in proportion to the angle, wake, lag, rate and play"
     assert {
-        "force of fin rudder, which is a joint with a plate",
+        f"{rest if kind == 'sdf' else 'force'} of fin rudder, which is a joint with a plate",
         "buoyancy engine",
         "moving_mass battery",
     } <= set(lost)
     assert "inflow of propeller" in lost
+
+
+@pytest.mark.parametrize("incidence", [None, 0.0, 0.6])
+@pytest.mark.parametrize("name", ["remus100", "torpedo", "eca_a9"])
+def test_the_lift_of_fins_comes_back(tmp_path, name, incidence):
+    """As LiftDrag of the fin's link, or of the body's where the angle of the flow counts in part alone."""
+    vehicle = load_vehicle(name)
+    changes = {f"actuators.{fin}.drag": [0.01, 0.3, 1.0] for fin in vehicle.actuators}
+    if incidence is not None:
+        changes |= {f"actuators.{fin}.incidence": incidence for fin in vehicle.actuators}
+    vehicle = vehicle.replace(changes)
+    found, point = returned(tmp_path, vehicle, "sdf"), vehicle.hydrodynamics["calibrated"].reference_point
+    assert set(found.actuators) == set(vehicle.actuators)
+    for fin, ours in vehicle.actuators.items():
+        theirs = found.actuators[fin]
+        across = ours.span - ours.chord * (ours.span @ ours.chord)  # the file's may be rounded
+        assert theirs.span == pytest.approx(across / np.linalg.norm(across), rel=1e-9, abs=1e-9)
+        for key in ("chord", "area", "lift_slope", "incidence", "stall", "minimum", "maximum"):
+            assert getattr(theirs, key) == pytest.approx(getattr(ours, key), rel=1e-9, abs=1e-9), key
+        assert theirs.position == pytest.approx(ours.position - point, rel=1e-9, abs=1e-9)
+        assert theirs.drag == pytest.approx([0.0, 0.3, 0.0], rel=1e-9)

@@ -1,4 +1,4 @@
-"""Export of vehicles: SDF and URDF with the plugins Hydrodynamics, Thruster and Buoyancy of gz-sim.
+"""Export of vehicles: SDF and URDF with the plugins Hydrodynamics, Thruster, Buoyancy and, in SDF, LiftDrag of gz-sim.
 
 The link of the body has its frame at the reference point of the hydrodynamic coefficients, x forward, y left, z up. Its
 only collision shape is a box of the displaced volume at the centre of buoyancy. SDF has the added mass in
@@ -55,7 +55,12 @@ def export_vehicle(
     lost = [f"section {name}" for name in SECTIONS if name in vehicle.model_fields_set]
     lost += [f"hydrodynamic set {name}" for name in vehicle.hydrodynamics if name != hydrodynamics]
     lost += [f"hydrodynamic term {name}" for name in chosen.terms]
-    lost += [f"force of fin {name}, which is a joint with a plate" for name in fins_of(vehicle)]
+    part = (
+        "force"
+        if kind == "urdf"
+        else "drag apart from that in proportion to the angle, wake, lag, rate and play"
+    )
+    lost += [f"{part} of fin {name}, which is a joint with a plate" for name in fins_of(vehicle)]
     lost += [f"{a.kind} {name}" for name, a in vehicle.actuators.items() if a.kind != "fin"]
     lost += [f"inflow of {name}" for name, thruster in vehicle.thrusters.items() if thruster.inflow]
     lost += ["lag, delay and rate limit of thrusters: the thrust of gz-sim follows at once"]
@@ -172,6 +177,25 @@ def _plugins(vehicle: Vehicle, chosen: HydrodynamicSet, *, added: bool) -> list[
     return plugins
 
 
+def _lift(vehicle: Vehicle, origin: NDArray[np.float64]) -> list[Element]:
+    """Return LiftDrag for each fin: of its link, or of the body's if its incidence does not count in full.
+
+    Args:
+        vehicle: The vehicle.
+        origin: Of the link of the body, body frame [m], (3,).
+    """
+    plugins = []
+    for name, fin in fins_of(vehicle).items():
+        words: dict[str, Any] = {"link_name": f"{name}_fin"}
+        if fin.incidence < 1.0:
+            words = {"link_name": "base_link", "cp": fin.position - origin, "control_joint_name": name,
+                     "control_joint_rad_to_cl": fin.lift_slope}  # fmt: skip
+        words |= {"forward": fin.chord, "upward": np.cross(fin.span, fin.chord), "area": fin.area, "a0": 0.0}
+        words |= {"air_density": vehicle.water.density, "cla": fin.incidence * fin.lift_slope}
+        plugins.append(_plugin("LiftDrag", **words, cda=fin.drag[1], alpha_stall=fin.stall))
+    return plugins
+
+
 def _geometry(vehicle: Vehicle) -> Any:
     """Return the sides of a box of the displaced volume, in the proportions of the size [m], (3,)."""
     return vehicle.body.size * (vehicle.body.displaced_volume / np.prod(vehicle.body.size)) ** (1.0 / 3.0)
@@ -203,7 +227,8 @@ def _sdf(vehicle: Vehicle, chosen: HydrodynamicSet) -> Element:
         ends = _x("parent", "base_link"), _x("child", f"{name}_fin")
         limit = _x("limit", _x("lower", fin.minimum), _x("upper", fin.maximum))
         parts.append(_x("joint", *ends, _x("axis", _x("xyz", fin.span), limit), name=name, type="revolute"))
-    model = _x("model", *parts, *_plugins(vehicle, chosen, added=False), name=vehicle.name)
+    plugins = [*_plugins(vehicle, chosen, added=False), *_lift(vehicle, origin)]
+    model = _x("model", *parts, *plugins, name=vehicle.name)
     gravity = _x("gravity", [0.0, 0.0, -vehicle.water.gravity])
     engine = [_plugin(kind) for kind in ("Physics", "UserCommands", "SceneBroadcaster")]
     buoyancy = _plugin("Buoyancy", uniform_fluid_density=vehicle.water.density)
