@@ -1,0 +1,118 @@
+"""Policies of a task for vehicles that must move to steer, beside its classical baseline, in plants nobody has seen.
+
+    python benchmarks/steering.py TASK --plants SEED [--vehicle remus100] [--plant beyond_cruise] [--trials 200]
+        [--seeds 1,2,3,4,5] [--steps N] [--set NAME=VALUE] [--out DIR] [--json FILE]
+
+Every policy is `finssim train TASK --randomize cruise --seed S`; a folder of --out that already holds one is used as it
+is. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`. Intervals hold 95 % of
+2000 redrawn figures: each redraws learner seeds and plants with replacement, of a policy and the baseline the same
+plants. `less error` is the baseline's error less the policy's, in the plants where both have one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from finssim.core.provenance import provenance
+from finssim.evaluation.evaluate import evaluate_controller
+from finssim.evaluation.plants import load_plant
+from finssim.evaluation.statistics import bootstrap
+from finssim.learning.train import TrainingSettings, train
+from finssim.tasks import task_named
+
+Array = NDArray[np.float64]
+
+
+def tried(controller: str, given: argparse.Namespace) -> dict[str, Array]:
+    """Success [-] and error [m] of a controller in every plant, (plants,); an error that there is not is NaN."""
+    found = evaluate_controller(
+        controller,
+        load_plant(given.plant),
+        task=given.task,
+        vehicle=given.vehicle,
+        trials=given.trials,
+        seed=given.plants,
+    )
+    rows = found.result["per_trial"]
+    return {name: np.array([row[name] for row in rows], float) for name in ("success", "error")}
+
+
+def figure(values: Array) -> dict[str, Any]:
+    """Mean of values (seeds, plants), and its interval over both."""
+
+    def redraw(random: np.random.Generator) -> Any:
+        seeds, plants = (random.integers(n, size=n) for n in values.shape)
+        return np.nanmean(values[np.ix_(seeds, plants)])
+
+    return {"value": float(np.nanmean(values)), "ci95": bootstrap(redraw).tolist()}
+
+
+def trained(given: argparse.Namespace, seed: int) -> tuple[str, float]:
+    """Folder of the policy of a seed, and what its training took [processor-s], 0 if it was there."""
+    folder, before = given.out / f"{given.task}-{seed}", time.process_time()
+    if not folder.is_dir():
+        settings = TrainingSettings(
+            vehicle=given.vehicle, randomize="cruise", seed=seed, steps=given.steps, settings=given.set
+        )
+        train(given.task, out=folder, settings=settings, console=Console(quiet=True))
+    return str(folder), time.process_time() - before
+
+
+def main() -> None:
+    """Train what is missing, try everyone, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task")
+    parser.add_argument("--plants", type=int, required=True, metavar="SEED")
+    parser.add_argument("--vehicle", default="remus100")
+    parser.add_argument("--plant", default="beyond_cruise")
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--seeds", default="1,2,3,4,5")
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    parser.add_argument("--out", type=Path, default=Path("steering"))
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    (baseline,) = task_named(given.task).baselines
+    classical, learned, costs = tried(baseline, given), [], []
+    print(
+        f"{baseline}: success {np.mean(classical['success']):.3f}, error {np.nanmean(classical['error']):.3f} m"
+    )
+    for seed in map(int, given.seeds.split(",")):
+        folder, cost = trained(given, seed)
+        learned.append(tried(folder, given))
+        costs.append(cost)
+        means = {name: float(np.nanmean(values)) for name, values in learned[-1].items()}
+        print(
+            f"seed {seed}: success {means['success']:.3f}, error {means['error']:.3f} m, {cost:.0f} s",
+            flush=True,
+        )
+    every = {name: np.array([one[name] for one in learned]) for name in classical}
+    figures = {
+        f"{who} {name}": figure(values)
+        for name in classical
+        for who, values in ((baseline, classical[name][None]), ("learned", every[name]))
+    }
+    figures["more success"] = figure(every["success"] - classical["success"])
+    figures["less error"] = figure(classical["error"] - every["error"])
+    for name, one in figures.items():
+        print(f"{name:24s} {one['value']:.3f} [{one['ci95'][0]:.3f}, {one['ci95'][1]:.3f}]")
+    if given.json:
+        about = {key: str(value) for key, value in vars(given).items()} | {"processor_s": costs}
+        per_plant = {key: np.round(values, 4).tolist() for key, values in (*every.items(),)}
+        record = {"settings": about, "provenance": provenance(), "figures": figures, "learned": per_plant}
+        record["baseline"] = {key: np.round(values, 4).tolist() for key, values in classical.items()}
+        given.json.write_text(json.dumps(record) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
