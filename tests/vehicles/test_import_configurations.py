@@ -35,6 +35,14 @@ BLUEROV = {
     },
 }  # fmt: skip
 """Marine-RL/MarineGym, BlueROV.yaml, commit b6d39c4."""
+HAUV = {
+    "volume": 0.00455865,
+    "hydro_coef": {
+        "added_mass": [9.08, 8.952, 10.9018, 0.3, 0.3, 0.3], "linear_damping": [0.0413, 0.432, 0.413, 0.1, 0.1, 0.1],
+        "quadratic_damping": [8.9, 12.27, 15.278, 0.3, 0.3, 0.3],
+    },
+}  # fmt: skip
+"""Hull of HAUV.yaml there, commit a72ed67; here with the rotors of BlueROV."""
 OWN = """
 extends: BlueROV.yaml
 origin: measured
@@ -148,16 +156,15 @@ def marinegym(folder, changes=(), name="BlueROV.yaml"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 1.6], ids=["bluerov", "larger"])
-def test_a_vehicle_of_marinegym_moves_as_its_equations(tmp_path, scale):
+@pytest.mark.parametrize(("hull", "mass"), [(BLUEROV, 11.2), (HAUV, 4.5)], ids=["bluerov", "hauv"])
+def test_a_vehicle_of_marinegym_moves_as_its_equations(tmp_path, hull, mass):
     """Completed by mass, inertia and thrusters: steps of force, floating up and a decay, within 0.2 %."""
-    coefficients = {key: [scale * x for x in row] for key, row in BLUEROV["hydro_coef"].items()}
-    marinegym(tmp_path, [("hydro_coef", coefficients), ("volume", 0.0113459 * scale)])
-    (tmp_path / "own.yaml").write_text(OWN)
+    marinegym(tmp_path, [(key, hull[key]) for key in HAUV])
+    (tmp_path / "own.yaml").write_text(OWN.replace("mass: 11.2", f"mass: {mass}"))
     with pytest.warns(VehicleWarning):
         vehicle = load_vehicle(tmp_path / "own.yaml")
-    origin = Fossen(11.2, [0.3, 0.32, 0.28], [0, 0, 0], [0, 0, -0.01], 997 * 9.8 * 0.0113459 * scale,
-                    *coefficients.values(), g=9.8)  # fmt: skip
+    origin = Fossen(mass, [0.3, 0.32, 0.28], [0, 0, 0], [0, 0, -0.01], 997 * 9.8 * hull["volume"],
+                    *hull["hydro_coef"].values(), g=9.8)  # fmt: skip
     assert_moves_alike(vehicle, origin, [20.0, 20.0, 20.0, 0.5, 0.5, 2.0])
 
 
@@ -177,6 +184,11 @@ def test_thrust_of_a_rotor_at_its_limits(tmp_path):
     assert thrusters["rotor_5"].force_min == pytest.approx(-2 * 51.55, abs=0.01)
     assert thrusters["rotor_0"].thrust(3900.0 * math.pi / 30.0) == pytest.approx(64.13, abs=0.01)
     assert thrusters["rotor_0"].time_constant == 0.01
+
+
+def test_words_that_marinegym_does_not_use_are_listed(tmp_path):
+    read = read_foreign(marinegym(tmp_path, [("rotor_configuration.num_arms", 6)])).not_read
+    assert {f"{word} (MarineGym does not use it)" for word in ("num_arms", "drag_coef")} <= set(read)
 
 
 def test_what_stands_in_a_usd_file_is_asked_for(tmp_path):
@@ -204,6 +216,7 @@ def test_what_stands_in_a_usd_file_is_asked_for(tmp_path):
         ("rotor_configuration.num_rotors", 8, "time_constants is [0.01"),
         ("rotor_configuration.force_constants", ["x"] * 6, "expected 6 numbers of 0 or more"),
         ("volume", None, "volume is None, expected 1 numbers"),
+        ("fin_configuration", {"num_fins": 4}, "vehicles of MarineGym with fins, whose propeller has another law"),
     ],
 )  # fmt: skip
 def test_refusals_of_parameters_are_sentences(tmp_path, path, value, sentence):

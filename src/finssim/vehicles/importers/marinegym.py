@@ -26,6 +26,7 @@ WORDS = ("name", "drag_coef", "volume", "coBM", "hydro_coef", "rotor_configurati
 MATRICES = ("added_mass", "linear_damping", "quadratic_damping")
 ROTORS = (
     "directions", "time_constants", "force_constants", "max_rotation_velocities", "moment_constants", "num_rotors",
+    "num_arms", "arm_lengths", "rotor_angles",
 )  # fmt: skip
 
 
@@ -47,6 +48,11 @@ def read_marinegym(path: Path) -> Draft:
         VehicleError: A word is unknown, or a number is missing or wrong.
     """
     tree = read_mapping(path, VehicleError, such_as="volume: 0.0113")
+    if "fin_configuration" in tree:
+        raise VehicleError(
+            f"{path}: has fin_configuration: vehicles of MarineGym with fins, whose propeller has another law, are not "
+            "read: write a vehicle file, such as that of the catalogue's torpedo"
+        )
     coefficients, rotors = (dict(x) if isinstance(x := tree.get(key), dict) else {} for key in WORDS[4:])
     for known, part in ((WORDS, tree), (MATRICES, coefficients), (ROTORS, rotors)):
         for word in part:
@@ -76,7 +82,7 @@ def read_marinegym(path: Path) -> Draft:
     draft.put("body.center_of_buoyancy", [0.0, 0.0, numbers(tree, "coBM", 1)[0]], "published", "coBM")
     for key in MATRICES:
         draft.put(f"hydrodynamics.calibrated.{key}", numbers(coefficients, key, 6))
-    count = int(numbers(rotors, "num_rotors", 1)[0])
+    count, given = int(numbers(rotors, "num_rotors", 1)[0]), tuple(rotors)
     lists = {key: numbers(rotors, key, count) for key in ROTORS[1:4]}
     for k, (lag, constant, rpm) in enumerate(zip(*lists.values(), strict=True)):
         for end, sign in (("max", 1.0), ("min", -1.0)):
@@ -97,7 +103,7 @@ def read_marinegym(path: Path) -> Draft:
     draft.different.append(
         "MarineGym takes the added mass from filtered accelerations; here it is part of the mass matrix"
     )
-    for key in ("drag_coef", "directions", "moment_constants"):
+    for key in ("drag_coef", "directions", "moment_constants", *(key for key in ROTORS[6:] if key in given)):
         draft.not_read[f"{key} (MarineGym does not use it)"] += 1
     put_envelope(draft, [])
     rotors = {f"rotor_{k}": {"position": "[x, y, z]", "axis": "[x, y, z]"} for k in range(count)}
