@@ -1,5 +1,6 @@
 """A command is a function: its signature is the options, its docstring the help."""
 
+import gc
 import inspect
 import re
 import sys
@@ -197,3 +198,12 @@ def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
     assert [line.rstrip(":") for line in lines if line.rstrip(":") in sections] == sections
     listed = [line.split()[0] for line in lines if line.startswith("  ") and line.split()[0] in first]
     assert listed == list(first)
+
+
+def test_garbage_is_searched_again_once_a_command_is_imported():
+    """`main` stops the search until then."""
+    gc.disable()
+    try:
+        assert command_line.loaded("math:sqrt")(4.0) == 2.0 and gc.isenabled()
+    finally:
+        gc.enable()

@@ -1,6 +1,6 @@
 """`python -m finssim` is the `finssim` command."""
 
-from finssim.cli.commands import main
+from finssim.cli import main
 
 if __name__ == "__main__":
     main()

@@ -26,6 +26,7 @@ that defines `tables_of`, every function returns a result, of which `tables_of` 
 from __future__ import annotations
 
 import ast
+import gc
 import inspect
 import re
 import sys
@@ -154,9 +155,12 @@ class Definition:
 
 
 def loaded(path: str) -> Callable[..., Any]:
-    """The function; Warp starts silently where its module needs it."""
+    """Import and return a function; Warp starts silently where its module needs it."""
     module, _, name = path.partition(":")
     function: Callable[..., Any] = getattr(import_module(module), name)
+    if not gc.isenabled():  # `main` waits for the imports
+        gc.freeze()
+        gc.enable()
     if "warp" in sys.modules:
         from finssim.core.quiet import start_warp
 
