@@ -4,12 +4,13 @@ import ast
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from itertools import accumulate, chain
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -164,24 +165,54 @@ def layer(path: Path) -> str:
 LAYERS = {layer(path) for path in MODULES}
 
 
+class Parsed(NamedTuple):
+    """What the tests ask of a source file."""
+
+    imports: frozenset[str]
+    """Dotted names of all modules that it imports, inside functions too."""
+    loaded: frozenset[str]
+    """Modules that are imported when it is."""
+    classes: tuple[str, ...]
+
+
 @cache
-def imports(path: Path) -> frozenset[str]:
-    """Dotted names of all modules a file imports, inside functions too."""
+def parsed(path: Path) -> Parsed:
+    """Read a file once."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    classes = tuple(node.name for node in nodes if isinstance(node, ast.ClassDef))
+    return Parsed(frozenset(names_of(nodes, path)), frozenset(names_of(executed(tree), path)), classes)
+
+
+def names_of(nodes: Iterable[ast.AST], path: Path) -> set[str]:
+    """Dotted names that import statements among nodes name."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, (
                 f"{path}: relative import: name modules in full, so that the arrows can be read"
             )
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return frozenset(names)
+            names |= {str(node.module)} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def executed(tree: ast.Module) -> Iterator[ast.AST]:
+    """Statements that run when a module is imported."""
+    nodes = list[ast.AST](tree.body)
+    while nodes:
+        node = nodes.pop()
+        yield node
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            nodes += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            nodes += ast.iter_child_nodes(node)
 
 
 def imported_layers(path: Path) -> set[str]:
     """Layers of FinsSim that a file imports."""
-    ours = {layer_of(tuple(n.split("."))[1:]) for n in imports(path) if n.split(".")[0] == "finssim"}
+    ours = {layer_of(tuple(n.split("."))[1:]) for n in parsed(path).imports if n.split(".")[0] == "finssim"}
     return ours & LAYERS - {"", "extensions"}
 
 
@@ -197,12 +228,7 @@ def test_every_module_has_its_place():
 
 def test_a_class_has_a_name_of_its_own():
     """One meaning for each name: no two classes of the package share theirs."""
-    names = Counter(
-        node.name
-        for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ClassDef)
-    )
+    names = Counter(name for path in MODULES for name in parsed(path).classes)
     assert [name for name, count in names.items() if count > 1] == []
 
 
@@ -220,19 +246,8 @@ def test_imports_follow_the_arrows():
 
 def loaded_with(path: Path) -> set[str]:
     """Modules of FinsSim that a module imports when it is imported, without the packages that it lies in."""
-    loaded, nodes = set(), list(ast.parse(path.read_text(encoding="utf-8")).body)
-    while nodes:
-        node = nodes.pop()
-        if isinstance(node, ast.Import):
-            loaded |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            loaded |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            nodes += node.orelse
-        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            nodes += ast.iter_child_nodes(node)
     own = dotted(path)
-    parts = chain.from_iterable(accumulate(name.split("."), "{}.{}".format) for name in loaded)
+    parts = chain.from_iterable(accumulate(name.split("."), "{}.{}".format) for name in parsed(path).loaded)
     return {name for name in parts if name != own and not own.startswith(f"{name}.")}
 
 
@@ -281,7 +296,7 @@ def test_a_package_exports_what_it_says(package):
 def test_the_package_imports_nothing_of_the_checkout():
     """Studies, benchmarks and tools import the package, which is installed without them."""
     outside = {"studies", "benchmarks", "tools", "tests"}
-    against = {path: imports(path) for path in MODULES}
+    against = {path: parsed(path).imports for path in MODULES}
     assert not [path for path, names in against.items() if outside & {n.partition(".")[0] for n in names}]
 
 
@@ -289,7 +304,7 @@ def test_heavy_libraries_stay_at_home():
     """A heavy library is imported in the files that need it, and in no other."""
     importers = {library: set() for library in HOMES}
     for path in MODULES:
-        for library in HOMES.keys() & {name.partition(".")[0] for name in imports(path)}:
+        for library in HOMES.keys() & {name.partition(".")[0] for name in parsed(path).imports}:
             importers[library].add(path.relative_to(SOURCE).as_posix())
     assert importers == HOMES
 
