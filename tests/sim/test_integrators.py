@@ -206,3 +206,17 @@ def test_long_steps_are_stable_from_any_start_at_the_surface(substeps):
     for _ in range(3000):
         simulator.step()
     assert np.abs(simulator.numpy("velocity")).max() < 0.01
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
+def test_slow_motion_far_away_is_not_lost_in_rounding(integrator):
+    """The way of a substep, 16 µm, is less than half the spacing of floats at 1 km; that of a control step is not."""
+    moved = []
+    for x in (0.0, 1000.0):
+        simulator = Simulator("finsrov", control_step=0.08, substeps=50, integrator=integrator)
+        simulator.place(position=(x, 0.0, -2.0), velocity=(0.01, 0.0, 0.0, 0.0, 0.0, 0.0))
+        for _ in range(10):
+            simulator.step()
+        moved.append(float(simulator.numpy("position")[0, 0, 0]) - x)
+    assert moved[0] > 0.004
+    assert moved[1] == pytest.approx(moved[0], abs=10 * 3.1e-5)

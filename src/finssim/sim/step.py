@@ -146,7 +146,10 @@ MODULE_OPTIONS = {
 class Course:
     """A vehicle on its way through the substeps of a control step."""
 
-    position: wp.vec3  # body origin, world frame [m]
+    start: wp.vec3  # body origin at the start of the control step, world frame [m]
+    moved: (
+        wp.vec3
+    )  # way since then [m]: apart, for a float far from 0 does not hold the way of a short, slow substep
     quaternion: wp.quat
     velocity: vec6  # nu, body frame [m/s, rad/s]
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
@@ -393,7 +396,7 @@ def physics_kernel(
         if wp.static(speed_lag):
             newest = lag_target(plant, w, v, newest)
         commands[w, v, head] = newest
-        out.position = state[w, v].position
+        out.start = state[w, v].position
         out.quaternion = state[w, v].quaternion
         out.velocity = state[w, v].velocity
         out.actuator = state[w, v].actuator
@@ -427,7 +430,8 @@ def physics_kernel(
     ) -> Course:
         """The course after substep k; -1 only looks ahead."""
         out = Course()
-        position = course.position
+        moved = course.moved
+        position = course.start + moved
         q = course.quaternion
         nu = course.velocity
         actuator = course.actuator
@@ -535,7 +539,7 @@ def physics_kernel(
                 elapsed + h,
                 0.0,
             ).nu_dot
-            position = position + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
+            moved = moved + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
             q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
             nu = nu + (h / 6.0) * (n1 + 2.0 * n2 + 2.0 * n3 + n4)
             x_dot = position_rate(q, nu)
@@ -579,9 +583,9 @@ def physics_kernel(
                 nu_new = nu + step_h * nu_dot
                 q = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
                 nu = nu_new
-                position = position + 0.5 * step_h * x_dot
+                moved = moved + 0.5 * step_h * x_dot
                 x_dot = position_rate(q, nu)
-                position = position + 0.5 * step_h * x_dot
+                moved = moved + 0.5 * step_h * x_dot
             else:
                 if wp.static(contacts):
                     parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
@@ -589,7 +593,8 @@ def physics_kernel(
                         parts = wp.max(parts, int(wp.ceil(h / solids.step - 1.0e-4)))
                     d = h / float(parts)
                     for _ in range(parts):
-                        position = position + 0.5 * d * x_dot
+                        moved = moved + 0.5 * d * x_dot
+                        position = course.start + moved
                         q = rotate_by(q, angular(nu), 0.5 * d)
                         touch = contact_at(
                             plant, walls, funnel, solids, course.clearing, w, v, position, q, nu
@@ -602,8 +607,9 @@ def physics_kernel(
                         nu = nu + d * (nu_dot + push)
                         q = rotate_by(q, angular(nu), 0.5 * d)
                         x_dot = position_rate(q, nu)
-                        position = position + 0.5 * d * x_dot
-        out.position = position
+                        moved = moved + 0.5 * d * x_dot
+        out.start = course.start
+        out.moved = moved
         out.quaternion = q
         out.velocity = nu
         out.actuator = actuator
@@ -630,12 +636,13 @@ def physics_kernel(
         course: Course,
     ):
         """Write down where the vehicle has come to, unless a number stopped being finite."""
+        position = course.start + course.moved
         q = wp.normalize(course.quaternion)
-        history[slot, w, v] = snapshot(course.position, q, course.velocity)
-        if not is_finite(course.position, q, course.velocity):
+        history[slot, w, v] = snapshot(position, q, course.velocity)
+        if not is_finite(position, q, course.velocity):
             broken[w] = 1
             return
-        state[w, v].position = course.position
+        state[w, v].position = position
         state[w, v].quaternion = q
         state[w, v].velocity = course.velocity
         delivered = thrust_of(plant, w, v, course.actuator)
