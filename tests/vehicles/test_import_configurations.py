@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from finssim.sim.model import acceleration
 from finssim.vehicles import VehicleError, VehicleWarning, load_vehicle
 from finssim.vehicles.importers.draft import read_foreign
 from finssim.vehicles.importers.marinegym import thrust
@@ -102,6 +103,29 @@ def test_matrices_of_a_torpedo_of_holoocean(tmp_path, dynamics):
     assert vehicle.buoyancy == pytest.approx(vehicle.weight)
 
 
+@pytest.mark.parametrize(
+    "fins", [{}, {"fin_count": 3, "fin_offset_deg": 30.0, "fin_area": 0.01, "CL_delta": 0.6}]
+)
+def test_fins_of_a_torpedo_of_holoocean(tmp_path, fins):
+    """Each pushes across its radius, at half the length behind: the force and moment of `fin.tau` of HoloOcean."""
+    actuator = ACTUATOR | {"fin_center": 0.12, "deltaMax_fin_deg": 20.0} | fins
+    vehicle = holoocean(tmp_path, scenario(actuator=actuator)).vehicle(tmp_path)
+    count, area, slope = (
+        actuator.get(k, x) for k, x in (("fin_count", 4), ("fin_area", 0), ("CL_delta", 0.5))
+    )
+    assert len(vehicle.actuators) == count
+    eta, nu, U = np.array([0.0, 0, -10, 0, 0, 0]), np.array([2.0, 0, 0, 0, 0, 0]), 2.0
+    free = acceleration(vehicle, eta, nu, actuators=np.zeros(1 + count))
+    for k, fin in enumerate(vehicle.actuators.values()):
+        angle = np.radians(actuator.get("fin_offset_deg", 0.0) + 360.0 * k / count)
+        push = 0.5 * 1026.0 * area * slope * 0.1 * U**2 * np.array([0.0, np.sin(angle), -np.cos(angle)])
+        arm = np.array([-0.8, 0.12 * np.cos(angle), 0.12 * np.sin(angle)])
+        expected = np.concatenate([push, np.cross(arm, push)]) * np.concatenate([F[:3], F[3:]])
+        turned = acceleration(vehicle, eta, nu, actuators=np.eye(1 + count)[1 + k] * 0.1) - free
+        assert vehicle.mass_matrix() @ turned == pytest.approx(expected, rel=1e-3, abs=2e-3)
+        assert (fin.maximum, fin.rate_limit, fin.time_constant) == pytest.approx((np.radians(20.0), 0.5, 0.1))
+
+
 def test_a_scenario_in_python_and_one_of_ros_are_read(tmp_path):
     """Without execution; the vehicle is the same."""
     expected = holoocean(tmp_path, scenario()).vehicle(tmp_path).sha256
@@ -118,7 +142,7 @@ def test_a_scenario_in_python_and_one_of_ros_are_read(tmp_path):
 def test_what_a_scenario_lacks_or_has_besides_is_named(tmp_path):
     draft = holoocean(tmp_path, scenario({"mass": 16}))
     assert any("what the scenario lacks" in x and "diam" in x and "mass" not in x for x in draft.different)
-    assert "agent: fin_area" in draft.not_read and "agent: sensors" in draft.not_read
+    assert "agent: KQ_0" in draft.not_read and "agent: sensors" in draft.not_read
     assert draft.vehicle(tmp_path).body.mass == 16.0
 
 

@@ -18,6 +18,7 @@ from finssim.vehicles.importers import torpedo
 from finssim.vehicles.importers.assignments import Assignments, read_assignments
 from finssim.vehicles.importers.coefficients import draft_of
 from finssim.vehicles.importers.draft import Draft
+from finssim.vehicles.importers.rigid import plain
 from finssim.vehicles.part import VehicleError, did_you_mean
 
 __all__ = ["HOLOOCEAN", "read_holoocean"]
@@ -29,11 +30,15 @@ TORPEDO: dict[str, Any] = {
     "KT_max": 0.1798, "Ja_max": 0.6632, "w": 0.056,
 }  # fmt: skip
 """Word of `dynamics` or `actuator` -> HoloOcean's value where the scenario has none."""
-CONTROL = (
-    "K_nomoto sampleTime KQ_0 KQ_max fin_count fin_offset_deg fin_center fin_area x_fin CL_delta CL_delta_r CL_delta_s "
-    "deltaMax_fin_deg fin_speed_max T_delta"
-).split()
-"""Words of fins, torque and control, which are not read."""
+FINS: dict[str, Any] = {
+    "fin_count": 4, "fin_offset_deg": 0.0, "fin_center": 0.1, "fin_area": 0.00697, "CL_delta": 0.5,
+    "deltaMax_fin_deg": 15.0, "fin_speed_max": 0.5, "T_delta": 0.1,
+}  # fmt: skip
+"""The same of the fins, which are alike, at the stern, in equal angles around the axis."""
+CONTROL = "K_nomoto sampleTime KQ_0 KQ_max x_fin CL_delta_r CL_delta_s".split()
+"""Words of torque and control, and of fins that HoloOcean's torpedo does not use; they are not read."""
+
+USUAL = TORPEDO | FINS
 
 
 def _scenarios(tree: Any) -> Iterator[Mapping[str, Any]]:
@@ -75,12 +80,18 @@ def read_holoocean(path: Path) -> Draft:
     words: dict[str, Any] = {}
     sections = [section for section in ("dynamics", "actuator") if isinstance(agent.get(section), Mapping)]
     for key, value in ((key, value) for section in sections for key, value in agent[section].items()):
-        if key not in TORPEDO and key not in CONTROL:
+        if key not in USUAL and key not in CONTROL:
             raise VehicleError(
-                f"{path}: unknown word '{key}'{did_you_mean(str(key), list(TORPEDO))} correct it"
+                f"{path}: unknown word '{key}'{did_you_mean(str(key), list(USUAL))} correct it"
             )
         count = 3 if key in ("r_bg", "r_bb") else 1
-        least = -np.inf if count == 3 or key in CONTROL else -1e-12 if key in ("w", "t_prop") else 0.0
+        least = (
+            -np.inf
+            if count == 3 or key in (*CONTROL, "fin_offset_deg")
+            else -1e-12
+            if key in ("w", "t_prop")
+            else 0.0
+        )
         plain = np.size(value) == count and np.array(value).dtype.kind in "if" and np.all(np.isfinite(value))
         if not plain or np.min(value) <= least:
             raise VehicleError(
@@ -92,8 +103,11 @@ def read_holoocean(path: Path) -> Draft:
         raise VehicleError(
             f"{path}: length is {length:g} and diam is {diam:g}, expected a body longer than it is wide"
         )
-    draft = draft_of(_torpedo(TORPEDO | words), path, f"{agent.get('agent_type')} of HoloOcean")
-    if defaults := sorted(TORPEDO.keys() - words.keys()):
+    numbers = USUAL | words
+    draft = draft_of(_torpedo(numbers), path, f"{agent.get('agent_type')} of HoloOcean")
+    del draft.not_read["fins, which turn the vehicle"]
+    _put_fins(numbers, draft)
+    if defaults := sorted(USUAL.keys() - words.keys()):
         draft.different.append(f"HoloOcean's torpedo gives what the scenario lacks: {', '.join(defaults)}")
     draft.different.append("linear damping of surge and sway, which vanishes as exp(-3 U), is left out")
     for key in (
@@ -104,12 +118,39 @@ def read_holoocean(path: Path) -> Draft:
     return draft
 
 
+def _put_fins(n: Mapping[str, Any], draft: Draft) -> None:
+    """Set the fins: each turns about its radius, and its lift goes with the deflection alone."""
+    if n["fin_count"] != int(n["fin_count"]):
+        raise VehicleError(f"fin_count is {n['fin_count']!r}, expected an integer")
+    travel = math.radians(n["deltaMax_fin_deg"])
+    for k in range(int(n["fin_count"])):
+        angle = math.radians(n["fin_offset_deg"] + 360.0 * k / n["fin_count"])
+        outwards = np.array([0.0, -math.cos(angle), -math.sin(angle)])
+        place = [-n["length"] / 2.0, *(n["fin_center"] * outwards[1:])]
+        given = {
+            "kind": "fin", "position": plain(np.array(place)), "span": plain(outwards), "area": n["fin_area"],
+            "lift_slope": n["CL_delta"], "drag": [0.0, 0.0, 0.0], "incidence": 0.0, "minimum": -travel,
+            "maximum": travel, "rate_limit": n["fin_speed_max"], "time_constant": n["T_delta"],
+        }  # fmt: skip
+        for key, value in given.items():
+            draft.put(f"actuators.fin_{k}.{key}", value, "derived", "equal fins around the axis at the stern")
+        draft.guess(f"actuators.fin_{k}.stall", 0.7, "lift of the file has no end")
+
+
 def _torpedo(n: Mapping[str, Any]) -> Assignments:
     """Return the numbers that `torpedo.py` computes from its words, under the names of the field."""
     m, a, b, W = n["mass"], n["length"] / 2.0, n["diam"] / 2.0, n["mass"] * 9.81
     rg, rb = np.array(n["r_bg"], float), np.array(n["r_bb"], float)
     moments, added = torpedo.spheroid_moments(a, b, m), torpedo.spheroid_added_mass(a, b, m, n["r44"])
-    values = dict(n) | {"g": 9.81, "W": W, "B": W, "I_g": moments, "MA": added, "r_bg": rg, "r_bb": rb}
+    values = {key: x for key, x in n.items() if key not in FINS} | {
+        "g": 9.81,
+        "W": W,
+        "B": W,
+        "I_g": moments,
+        "MA": added,
+        "r_bg": rg,
+        "r_bb": rb,
+    }
     M = added + np.concatenate([[m] * 3, moments + m * (rg @ rg - rg**2)])
     times, ratios = np.array([math.inf, n["T_sway"], n["T_yaw"]]), np.array([n["zeta_roll"], n["zeta_pitch"]])
     values["D"] = torpedo.slow_damping(M, times, ratios, W * (rg[2] - rb[2])) * [1, 0, 1, 1, 1, 1]
