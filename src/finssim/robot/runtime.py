@@ -241,6 +241,10 @@ class Intake:
 Array = npt.NDArray[np.float64]
 
 
+FORGET_AFTER = 1.0
+"""Time in hold after which a pilot restarts from its first decision [s]."""
+
+
 class Runtime:
     """Perception, pilot and bridge of one vehicle. Knows no clock and no wire: `step` is given both.
 
@@ -287,7 +291,7 @@ class Runtime:
         """When the guide's time began [s]; NaN before."""
         self.refusal = ""
         """Why arming was refused last; empty where it was not."""
-        self._arm = arm
+        self._arm, self._held_since = arm, math.inf
         self._ticks = Ticks()
         self.intake = Intake(self.perception, self.bridge, self.counters, recorder)
         self.attach(self.intake.link)
@@ -411,6 +415,9 @@ class Runtime:
         """Ask the pilot when it is its turn and it knows enough."""
         if math.isnan(self.started):
             return
+        self._held_since = min(self._held_since, now) if self.bridge.state == "hold" else math.inf
+        if now - self._held_since > FORGET_AFTER:
+            self.pilot.reset()  # its integral would grow against a vehicle that has no thrust
         due, missed = self._ticks.due(now, self.pilot.period)
         self.counters.missed += missed
         if not due or self.bridge.state == "fault" or (self.pilot.needs_state and not reading.ready):

@@ -201,15 +201,15 @@ def test_an_origin_in_mid_run_turns_no_thrust():
 
     send = at(10.0, ORIGIN)
     declination = {"declination": math.radians(11.4)}
-    runtime, pool, link, _, _ = drive(50.0, goal=(1.6, 0.3, -2.2), meanwhile=watch, firmware=declination)
+    runtime, pool, link, _, _ = drive(50.0, goal=(1.0, 0.3, -2.2), meanwhile=watch, firmware=declination)
     rows = np.array(rows)
     assert rows[(rows[:, 0] > 11.0) & (rows[:, 0] < 28.0), 1].max() < 0.1
     kinds = [event.kind for event in runtime.counters.events]
     assert kinds.count("hold") == 1 and "fault" not in kinds and kinds.count("armed") == 2
     assert math.degrees(link._north) == pytest.approx(11.4, abs=2.5)
-    # The frame of the start has magnetic north, which lies to the right of the true one: 0.32 m at the goal.
+    # The frame of the start has magnetic north, which lies to the right of the true one: 0.2 m at the goal.
     cos, sin = math.cos(math.radians(11.4)), math.sin(math.radians(11.4))
-    assert off(pool, (1.6 * cos + 0.3 * sin, 0.3 * cos - 1.6 * sin)) < 0.16
+    assert off(pool, (1.0 * cos + 0.3 * sin, 0.3 * cos - 1.0 * sin)) < 0.14
 
 
 def test_a_quiet_instrument_has_not_frozen():
