@@ -416,12 +416,12 @@ class Runtime:
         if math.isnan(self.started):
             return
         self._held_since = min(self._held_since, now) if self.bridge.state == "hold" else math.inf
-        if now - self._held_since > FORGET_AFTER:
-            self.pilot.reset()  # its integral would grow against a vehicle that has no thrust
         due, missed = self._ticks.due(now, self.pilot.period)
         self.counters.missed += missed
         if not due or self.bridge.state == "fault" or (self.pilot.needs_state and not reading.ready):
             return
+        if now - self._held_since > FORGET_AFTER:
+            self.pilot.reset()  # its integral would grow against a vehicle that has no thrust
         force = self._asked(now, reading)
         if force is None:
             return
