@@ -136,12 +136,9 @@ class ScenarioFiles:
         rest = name[package.end() :] if package else name
         places = [self.packages.get(package[1])] if package else self.places
         for place in places if re.fullmatch(r"(?!.*\.\.)[\w. +()-][\w. +()/-]*", rest) else ():
-            if (
-                place is not None
-                and (place / rest).is_file()
-                and (place / rest).resolve().is_relative_to(place)
-            ):
-                return place / rest
+            file = None if place is None else place / rest
+            if file is not None and file.is_file() and file.resolve().is_relative_to(place):
+                return file
         raise VehicleError(
             f"{where}: no file '{name[:200]}' near the scenario: give its folder with --folder"
         )
@@ -288,14 +285,8 @@ def sphere_mesh(radius: float) -> tuple[Vertices, Faces]:
 def mesh_moments(points: Array, density: float) -> Array:
     """Return the inertia (3, 3) [kg m²] about the origin of the solid that triangles (n, 3, 3) [m] enclose."""
     volumes, total = np.linalg.det(points), points.sum(axis=1)
-    P = (
-        density
-        / 120.0
-        * (
-            np.einsum("n,nij,nik->jk", volumes, points, points)
-            + np.einsum("n,nj,nk->jk", volumes, total, total)
-        )
-    )
+    P = np.einsum("n,nij,nik->jk", volumes, points, points) + np.einsum("n,nj,nk->jk", volumes, total, total)
+    P *= density / 120.0
     return np.trace(P) * np.eye(3) - P
 
 
@@ -337,10 +328,8 @@ def added_mass(kind: str, size: Array, density: float) -> tuple[Array, Array]:
     if kind == "sphere":
         return np.full(3, 2.0 / 3.0 * math.pi * density * size[0] ** 3), np.zeros(3)
     if kind == "cylinder":
-        disc, turning = (
-            density * math.pi * size[0] ** 2,
-            math.pi * density * size[1] ** 2 * size[0] ** 3 / 12.0,
-        )
+        disc = density * math.pi * size[0] ** 2
+        turning = disc * size[0] * size[1] ** 2 / 12.0
         return np.array([disc * size[1], disc * size[1], disc]), np.array([turning, turning, 0.0])
     a, b, c = size
     mean = (b + c) / 2.0
@@ -393,10 +382,7 @@ def _primitive(
         size = values(dimensions, "xyz", 3, where) / 2.0
         mesh = box_mesh(size)
     elif kind == "cylinder":
-        size = np.array([scalar(dimensions, name, where) for name in ("radius", "height")]) / [
-            1.0,
-            2.0,
-        ]
+        size = np.array([scalar(dimensions, "radius", where), scalar(dimensions, "height", where) / 2.0])
         mesh = cylinder_mesh(*size)
     else:
         size = values(dimensions, "radius", 1, where)
@@ -722,6 +708,23 @@ def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> No
         draft.put(f"thrusters.{name}.time_constant", lag, "derived", how)
 
 
+def _placed(
+    actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
+) -> tuple[str, LinkPose]:
+    """Return name and pose of an actuator in the base link."""
+    kind = "rudder" if actuator.get("type") == "rudder" else "thruster"
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", actuator.get("name", "") or kind)[:64]
+    link = word(actuator.find("link"), "name", f"{where}: link")
+    if (
+        name in {**draft.values.get("thrusters", {}), **draft.values.get("actuators", {})}
+        or link not in links
+    ):
+        raise VehicleError(
+            f"{where}: its name is there twice, or its link '{link}' is not of the robot: correct it"
+        )
+    return name, links[link][0].after(pose_of(actuator.find("origin"), f"{where}: origin"))
+
+
 RUDDER = {"specs", "visual", "origin", "link", "watchdog"}
 """Words of a rudder."""
 ENDLESS = 1.5
@@ -733,13 +736,7 @@ def _put_rudder(
 ) -> None:
     """Set a rudder, which turns about the z axis of its origin: lift is lift_coeff by the angle, drag by its square."""
     refuse_strange(actuator, RUDDER, where, draft)
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", actuator.get("name", "") or "rudder")[:64]
-    link, specs = word(actuator.find("link"), "name", f"{where}: link"), actuator.find("specs")
-    taken = (*draft.values.get("thrusters", {}), *draft.values.get("actuators", {}))
-    if name in taken or link not in links:
-        raise VehicleError(
-            f"{where}: its name is there twice, or its link '{link}' is not of the robot: correct it"
-        )
+    (name, pose), specs = _placed(actuator, links, draft, where), actuator.find("specs")
     lift, drag, area, most = (
         scalar(specs, key, f"{where}: specs", default)
         for key, default in (("lift_coeff", None), ("drag_coeff", "0"), ("area", None), ("max_angle", None))
@@ -748,7 +745,6 @@ def _put_rudder(
         raise VehicleError(
             f"{where}: expected lift_coeff, area and max_angle above 0 and drag_coeff of 0 or more"
         )
-    pose = links[link][0].after(pose_of(actuator.find("origin"), f"{where}: origin"))
     path = f"actuators.{name}"
     draft.put(f"{path}.kind", "fin")
     draft.put(f"{path}.position", plain(flu_of_frd(pose.place)))
@@ -772,13 +768,7 @@ def _put_thruster(
 ) -> None:
     """Set a thruster, or a force of limited size in its place."""
     refuse_strange(actuator, ACTUATOR, where, draft)
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", actuator.get("name", "") or "thruster")[:64]
-    link = word(actuator.find("link"), "name", f"{where}: link")
-    if name in draft.values.get("thrusters", {}) or link not in links:
-        raise VehicleError(
-            f"{where}: its name is there twice, or its link '{link}' is not of the robot: correct it"
-        )
-    pose = links[link][0].after(pose_of(actuator.find("origin"), f"{where}: origin"))
+    name, pose = _placed(actuator, links, draft, where)
     path = f"thrusters.{name}"
     draft.put(f"{path}.position", plain(flu_of_frd(pose.place)))
     draft.put(f"{path}.axis", plain(flu_of_frd(pose.turn[:, 0])), "derived", "x axis of its origin")
@@ -792,13 +782,10 @@ def _put_thruster(
         ends = own if own[0] < own[1] else ends
     factor = abs(ends[1] if math.isfinite(ends[1]) else draft.values["body"]["mass"]) / (100.0 * math.pi) ** 2
     put_curve(draft, name, quadratic(factor, factor, where), *ends, "limits of the thruster")
+    own = draft.values["thrusters"][name]
     for key in ("c_plus", "c_minus", "rpm_min", "rpm_max"):
-        draft.guess(
-            f"{path}.{key}",
-            draft.values["thrusters"][name][key],
-            "a force has no shaft: 3000 rpm at its limit",
-        )
-    draft.values["thrusters"][name]["domain"] = "force"
+        draft.guess(f"{path}.{key}", own[key], "a force has no shaft: 3000 rpm at its limit")
+    own["domain"] = "force"
     draft.guess(f"{path}.time_constant", LAG, "the force follows at once")
 
 
@@ -829,10 +816,6 @@ def read_stonefish(path: Path, folders: Sequence[Path] = ()) -> Draft:
     for element in elements:
         if element.tag not in ("robot", "materials", "environment"):
             draft.not_read[f"scenario: {element.tag}"] += 1
-        elif element.tag not in ("robot", "materials", "environment"):
-            raise VehicleError(
-                f"{path}: unknown element '{element.tag}', expected those of a scenario: correct it"
-            )
     refuse_strange(
         robot,
         {"base_link", "link", "joint", "sensor", "actuator", "light", "comm", "world_transform"},
@@ -892,19 +875,12 @@ def _put_body(
     if volume > 0.0:
         lift = np.average([x.lift for x in solids], axis=0, weights=[x.volume for x in solids])
         draft.put("body.displaced_volume", volume, "derived", f"buoyant ones of {len(solids)} parts")
-        draft.put(
-            "body.center_of_buoyancy",
-            plain(flu_of_frd(lift)),
-            "derived",
-            f"buoyant ones of {len(solids)} parts",
-        )
+        note = f"buoyant ones of {len(solids)} parts"
+        draft.put("body.center_of_buoyancy", plain(flu_of_frd(lift)), "derived", note)
     else:
         draft.guess("body.displaced_volume", mass / water, "no part is buoyant: neutral buoyancy")
-        draft.guess(
-            "body.center_of_buoyancy",
-            plain(flu_of_frd(centre)),
-            "no part is buoyant: at the centre of gravity",
-        )
+        how = "no part is buoyant: at the centre of gravity"
+        draft.guess("body.center_of_buoyancy", plain(flu_of_frd(centre)), how)
     added = np.zeros((6, 6))
     for parts in groups:
         m, c, bare = rigid(parts, False)
@@ -917,15 +893,10 @@ def _put_body(
         ahead, astern = (water_wrench(groups, centre, sign * twist, water) for sign in (1.0, -1.0))
         D2[:, k], D1[:, k] = (astern[0] - ahead[0]) / 2.0, (astern[1] - ahead[1]) / 2.0
     for key, matrix in (("added_mass", added), ("linear_damping", D1), ("quadratic_damping", D2)):
-        draft.put(
-            f"hydrodynamics.calibrated.{key}",
-            plain(flu_of_frd(matrix)),
-            "derived",
-            "from the shapes, as Stonefish",
-        )
-    draft.put(
-        "hydrodynamics.calibrated.reference_point", plain(flu_of_frd(centre)), "derived", "centre of gravity"
-    )
+        full = plain(flu_of_frd(matrix))
+        draft.put(f"hydrodynamics.calibrated.{key}", full, "derived", "from the shapes, as Stonefish")
+    point = plain(flu_of_frd(centre))
+    draft.put("hydrodynamics.calibrated.reference_point", point, "derived", "centre of gravity")
     draft.different += files.notes + [
         "the added mass is that of Stonefish: one number for all directions, and no couplings",
         "drag is quadratic and equal to that of Stonefish 1.6 at 1 m/s; there it grows with the cube of the speed",
