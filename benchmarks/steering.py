@@ -1,7 +1,7 @@
 """Policies of a task for vehicles that must move to steer, beside its classical baseline, in plants nobody has seen.
 
     python benchmarks/steering.py TASK --plants SEED [--vehicle remus100] [--plant beyond_cruise] [--trials 200]
-        [--seeds 1,2,3,4,5] [--steps N] [--set NAME=VALUE] [--out DIR] [--json FILE]
+        [--seeds 1,2,3,4,5] [--steps N] [--init NAME] [--set NAME=VALUE] [--out DIR] [--json FILE]
 
 Every policy is `finssim train TASK --randomize cruise --seed S`; a folder of --out that already holds one is used as it
 is. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`. Intervals hold 95 % of
@@ -60,7 +60,12 @@ def trained(given: argparse.Namespace, seed: int) -> tuple[str, float]:
     folder, before = given.out / f"{given.task}-{seed}", time.process_time()
     if not folder.is_dir():
         settings = TrainingSettings(
-            vehicle=given.vehicle, randomize="cruise", seed=seed, steps=given.steps, settings=given.set
+            vehicle=given.vehicle,
+            randomize="cruise",
+            seed=seed,
+            steps=given.steps,
+            init=given.init,
+            settings=given.set,
         )
         train(given.task, out=folder, settings=settings, console=Console(quiet=True))
     return str(folder), time.process_time() - before
@@ -78,6 +83,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--init")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--out", type=Path, default=Path("steering"))
     parser.add_argument("--json", type=Path)

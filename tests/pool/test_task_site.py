@@ -42,7 +42,7 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
     task = replace(task, time_limit=SHORT.get(name, task.time_limit))
     guide = TRAJECTORIES["lemniscate"] if name == "t2" else None
-    vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints") else FINSROV
+    vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints", "homing") else FINSROV
     site = site_of(task, who, [vehicle] * len(task.vehicles), seed=SEEDS.get(name, 1), guide=guide)
     measured = site.run()
     assert measured["success"] == 1.0

@@ -105,3 +105,32 @@ class TerrainPilot:
         (turn, pitch), integrals = self.guide.aim(memory[0], errors, self.period)
         action = np.column_stack([nothing, turn / WIDEST, pitch / STEEPEST])
         return np.clip(action, -1.0, 1.0).astype(np.float32), (integrals, seabed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HomingPilot:
+    """The bearing of a dock, led past it in proportion to its angle from the axis, so that the way bends into that."""
+
+    lead: float = 1.0
+    """Part of the angle from the axis to the bearing that is added to the bearing [-]."""
+    period: float = PERIOD
+    """Time between two actions [s]."""
+
+    @classmethod
+    def for_vehicle(cls, vehicle: Vehicle) -> HomingPilot:
+        """Return the baseline, which is the same for every vehicle."""
+        return cls()
+
+    def reset(self, n: int) -> Array:
+        """Return no memory [-], (n, 0)."""
+        return np.zeros((n, 0))
+
+    def act(self, memory: Array, observation: Rows) -> tuple[Rows, Array]:
+        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        o = np.asarray(observation, float)
+        dock, axis, velocity, up = o[:, 0:3], o[:, 3:6], o[:, 6:9], o[:, 12:15]
+        turn = level_angle(velocity, dock, up) + self.lead * level_angle(axis, dock, up)
+        slopes = [-np.arcsin(np.clip((way * up).sum(axis=1), -1.0, 1.0)) for way in (dock, axis)]
+        pitch = slopes[0] + self.lead * (slopes[0] - slopes[1])
+        action = np.column_stack([np.zeros(len(o)), turn / WIDEST, pitch / STEEPEST])
+        return np.clip(action, -1.0, 1.0).astype(np.float32), memory

@@ -226,6 +226,7 @@ TASKS = Family(
         "path": "finssim.tasks.path:PathFollowing",
         "waypoints": "finssim.tasks.path:WaypointTour",
         "terrain": "finssim.tasks.terrain:TerrainFollowing",
+        "homing": "finssim.tasks.homing:Homing",
     },
     check="finssim.tasks.catalogue:check_registered",
 )

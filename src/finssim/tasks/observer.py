@@ -216,7 +216,7 @@ class Observer:
         elif math.isfinite(guide.duration):
             path = Waypoints.along(guide, task.fit.size)
         else:
-            path = Waypoints(np.stack([here, np.asarray(guide.at(0.0).position, float)]))
+            path = Waypoints(task.straight(here, guide.at(0.0)))
         self._path = path = replace(path, radius=task.fit.size * task.radius)
         self._leg = path.reset()
         self.task = replace(task, legs=path.legs)

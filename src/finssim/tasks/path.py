@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.control.course import course_speeds
+from finssim.control.guidance import Reference
 from finssim.control.path_following import Waypoints
 from finssim.physics.types import vec6
 from finssim.sim import RectangularPool
@@ -334,6 +335,10 @@ class PathFollowing(Task):
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every world's path."""
         arrays.path = allocated(PathTable, worlds, device, points=self.legs + 1)
+
+    def straight(self, here: NDArray[np.float64], goal: Reference) -> NDArray[np.float64]:
+        """Return the path from a place to a goal [m], (2, 3), for a robot that is sent to a station."""
+        return np.stack([here, np.asarray(goal.position, float)])
 
     def success_rule(self) -> str:
         """See `Task`."""
