@@ -64,7 +64,7 @@ class Ground:
                 queue.append(self.pack(mavlink.MAVLink_rc_channels_override_message(1, 1, *six)))
             for _, frame in self.pool.exchange(self.pool.time + 0.05, queue).frames:
                 if frame[:1] == b"{":
-                    self.lines.append(frame)
+                    self.lines += [frame] if b"velocity_valid" in frame else []
                 else:
                     out += self.mav.parse_buffer(frame) or ()
             queue = []

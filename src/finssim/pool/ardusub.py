@@ -23,11 +23,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.control.ardusub import Mixer
 from finssim.core.frames import TO_FOSSEN
-from finssim.core.rotations import quat_rotate, quat_to_euler, quat_to_matrix
+from finssim.core.rotations import quat_multiply, quat_rotate, quat_to_euler, quat_to_matrix
 from finssim.pool.ardusub_loops import AttitudeLoop, DepthLoop, climb_rate, lean_angles, yaw_rate
 from finssim.pool.firmware import AttitudeFilter, FirmwareSample
 from finssim.pool.plant_spec import PlantSpec
-from finssim.robot.links.water_linked import encode_velocity
+from finssim.robot.links.water_linked import DeadReckoning, encode_velocity
 from finssim.robot.messages import HEADING, VELOCITY, NavigationAid
 from finssim.vehicles import Vehicle
 
@@ -258,7 +258,7 @@ class ArduSub:
         self._origin: tuple[int, int] | None = None
         self._origin_at = math.inf
         self._battery, self._used = (0.0, 0.0), 0.0
-        self._dvl_time = now
+        self._dvl_time, self._reckoning = now, DeadReckoning()
         self._requested_parameters: deque[str] = deque()
         self._sender = (0, 0)
         self._rebooting = False
@@ -447,8 +447,10 @@ class ArduSub:
         if not velocities and interval * self._dvl.rate < 1.5:
             return []
         self._dvl_time = now
+        q = quat_multiply(plant.quaternion, self._dvl.orientation)
+        place = self._reckoning.take(now, velocities[-1].values if velocities else None, q, now)
         if not velocities:
-            return [encode_velocity(None, measured=now, sent=now, interval=interval)]
+            return [encode_velocity(None, measured=now, sent=now, interval=interval), *place]
         height = plant.spec.basin.depth + float(plant.position[2])
         upright = float(quat_rotate(plant.quaternion, (0.0, 0.0, 1.0))[2])
         return [
@@ -459,7 +461,8 @@ class ArduSub:
                 sent=now,
                 interval=interval,
                 std=(self._dvl.noise_std,) * 3,
-            )
+            ),
+            *place,
         ]
 
     # Motors.

@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 
 from finssim.control.ardusub import motors_of
 from finssim.core.frames import TO_FOSSEN, wxyz_from_xyzw
-from finssim.core.rotations import cross, quat_from_yaw, quat_to_euler, quat_to_matrix
+from finssim.core.rotations import cross, matrix_to_quat, quat_from_yaw, quat_to_euler, quat_to_matrix
 from finssim.pool.plant_spec import Battery, PlantSpecError
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.transports import host_port
-from finssim.robot.links.water_linked import DvlServer, encode_velocity
+from finssim.robot.links.water_linked import DeadReckoning, DvlServer, encode_velocity, serve_about
 from finssim.sim import RectangularPool, Simulator, Water, Wave
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import POOL, SITES, with_navigation
@@ -228,6 +228,7 @@ class _DopplerLog:
         """Back to time 0, which is now."""
         self._next, self._sent = 0.0, 0.0
         self._waiting: deque[tuple[float, Array | None, float]] = deque()
+        self._reckoning = DeadReckoning()
         self._epoch = time.time()
 
     def look(self, now: float, position: Array, R: Array, nu: Array) -> None:
@@ -250,6 +251,9 @@ class _DopplerLog:
             )
             lock = lock and log.altitude_min <= altitude <= log.altitude_max
             self._waiting.append((now, v if lock else None, altitude))
+            q = matrix_to_quat(R @ self._R_bs)
+            for report in self._reckoning.take(now, v if lock else None, q, self._epoch + now):
+                self.server.send(report)
         while self._waiting and now >= self._waiting[0][0] + log.latency - 1e-9:
             at, velocity, altitude = self._waiting.popleft()
             self.server.send(
@@ -272,6 +276,10 @@ _POLL = 0.1
 _PACKETS_AT_ONCE = 1024
 _AWAY = 1.5
 """A SITL that is silent for so long may be followed by another one [s]."""
+
+
+SETTLING = 0.5
+"""Time of the world after a restart of SITL in which its counts may jump without a lost answer [s]."""
 
 
 class SitlServer:
@@ -303,6 +311,7 @@ class SitlServer:
         self._clock, self._heard = clock, -math.inf
         self._peer: Address | None = None
         self._last, self._answer = -1, b""
+        self._settling = False
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind(address)
@@ -360,7 +369,10 @@ class SitlServer:
         if count < self._last:
             self._note("restarts", "SITL has started again: the world starts again too")
             self.world.restart()
-        elif self._last >= 0 and count > self._last + 1:
+            self._settling = True
+        elif (
+            self._last >= 0 and count > self._last + 1 and not (self._settling and self.world.time < SETTLING)
+        ):
             self._note("gaps", "SITL counts from frame %d to %d: answers were lost", self._last, count)
         self._last = count
         self.counts["frames"] += 1
@@ -396,6 +408,7 @@ def run(
     voltage: Annotated[float, (5.0, 30.0)] = 16.0,
     resistance: Annotated[float, (0.0, 1.0)] = 0.02,
     dvl: str | None = None,
+    dvl_page: str | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 1,
 ) -> None:
@@ -416,6 +429,7 @@ def run(
         resistance: Resistance of battery and wiring [ohm].
         dvl (HOST:PORT): Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
             16171.
+        dvl_page (HOST:PORT): Address of the DVL's web page, by which BlueOS' driver finds it; none if not given.
         duration: Simulated duration [s]; until Ctrl-C if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
@@ -436,6 +450,10 @@ def run(
         if dvl is not None:
             log = DvlServer(host_port(dvl, "--dvl"))
             stack.callback(log.close)
+        if dvl_page is not None:
+            page = serve_about(host_port(dvl_page, "--dvl-page"))
+            stack.callback(page.server_close)
+            stack.callback(page.shutdown)
         world = SitlWorld(
             load_vehicle(vehicle),
             pool=RectangularPool(length=length, width=width, depth=depth),

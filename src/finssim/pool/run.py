@@ -40,7 +40,7 @@ from finssim.robot.links.transports import (
     host_port,
     resolved,
 )
-from finssim.robot.links.water_linked import DvlServer
+from finssim.robot.links.water_linked import DvlServer, serve_about
 from finssim.robot.lockstep import LockstepError, decode_request, encode_delivery, encode_refusal, receive
 from finssim.robot.messages import Picture
 from finssim.robot.team import decode_track
@@ -224,7 +224,14 @@ class GroundLinks:
         dvl: The log's server.
     """
 
-    def __init__(self, bind: Address, stations: Sequence[Address], tcp: Address, dvl: Address) -> None:
+    def __init__(
+        self,
+        bind: Address,
+        stations: Sequence[Address],
+        tcp: Address,
+        dvl: Address,
+        page: Address | None = None,
+    ) -> None:
         """Open all; port 0 takes a free one.
 
         Args:
@@ -232,6 +239,7 @@ class GroundLinks:
             stations: UDP, that frames go to before they have sent anything.
             tcp: To listen at.
             dvl: For the Doppler log.
+            page: For the log's web page; none if None.
 
         Raises:
             LinkError: One cannot be bound or found.
@@ -243,6 +251,10 @@ class GroundLinks:
             self._socket.setblocking(False)
             self._streams = stack.enter_context(closing(TcpServer(tcp, bytearray)))
             self.dvl = stack.enter_context(closing(DvlServer(dvl)))
+            if page is not None:
+                server = serve_about(page)
+                stack.callback(server.server_close)
+                stack.callback(server.shutdown)
             self._stack = stack.pop_all()
         self.address: Address = self._socket.getsockname()
         self.tcp = self._streams.address
@@ -620,6 +632,8 @@ class Ends:
     """(HOST:PORT) With ardusub: TCP address for ground stations; port 0 selects a free one."""
     dvl: str = "127.0.0.1:16171"
     """(HOST:PORT) With ardusub: TCP address of the Water Linked DVL; port 0 selects a free one."""
+    dvl_page: str | None = None
+    """(HOST:PORT) With ardusub: TCP address of the DVL's web page, by which BlueOS finds it; none if not given."""
 
     @property
     def ours(self) -> tuple[str, int]:
@@ -635,9 +649,9 @@ class Ends:
         """Return a function that opens what an autopilot has instead of the motor controller's wire."""
         texts = [] if self.ground == "none" else self.ground.split(",")
         stations = [host_port(text.strip(), "--ground") for text in texts]
-        return partial(
-            GroundLinks, self.ours, stations, host_port(self.tcp, "--tcp"), host_port(self.dvl, "--dvl")
-        )
+        page = None if self.dvl_page is None else host_port(self.dvl_page, "--dvl-page")
+        tcp, dvl = host_port(self.tcp, "--tcp"), host_port(self.dvl, "--dvl")
+        return partial(GroundLinks, self.ours, stations, tcp, dvl, page)
 
 
 def run(

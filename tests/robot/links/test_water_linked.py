@@ -6,14 +6,24 @@ import random
 import re
 import socket
 import time
+import urllib.error
+import urllib.request
 from collections import Counter
 
 import numpy as np
 import pytest
 
+from finssim.core.rotations import quat_from_yaw
 from finssim.robot.links import water_linked
 from finssim.robot.links.frames import LinkError
-from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.robot.links.water_linked import (
+    DeadReckoning,
+    DvlClient,
+    DvlServer,
+    decode_line,
+    encode_velocity,
+    serve_about,
+)
 from finssim.robot.messages import VELOCITY
 
 REPORT = {
@@ -23,7 +33,7 @@ REPORT = {
         {"id": i, "velocity": 1e-4, "distance": 0.55, "rssi": -30.5, "nsd": -88.7, "beam_valid": True}
         for i in range(4)
     ],
-    "velocity_valid": True, "status": 0, "format": "json_v3.1", "type": "velocity",
+    "velocity_valid": True, "tracking_mode": "bottom", "status": 0, "format": "json_v3.2", "type": "velocity",
     "time_of_validity": 1638191471563017, "time_of_transmission": 1638191471752336,
 }  # fmt: skip
 """As the protocol's page has it, with velocities whose signs can be seen."""
@@ -225,15 +235,92 @@ def test_reports_reach_several_clients_as_whole_lines(server):
         assert client.receive() == [] and "closed" in client.describe()
 
 
-@pytest.mark.parametrize("command", ["reset_dead_reckoning", "set_config", ["set_config"]])
-def test_commands_are_refused(server, command):
-    """With a `response` as a log gives it, which the reader knows."""
-    client, counts = connected(server), Counter()
-    client.send(json.dumps({"command": command}).encode() + b"\n")
+def asked(client, server, command, **parameters):
+    """Response to a command."""
+    request = {"command": command} | ({"parameters": parameters} if parameters else {})
+    client.send(json.dumps(request).encode() + b"\n")
     (answer,) = received(client, server)
-    assert json.loads(answer)["success"] is False and json.loads(answer)["error_message"]
-    assert decode_line(answer, counts) is None and counts == {"response": 1}
+    return json.loads(answer)
+
+
+def test_a_driver_configures_the_log(server):
+    """Settings are taken all or none, and come back; what is no command or no setting is refused by name."""
+    client, counts = connected(server), Counter()
+    assert asked(client, server, "set_config", speed_of_sound=1500, range_mode="=2")["success"] is True
+    answer = asked(client, server, "get_config")
+    assert decode_line(json.dumps(answer).encode(), counts) is None and counts == {"response": 1}
+    assert (answer["result"]["speed_of_sound"], answer["result"]["range_mode"]) == (1500, "=2")
+    for wrong in ({"speed_of_sound": 99}, {"dark_mode_enabled": 1}, {"range_mode": "far"}, {"gain": 1}):
+        answer = asked(client, server, "set_config", acoustic_enabled=False, **wrong)
+        assert answer["success"] is False and next(iter(wrong)) in answer["error_message"]
+    assert server.settings["acoustic_enabled"] is True
+    for command in ("reset_dead_reckoning", "calibrate_gyro", "trigger_ping"):
+        answer = asked(client, server, command)
+        assert answer["success"] is True and answer["response_to"] == command
+    assert asked(client, server, "explode")["error_message"] == "unknown command"
     client.close()
+
+
+def test_settings_change_what_is_measured(server):
+    """The speed of sound scales, the mounting offset turns, and without acoustics nothing comes."""
+    client = connected(server)
+    data = encode_velocity([0.5, 0.0, 0.0], altitude=2.0, measured=1.0, sent=1.1, interval=0.1)
+    asked(client, server, "set_config", speed_of_sound=1475 * 1.02, mounting_rotation_offset=90)
+    server.send(data)
+    report = json.loads(received(client, server)[0])
+    assert report["vy"] == pytest.approx(0.51) and report["vx"] == pytest.approx(0.0, abs=1e-12)
+    assert report["altitude"] == pytest.approx(2.04)
+    asked(client, server, "set_config", acoustic_enabled=False)
+    server.send(data)
+    assert received(client, server, within=0.1) == []
+    client.close()
+
+
+def test_dead_reckoning_counts_from_its_reset(server):
+    """A quarter of a circle to the left, 5 reports a second; after a reset x is ahead and the heading 0."""
+    client, reckoning, reports = connected(server), DeadReckoning(), []
+    radius, speed = 2.0, 0.5
+    for k in range(round(0.5 * math.pi * radius / speed * 10) + 1):
+        turn = speed / radius * 0.1 * k
+        reports += reckoning.take(0.1 * k, (speed, 0.0, 0.0), quat_from_yaw(turn), 1e9)
+    last = json.loads(reports[-1])
+    assert len(reports) == pytest.approx(len(range(0, 64, 2)), abs=1)
+    assert (last["x"], last["y"]) == pytest.approx((radius, -radius), abs=0.1) and last[
+        "yaw"
+    ] == pytest.approx(-90, abs=4)
+    assert last["type"] == "position_local" and last["status"] == 0
+    server.send(reports[-1])
+    received(client, server)
+    asked(client, server, "reset_dead_reckoning")
+    ahead = last | {"x": last["x"], "y": last["y"] - 1.0}
+    server.send(json.dumps(ahead).encode() + b"\n")
+    report = json.loads(received(client, server)[0])
+    assert (report["x"], report["y"]) == pytest.approx((1.0, 0.0), abs=0.1) and report[
+        "yaw"
+    ] == pytest.approx(0.0)
+    client.close()
+
+
+def test_beams_lie_where_the_log_has_them():
+    """Beams 0 to 3 at 135, -135, -45 and 45 degrees from x towards y, 22.5 degrees from z."""
+    report = json.loads(encode_velocity([1.0, 0.0, 0.0], altitude=1.0, measured=1.0, sent=1.0, interval=0.1))
+    along = [beam["velocity"] for beam in report["transducers"]]
+    tilt = math.sin(math.radians(22.5))
+    assert along == pytest.approx([tilt * math.cos(math.radians(a)) for a in (135, -135, -45, 45)])
+
+
+def test_blueos_finds_the_log_by_its_page():
+    """The name contains DVL; other pages are not there."""
+    server = serve_about(("127.0.0.1", 0))
+    try:
+        address = "http://{}:{}".format(*server.server_address)
+        with urllib.request.urlopen(f"{address}/api/v1/about", timeout=5.0) as answer:
+            assert "DVL" in json.load(answer)["product_name"]
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{address}/api/v1/outputs", timeout=5.0)
+    finally:
+        server.shutdown()
+        server.server_close()
 
 
 def test_a_lost_log_is_found_again_without_waiting():

@@ -1,32 +1,41 @@
-"""Water Linked A50 and A125 Doppler logs: JSON lines over TCP, as their makers publish them (json_v1 to json_v3.1).
+"""Water Linked A50 and A125 Doppler logs: JSON lines over TCP, as their makers publish them (json_v1 to json_v3.2).
 
-`DvlClient` brings lines from a log and `decode_line` reads them; `encode_velocity` writes a report and `DvlServer`
-sends it, for a log that is simulated. The log's axes on the wire are x forward, y right, z down.
+`DvlClient` brings lines from a log and `decode_line` reads them. For a log that is simulated `encode_velocity` and
+`DeadReckoning` write reports, `DvlServer` sends them and performs a driver's commands, and `serve_about` is its web
+page. The log's axes on the wire are x forward, y right, z down.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from finssim.core.frames import FROM_FOSSEN, TO_FOSSEN
+from finssim.core.rotations import quat_rotate, quat_to_euler
+from finssim.robot.links.frames import LinkError
 from finssim.robot.links.transports import Address, TcpServer, TcpTransport
 from finssim.robot.messages import VELOCITY, NavigationAid
 
-__all__ = ["PORT", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "encode_velocity"]
+__all__ = [
+    "PORT", "SETTINGS", "DeadReckoning", "DvlClient", "DvlServer", "DvlVelocity", "decode_line", "encode_velocity",
+    "serve_about",
+]  # fmt: skip
 
 PORT = 16171
 """TCP port of a log."""
 
-_FORMAT, _UNTIMED = "json_v3.1", ("json_v1", "json_v2")
+_FORMAT, _UNTIMED = "json_v3.2", ("json_v1", "json_v2")
 _FASTEST, _OLDEST, _HIGHEST = 10.0, 5.0, 300.0
 """Speed [m/s], age [s] and altitude [m] beyond what either log can report."""
 _MICROSECONDS = 1e17
@@ -63,8 +72,8 @@ def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity 
     # The first firmware has no types, and neither it nor json_v2 has times.
     kind = report.get("type", "velocity" if "velocity_valid" in report else None)
     if kind != "velocity" or report.get("tracking_mode", "bottom") != "bottom":
-        recognised = kind in ("velocity", "velocity_water", "position_local", "response")
-        counts["velocity_water" if kind == "velocity" else kind if recognised else "not a report"] += 1
+        named = str(kind) if kind in ("velocity_water", "position_local", "response") else "not a report"
+        counts["velocity_water" if kind == "velocity" else named] += 1
         return None
     if report.get("velocity_valid") is not True:
         counts["no bottom lock"] += 1
@@ -101,7 +110,8 @@ def _number(value: Any, lowest: float, highest: float) -> float:
 
 BEAM_ANGLE = math.radians(22.5)
 """Angle of the four beams from the log's z axis [rad]."""
-_AZIMUTHS = np.radians([45.0, 135.0, 225.0, 315.0])
+_AZIMUTHS = np.radians([135.0, -135.0, -45.0, 45.0])
+"""Of beams 0 to 3, from x towards y."""
 _ACROSS = math.tan(BEAM_ANGLE) * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=1)
 _BEAMS = math.cos(BEAM_ANGLE) * np.column_stack([_ACROSS, np.ones(4)])
 _NO_LOCK_FOM = 2.66
@@ -144,6 +154,7 @@ def encode_velocity(
             {"id": i, **beam, "velocity": along} for i, along in enumerate((_BEAMS @ v).tolist())
         ],
         "velocity_valid": valid,
+        "tracking_mode": "bottom",
         "status": 0,
         "format": _FORMAT,
         "type": "velocity",
@@ -151,6 +162,46 @@ def encode_velocity(
         "time_of_transmission": round(1e6 * sent),
     }
     return _line(report)
+
+
+class DeadReckoning:
+    """Position of a log by its own velocities and attitude, as `position_local` reports.
+
+    Its axes are those of the log at the last reset: x forward, y right, z down; `DvlServer` turns reports into them.
+    """
+
+    def __init__(self) -> None:
+        self._position = np.zeros(3)
+        self._time, self._due = math.nan, -math.inf
+
+    def take(
+        self, time: float, velocity: npt.ArrayLike | None, quaternion: npt.ArrayLike, stamp: float
+    ) -> list[bytes]:
+        """Take a velocity, and return a report where one is due, else nothing.
+
+        Args:
+            time: When it was measured [s].
+            velocity: Over the floor, our axes of the log [m/s], (3,); None without bottom lock: the position waits.
+            quaternion: The log's axes to the world, x y z w, (4,).
+            stamp: Unix time of the report [s].
+        """
+        if velocity is not None and 0.0 < time - self._time < LONGEST_STEP:
+            self._position = self._position + (time - self._time) * quat_rotate(quaternion, velocity)
+        self._time = time
+        if time < self._due - 1e-9:
+            return []
+        self._due = time + LOCAL_PERIOD
+        q = np.asarray(quaternion, float)
+        roll, pitch, yaw = (math.degrees(a) for a in quat_to_euler(np.append(TO_FOSSEN.vector(q[:3]), q[3])))
+        place = dict(zip("xyz", TO_FOSSEN.vector(self._position).tolist(), strict=True))
+        angles = {"roll": roll, "pitch": pitch, "yaw": yaw}
+        status = {"type": "position_local", "status": int(velocity is None), "format": _FORMAT}
+        return [_line({"ts": stamp, **place, "std": LOCAL_STD, **angles, **status})]
+
+
+LOCAL_PERIOD, LONGEST_STEP, LOCAL_STD = 0.2, 1.0, 0.01
+"""Between two reports of the position [s], longest time over which a velocity is integrated [s], and the reported
+standard deviation [m]."""
 
 
 def _line(value: dict[str, Any]) -> bytes:
@@ -200,7 +251,13 @@ class DvlClient(TcpTransport):
 
 
 class DvlServer:
-    """A log's TCP server: reports to everyone who is connected; commands are refused. No call waits."""
+    """A log's TCP server: reports to everyone who is connected, and answers to commands. No call waits.
+
+    Attributes:
+        address: Where it listens.
+        settings: As `get_config` gives them. The speed of sound scales velocities and distances, over 1475 m/s; the
+            mounting offset turns velocities; without acoustics there are none. The others have no effect.
+    """
 
     def __init__(self, address: Address = ("127.0.0.1", PORT)) -> None:
         """Listen.
@@ -212,14 +269,72 @@ class DvlServer:
         Raises:
             LinkError: It cannot be bound.
         """
+        self.settings = {name: value for name, (value, _) in SETTINGS.items()}
+        self._newest: dict[str, Any] = {}
+        self._start: dict[str, Any] = {}
         self._server = TcpServer(address, _Lines)
         self.address: Address = self._server.address
 
     def poll(self) -> None:
-        """Let new clients in and refuse their commands; call it often."""
+        """Let new clients in and answer their commands; call it often."""
         for client, lines, data in self._server.receive():
             for line in lines.feed(data):
-                self._server.send(_line(_refusal(_object(line))), client)
+                self._server.send(_line(self._answer(_object(line))), client)
+
+    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Perform a command and return its response."""
+        command = request.get("command")
+        error, result = "", None
+        if command == "get_config":
+            result = dict(self.settings)
+        elif command == "set_config":
+            error = self._set(request.get("parameters"))
+        elif command == "reset_dead_reckoning":
+            self._start = self._newest
+        elif command not in ("calibrate_gyro", "trigger_ping"):
+            error = "unknown command"
+        return {
+            "response_to": command if isinstance(command, str) else "",
+            "success": not error,
+            "error_message": error,
+            "result": result,
+            "format": _FORMAT,
+            "type": "response",
+        }
+
+    def _set(self, wanted: Any) -> str:
+        """Take settings, all or none; return what is wrong with them."""
+        if not isinstance(wanted, dict) or not wanted:
+            return "expected parameters: an object of settings"
+        for name, value in wanted.items():
+            if name not in SETTINGS:
+                return f"unknown setting {name}; available: {', '.join(SETTINGS)}"
+            if not SETTINGS[name][1](value):
+                return f"{name} cannot be {value!r}"[:200]
+        self.settings |= wanted
+        return ""
+
+    def _as_set(self, line: bytes) -> bytes:
+        """Return a report as the settings and the last reset have it; empty where there is none."""
+        sound, turn = float(self.settings["speed_of_sound"]), float(self.settings["mounting_rotation_offset"])
+        report = _object(line)
+        if report.get("type") == "position_local":
+            self._newest = report
+            return _line(_since(report, self._start)) if self._start else line
+        if not self.settings["acoustic_enabled"]:
+            return b""
+        if sound == SETTINGS["speed_of_sound"][0] and turn == 0.0:
+            return line
+        scale, angle = sound / SETTINGS["speed_of_sound"][0], math.radians(turn)
+        x, y = scale * report["vx"], scale * report["vy"]
+        report["vx"] = math.cos(angle) * x - math.sin(angle) * y
+        report["vy"] = math.sin(angle) * x + math.cos(angle) * y
+        report["vz"] *= scale
+        report["altitude"] *= scale if report["altitude"] > 0.0 else 1.0
+        for beam in report["transducers"]:
+            beam["velocity"] *= scale
+            beam["distance"] *= scale if beam["distance"] > 0.0 else 1.0
+        return _line(report)
 
     def send(self, line: bytes) -> None:
         """Send a report to every client.
@@ -228,22 +343,94 @@ class DvlServer:
             line: With its newline. A client that does not read is let go.
         """
         self.poll()
-        for client in list(self._server.clients):
-            self._server.send(line, client)
+        report = self._as_set(line) if line[:1] == b"{" else line
+        for client in list(self._server.clients) if report else ():
+            self._server.send(report, client)
 
     def close(self) -> None:
         """Let everyone go and stop listening."""
         self._server.close()
 
 
-def _refusal(request: dict[str, Any]) -> dict[str, Any]:
-    """The response to a command: a simulated log has no settings."""
-    command = request.get("command")
-    return {
-        "response_to": command if isinstance(command, str) else "",
-        "success": False,
-        "error_message": "a simulated log takes no commands",
-        "result": None,
-        "format": _FORMAT,
-        "type": "response",
+def _since(report: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
+    """Return a local position counted from an earlier one, in the axes that the log had there."""
+    yaw = math.radians(start["yaw"])
+    x, y = report["x"] - start["x"], report["y"] - start["y"]
+    return report | {
+        "x": math.cos(yaw) * x + math.sin(yaw) * y,
+        "y": math.cos(yaw) * y - math.sin(yaw) * x,
+        "z": report["z"] - start["z"],
+        "yaw": math.degrees(math.remainder(math.radians(report["yaw"]) - yaw, math.tau)),
     }
+
+
+def _between(low: float, high: float) -> Callable[[Any], bool]:
+    return lambda value: math.isfinite(_number(value, low, high))
+
+
+def _truth(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
+_RANGE_MODE = re.compile(r"auto|=[0-4]|[0-4]<=[0-4]|wt")
+
+SETTINGS: dict[str, tuple[Any, Callable[[Any], bool]]] = {
+    "speed_of_sound": (1475.0, _between(1000.0, 2000.0)),
+    "acoustic_enabled": (True, _truth),
+    "dark_mode_enabled": (False, _truth),
+    "mounting_rotation_offset": (0.0, _between(0.0, 360.0)),
+    "range_mode": ("auto", lambda value: isinstance(value, str) and bool(_RANGE_MODE.fullmatch(value))),
+    "periodic_cycling_enabled": (True, _truth),
+}
+"""Settings of a log, their values at first, and what they may be."""
+
+
+def serve_about(address: Address) -> ThreadingHTTPServer:
+    """Start the log's web page in a thread: `/api/v1/about` and `/api/v1/about/status`, by which BlueOS finds a log.
+
+    Args:
+        address: Host and port; a real log has port 80; port 0 takes a free one (`server_address`).
+
+    Returns:
+        The server; `shutdown` and `server_close` end it.
+
+    Raises:
+        LinkError: It cannot be bound.
+    """
+    pages = {
+        "/api/v1/about": {
+            "chipid": "0x0",
+            "hardware_revision": 4,
+            "is_ready": True,
+            "name": "DVL",
+            "product_id": 0,
+            "product_name": "DVL A50 (FinsSim)",
+            "variant": "Standard",
+            "version": "2.4.0",
+            "version_short": "2.4.0",
+        },
+        "/api/v1/about/status": {"temperature": 20.0},
+    }
+
+    class Page(BaseHTTPRequestHandler):
+        timeout = 5.0
+
+        def do_GET(self) -> None:
+            page = pages.get(self.path.rstrip("/"))
+            body = json.dumps(page if page is not None else {"error": "not found"}).encode()
+            self.send_response(200 if page is not None else 404)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Print nothing."""
+
+    try:
+        server = ThreadingHTTPServer(address, Page)
+    except OSError as error:
+        raise LinkError(f"cannot serve the log's page at {address[0]}:{address[1]}: {error}") from None
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return server
