@@ -111,7 +111,10 @@ def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
         "wrench_negative": capability.negative.tolist(),
         "terminal_speeds": by_set(terminal_speeds),
         "time_constants": by_set(time_constants),
-        "checks": [{"name": f.name, "passed": f.passed, "text": f.sentence} for f in check_vehicle(vehicle)],
+        "checks": [
+            {"name": f.name, "passed": f.passed, "remark": f.remark, "text": f.sentence}
+            for f in check_vehicle(vehicle)
+        ],
     }
 
 
