@@ -5,6 +5,8 @@ import math
 import runpy
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -14,8 +16,17 @@ import pytest
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.pool.ardusub_sitl import GRAVITY, Pulses, SitlServer, SitlWorld, decode_pulses
-from finssim.pool.plant_spec import Battery
+from finssim.pool import ardusub
+from finssim.pool.ardusub_sitl import (
+    GRAVITY,
+    Pulses,
+    SitlServer,
+    SitlWorld,
+    decode_pulses,
+    sitl_parameters,
+    write_parameters,
+)
+from finssim.pool.plant_spec import Battery, PlantSpecError
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
 from finssim.sim import RectangularPool, Simulator, Water
@@ -487,8 +498,9 @@ def test_velocities_reach_ardusub_as_vision_position_deltas(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_serves_until_its_time_is_over(capsys):
-    """Its options reach the world; the end tells what came."""
+def test_the_command_serves_until_its_time_is_over(capsys, tmp_path, monkeypatch):
+    """Its options reach the world, it says how SITL starts, and the end tells what came."""
+    monkeypatch.chdir(tmp_path)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         address = free.getsockname()
@@ -505,15 +517,92 @@ def test_the_command_serves_until_its_time_is_over(capsys):
     north, east, _ = states[-1]["velocity"]
     assert east < -0.01 and abs(north) < 0.1 * abs(east), "carried by a wave that travels to the left, west"
     assert states[0]["rng_1"] == pytest.approx(17.0, abs=0.01)
-    assert "20 frames" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "20 frames" in told and "--model JSON:127.0.0.1" in told and "--defaults" in told
+    assert "VISO_TYPE 1\n" in (tmp_path / "finssim.parm").read_text()
     client.socket.close()
 
 
 @pytest.mark.parametrize(
-    "words",
-    ["--site moon", "--current 1,2", "--wave 1,nan,2", "--bind here", "--vehicle finsrov", "--start up"],
+    "version, there, missing",
+    [
+        ("4.1", ["SIM_GPS_DISABLE 1", "BARO_SPEC_GRAV 1.024"], ["ORIGIN_LAT", "SIM_GPS1_ENABLE"]),
+        (
+            "4.5",
+            ["SIM_GPS_DISABLE 1", "GPS_TYPE 0", "ORIGIN_LAT 33.810313"],
+            ["SIM_GPS1_ENABLE", "VISO_TYPE"],
+        ),
+        ("4.6", ["SIM_GPS1_ENABLE 0", "GPS1_TYPE 0"], ["SIM_GPS_DISABLE", "SURFACE_MAX_THR"]),
+        ("4.7", ["SIM_GPS1_ENABLE 0", "SURFACE_MAX_THR 1"], ["SIM_GPS_DISABLE"]),
+    ],
 )
-def test_the_command_refuses_what_cannot_be(words, capsys):
+def test_each_version_gets_its_parameters(version, there, missing, tmp_path):
+    """Those of 4.5 are names that the recorded one has; another's file is not replaced."""
+    path = tmp_path / "a.parm"
+    for _ in range(2):
+        write_parameters(path, sitl_parameters(load_vehicle("bluerov2_heavy"), version, dvl=False))
+    text = path.read_text()
+    assert all(line + "\n" in text for line in there) and not any(name in text for name in missing)
+    assert "FRAME_CONFIG 2\n" in text
+    if version == "4.5":
+        known = {line.split(",")[0] for line in ardusub.PARAMETERS.read_text().splitlines()}
+        names = {line.split()[0] for line in text.splitlines()[1:]}
+        assert names <= known
+    path.write_text("FRAME_CONFIG 1\n")
+    with pytest.raises(PlantSpecError, match="was not written by finssim"):
+        write_parameters(path, {})
+
+
+@pytest.mark.slow
+def test_one_command_starts_and_ends_sitl(tmp_path, monkeypatch, capsys):
+    """A program that notes its arguments stands for SITL; SIGTERM ends both with the summary."""
+    program = tmp_path / "sitl"
+    program.write_text('#!/bin/sh\necho "$@" > started\nexec sleep 60\n')
+    program.chmod(0o755)
+    command = [sys.executable, "-m", "finssim", "ardusub-sitl", "--bind", "127.0.0.1:0", "--exec", "./sitl"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    try:
+        end = time.monotonic() + 60.0
+        while not (tmp_path / "started").exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        process.terminate()
+        told, _ = process.communicate(timeout=60.0)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "ended after 0.0 s: SITL sent nothing" in told
+    words = (tmp_path / "started").read_text()
+    assert "--model JSON:127.0.0.1" in words and str(tmp_path / "finssim.parm") in words
+
+
+def test_the_imu_has_the_files_noise_and_repeats_it(world):
+    """Rates of a vehicle at rest scatter by the density times the root of the rate; a restart draws the same."""
+    noisy = SitlWorld(NEUTRAL, position=(0.0, 0.0, -1.0), noise=True, seed=3)
+    noisy.step(STILL, 400)
+
+    def rates():
+        noisy.restart()
+        return np.array([json.loads(noisy.answer())["imu"]["gyro"] for _ in range(400)])
+
+    first = rates()
+    expected = NEUTRAL.sensors.imu.gyro_noise_density * math.sqrt(400)
+    assert first.std() == pytest.approx(expected, rel=0.1)
+    np.testing.assert_array_equal(rates(), first)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--site moon",
+        "--current 1,2",
+        "--wave 1,nan,2",
+        "--bind here",
+        "--vehicle finsrov",
+        "--start up",
+        "--exec ./nothing --bind 127.0.0.1:0",
+    ],
+)
+def test_the_command_refuses_what_cannot_be(words, capsys, tmp_path, monkeypatch):
     """With one sentence."""
+    monkeypatch.chdir(tmp_path)
     assert boundary.run(app, ["ardusub-sitl", *words.split()]) == 2
     assert "Traceback" not in capsys.readouterr().err

@@ -10,24 +10,28 @@ import json
 import logging
 import math
 import select
+import shlex
 import socket
 import struct
+import subprocess
 import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.control.ardusub import motors_of
+from finssim.control.ardusub import Mixer, motors_of
 from finssim.core.frames import TO_FOSSEN, wxyz_from_xyzw
 from finssim.core.rotations import cross, matrix_to_quat, quat_from_yaw, quat_to_euler, quat_to_matrix
 from finssim.pool.plant_spec import Battery, PlantSpecError
 from finssim.robot.goals import station_of
+from finssim.robot.interrupt import interrupting
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.transports import host_port
 from finssim.robot.links.water_linked import DeadReckoning, DvlServer, encode_velocity, serve_about
@@ -106,6 +110,7 @@ class SitlWorld:
         yaw: float = 0.0,
         battery: Battery | None = None,
         dvl: DvlServer | None = None,
+        noise: bool = False,
         seed: int = 0,
     ) -> None:
         """Put the vehicle into the water, at rest and level.
@@ -118,6 +123,7 @@ class SitlWorld:
             yaw: From world x, which is north, left positive [rad].
             battery: Of its motors; 16 V whatever the load if None.
             dvl: Server of its Doppler log; none if None.
+            noise: Whether rates and specific force have the noise of the vehicle file's IMU.
             seed: Of everything random.
 
         Raises:
@@ -141,6 +147,12 @@ class SitlWorld:
         self._forces = lru_cache(maxsize=512)(self._forces_at)
         self._fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in self._thrusters]) * (math.tau / 60.0)
         self.log = None if dvl is None else _DopplerLog(with_navigation(vehicle), dvl, self._floor, seed)
+        imu, self._seed = vehicle.sensors.imu, seed
+        self._noise = (
+            np.array([imu.gyro_noise_density, imu.accel_noise_density])[:, None]
+            if noise and imu is not None
+            else None
+        )
         self._rate = FASTEST
         self.restart()
         self.step((0,) * 32, self._rate)  # kernels are compiled before anybody waits
@@ -153,6 +165,7 @@ class SitlWorld:
         self.simulator.restart_episodes()
         position, quaternion = self._start
         self.simulator.place(position, quaternion)
+        self._random = np.random.default_rng([self._seed, 74])
         if self.log is not None:
             self.log.restart()
 
@@ -196,8 +209,10 @@ class SitlWorld:
         R = quat_to_matrix(self._quaternion)
         nu, nu_dot = self._nu.astype(float), self._nu_dot.astype(float)
         v, omega = nu[:3], nu[3:]
-        force = nu_dot[:3] + cross(omega, v) + GRAVITY * R[2]
-        gyro, accel, velocity, position = (np.array([omega, force, R @ v, self._position]) @ _FLIP.T).tolist()
+        felt = np.array([omega, nu_dot[:3] + cross(omega, v) + GRAVITY * R[2]])
+        if self._noise is not None:
+            felt += self._noise * math.sqrt(self._rate) * self._random.standard_normal((2, 3))
+        gyro, accel, velocity, position = (np.array([*felt, R @ v, self._position]) @ _FLIP.T).tolist()
         q = TO_FOSSEN.quaternion(self._quaternion)
         state: dict[str, Any] = {
             "timestamp": round(self.time, 9),
@@ -409,6 +424,9 @@ def run(
     resistance: Annotated[float, (0.0, 1.0)] = 0.02,
     dvl: str | None = None,
     dvl_page: str | None = None,
+    version: Literal["4.1", "4.5", "4.6", "4.7"] = "4.5",
+    parm: str = "finssim.parm",
+    exec: str | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 1,
 ) -> None:
@@ -421,8 +439,8 @@ def run(
             file.
         bind (HOST:PORT): Address to which SITL sends its packets; only this machine if not given.
         site (NAME): Walls and floor: pool, tank or open-water (no walls near, floor at 20 m).
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; half
-            of the depth if not given.
+        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; at the
+            surface if not given, since SITL calibrates its barometers where the vehicle starts.
         current (X,Y,Z): Current, world frame [m/s].
         wave (A,LENGTH,HEADING): One wave: amplitude [m], length [m], direction of travel [deg]; none if not given.
         voltage: Battery voltage without load [V].
@@ -430,7 +448,12 @@ def run(
         dvl (HOST:PORT): Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
             16171.
         dvl_page (HOST:PORT): Address of the DVL's web page, by which BlueOS' driver finds it; none if not given.
-        duration: Simulated duration [s]; until Ctrl-C if not given.
+        version (VERSION): ArduSub's, which decides the names of parameters.
+        parm (FILE): Parameters for SITL, written at the start: frame, rate, barometers, satellites, origin and, with
+            --dvl, the DVL. A file that was not written by this command is not replaced.
+        exec (FILE): ArduSub's SITL program, started with these parameters in the folder of --parm and ended with this
+            command; if not given, start it yourself.
+        duration: Simulated duration [s]; until Ctrl-C or SIGTERM if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
     Raises:
@@ -440,7 +463,9 @@ def run(
     if site not in SITES:
         raise PlantSpecError(f"unknown site '{site}'; available: {', '.join(SITES)}")
     length, width, depth = SITES[site] or POOL
-    begin = station_of(start or f"0,0,{-0.5 * depth:g},0")
+    begin = station_of(start or "0,0,0,0")
+    known = load_vehicle(vehicle)
+    file = write_parameters(Path(parm), sitl_parameters(known, version, dvl=dvl is not None))
     waves = []
     if wave is not None:
         amplitude, wavelength, heading = _three(wave, "wave")
@@ -455,13 +480,14 @@ def run(
             stack.callback(page.server_close)
             stack.callback(page.shutdown)
         world = SitlWorld(
-            load_vehicle(vehicle),
+            known,
             pool=RectangularPool(length=length, width=width, depth=depth),
             water=Water(current=_three(current, "current"), waves=waves, depth=depth),
             position=tuple(begin.position),
             yaw=begin.yaw,
             battery=Battery(full_voltage=voltage, resistance=resistance, motor_power=MOTOR_POWER),
             dvl=log,
+            noise=True,
             seed=seed,
         )
         server = SitlServer(world, host_port(bind, "--bind"))
@@ -471,12 +497,105 @@ def run(
         )
         if log is not None:
             print(f"DVL: {log.address[0]}:{log.address[1]}", flush=True)
-        try:
+        command = sitl_command(exec or "ardusub", file, server.address)
+        if exec is None:
+            print("start SITL with: " + shlex.join(command), flush=True)
+        else:
+            stack.callback(_end, _started(command, file.parent))
+        with suppress(KeyboardInterrupt), interrupting():
             server.serve(math.inf if duration is None else duration)
-        except KeyboardInterrupt:
-            pass
         summary = ", ".join(f"{count} {kind}" for kind, count in sorted(server.counts.items()) if count)
         print(f"ended after {world.time:.1f} s: {summary or 'SITL sent nothing'}")
+
+
+HOME = (33.810313, -118.393867)
+"""Latitude and longitude of ArduSub's own test place [deg]."""
+WRITTEN = "# written by finssim ardusub-sitl"
+
+
+def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, float]:
+    """Return the parameters with which SITL flies a vehicle on this physics, by name [ArduPilot's units].
+
+    Args:
+        vehicle: Its autopilot's frame and directions are taken.
+        version: Of ArduSub: 4.1, 4.5, 4.6 or 4.7.
+        dvl: Whether a Doppler log gives velocities.
+
+    Raises:
+        ControlError: The vehicle has no autopilot.
+    """
+    mixer, at_least = Mixer.of(vehicle), tuple(map(int, version.split(".")))
+    values: dict[str, float] = {
+        "FRAME_CONFIG": {"VECTORED": 1, "VECTORED_6DOF": 2}.get(mixer.autopilot.name, 7),
+        "SIM_RATE_HZ": 400,
+        "BARO_SPEC_GRAV": 1.024,
+        "SIM_BARO_RND": 0.01,
+        "SIM_BAR2_RND": 0.01,
+    }
+    values |= {f"MOT_{i}_DIRECTION": float(sign) for i, sign in enumerate(mixer.directions, 1)}
+    values |= (
+        {"SIM_GPS1_ENABLE": 0, "GPS1_TYPE": 0}
+        if at_least >= (4, 6)
+        else {"SIM_GPS_DISABLE": 1, "GPS_TYPE": 0}
+    )
+    if at_least >= (4, 5):
+        values |= {"ORIGIN_LAT": HOME[0], "ORIGIN_LON": HOME[1], "ORIGIN_ALT": 0}
+    if at_least >= (4, 7):
+        values["SURFACE_MAX_THR"] = 1
+    if dvl:
+        values |= {"AHRS_EKF_TYPE": 3, "EK3_ENABLE": 1, "EK2_ENABLE": 0, "VISO_TYPE": 1}
+        values |= {"EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_VELZ": 0}
+        values |= {"EK3_SRC1_YAW": 1}
+    return values
+
+
+def write_parameters(path: Path, values: dict[str, float]) -> Path:
+    """Write a file of parameters for SITL, by name [ArduPilot's units]; return its path.
+
+    Raises:
+        PlantSpecError: Another file is there, or it cannot be written.
+    """
+    try:
+        if path.exists() and not path.read_text(errors="replace").startswith(WRITTEN):
+            raise PlantSpecError(f"{path} was not written by finssim: give another file with --parm")
+        lines = [WRITTEN, *(f"{name} {value:.10g}" for name, value in values.items())]
+        path.write_text("\n".join(lines) + "\n")
+    except OSError as error:
+        raise PlantSpecError(f"{path}: {error.strerror or error}") from None
+    return path
+
+
+def sitl_command(program: str, parameters: Path, address: Address) -> list[str]:
+    """Return the command that starts SITL on this physics; its instance follows from the port of `address`."""
+    instance = max(address[1] - 9002, 0) // 10
+    home = f"{HOME[0]},{HOME[1]},0,185"
+    words = ["--model", f"JSON:{address[0]}", "--speedup", "1", "--home", home, "-I", str(instance)]
+    return [program, *words, "--defaults", str(parameters.resolve())]
+
+
+def _started(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
+    """Start SITL, quietly.
+
+    Raises:
+        PlantSpecError: It cannot be started.
+    """
+    try:
+        program = str(Path(command[0]).resolve()) if Path(command[0]).exists() else command[0]
+        return subprocess.Popen(
+            [program, *command[1:]], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+    except OSError as error:
+        raise PlantSpecError(f"--exec {command[0]}: {error.strerror or error}") from None
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End SITL, and wait for it."""
+    process.terminate()
+    try:
+        process.wait(5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _three(text: str, option: str) -> tuple[float, float, float]:
