@@ -166,7 +166,7 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
             raise KeyboardInterrupt
         return update(self, total)
 
-    options = {"steps": 65_536, "scope": replace(SMALL, pictures=()), "console": Console(quiet=True)}
+    options = {"steps": 32_768, "scope": replace(SMALL, pictures=()), "console": Console(quiet=True)}
     with monkeypatch.context() as patch:
         patch.setattr(TrainingLoop, "_update", stop)
         with pytest.raises(KeyboardInterrupt):

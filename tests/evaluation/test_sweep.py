@@ -21,9 +21,9 @@ from studies.faults import faults_experiment
 ray = pytest.importorskip("ray")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def nothing_left():
-    """No process of Ray outlives a test."""
+    """No process of Ray outlives the tests."""
     before = ray_processes()
     yield
     left = ray_processes() - before
@@ -103,45 +103,23 @@ def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, cap
     assert evaluations.items() < evaluated.items() and len(evaluated) == 3  # one of the repeated training
 
 
-@pytest.fixture
-def two_machines(monkeypatch):
-    """Two Ray nodes of one processor each, on the loopback interface; the second one can be killed."""
+@pytest.fixture(scope="module")
+def two_machines():
+    """Two Ray nodes of one processor each, on the loopback interface; the second one is killed by the last test."""
     from ray._private import ray_constants
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    # Otherwise Ray takes 127.0.0.1 for this machine's address on the network, where these nodes do not listen.
-    monkeypatch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
-    node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args=node)
-    try:
-        yield cluster, cluster.add_node(**node)
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
-
-
-@pytest.mark.slow
-def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, two_machines, monkeypatch):
-    """One of two nodes is killed while both work. Every job still has its row and its policy."""
-    changed(sweep_file, seeds=2)
-    cluster, second = two_machines
-    ended, train_policies = [], command.train_policies
-
-    def watched(*words):
-        for policy, error in train_policies(*words):
-            ended.append(policy.name)
-            if (
-                len(ended) == 1
-            ):  # both nodes work now: one on its second training, the other on its first or second
-                cluster.remove_node(second, allow_graceful=False)
-            yield policy, error
-
-    monkeypatch.setattr(command, "train_policies", watched)
-    result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
-    assert result["ok"] and sorted(ended) == sorted(t.run for t in load_sweep(sweep_file).trainings())
-    assert len(list(tmp_path.glob("out/runs/*/policy.onnx"))) == 4
-    assert all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        # Otherwise Ray takes 127.0.0.1 for this machine's address on the network, where these nodes do not listen.
+        patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
+        node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "include_dashboard": False}
+        cluster = Cluster(initialize_head=True, head_node_args=node)
+        try:
+            yield cluster, cluster.add_node(**node)
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
 
 
 def test_a_table_without_a_policy_shows_the_errors():
@@ -183,3 +161,26 @@ def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
     with pytest.raises(ClusterError, match=sentence):
         command.sweep(sweep_file, out=tmp_path / "out", address=address)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, two_machines, monkeypatch):
+    """One of two nodes is killed while both work. Every job still has its row and its policy."""
+    changed(sweep_file, seeds=2)
+    cluster, second = two_machines
+    ended, train_policies = [], command.train_policies
+
+    def watched(*words):
+        for policy, error in train_policies(*words):
+            ended.append(policy.name)
+            if (
+                len(ended) == 1
+            ):  # both nodes work now: one on its second training, the other on its first or second
+                cluster.remove_node(second, allow_graceful=False)
+            yield policy, error
+
+    monkeypatch.setattr(command, "train_policies", watched)
+    result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
+    assert result["ok"] and sorted(ended) == sorted(t.run for t in load_sweep(sweep_file).trainings())
+    assert len(list(tmp_path.glob("out/runs/*/policy.onnx"))) == 4
+    assert all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])

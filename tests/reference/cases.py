@@ -13,6 +13,7 @@ load = cache(load_vehicle)
 THRUSTED = [name for name in catalogue() if load(name).thrusters]
 """Vehicles with thrusters: all but gliders."""
 PAIRS = [(name, model) for name in catalogue() for model in sorted(load(name).hydrodynamics)]
+PAIRS.remove(("finsrov_sim7", "mesh"))  # body, mesh and thrusters are those of FinsROV
 
 
 def for_each(pairs):

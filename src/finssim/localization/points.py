@@ -22,7 +22,7 @@ from finssim.localization.overhead_camera import load_pool
 
 # Tables of points or pixels, one per row: named columns of numbers, and others that are carried along.
 
-_UNIT = re.compile(r"\s*(\[[^\]]*\]|\([^)]*\)|_m|_px|_pix|_pixels?|_metres|_meters)$")
+_UNIT = re.compile(r"(\[[^\]]{0,80}\]|\([^)]{0,80}\)|_m|_px|_pix|_pixels?|_metres|_meters)$")
 _BAD_ROWS_NAMED = 5
 
 
@@ -107,7 +107,7 @@ def read_points(path: Path, required: Sequence[str], optional: Sequence[str] = (
 
 
 def _plain(name: str) -> str:
-    return _UNIT.sub("", name.strip().lower())
+    return _UNIT.sub("", name.strip().lower()).rstrip()
 
 
 Array = npt.NDArray[np.float64]
