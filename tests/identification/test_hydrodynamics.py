@@ -138,6 +138,9 @@ def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
     assert _worse(wild, vehicle, slow, slow, None)
     crossed = _worse(bad, vehicle, slow, (), lambda k: bad)
     assert [one.values["judged"] for one in crossed] == ["trials left out of the fit in turn"]
+    left = []
+    assert not _worse(fit, calibrated(fit), slow, (), lambda k: left.append(k) or fit)
+    assert left == [0, 1]  # two of three decide the median
 
 
 @pytest.mark.slow

@@ -167,16 +167,27 @@ def _worse(
         after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), trials)
         doubtful = [axis for axis, value in after.items() if value > CLEARLY * before.get(axis, math.inf)]
         if doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
-            judged, after = "trials left out of the fit in turn", _left_out(without, trials)
+            judged, after = "trials left out of the fit in turn", _left_out(without, trials, _limits(before))
+    limits = _limits(before)
     return [
         finding("replays_worse", axis, judged=judged, after=value, before=before[axis])
         for axis, value in after.items()
-        if axis in before and value > WORSE * before[axis] + 0.01
+        if axis in before and value > limits[axis]
     ]
 
 
-def _left_out(without: Callable[[int], Fit], trials: Sequence[Trial]) -> dict[str, float]:
-    """NRMSE by axis, the median over the trials, each replayed by the fit of the others."""
+def _limits(before: Mapping[str, float]) -> dict[str, float]:
+    """Return the NRMSE of each axis above which a replay is worse than that of the file."""
+    return {axis: WORSE * value + 0.01 for axis, value in before.items()}
+
+
+def _left_out(
+    without: Callable[[int], Fit], trials: Sequence[Trial], limits: Mapping[str, float]
+) -> dict[str, float]:
+    """NRMSE by axis, the median over the trials, each replayed by the fit of the others.
+
+    No more trials are left out once most of them are replayed within the limits: the medians are then too.
+    """
     values: dict[str, list[float]] = {}
     for k, trial in enumerate(trials):
         try:
@@ -185,6 +196,9 @@ def _left_out(without: Callable[[int], Fit], trials: Sequence[Trial]) -> dict[st
             continue  # the others excite nothing
         for axis, found in _values(calibrated(fit), [trial]).items():
             values.setdefault(axis, []).extend(found)
+        within = (sum(value <= limits[axis] for value in values.get(axis, ())) for axis in limits)
+        if all(2 * count > len(trials) for count in within):
+            break
     return {axis: float(np.median(found)) for axis, found in values.items()}
 
 
