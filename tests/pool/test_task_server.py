@@ -151,33 +151,12 @@ def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task,
     """Of the prey or the goal that moves; located by motion capture on its wire, it decides ten times a second."""
     port = free_port()
     finssim = [sys.executable, "-m", "finssim"]
-    words = [
-        "pool",
-        "--task",
-        task,
-        "--plant",
-        "0",
-        "--severity",
-        "nominal",
-        "--positioning",
-        "motion-capture",
-    ]
+    words = f"pool --task {task} --plant 0 --severity nominal --positioning motion-capture".split()
     ends = ["--port", str(port), "--robot", f"127.0.0.1:{port + 100}", "--seed", "3"]
     with subprocess.Popen([*finssim, *words, *ends], stdout=subprocess.PIPE, text=True) as site:
         try:
-            while not site.stdout.readline().startswith("messages"):
-                pass
-            words = [
-                "run",
-                "--policy",
-                policy,
-                "--task",
-                task,
-                "--site",
-                "open-water",
-                "--pool-file",
-                "none",
-            ]
+            assert any(line.startswith("messages") for line in iter(site.stdout.readline, ""))
+            words = f"run --policy {policy} --task {task} --site open-water --pool-file none".split()
             ends = ["--robot", f"udp://127.0.0.1:{port}", "--bind", f"127.0.0.1:{port + 100}"]
             more = ["--team", f"127.0.0.1:{port + 5}", "--duration", "8", "--arm", "--json"]
             run = subprocess.run(

@@ -58,6 +58,9 @@ Array = NDArray[np.float64]
 class TrueState:
     """Replacement of a perception: the plant's own state, always known. Of vehicles that belong to the site alone."""
 
+    let_in = None
+    """Needs no fix to begin with."""
+
     def __init__(self, world: VirtualPool) -> None:
         """Give the state of the vehicle in a virtual pool."""
         self.vehicle, self._world = world.vehicle, world
