@@ -71,17 +71,7 @@ def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
         excite(out, robot(wiring, unattended=True), "surge", levels=[12.0])
-    words = [
-        "calibrate",
-        "hydrodynamics",
-        out,
-        "--axes",
-        "surge",
-        "--damping",
-        "linear",
-        "--vehicle",
-        "finsrov",
-    ]
+    words = f"calibrate hydrodynamics {out} --axes surge --damping linear --vehicle finsrov".split()
     assert boundary.run(app, [*map(str, words), "--out", str(tmp_path / "new.yaml")]) == 0
     found = load_vehicle(tmp_path / "new.yaml").hydrodynamics["calibrated"].linear_damping
     assert found[0, 0] == pytest.approx(39.07, rel=0.05)

@@ -153,18 +153,7 @@ def test_who_is_no_expert_is_refused():
 
 def test_commands(tmp_path, capsys):
     """Collected, listed by folder and by name, as a table and as JSON."""
-    words = [
-        "collect",
-        "pid",
-        "--task",
-        "t1",
-        "--episodes",
-        "1",
-        "--disturb",
-        "0.1",
-        "--out",
-        str(tmp_path / "a"),
-    ]
+    words = f"collect pid --task t1 --episodes 1 --disturb 0.1 --out {tmp_path / 'a'}".split()
     assert boundary.run(app, [*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["disturb"] == 0.1
     assert boundary.run(app, ["datasets", str(tmp_path), "--json"]) == 0

@@ -76,14 +76,8 @@ def test_mavproxy_connects_arms_drives_and_disarms(tmp_path):
     pool += ["--tcp", "127.0.0.1:0", "--dvl", "127.0.0.1:0", "--ground", "none", "--truth", truth]
     with Program("-m", "finssim", "pool", *pool) as site:
         port = site.until(r"127\.0\.0\.1:(\d+) \(TCP\)")[1]
-        words = [
-            "--master",
-            f"tcp:127.0.0.1:{port}",
-            "--state-basedir",
-            tmp_path,
-            "--default-modules",
-            "mode,arm,rc,param",
-        ]
+        words = f"--master tcp:127.0.0.1:{port} --state-basedir {tmp_path} --default-modules".split()
+        words += "mode,arm,rc,param".split()
         with Program("-m", "MAVProxy.mavproxy", *words, HOME=str(tmp_path)) as station:
             received = station.until(r"Received (\d+) parameters")
             assert int(received[1]) > 90

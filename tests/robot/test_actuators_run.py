@@ -90,30 +90,8 @@ def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
     """`finssim run` by line of sight, autopilot, wire and fins: at 2 m/s within a metre of a way that dives."""
     file, way, truth = torpedo_file(tmp_path), tmp_path / "way.csv", tmp_path / "truth"
     way.write_text("t,x,y,z\n0,0,0,-8\n20,30,0,-8\n40,55,15,-10\n", encoding="utf-8")
-    words = [
-        "run",
-        "--vehicle",
-        file,
-        "--site",
-        "open-water",
-        "--pool-file",
-        "none",
-        "--let-in",
-        "0,0",
-        "--lockstep",
-    ]
-    words += [
-        "--policy",
-        "line-of-sight",
-        "--task",
-        "path",
-        "--trajectory",
-        way,
-        "--duration",
-        22,
-        "--arm",
-        "--json",
-    ]
+    words = f"run --vehicle {file} --site open-water --pool-file none --let-in 0,0 --lockstep".split()
+    words += f"--policy line-of-sight --task path --trajectory {way} --duration 22 --arm --json".split()
     with lockstep_pool(load_vehicle(file), None, site="open-water", position=START, truth=truth) as wiring:
         status = boundary.run(app, [*map(str, words), "--robot", wiring.robot])
     report = json.loads(capsys.readouterr().out)
