@@ -16,7 +16,7 @@ from finssim.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2_heavy")
-NAMES = ("surge_plus_82", "heave_dive_55", "roll_plus_3.2", "yaw_minus_8.8")
+NAMES = ("surge_plus_70", "heave_dive_55", "roll_plus_3.2", "yaw_minus_8.8")
 COLUMNS = ("u", "v", "w", "p", "q", "r", "ax", "ay", "az", "roll", "pitch", "yaw", "x", "y", "z", "depth")
 
 
@@ -26,7 +26,7 @@ def simulated():
     every = {
         p.name: p
         for p in programmes(
-            ["surge", "heave", "roll", "yaw"], VEHICLE, seed=3, levels={"surge": (41.0, 82.0, 123.0)}
+            ["surge", "heave", "roll", "yaw"], VEHICLE, seed=3, levels={"surge": (41.0, 70.0, 123.0)}
         )
     }
     trials = simulate_programme(
