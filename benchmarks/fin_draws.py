@@ -53,7 +53,8 @@ def draw(vehicle: Vehicle, number: int) -> dict:
         i = AXES.index(axis)
         compare(f"{axis}.m_eff", float(M[i, i]))
         compare(f"{axis}.d2", float(chosen.quadratic_damping[i, i]))
-    return {"draw": number, "seconds": time.process_time() - start, "numbers": rows}
+    found = sorted({one.code for one in fit.findings})
+    return {"draw": number, "seconds": time.process_time() - start, "numbers": rows, "findings": found}
 
 
 def summary(draws: list[dict]) -> None:
@@ -61,6 +62,8 @@ def summary(draws: list[dict]) -> None:
     lost = [d["draw"] for d in draws if "lost" in d]
     print(f"not held by the autopilot: {lost or 'none'}")
     draws = [d for d in draws if "lost" not in d]
+    apart = [d["draw"] for d in draws if "not_converged" in d.get("findings", ())]
+    print(f"not converged, as the fit says: {apart or 'none'}")
     print(f"{len(draws)} draws, {np.mean([d['seconds'] for d in draws]):.0f} processor-seconds each")
     print(f"{'':16s} {'median |error|':>14s} {'within 10 %':>12s} {'in interval':>12s} {'half width':>11s}")
     for name in draws[0]["numbers"]:

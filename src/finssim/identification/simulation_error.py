@@ -1186,6 +1186,8 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
             width = float(np.hypot(half[c], own_error * abs(value + rigid_part(p, name))))
             low = max(min(free - width, value), p.low[c])
             high = free + width if free + width > value else value + width
+            # Where a fit ended early, the truth may be where one step more would go.
+            low, high = min(low, float(found.interval[c, 0])), max(high, float(found.interval[c, 1]))
         out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
     return out
 
