@@ -271,6 +271,7 @@ def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tup
             raise VehicleError(f"{label}: {noun}_groups: {group} is {numbers!r}, expected a section of keys")
     if not isinstance(members, dict):
         return values, origins
+    sources: dict[str, list[str]] = {}
     for name, member in members.items():
         if not isinstance(member, dict) or "group" not in member:
             continue
@@ -282,7 +283,10 @@ def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tup
             )
         for key in groups[group]:
             if key not in member:
-                for source in [o for o in origins if (o + ".").startswith(f"{noun}_groups.{group}.{key}.")]:
+                start = f"{noun}_groups.{group}.{key}."
+                if start not in sources:
+                    sources[start] = [o for o in origins if (o + ".").startswith(start)]
+                for source in sources[start]:
                     origins[source.replace(f"{noun}_groups.{group}", f"{noun}s.{name}", 1)] = origins[source]
         members[name] = {**groups[group], **member}
         if noun == "actuator":
