@@ -1792,6 +1792,21 @@ class Stages:
         if start and not np.isfinite(problem.cost(problem.start())):
             self.shorter.clear()
             return self.first(kinds, {})
+        stage = self.finish(problem, problem.start(), 0.6)
+        least = 0.5**HALVINGS
+        long = [one.trial.name for one in self.used if self._part(one) > least]
+        if (
+            stage.solution.converged
+            or stage.solution.interrupted
+            or self.given
+            or not self.shorter
+            or not long
+        ):
+            return stage
+        # Where some trials grow so fast that they were cut shorter, the others may do so on the way to the solution.
+        self.shorter |= dict.fromkeys(long, least)
+        self.cut(self.length)
+        problem = self.problem(kinds, start)
         return self.finish(problem, problem.start(), 0.6)
 
     def next(self, kinds: dict[str, str], before: Stage) -> Stage:
