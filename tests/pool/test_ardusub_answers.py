@@ -446,7 +446,7 @@ def test_stabilize_leans_and_turns_as_recorded(name):
 
 @pytest.mark.parametrize("name", SECOND["althold_climb"])
 def test_depth_hold_climbs_as_recorded(name):
-    """Climb rate to 10 % (or 1 cm/s), throttle to 3 %, pulses of the vertical motors to 25 µs."""
+    """Climb rate to 10 % (or 1.5 cm/s: the catalogue has changed its buoyancy), throttle to 3 %, pulses to 25 µs."""
     ground = at_once(ALT_HOLD)
     x, y, z, r, _, _ = axes(name)
     ground.axes = (x, y, z, r)
@@ -456,7 +456,7 @@ def test_depth_hold_climbs_as_recorded(name):
         ground.run(0.1)
         climbs.append(float(ground.pool.plant.nu[2]))
     climb, throttle, pulses = SECOND["althold_climb"][name]
-    assert np.mean(climbs) == pytest.approx(climb, rel=0.1, abs=0.01)
+    assert np.mean(climbs) == pytest.approx(climb, rel=0.1, abs=0.015)
     assert ground.last["VFR_HUD"].throttle == pytest.approx(throttle, abs=3)
     np.testing.assert_allclose(ground.firmware.pulses[4:], pulses, atol=25)
 
