@@ -412,7 +412,7 @@ def serve_about(address: Address) -> ThreadingHTTPServer:
         "/api/v1/about/status": {"temperature": 20.0},
     }
 
-    class Page(BaseHTTPRequestHandler):
+    class WebInterface(BaseHTTPRequestHandler):
         timeout = 5.0
 
         def do_GET(self) -> None:
@@ -428,7 +428,7 @@ def serve_about(address: Address) -> ThreadingHTTPServer:
             """Print nothing."""
 
     try:
-        server = ThreadingHTTPServer(address, Page)
+        server = ThreadingHTTPServer(address, WebInterface)
     except OSError as error:
         raise LinkError(f"cannot serve the log's page at {address[0]}:{address[1]}: {error}") from None
     server.daemon_threads = True
