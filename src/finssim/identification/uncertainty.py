@@ -213,6 +213,9 @@ TIGHT = 0.98
 
 LOOSE = 0.1
 """Relative standard error below which a trade-off does not matter."""
+EXACT = 0.9999
+"""Multiple correlation above which parameters trade off however well they seem to be known: a fit may move them far
+along their common direction, and their errors are then small beside their values [-]."""
 
 
 def correlation(names: Sequence[str], covariance: Array) -> Correlation:
@@ -236,7 +239,7 @@ def degeneracy(
     """Correlation of the errors, and a finding for each group of parameters that trade off.
 
     The groups are the weak directions of the scaled information: eigenvectors of the errors' correlation with large
-    eigenvalues. A trade-off among parameters that are all known well is left out.
+    eigenvalues. A trade-off among parameters that are all known well is left out, unless it is exact.
 
     Args:
         names: (P,)
@@ -262,7 +265,7 @@ def degeneracy(
     values, vectors = np.linalg.eigh(R)
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
     multiple = np.sqrt(np.clip(1.0 - 1.0 / np.maximum(np.diagonal(inverse), 1.0), 0.0, 1.0))
-    traded = (multiple > TIGHT) & loose[index]
+    traded = (multiple > TIGHT) & (loose[index] | (multiple > EXACT))
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         # Trade-offs appear as directions whose error is larger than that of independent parameters.
         if value < 1.5:
