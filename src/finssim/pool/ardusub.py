@@ -518,7 +518,7 @@ class ArduSub:
         self._driven = demands
         pulses = np.full(len(self._motor), float(NEUTRAL))
         if demands is not None:
-            # Whole microseconds, truncated; 1e-3 for what single precision is short of a whole one.
+            # Truncated to microseconds; 1e-3 makes up for single precision.
             offsets = self._signs() * (self._mixer.pulses(np.array(demands)) - NEUTRAL)
             pulses = np.floor(NEUTRAL + offsets + 1e-3)
         self._output(pulses)
@@ -584,7 +584,7 @@ class ArduSub:
         scale = 0.4 * self._gain
         lift = 2.0 * scale * self.parameters["JS_THR_GAIN"]
         pitch, roll = (message.s, message.t) if self._version >= (4, 5) else (0, 0)
-        # The autopilot computes in whole numbers of 16 bits: pitch and roll can wrap.
+        # The autopilot computes in integers of 16 bits: pitch and roll can wrap.
         for channel, width in (
             (PITCH, _wrapped(NEUTRAL + pitch)),
             (ROLL, _wrapped(NEUTRAL + roll)),

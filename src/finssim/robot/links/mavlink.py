@@ -121,7 +121,7 @@ class MavlinkLink:
     """
 
     peer = "autopilot"
-    # Its accelerations are whole milli-g, which a quiet instrument repeats: attitude and rates are not.
+    # Its accelerations are rounded to milli-g, so a quiet instrument repeats them; attitude and rates are not.
     watched: tuple[tuple[str, ...], ...] = (("quaternion", "gyro"),)
 
     def __init__(self, vehicle: Vehicle, *, key: bytes = b"") -> None:
