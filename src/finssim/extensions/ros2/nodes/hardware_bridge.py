@@ -194,6 +194,9 @@ class HardwareBridge(RobotNode):
     def _turn(self) -> None:
         now = self.now()
         self.intake.take(now, [(now, data) for data in self.transport.receive()])
+        for note in self.intake.link.notes:
+            self.bridge.note(now, note)
+        self.intake.link.notes.clear()
         command = self.bridge.tick(now)
         if self.now() - now < self.bridge.settings.command_timeout:  # else the process stood still meanwhile
             for data in self.intake.link.encode(now, command, self.bridge.state):

@@ -68,7 +68,7 @@ class RemoteState:
             oldest: Age at which a reading may not be acted on any more [s].
         """
         # `robot.runtime.Intake` wants to know the frames of a motor controller; here none comes.
-        self.vehicle = node.vehicle
+        self.vehicle, self.let_in = node.vehicle, None
         self._oldest = oldest
         nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
         self._newest = Reading(-math.inf, *nothing, False, "uninitialized", "the estimator is silent")
