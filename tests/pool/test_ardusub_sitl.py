@@ -598,7 +598,7 @@ def test_the_imu_has_the_files_noise_and_repeats_it(world):
         "--bind here",
         "--vehicle finsrov",
         "--start up",
-        "--exec ./nothing --bind 127.0.0.1:0",
+        pytest.param("--exec ./nothing --bind 127.0.0.1:0", marks=pytest.mark.slow),
     ],
 )
 def test_the_command_refuses_what_cannot_be(words, capsys, tmp_path, monkeypatch):

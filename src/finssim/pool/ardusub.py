@@ -250,7 +250,7 @@ class ArduSub:
         self._sampled, self._headed = now, False
         self._attitude, self._quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self._rates, self._gyro, self._force = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._altitude = self._climb = self._lift = 0.0
+        self._altitude = self._climb = self._lift = self._lift_offset = 0.0
         self._surfaced = False
         self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
         self._aided_since = math.inf
@@ -424,16 +424,18 @@ class ArduSub:
                 self._store(name, self._sample.pressure)
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
-        """Height and climb rate from pressure and vertical acceleration [m/s^2]: an observer of two poles."""
+        """Height, climb rate and the accelerometer's offset from pressure and vertical acceleration [m/s^2]: an
+        observer of three equal poles."""
         assert self._sample is not None
         weight = SPECIFIC_WEIGHT * self._within("BARO_SPEC_GRAV", 0.5, 2.0)
         measured = (self._within("BARO1_GND_PRESS", 5e4, 2e5) - self._sample.pressure) / weight
         if self._rates_count <= 1:
             self._altitude = measured
         error = measured - self._altitude
-        self._altitude += dt * (self._climb + 2.0 / DEPTH_LAG * error)
-        self._climb += dt * (acceleration + error / DEPTH_LAG**2)
-        self._lift = acceleration
+        self._lift = acceleration + self._lift_offset
+        self._altitude += dt * (self._climb + 3.0 / DEPTH_LAG * error)
+        self._climb += dt * (self._lift + 3.0 / DEPTH_LAG**2 * error)
+        self._lift_offset += dt * error / DEPTH_LAG**3
         # Above SURFACE_DEPTH; below it again by 5 cm.
         self._surfaced = (
             self.armed and measured > 0.01 * self.parameters["SURFACE_DEPTH"] - 0.05 * self._surfaced
