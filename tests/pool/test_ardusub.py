@@ -8,8 +8,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.core.rotations import quat_to_euler
 from finssim.pool import draw_plant
-from finssim.pool.ardusub import ALT_HOLD, MANUAL, STABILIZE, SURFACE
+from finssim.pool.ardusub import ACRO, ALT_HOLD, MANUAL, MOTOR_DETECT, STABILIZE, SURFACE, SURFTRAK
 from finssim.pool.firmware import AttitudeFilter
+from finssim.pool.plant_spec import PlantSpecError
+from finssim.pool.run import SiteChoice
 from finssim.robot.links.water_linked import decode_line
 from finssim.vehicles import load_vehicle
 from reference.ground_station import (
@@ -292,6 +294,46 @@ def test_version_4_1_knows_no_axes_of_pitch_and_roll():
     ground.tilt = (400, 400)
     ground.run(0.3)
     assert ground.firmware.pulses.tolist() == [1500.0] * 8 and ground.command(MODE, 1, 21) == FAILED
+
+
+def test_the_version_is_an_option_of_the_pool():
+    """Of ArduSub alone: with the motor controller another one is refused."""
+    plan, _ = SiteChoice(vehicle="bluerov2_heavy", firmware="ardusub", version="4.1").plan()
+    assert plan.spec.firmware.version == "4.1"
+    with pytest.raises(PlantSpecError, match="--firmware ardusub"):
+        SiteChoice(version="4.7", camera="none").plan()
+
+
+def test_acro_turns_by_the_stick_and_rights_itself():
+    """Yaw rate of the stick, roll while it is held, and back to level without it; the throttle is the pilot's."""
+    ground = Ground().armed(ACRO, gain=0.5)
+    ground.axes, ground.tilt = (0, 0, 500, 500), (0, 200)
+    ground.run(2.0)
+    roll, _, _ = (float(a) for a in quat_to_euler(ground.pool.plant.quaternion.astype(float)))
+    # A quarter of the range: 3.375 · 45° times what lies beyond the dead zone.
+    turn = -math.degrees(ground.pool.plant.nu[5])
+    assert turn == pytest.approx(3.375 * 45.0 * (100 - 20) / (400 - 20), rel=0.2) and roll > math.radians(
+        20.0
+    )
+    ground.axes, ground.tilt = NEUTRAL, (0, 0)
+    ground.run(4.0)
+    roll, _, _ = (float(a) for a in quat_to_euler(ground.pool.plant.quaternion.astype(float)))
+    assert abs(roll) < math.radians(6.0)
+
+
+def test_motor_detection_is_accepted_and_turns_nothing():
+    ground = Ground().armed(MOTOR_DETECT)
+    ground.axes = (1000, 0, 1000, 0)
+    ground.run(0.5)
+    assert ground.firmware.mode == MOTOR_DETECT and not ground.firmware.target.any()
+
+
+def test_surface_tracking_holds_the_depth_without_a_rangefinder():
+    ground = Ground().armed(SURFTRAK, gain=0.5)
+    ground.run(2.0)
+    z = float(ground.pool.plant.position[2])
+    ground.run(4.0)
+    assert ground.firmware.mode == SURFTRAK and abs(ground.pool.plant.position[2] - z) < 0.05
 
 
 def test_after_a_reboot_under_water_depth_counts_from_there():

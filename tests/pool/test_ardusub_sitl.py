@@ -518,7 +518,7 @@ def test_the_command_serves_until_its_time_is_over(capsys, tmp_path, monkeypatch
     assert east < -0.01 and abs(north) < 0.1 * abs(east), "carried by a wave that travels to the left, west"
     assert states[0]["rng_1"] == pytest.approx(17.0, abs=0.01)
     told = capsys.readouterr().out
-    assert "20 frames" in told and "--model JSON:127.0.0.1" in told and "--defaults" in told
+    assert "20 frames" in told and f"--model JSON:127.0.0.1 --sim-port-out {address[1]}" in told
     assert "VISO_TYPE 1\n" in (tmp_path / "finssim.parm").read_text()
     client.socket.close()
 

@@ -1,8 +1,10 @@
 """The router between an autopilot and its ground stations, by real sockets on this machine."""
 
+import json
 import socket
 import threading
 import time
+import urllib.request
 
 import pytest
 from pymavlink import mavutil
@@ -39,6 +41,18 @@ def test_frames_are_cut_off_a_stream_as_they_complete():
         stream.append(byte)
         frames += whole_frames(stream)
     assert frames == [beat(1), beat(2), beat(3)] and not stream
+
+
+def test_the_page_of_the_log_is_served_with_it_and_ends_with_it():
+    with socket.socket() as free:
+        free.bind(FREE)
+        page = free.getsockname()
+    links = GroundLinks(FREE, (), FREE, FREE, page)
+    with urllib.request.urlopen("http://{}:{}/api/v1/about".format(*page), timeout=5.0) as answer:
+        assert "DVL" in json.load(answer)["product_name"]
+    links.close()
+    with pytest.raises(OSError):
+        socket.create_connection(page, timeout=1.0)
 
 
 def test_stations_hear_the_vehicle_and_each_other(links):

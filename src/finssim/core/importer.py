@@ -37,9 +37,9 @@ class Importer:
     log (`TrialStreams`); of a path for a lens (`Lens`).
     """
     folders: bool = False
-    """Whether its files name others by the name of a package or below a folder that is not in the file."""
+    """True if its files name others by the name of a package or below a folder that is not in the file."""
     general: bool = False
-    """Whether more special formats are tried before."""
+    """True if more special formats are tried before."""
 
 
 def check_registered(name: str, member: Any) -> None:

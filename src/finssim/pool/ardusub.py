@@ -134,7 +134,7 @@ REAL32 = 9
 BUTTON_MODES = {5: MANUAL, 6: STABILIZE, 7: ALT_HOLD, 8: POSHOLD, 12: ACRO, 13: SURFTRAK}
 """BTNn_FUNCTION -> mode."""
 LIMITS = {2: 2**7 - 1, 4: 2**15 - 1, 6: 2**31 - 1}
-"""Type of a whole parameter -> its greatest value."""
+"""Type of an integer parameter -> its greatest value."""
 ANSWERS = {
     mavlink.MAV_CMD_DO_SET_RELAY: ACCEPTED,
     mavlink.MAV_CMD_DO_FENCE_ENABLE: ACCEPTED,
@@ -485,7 +485,7 @@ class ArduSub:
         if self.mode == ACRO:
             tilt = np.array([widths[ROLL], widths[PITCH]]) / HALF_RANGE * math.radians(45.0 * p["ACRO_RP_P"])
             level = self._attitude[:2] * (p["ACRO_BAL_ROLL"], p["ACRO_BAL_PITCH"])
-            turning = self._attitude_loop.track(dt, np.append(tilt - level, turn), self._rates, p)
+            turning = self._attitude_loop.turn_by(dt, np.append(tilt - level, turn), self._rates, p)
         else:
             lean = lean_angles(widths[ROLL], widths[PITCH], p)
             state = self._attitude, self._quaternion, self._rates
@@ -1213,7 +1213,7 @@ def _name(number: float) -> str:
 
 
 def _wrapped(value: int) -> int:
-    """Return a whole number as it is in 16 bits."""
+    """Return an integer as it is in 16 bits."""
     return (value + 2**15) % 2**16 - 2**15
 
 

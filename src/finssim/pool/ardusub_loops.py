@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 AXES = ("RLL", "PIT", "YAW")
 FULL_STICK = math.radians(45.0)
-"""Angle that a full stick of roll, pitch or yaw stands for, before gains [rad]."""
+"""Angle of a full stick of roll, pitch or yaw, before gains [rad]."""
 SETTLING = 0.25
 """Time after a turn in which the vehicle slows down before its heading is held [s]."""
 LEAD = math.radians(45.0)
@@ -101,7 +101,9 @@ class AttitudeLoop:
     since_turn: float = math.inf
     """Time since the stick of yaw was last used [s]."""
     integral: Array = field(default_factory=lambda: np.zeros(3))
-    """Of roll, pitch, yaw [-]."""
+    """Integrals of roll, pitch, yaw [-]."""
+    lead: Array = field(default_factory=lambda: np.zeros(3))
+    """Lead of the turn that was asked for over the vehicle's, in ACRO [rad]."""
 
     def step(
         self,
@@ -135,6 +137,18 @@ class AttitudeLoop:
         rate = _gains("ANG", "P", parameters) * quat_to_rotvec(error) + turning
         return self.track(dt, rate, rates, parameters)
 
+    def turn_by(self, dt: float, rate: Array, rates: Array, parameters: Mapping[str, float]) -> list[float]:
+        """Return demands of roll, pitch and yaw in [-1, 1] that turn the vehicle as far as body rates would.
+
+        Args:
+            dt: Since the last step [s].
+            rate: Wanted [rad/s], (3,).
+            rates: Of the vehicle [rad/s], (3,).
+            parameters: Of the autopilot, by name [its own units].
+        """
+        self.lead = np.clip(self.lead + (rate - rates) * dt, -LEAD, LEAD)
+        return self.track(dt, rate + _gains("ANG", "P", parameters) * self.lead, rates, parameters)
+
     def track(self, dt: float, rate: Array, rates: Array, parameters: Mapping[str, float]) -> list[float]:
         """Return demands of roll, pitch and yaw in [-1, 1] that give the vehicle body rates [rad/s], (3,).
 
@@ -167,9 +181,9 @@ class DepthLoop:
     height: float | None = None
     """Held [m]; None before the first step."""
     rate: float = 0.0
-    """Of the target [m/s]."""
+    """Climb rate of the target [m/s]."""
     integral: float = 0.0
-    """Of the acceleration, times its gain [m/s^2]."""
+    """Integral of the acceleration's error, times its gain [m/s^2]."""
 
     def step(
         self,

@@ -498,9 +498,8 @@ def run(
         if log is not None:
             print(f"DVL: {log.address[0]}:{log.address[1]}", flush=True)
         command = sitl_command(exec or "ardusub", file, server.address)
-        if exec is None:
-            print("start SITL with: " + shlex.join(command), flush=True)
-        else:
+        print("SITL: " + shlex.join(command), flush=True)
+        if exec is not None:
             stack.callback(_end, _started(command, file.parent))
         with suppress(KeyboardInterrupt), interrupting():
             server.serve(math.inf if duration is None else duration)
@@ -566,10 +565,18 @@ def write_parameters(path: Path, values: dict[str, float]) -> Path:
 
 
 def sitl_command(program: str, parameters: Path, address: Address) -> list[str]:
-    """Return the command that starts SITL on this physics; its instance follows from the port of `address`."""
-    instance = max(address[1] - 9002, 0) // 10
+    """Return the command that starts SITL on this physics, which listens at `address`."""
     home = f"{HOME[0]},{HOME[1]},0,185"
-    words = ["--model", f"JSON:{address[0]}", "--speedup", "1", "--home", home, "-I", str(instance)]
+    words = [
+        "--model",
+        f"JSON:{address[0]}",
+        "--sim-port-out",
+        str(address[1]),
+        "--speedup",
+        "1",
+        "--home",
+        home,
+    ]
     return [program, *words, "--defaults", str(parameters.resolve())]
 
 

@@ -381,11 +381,11 @@ class FirmwareSpec(Section):
     reboot_time: float = Field(default=1.5, ge=0.0)
     """Silence after a reboot [s]."""
     version: Literal["4.1", "4.5", "4.7"] = "4.5"
-    """Of ArduSub, where the vehicle has an autopilot."""
+    """Version of ArduSub, where the vehicle has an autopilot."""
     aiding_delay: float = Field(default=30.0, ge=0.0)
     """Time of velocities by a Doppler log after which an autopilot has a position [s]; recorded: 28 to 36 s."""
     declination: float = Field(default=0.0, ge=-math.pi, le=math.pi)
-    """Of the place, east positive [rad]: an autopilot without an origin gives the magnetic heading."""
+    """Magnetic declination, east positive [rad]: without an origin an autopilot gives the magnetic heading."""
     attitude_gain: float = Field(default=0.5, ge=0.0)
     """Gain of the accelerometer in the attitude filter [1/s]."""
     attitude_integral: float = Field(default=0.01, ge=0.0)

@@ -603,6 +603,8 @@ class SiteChoice:
             firmware=self.firmware,
             world=self.world,
         )
+        if self.version != "4.5" and self.firmware != "ardusub":
+            raise PlantSpecError(f"--version {self.version} is ArduSub's: give --firmware ardusub")
         firmware = plan.spec.firmware.model_copy(update={"version": self.version})
         plan = replace(plan, spec=self.wet(plan.spec.model_copy(update={"firmware": firmware})))
         start = self.start

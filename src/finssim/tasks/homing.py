@@ -39,7 +39,7 @@ from finssim.tasks.terms import (
 
 @wp.func
 def bearing(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """Direction to the dock, body frame, as a USBL on the vehicle hears it [-]."""
+    """Direction to the dock, body frame, as a USBL on the vehicle measures it [-]."""
     way = wp.normalize(arrays.path.points[w, 1] - arrays.position[w, 0])
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], way)
 
@@ -148,7 +148,7 @@ class Homing(PathFollowing):
     line: float = 40.0
     """Length of the axis before the mouth [m]."""
     radius: float = 0.5
-    """Of the mouth [m]."""
+    """Radius of the mouth [m]."""
     slant: float = math.radians(20.0)
     """Largest angle between the velocity over ground and the axis in the mouth [rad]."""
     far: tuple[float, float] = (25.0, 40.0)

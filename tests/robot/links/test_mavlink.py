@@ -20,6 +20,7 @@ from finssim.robot.messages import HEADING, VELOCITY, NavigationAid, Telemetry, 
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
+from finssim.robot.wiring import Wiring, connected
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at, with_navigation
 
@@ -96,12 +97,20 @@ def test_an_older_firmware_is_steered_by_overrides_and_a_small_gain_too():
     np.testing.assert_allclose(pulses[0], pulses[1], atol=1.0)
 
 
+SURFACE = [
+    mavlink.MAVLink_param_value_message(name, 101325.0, 9, 2, i)
+    for i, name in enumerate((b"BARO1_GND_PRESS", b"BARO2_GND_PRESS"))
+]
+"""The barometers' pressure at the surface, which telemetry waits for."""
+
+
 def test_axes_and_attitude_turn_from_its_frame_to_ours():
     """Nose up and right side down in the autopilot's axes: pitch below zero, roll above; specific force points up."""
     link = MavlinkLink(HEAVY)
     auto = mavlink.MAVLink(None, 1, 1)
     made = []
     for message in (
+        *SURFACE,
         mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
         mavlink.MAVLink_scaled_pressure2_message(10, 1013.25 + 98.2, 0, 0),
         mavlink.MAVLink_attitude_message(10, 0.1, 0.2, -0.3, 0.01, 0.02, 0.03),
@@ -130,7 +139,7 @@ def test_its_own_velocity_counts_where_no_log_speaks():
     auto = mavlink.MAVLink(None, 1, 1)
     moving = mavlink.MAVLink_local_position_ned_message(10, 0, 0, 0, 0.4, 0.0, 0.0)
     turned = mavlink.MAVLink_attitude_message(10, 0.0, 0.0, math.pi / 4, 0, 0, 0)
-    rest = (mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+    rest = (*SURFACE, mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
             mavlink.MAVLink_scaled_pressure2_message(10, 1013.25, 0, 0), turned)  # fmt: skip
     for message in rest:
         link.feed(1.0, bytes(message.pack(auto)))
@@ -256,10 +265,33 @@ def test_a_robot_that_starts_before_the_firmware_keeps_its_place():
     def boot(pool):
         if not begun:
             begun.append(pool.firmware.reboot(2.5))
+            pool.firmware._calibrate_at_start = False  # as if it had booted at the surface
         return ()
 
     runtime, pool, _, _, _ = drive(20.0, meanwhile=boot)
     assert runtime.counters.events and off(pool, (0.8, 0.3)) < 0.12
+
+
+def test_telemetry_waits_for_the_pressure_at_the_surface():
+    """Depth would step when it comes; an autopilot that does not answer is waited for 3 s."""
+    auto = mavlink.MAVLink(None, 1, 1)
+
+    def depths(answered):
+        link, found = MavlinkLink(HEAVY), []
+        for k in range(200):
+            now, sent = 0.02 * k, list(SURFACE) if answered and k == 50 else []
+            sent += [
+                mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+                mavlink.MAVLink_scaled_pressure2_message(20 * k, 1111.45, 0, 0),
+                mavlink.MAVLink_attitude_message(20 * k + 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+            ]
+            for message in sent:
+                made = link.feed(now, bytes(message.pack(auto)))
+                found += [(now, m.depth) for m in made if isinstance(m, Telemetry)]
+        return np.array(found)
+
+    assert depths(True)[0, 0] == pytest.approx(1.0, abs=0.03) and np.ptp(depths(True)[:, 1]) == 0.0
+    assert depths(False)[0, 0] == pytest.approx(3.0, abs=0.05)
 
 
 @pytest.mark.slow
@@ -275,8 +307,21 @@ def test_depth_is_calibrated_at_the_surface_before_arming():
     runtime, pool, link, _, _ = drive(6.0, arm=False, meanwhile=boot)
     assert link.depth_offset == pytest.approx(2.0, abs=0.2)
     assert any("--calibrate-depth" in event.text for event in runtime.counters.events)
-    runtime, pool, link, _, _ = drive(6.0, calibrate=True)
-    assert pool.firmware.parameters["BARO2_GND_PRESS"] > 1.15e5 and link._calibrated == "done"
+    runtime, pool, link, _, _ = drive(20.0, calibrate=True, goal=(0.0, 0.0, -0.3))
+    assert pool.firmware.parameters["BARO2_GND_PRESS"] > 1.15e5 and link.depth_offset == pytest.approx(
+        2.0, abs=0.2
+    )
+    kinds = [event.kind for event in runtime.counters.events]
+    assert kinds.count("armed") == 1 and "fault" not in kinds
+    assert pool.plant.position[2] == pytest.approx(-2.3, abs=0.15)  # 0.3 m below where it was calibrated
+
+
+def test_only_an_autopilot_calibrates_its_depth():
+    with (
+        pytest.raises(LinkError, match="is for an autopilot"),
+        connected(Wiring(robot="pool", calibrate_depth=True), HEAVY, None),
+    ):
+        pass
 
 
 def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():

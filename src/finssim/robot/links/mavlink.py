@@ -46,7 +46,9 @@ INTERVALS = {
 }
 """Message -> time between two that is asked for [s]. That of the inputs is no multiple of the usual
 period of axes: two pilots take turns, and a report in step with them would show one alone."""
-PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", "BARO1_GND_PRESS", "BARO2_GND_PRESS")
+SURFACES = ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
+"""Parameters with the pressure at the surface, of the first barometer and of the second."""
+PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", *SURFACES)
 
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
 """Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
@@ -178,7 +180,8 @@ class MavlinkLink:
         self._alive = self._boot_ms = -math.inf
         self._accel: tuple[float, float, float] | None = None
         self._q = np.array([0.0, 0.0, 0.0, 1.0])
-        self._pressure, self._surface, self._surface_known = math.nan, STANDARD_ATMOSPHERE, False
+        self._pressure, self._surface = math.nan, STANDARD_ATMOSPHERE
+        self._begun = False
         self._placed_at, self._shift = -math.inf, np.zeros(3)
         self._world: Any = None
         self._last_place: tuple[float, Any] | None = None
@@ -264,6 +267,9 @@ class MavlinkLink:
             self._clocks.clear()
             self._turns.clear()
             self._boot_ms, self._soonest, self._last_place = -math.inf, math.inf, None
+        self._begun = self._begun or self._knows_surface(now)
+        if not self._begun:
+            return []
         if m.time_boot_ms == self._boot_ms:  # the same sample again refreshes nothing
             return []
         step = 0.001 * (m.time_boot_ms - self._boot_ms)
@@ -294,6 +300,12 @@ class MavlinkLink:
             self._heading_at = now
             messages.append(self._numbered(HEADING, 0.0, (self._north - float(m.yaw), 0.0, 0.0)))
         return messages
+
+    def _knows_surface(self, now: float) -> bool:
+        """Return whether depth will not step any more: its surface is known, or the autopilot does not answer."""
+        if self.calibrate_depth and not self._calibrated:
+            return False
+        return set(SURFACES) <= self._parameters.keys() or now - self._first(now, "surface") > PATIENCE
 
     def _watch_clock(self, now: float, boot: float) -> None:
         """Keep pairs of our time and the autopilot's [s] over `SLOW_WINDOW`."""
@@ -404,9 +416,7 @@ class MavlinkLink:
         if self.let_in is None or now - self._placed_at > AIDED_LASTS:
             return found
         time = 0.001 * m.time_boot_ms
-        if (
-            self._last_place is None
-        ):  # the first, or the first after a gap: it continues where the last one was
+        if self._last_place is None:  # the first after a gap continues where the last one was
             self._shift = (np.array([*self.let_in, 0.0]) if self._world is None else self._world) - p
         else:
             before, old = self._last_place
@@ -465,7 +475,7 @@ class MavlinkLink:
             self._calibrated = (
                 "done" if done else f"the autopilot does not calibrate its barometer: result {m.result}"
             )
-            for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):  # read again
+            for name in SURFACES:  # read again
                 self._parameters.pop(name, None)
                 self._asked.pop(("first", name), None)
         return []
@@ -490,8 +500,7 @@ class MavlinkLink:
         if unknown and now - self._first(now, "known") < PATIENCE:
             return "waiting for the autopilot's version and parameters"
         if self.calibrate_depth and self._calibrated != "done":
-            self._wanted = now
-            return self._calibrated or "waiting for the barometer's calibration, at the surface"
+            return self._calibrated
         if self.let_in is not None and now - max(self._dvl_at, self._aided_at) > AIDED_LASTS:
             return (
                 "waiting for the autopilot's velocity: it needs a Doppler log for half a minute, and an origin; or "
@@ -516,6 +525,8 @@ class MavlinkLink:
 
     def pause(self, now: float) -> str:
         """Return why no thrust may be given now, though nothing is lost; "" otherwise. `now` is the time [s]."""
+        if self.calibrate_depth and not self._calibrated:
+            return "waiting for the calibration of the barometer, at the surface"
         if self._turning:
             return "the autopilot turns its north: the heading is not the one of the start"
         if self.clock_rate < SLOWEST:
@@ -572,10 +583,7 @@ class MavlinkLink:
         if running:
             self._ours = True
         elif requested and state == "disarmed":
-            if self.calibrate_depth and not self._calibrated:
-                calibrate = self._command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0.0, 0.0, 1.0)
-                frames += self._ask(now, "calibrate", CALIBRATION_LASTS, calibrate)
-            elif self.mode != MANUAL:
+            if self.mode != MANUAL:
                 custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
                 mode = self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, float(MANUAL))
                 frames += self._ask(now, "mode", ASK_AGAIN, mode)
@@ -626,6 +634,9 @@ class MavlinkLink:
             if gap > SELDOM * interval:
                 ask = self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message), 1e6 * interval)
                 frames += self._ask(now, ("interval", message), 1.0, ask)
+        if self.calibrate_depth and not self._calibrated:
+            calibrate = self._command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0.0, 0.0, 1.0)
+            frames += self._ask(now, "calibrate", CALIBRATION_LASTS, calibrate)
         if self._version is None:
             version = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             frames += self._ask(now, "version", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, version))

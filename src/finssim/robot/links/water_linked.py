@@ -111,7 +111,7 @@ def _number(value: Any, lowest: float, highest: float) -> float:
 BEAM_ANGLE = math.radians(22.5)
 """Angle of the four beams from the log's z axis [rad]."""
 _AZIMUTHS = np.radians([135.0, -135.0, -45.0, 45.0])
-"""Of beams 0 to 3, from x towards y."""
+"""Azimuths of beams 0 to 3, from x towards y [rad]."""
 _ACROSS = math.tan(BEAM_ANGLE) * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=1)
 _BEAMS = math.cos(BEAM_ANGLE) * np.column_stack([_ACROSS, np.ones(4)])
 _NO_LOCK_FOM = 2.66
