@@ -1,12 +1,12 @@
-"""Policies of a task for vehicles that must move to steer, beside its classical baseline, in plants nobody has seen.
+"""Policies of a task for vehicles that must move to steer, beside its classical baseline, in plants of a given seed.
 
     python benchmarks/steering.py TASK --plants SEED [--vehicle remus100] [--plant beyond_cruise] [--trials 200]
         [--seeds 1,2,3,4,5] [--steps N] [--init NAME] [--set NAME=VALUE] [--out DIR] [--json FILE]
 
-Every policy is `finssim train TASK --randomize cruise --seed S`; a folder of --out that already holds one is used as it
-is. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`. Intervals hold 95 % of
-2000 redrawn figures: each redraws learner seeds and plants with replacement, of a policy and the baseline the same
-plants. `less error` is the baseline's error less the policy's, in the plants where both have one.
+Every policy is `finssim train TASK --randomize cruise --seed S`; one that --out already holds, trained with the same
+options, is used again. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`.
+Intervals hold 95 % of 2000 redrawn figures: each redraws learner seeds and plants with replacement, of a policy and the
+baseline the same plants. `less error` is the baseline's error less the policy's, in the plants where both have one.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,9 @@ def figure(values: Array) -> dict[str, Any]:
 
 def trained(given: argparse.Namespace, seed: int) -> tuple[str, float]:
     """Folder of the policy of a seed, and what its training took [processor-s], 0 if it was there."""
-    folder, before = given.out / f"{given.task}-{seed}", time.process_time()
+    asked = json.dumps([given.vehicle, given.steps, given.init, given.set])
+    folder = given.out / f"{given.task}-{seed}-{zlib.crc32(asked.encode()):08x}"
+    before = time.process_time()
     if not folder.is_dir():
         settings = TrainingSettings(
             vehicle=given.vehicle,

@@ -150,8 +150,8 @@ class Wiring:
     lockstep: bool = False
     """Run in lock-step with finssim pool --lockstep, as fast as possible."""
     calibrate_depth: bool = False
-    """Calibrate an autopilot's barometer before arming, with the vehicle at the surface: depth then counts from
-    there."""
+    """Calibrate an autopilot's barometer as soon as it is heard, with the vehicle at the surface: depth then counts
+    from there."""
     messages: str = ""
     """(ADDRESS) Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team the default is
     the port of --robot plus five."""

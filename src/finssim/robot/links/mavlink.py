@@ -118,7 +118,7 @@ class MavlinkLink:
         says: Its newest sentence of a severity that matters.
         let_in: x, y of the vehicle when the autopilot first has a position, world frame [m]; None: its position is not
             used.
-        calibrate_depth: Whether the barometer is calibrated before arming: the vehicle is at the surface.
+        calibrate_depth: Whether the barometer is calibrated, with the vehicle at the surface, before any telemetry.
         notes: Sentences for the user since they were last taken.
     """
 
