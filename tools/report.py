@@ -95,7 +95,7 @@ def report(results: Sequence[Path], *, into: Annotated[Sequence[Path], "--into"]
 
     A page marks a table with <!-- report: t1 --> and <!-- end -->, for the result in t1.json; options after
     the name are table=2 (the second table of the result), columns=0,1,3, rows=calibrated;paper: calibrated (names
-    as in the table), and headline=yes. A result in sentences, such as soak, becomes a list.
+    as in the table; all rows of a name), and headline=yes. A result in sentences, such as soak, becomes a list.
 
     Example: python tools/report.py results/t1.json results/anatomy.json --into docs/evidence.md --into README.md
 
@@ -168,12 +168,14 @@ def _table(tables: Sequence[Table], options: str) -> str:
         raise ReportError(f"table {number}: the result has {len(tables)}")
     selected = tables[number - 1]
     if "rows" in chosen:
-        by_name = {row[0].strip(): row for row in selected.rows if row}
+        by_name: dict[str, list[Any]] = {}
+        for row in filter(None, selected.rows):
+            by_name.setdefault(row[0].strip(), []).append(row)
         names = chosen["rows"].split(";")
         missing = [row for row in names if row not in by_name]
         if missing:
             raise ReportError(f"no row '{missing[0]}'; there are: {'; '.join(by_name)}")
-        selected = replace(selected, rows=[by_name[row] for row in names])
+        selected = replace(selected, rows=[row for name in names for row in by_name[name]])
     if "columns" in chosen:
         columns = [int(word) for word in chosen["columns"].split(",")]
         if max(columns) >= len(selected.heads):

@@ -201,13 +201,10 @@ def die_in_the_sixth_update(out, learner, options):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-@pytest.mark.parametrize("learner", ["ppo", "ppo from pid", "ppo informed", "sb3-ppo"])
+@pytest.mark.parametrize("learner", ["ppo", "ppo from pid", "sb3-ppo"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
     """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
     options = dict(SMALL)
-    if learner == "ppo informed":
-        learner, options["init"], options["randomize"] = "ppo", "informed", "pool"
-        options["settings"] = {**SMALL["settings"], "taught": 0.9, "informed_steps": 1024}
     if learner == "ppo from pid":
         learner, options["init"] = "ppo", "pid"
         options["settings"] = {**SMALL["settings"], "taught": 0.9}

@@ -62,9 +62,9 @@ class TrainingSettings:
     """(SHARE) Share of successes, such as 0.95, that ends the training early if reached in two consecutive
     evaluations."""
     init: str | Path | None = None
-    """(NAME|DIR) Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy directory,
-    informed (a policy trained first that observes the parameters drawn by --randomize), or none; pursuit, team-pursuit
-    and formation default to their baselines. --set taught=FRACTION sets the fraction of the training."""
+    """(NAME|DIR) Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy directory, or
+    none; pursuit, team-pursuit and formation default to their baselines. --set taught=FRACTION sets the fraction of the
+    training."""
     settings: Annotated[Mapping[str, Any] | Sequence[str], "--set"] = ()
     """(NAME=VALUE) Change a setting of the learner, such as learning_rate=1e-3 or hidden=128,128. May be repeated."""
     wandb: str | None = None

@@ -9,14 +9,12 @@ import torch
 import warp as wp
 
 import finssim
-from finssim.control.guidance import Known
 from finssim.control.policy import Policy
 from finssim.learning.episodes import HeldEvaluation
 from finssim.learning.layers import Arrays
 from finssim.learning.learners import learner_named
-from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.ppo import Ppo
-from finssim.learning.network import Network, answer_of, first_memory
+from finssim.learning.network import Network
 from finssim.sim.state import State
 from finssim.tasks import ObservationPart, StationKeeping
 from finssim.tasks.arrays import TaskArrays
@@ -63,10 +61,7 @@ VARIANTS = [
 ]
 
 
-INFORMED = {"teacher": "informed", "informed_steps": 64, "taught": 0.9, "last_action": True}
-
-
-@pytest.mark.parametrize("changes", [*VARIANTS, INFORMED])
+@pytest.mark.parametrize("changes", VARIANTS)
 def test_torch_learns_what_numpy_learns(changes):
     """Equal random numbers, three updates: parameters within what float32 rounds differently, and equal curves."""
     numpy, torchs = made(StationKeeping(), **changes), made(StationKeeping(), Torch(3), **changes)
@@ -130,24 +125,6 @@ def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
     looks = touched.count("__bool__")
     assert steps == looks == 10, "on a processor alone: whether all episodes have ended"
     assert len(touched) - looks <= 8, "the measures, once at the end"
-
-
-def test_an_informed_teacher_sees_what_was_drawn_and_the_student_does_not():
-    """Of other plants at the same places the teacher's actions are others and the student's are not."""
-    learner = made(StationKeeping(), **INFORMED)
-    learner.update()
-    known, teacher = Known(learner.arrays.numpy(learner._observation)), learner._teacher
-    network, memory = learner.network(), first_memory(learner.network(), 8, None)
-    before = teacher.act(teacher.reset(8), known, None)[0], answer_of(network, known.observation, memory)[0]
-    learner._drawn += 1.0
-    after = teacher.act(teacher.reset(8), known, None)[0], answer_of(network, known.observation, memory)[0]
-    assert np.abs(after[0] - before[0]).max() > 1e-3
-    np.testing.assert_array_equal(after[1], before[1])
-
-
-def test_without_ranges_there_is_nothing_to_be_informed_of():
-    with pytest.raises(LearningError, match="observes the drawn parameters: give randomize"):
-        made(StationKeeping(), ranges=None, **INFORMED)
 
 
 def torch_module(network):

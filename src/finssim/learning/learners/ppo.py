@@ -13,25 +13,19 @@ policy learns (DAgger, Ross et al. 2011), while the value learns what that is wo
 
     policy      minimise E |μ(x) - a_teacher|² / 2
 
-The teacher `informed` is trained first, as a policy of its own that sees what randomisation has drawn; the student
-tells that from what it saw and did (Kumar et al. 2021, RMA, with the teacher's action in place of its latent numbers).
-
 Where time ends an episode, the value of its last observation follows; where the task ends it, nothing does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from finssim.agents.agent import NOWHERE
 from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
 from finssim.learning.layers import Adam, Array, Arrays, FreeRow, Gru, NetworkParameters, TanhLayers
 from finssim.learning.learners.base import ActingLearner, expert_in
-from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
 from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
@@ -82,66 +76,9 @@ class PpoSettings:
     asymmetric: bool = True
     """True if the value observes what randomisation has drawn, which the policy does not."""
     teacher: str = ""
-    """A baseline of the task by name, a policy directory, or `informed`, that is imitated first; none if empty."""
-    informed_steps: int = 1_000_000
-    """Control steps of the training of the teacher `informed`, before the first of `steps`."""
+    """A baseline of the task by name, or a policy directory, that is imitated first; none if empty."""
     taught: float = 0.2
     """Share of the steps in which it is; in the first third of these it also acts."""
-
-
-INFORMED = "informed"
-
-
-class InformedTeacher:
-    """A policy without a past that sees what randomisation has drawn; a student asks it in the same worlds."""
-
-    def __init__(self, student: Ppo) -> None:
-        """For a student, in whose worlds it is trained by the student's first update."""
-        s = student.settings
-        settings = replace(
-            s, steps=s.informed_steps, teacher="", history=0, last_action=False, memory=0, normalize=False
-        )
-        self.trained = False
-        self._ppo = Ppo(
-            student.environment, settings, seed=student._seed, device=student._device, arrays=student.arrays,
-            informed=True,
-        )  # fmt: skip
-
-    def train(self) -> None:
-        """Learn for `informed_steps` control steps; the student's episodes restart."""
-        ppo, environment = self._ppo, self._ppo.environment
-        while ppo.steps < ppo.settings.steps:
-            environment.set_progress(ppo.steps / ppo.settings.steps)
-            ppo.update()
-        environment.set_progress(0.0)
-        environment.reset()
-        age_episodes(environment)
-        self.trained = True
-
-    def reset(self, rows: int) -> Any:
-        """Integrals of the errors at the start of episodes."""
-        return np.zeros((rows, len(self._ppo._errors)), np.float32)
-
-    def act(self, memory: Any, reading: Known, goal: Any) -> tuple[Any, Any]:
-        """Return its action in the current state of the student's worlds, and its integrals after; the observation
-        holds the goal."""
-        ppo, A = self._ppo, self._ppo.arrays
-        observation, ppo._integral = A.array(reading.observation), A.array(memory)
-        observation, integral = ppo._integrated(observation)
-        action = ppo.actor(ppo._encode(observation, ppo._drawn)[1])
-        return A.numpy(A.xp.clip(action, -1.0, 1.0)), A.numpy(integral)
-
-    def learned(self) -> dict[str, Any] | None:
-        """The trained policy; None before."""
-        return self._ppo.learned() if self.trained else None
-
-    def load_learned(self, state: dict[str, Any] | None) -> None:
-        """Take what `learned` gave."""
-        self.trained = state is not None
-        if state is not None:
-            streams = self._ppo.arrays.state()  # the student's own
-            self._ppo.load_learned(state)
-            self._ppo.arrays.load(streams)
 
 
 class Ppo(ActingLearner):
@@ -158,7 +95,6 @@ class Ppo(ActingLearner):
         seed: int,
         device: str = "cpu",
         arrays: Arrays | None = None,
-        informed: bool = False,
     ) -> None:
         """Set up networks and optimisers, and age the first episodes.
 
@@ -168,10 +104,6 @@ class Ppo(ActingLearner):
             seed: Of first weights, action noise and the order of samples.
             device: cpu or cuda.
             arrays: NumPy on a processor and torch on a GPU, unless given.
-            informed: Whether the policy sees what randomisation has drawn too, as a teacher may.
-
-        Raises:
-            LearningError: The teacher is `informed`, and nothing is drawn.
         """
         self.arrays = A = arrays or Arrays(seed, None if device == "cpu" else device)
         super().__init__(environment, settings, A)
@@ -185,15 +117,10 @@ class Ppo(ActingLearner):
         self._drawn, self._final_drawn = (
             self._views(name) if has_privileged else None for name in ("privileged", "final_privileged")
         )
-        if s.teacher == INFORMED and not has_privileged:
-            raise LearningError(
-                "an informed teacher observes the drawn parameters: give randomize, and keep asymmetric"
-            )
         self._window = s.history * n + (m if s.last_action else 0)
         drawn = 0 if self._drawn is None else self._drawn.shape[1]
-        self._informed = informed
-        inputs = n + self._window + (drawn if informed else 0)
-        judged = inputs + s.memory + (0 if informed else drawn)
+        inputs = n + self._window
+        judged = inputs + s.memory + drawn
         self.gru = Gru(A, inputs, s.memory) if s.memory else None
         self.actor, self.noise = TanhLayers(A, [s.memory or inputs, *s.hidden, m]), FreeRow(m)
         self.critic = TanhLayers(A, [judged, *s.hidden, 1])
@@ -214,14 +141,7 @@ class Ppo(ActingLearner):
         self._c = self._x if judged == inputs else A.empty(s.rollout + 1, self._rows, judged)
         """What the critic saw."""
         self._u, self._noise = A.empty(s.rollout, self._rows, m), A.empty(self._rows, m)
-        self._seed, self._device = seed, device
-        self._teacher = (
-            InformedTeacher(self)
-            if s.teacher == INFORMED
-            else expert_in(environment, s.teacher)
-            if s.teacher
-            else None
-        )
+        self._teacher = expert_in(environment, s.teacher) if s.teacher else None
         self._fresh = self._teacher.reset(self._rows) if self._teacher else None
         self._remembered = self._fresh
         """What the teacher remembers."""
@@ -239,8 +159,6 @@ class Ppo(ActingLearner):
 
         The row has the units of the curve.
         """
-        if isinstance(self._teacher, InformedTeacher) and not self._teacher.trained:
-            self._teacher.train()
         rate = self.settings.learning_rate * self.remaining
         with self.arrays.plain():
             before = self.arrays.copy(self._memory[:, self._window :])
@@ -300,8 +218,6 @@ class Ppo(ActingLearner):
         xp, k = self.arrays.xp, self._window
         x = (observation - self._mean) * self._scale if self.settings.normalize else observation
         policy_input = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
-        if self._informed:
-            policy_input, drawn = xp.concatenate([policy_input, drawn], 1), None
         h = self._cell.step(policy_input, self._memory[:, k:]) if self.gru else None
         parts = [part for part in (policy_input, h, drawn) if part is not None]
         return x, policy_input, h, xp.concatenate(parts, 1) if len(parts) > 1 else policy_input
@@ -498,7 +414,6 @@ class Ppo(ActingLearner):
         """Networks, optimisers, scales, memories and random streams."""
         return {
             "teacher": memory_leaves(self._remembered) if self._teacher else None,
-            "informed": self._teacher.learned() if isinstance(self._teacher, InformedTeacher) else None,
             "numbers": {name: self.arrays.numpy(array) for name, array in self._numbers().items()},
             "counts": [self._seen, *(optimizer.count for optimizer in self._optimizers)],
             "streams": self.arrays.state(),
@@ -511,8 +426,6 @@ class Ppo(ActingLearner):
         self._seen, *counts = (int(count) for count in state["counts"])
         for optimizer, count in zip(self._optimizers, counts, strict=True):
             optimizer.count = count
-        if isinstance(self._teacher, InformedTeacher):
-            self._teacher.load_learned(state["informed"])
         if self._teacher:
             self._remembered = memory_from(state["teacher"], self._fresh)
         self.arrays.load(state["streams"])
