@@ -235,7 +235,7 @@ def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path
     [
         (("--policy", "pid"), "either a goal"),
         (("--policy", "pid", "--goal", "1,2,3"), "expected four numbers"),
-        (("--policy", "pid", "--goal", "0,0,0.5,0"), "outside the workspace"),
+        (("--policy", "pid", "--goal", "0,0,0.5,0"), "0.50 m above the surface"),
         (("--policy", "nobody", "--goal", "0,0,-0.5,0"), "neither pid nor pid-paper"),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--robot", "tin://can"), "unknown wire"),
         (("--policy", "pid", "--goal", "0,0,-0.5,0", "--pictures", "eyes", "--bind", "127.0.0.1:0"), "eyes"),

@@ -99,15 +99,30 @@ def guide_of(goal: str | None, trajectory: str | None) -> Guide:
     return load_trajectory(str(trajectory))
 
 
+def highest(guide: Guide) -> float:
+    """Return the greatest z to which a guide leads, world frame [m]."""
+    return float(_places(guide)[:, 2].max())
+
+
+def _places(guide: Guide) -> npt.NDArray[np.float64]:
+    """Return positions along a guide, world frame [m], (k, 3)."""
+    end = guide.duration if math.isfinite(guide.duration) else 0.0
+    return guide.at(np.linspace(0.0, end, 401 if end else 1)).position
+
+
 def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
     """Refuse a motion that leaves the box in which the vehicle may move, or that is faster than it can go.
 
     Raises:
         GoalError: It does, or is; says where or when.
     """
-    end = guide.duration if math.isfinite(guide.duration) else 0.0
-    places = guide.at(np.linspace(0.0, end, 401)).position
+    places, end = _places(guide), guide.duration if math.isfinite(guide.duration) else 0.0
     lower, upper = vehicle.safety.workspace_lower, vehicle.safety.workspace_upper
+    if places[:, 2].max() > max(float(upper[2]), 0.0):
+        raise GoalError(
+            f"{guide.name} leads to {places[:, 2].max():.2f} m above the surface, which is z = 0 (with an autopilot "
+            "where its barometer was calibrated; --calibrate-depth does it again): give a z below 0"
+        )
     outside = np.any((places < lower) | (places > upper), axis=1)
     if outside.any():
         point = np.round(places[outside][0], 3).tolist()

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from finssim.control.guidance import Guide
 from finssim.localization.overhead_camera import Pool
 from finssim.robot.bridge import Bridge, MotorDevice
+from finssim.robot.goals import highest
 from finssim.robot.links.clock import ClockMap
 from finssim.robot.links.frames import McuLink, Message
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry, ThrusterCommand
@@ -154,6 +155,8 @@ class Link(MotorDevice, Protocol):
     """x, y of where the vehicle begins, world frame [m]; None: not given."""
     calibrate_depth: bool
     """Whether the device calibrates its barometer, at the surface, before it arms."""
+    highest: float
+    """Greatest z of what is to be followed, world frame [m], for a device that counts depth by itself."""
     notes: list[str]
     """Sentences for the user since they were last taken."""
 
@@ -389,6 +392,7 @@ class Runtime:
         if not math.isnan(self.started) or (self.pilot.needs_state and not reading.ready):
             return
         if self._arm:
+            self.link.highest = highest(self.guide) if self.pilot.needs_state else -math.inf
             self.refusal = self.bridge.arm(now, self.pilot.name)
             if self.refusal:
                 return

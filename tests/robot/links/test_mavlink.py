@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.control.guidance import Station
-from finssim.core.rotations import quat_to_euler
+from finssim.core.rotations import quat_from_yaw, quat_to_euler
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.drawn_plant import site_of
 from finssim.robot.links.frames import LinkError
@@ -30,7 +30,15 @@ START = (0.0, 0.0, -2.0)
 
 
 def drive(
-    seconds, *, arm=True, goal=(0.8, 0.3, -2.2), log=True, meanwhile=None, firmware=None, calibrate=False
+    seconds,
+    *,
+    arm=True,
+    goal=(0.8, 0.3, -2.2),
+    log=True,
+    meanwhile=None,
+    firmware=None,
+    calibrate=False,
+    yaw=0.0,
 ):
     """A PID in lock-step with the pool; the runtime, what truly happened, the link and what it sent.
 
@@ -39,7 +47,7 @@ def drive(
     """
     spec = SPEC.firmware.model_copy(update={"aiding_delay": 2.0, **(firmware or {})})
     spec = SPEC.model_copy(update={"firmware": spec})
-    pool = VirtualPool(HEAVY, spec, firmware="ardusub", start=(START, (0, 0, 0, 1)), seed=1)
+    pool = VirtualPool(HEAVY, spec, firmware="ardusub", start=(START, quat_from_yaw(yaw)), seed=1)
     perception = Perception(HEAVY, None, mode="error-state", let_in=START[:2])
     runtime = Runtime(
         HEAVY, None, make_pilot("pid", HEAVY), Station(goal, 0.4), arm=arm, perception=perception
@@ -98,10 +106,13 @@ def test_an_older_firmware_is_steered_by_overrides_and_a_small_gain_too():
 
 
 SURFACE = [
-    mavlink.MAVLink_param_value_message(name, 101325.0, 9, 2, i)
-    for i, name in enumerate((b"BARO1_GND_PRESS", b"BARO2_GND_PRESS"))
+    *(
+        mavlink.MAVLink_param_value_message(name, 101325.0, 9, 2, i)
+        for i, name in enumerate((b"BARO1_GND_PRESS", b"BARO2_GND_PRESS"))
+    ),
+    mavlink.MAVLink_gps_global_origin_message(338103130, -1183938670, 0),
 ]
-"""The barometers' pressure at the surface, which telemetry waits for."""
+"""What telemetry waits for: the barometers' pressure at the surface, and the origin."""
 
 
 def test_axes_and_attitude_turn_from_its_frame_to_ours():
@@ -215,10 +226,93 @@ def test_an_origin_in_mid_run_turns_no_thrust():
     assert rows[(rows[:, 0] > 11.0) & (rows[:, 0] < 28.0), 1].max() < 0.1
     kinds = [event.kind for event in runtime.counters.events]
     assert kinds.count("hold") == 1 and "fault" not in kinds and kinds.count("armed") == 2
-    assert math.degrees(link._north) == pytest.approx(11.4, abs=2.5)
-    # The frame of the start has magnetic north, which lies to the right of the true one: 0.2 m at the goal.
-    cos, sin = math.cos(math.radians(11.4)), math.sin(math.radians(11.4))
-    assert off(pool, (1.0 * cos + 0.3 * sin, 0.3 * cos - 1.0 * sin)) < 0.14
+    assert math.degrees(link._north - link._first_north) == pytest.approx(11.4, abs=2.5)
+    # World x is where the vehicle pointed at the start.
+    assert off(pool, (1.0, 0.3)) < 0.14
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("origin", [False, True])
+def test_goals_count_from_the_heading_of_the_start_without_an_origin(origin):
+    """The vehicle points 60 degrees to the left of north: 0.8 m ahead of it, or with an origin 0.8 m to the north."""
+    meanwhile = at(0.0, ORIGIN) if origin else None
+    runtime, pool, _, _, _ = drive(20.0, goal=(0.8, 0.0, -2.2), meanwhile=meanwhile, yaw=math.radians(60.0))
+    ahead = 0.0 if origin else math.radians(60.0)
+    assert off(pool, (0.8 * math.cos(ahead), 0.8 * math.sin(ahead))) < 0.1
+    turned = float(quat_to_euler(pool.plant.quaternion.astype(float))[2])
+    assert turned == pytest.approx(ahead + 0.4, abs=0.05)
+    told = [event.text for event in runtime.counters.events]
+    assert any("world x is where the vehicle points now" in text for text in told) is not origin
+
+
+def turned_by(link, seconds, rate, scale=1.0, north=0.0, begin=(1.0, 0.0)):
+    """Feed a turning vehicle at 50 Hz; time and heading at the end, and whether the link ever paused.
+
+    `rate` is the vehicle's [rad/s], of which the gyroscope shows `scale`; `north` turns the autopilot's [rad/s].
+    """
+    (now, yaw), auto, paused = begin, mavlink.MAVLink(None, 1, 1), False
+    for _ in range(round(50 * seconds)):
+        now, yaw = now + 0.02, yaw + 0.02 * (rate + north)
+        shown = math.remainder(yaw, math.tau)
+        for message in (
+            mavlink.MAVLink_raw_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_scaled_pressure2_message(0, 1111.0, 0, 0),
+            mavlink.MAVLink_attitude_message(round(1000 * now), 0.0, 0.0, shown, 0.0, 0.0, scale * rate),
+        ):
+            link.feed(now, bytes(message.pack(auto)))
+        paused = paused or "turns its north" in link.pause(now)
+    return (now, yaw), paused
+
+
+def test_a_compass_that_is_read_late_does_not_turn_the_frame_of_the_start():
+    """Without an origin world x is where the vehicle points, whatever its heading is called."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    for message in SURFACE[:2]:
+        link.feed(1.0, bytes(message.pack(auto)))
+    (now, _), _ = turned_by(link, 1.0, 0.0)
+    assert link._begun and any("no origin" in note for note in link.notes)
+    turned_by(link, 1.0, 0.0, begin=(now, 1.2))
+    assert float(quat_to_euler(link._q)[2]) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_a_long_spin_with_an_inexact_gyroscope_is_no_turn_of_the_north(scale):
+    """Ten turns at 73 deg/s, the recorded rate of a full stick: 4 % of them are 144 degrees. A turn of 11.4 degrees in
+    20 s afterwards is seen, and its end too."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    for message in SURFACE:
+        link.feed(1.0, bytes(message.pack(auto)))
+    rate = math.radians(73.2)
+    state, paused = turned_by(link, 50.0, rate, scale)
+    assert not paused
+    for way in (-rate, rate):  # and back
+        state, paused = turned_by(link, 8.0, way, scale, begin=state)
+        assert not paused
+    state, _ = turned_by(link, 12.0, 0.0, begin=state)
+    state, paused = turned_by(link, 20.0, 0.0, north=math.radians(0.57), begin=state)
+    assert paused
+    state, _ = turned_by(link, 15.0, 0.0, begin=state)
+    assert link.pause(state[0]) == ""
+
+
+def test_a_goal_above_the_surface_by_the_pressure_is_refused_with_the_offset():
+    """Calibrated at 5 kPa less than the atmosphere, which is 0.51 m above the surface; a deeper goal, and a calibration
+    of this run, count."""
+    link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
+    for name in (b"BARO1_GND_PRESS", b"BARO2_GND_PRESS"):
+        link.feed(1.0, bytes(mavlink.MAVLink_param_value_message(name, 96325.0, 9, 2, 0).pack(auto)))
+    link.feed(1.0, bytes(mavlink.MAVLink_heartbeat_message(12, 3, 209, 19, 4, 3).pack(auto)))
+    link._version, link._parameters["JS_GAIN_DEFAULT"] = (4, 5), 0.5
+    assert any("0.5 m above the surface" in note for note in link.notes)
+    link.highest = -0.3
+    assert link.prepare(1.0) == (
+        "a depth of 0.30 m is 0.21 m above the surface, since the autopilot counts depth from 0.5 m above the surface: "
+        "bring the vehicle to the surface and give --calibrate-depth, or a goal below 0.51 m"
+    )
+    link.highest = -0.6
+    assert link.prepare(1.0) == ""
+    link.highest, link._calibrated = -0.3, "done"
+    assert link.prepare(1.0) == ""
 
 
 def test_a_quiet_instrument_has_not_frozen():
@@ -266,8 +360,9 @@ def test_a_robot_that_starts_before_the_firmware_keeps_its_place():
         if not begun:
             begun.append(pool.firmware.reboot(2.5))
             pool.firmware._calibrate_at_start = False  # as if it had booted at the surface
-        return ()
+        return send(pool)
 
+    send = at(4.02, ORIGIN)
     runtime, pool, _, _, _ = drive(20.0, meanwhile=boot)
     assert runtime.counters.events and off(pool, (0.8, 0.3)) < 0.12
 

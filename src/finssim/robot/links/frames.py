@@ -534,7 +534,7 @@ class McuLink:
         """
         self._decoder = Decoder(outputs=outputs, others=others)
         self.let_in: tuple[float, float] | None = None
-        self.calibrate_depth = False
+        self.calibrate_depth, self.highest = False, -math.inf
         self.notes: list[str] = []
 
     def feed(self, now: float, data: bytes) -> list[Message]:

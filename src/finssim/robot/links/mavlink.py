@@ -88,12 +88,16 @@ TURN_WINDOW, TURN_LIMIT, TURN_OVER = 10.0, math.radians(4.0), math.radians(1.0)
 """Span over which heading and gyroscope are compared [s], difference at which the autopilot turns its north, and the
 one below which it has stopped [rad]: an origin turns it by the declination in 20 s; a vehicle that speeds up and turns
 shows up to 3 degrees."""
+SCALE_ERROR = 0.05
+"""Part of a turn that the gyroscope may miss [-]: 3 % at 25 °C and 2 % by temperature (MPU-6000; newer ones 1 and 2 %);
+the autopilot's filter estimates its offset, not its scale."""
 ALIGNED = math.radians(1.0)
 """Step of the heading between two messages that a vehicle that is not ours yet may make [rad]."""
 SLOW_WINDOW, SLOWEST = 3.0, 0.8
 """Span over which the autopilot's clock is compared with ours [s], and the least rate of it [-]."""
-ORIGIN_ASKED = 3.0
-"""Time for which the autopilot is asked for its origin; then it has none [s]."""
+ORIGIN_ASKED, ORIGIN_PERIODS = 0.5, (0.15, 1.0)
+"""Time for which the autopilot is asked for its origin before it has none, and between two questions before and after
+that [s]."""
 CALIBRATION_LASTS = 5.0
 """Longest wait for the answer to a calibration of the barometer [s]."""
 DEEPEST = 1e6
@@ -119,6 +123,7 @@ class MavlinkLink:
         let_in: x, y of the vehicle when the autopilot first has a position, world frame [m]; None: its position is not
             used.
         calibrate_depth: Whether the barometer is calibrated, with the vehicle at the surface, before any telemetry.
+        highest: Greatest z of what is to be followed, world frame [m]; -inf if it is not known.
         notes: Sentences for the user since they were last taken.
     """
 
@@ -154,7 +159,7 @@ class MavlinkLink:
             self._wire.signing.allow_unsigned_callback = None
         self.counts: Counter[str] = Counter()
         self.let_in: tuple[float, float] | None = None
-        self.calibrate_depth = False
+        self.calibrate_depth, self.highest = False, -math.inf
         self.notes: list[str] = []
         self._handlers: dict[str, Callable[[float, Any], list[Message]]] = {
             "HEARTBEAT": self._heartbeat,
@@ -188,7 +193,9 @@ class MavlinkLink:
         self._origin, self._turn_began = "", -math.inf
         self._critical = ""
         # Of the autopilot's north against that of the start: by how much it has turned, and what is compared.
-        self._north, self._turns, self._turning, self._spun = 0.0, deque[tuple[float, float]](), False, 0.0
+        self._north = self._first_north = 0.0
+        self._ahead = False  # world x is the heading of the start
+        self._turns, self._turning, self._spun = deque[tuple[float, float, float]](), False, 0.0
         self._soonest = math.inf
         self._clocks: deque[tuple[float, float]] = deque()
         self._calibrated = ""
@@ -267,9 +274,14 @@ class MavlinkLink:
             self._clocks.clear()
             self._turns.clear()
             self._boot_ms, self._soonest, self._last_place = -math.inf, math.inf, None
-        self._begun = self._begun or self._knows_surface(now)
-        if not self._begun:
+        if not self._begun and not all((self._knows_surface(now), self._knows_origin(now))):
             return []
+        if not self._begun and self._origin == "none":
+            # Its north is magnetic and may turn: world x is the vehicle's heading instead.
+            self._north = self._first_north = float(m.yaw)
+            self._ahead = True
+            self.notes.append("the autopilot has no origin: world x is where the vehicle points now")
+        self._begun = True
         if m.time_boot_ms == self._boot_ms:  # the same sample again refreshes nothing
             return []
         step = 0.001 * (m.time_boot_ms - self._boot_ms)
@@ -307,6 +319,12 @@ class MavlinkLink:
             return False
         return set(SURFACES) <= self._parameters.keys() or now - self._first(now, "surface") > PATIENCE
 
+    def _knows_origin(self, now: float) -> bool:
+        """Return whether it is known that the autopilot has an origin, or that it has none."""
+        if not self._origin and now - self._first(now, "origin") > ORIGIN_ASKED:
+            self._origin = "none"
+        return bool(self._origin)
+
     def _watch_clock(self, now: float, boot: float) -> None:
         """Keep pairs of our time and the autopilot's [s] over `SLOW_WINDOW`."""
         self._clocks.append((now, boot))
@@ -336,7 +354,8 @@ class MavlinkLink:
         """Compare the heading with the integrated rates.
 
         A turn of the autopilot's north is waited for before arming, and taken out of the heading afterwards: the world
-        frame is that of the arming.
+        frame is that of the arming; of the start, if world x is the heading there. A vehicle that spins shows
+        `SCALE_ERROR` of what it turned, which is none.
         """
         if not 0.0 < step < 0.5:
             self._turns.clear()
@@ -348,22 +367,24 @@ class MavlinkLink:
         if self._turns:
             turn = self._turns[-1][1] + math.remainder(turn - self._turns[-1][1], math.tau)
             if not self._ours and abs(turn - self._turns[-1][1]) > ALIGNED:
+                self._north += (turn - self._turns[-1][1]) * self._ahead
                 self._turns.clear()  # a compass that is read for the first time
-        self._turns.append((time, turn))
+        self._turns.append((time, turn, self._spun))
         while time - self._turns[0][0] > TURN_WINDOW:
             self._turns.popleft()
         if time - self._turns[0][0] < 0.9 * TURN_WINDOW:
             return
-        turned = turn - self._turns[0][1]
-        if not self._turning and abs(turned) > TURN_LIMIT:
-            self._north += turned * self._ours
+        kept = self._ours or self._ahead
+        turned, missed = turn - self._turns[0][1], SCALE_ERROR * abs(self._spun - self._turns[0][2])
+        if not self._turning and abs(turned) > TURN_LIMIT + missed:
+            self._north += turned * kept
             self._turn_begins(time)
         elif self._turning:
-            self._north += (turn - self._turns[-2][1]) * self._ours
-            if abs(turned) < TURN_OVER and time - self._turn_began > TURN_WINDOW:
+            self._north += (turn - self._turns[-2][1]) * kept
+            if abs(turned) < TURN_OVER + missed and time - self._turn_began > TURN_WINDOW:
                 self._turning = False
                 self.notes.append(
-                    f"the autopilot's north has turned by {math.degrees(self._north):.1f} degrees"
+                    f"the autopilot's north has turned by {math.degrees(self._north - self._first_north):.1f} degrees"
                 )
 
     def _raw_imu(self, now: float, m: Any) -> list[Message]:
@@ -447,8 +468,8 @@ class MavlinkLink:
             self._surface = float(m.param_value) if first else self._surface
             if first and abs(self._surface - STANDARD_ATMOSPHERE) > SHALLOW:
                 self.notes.append(
-                    f"depth counts from {self.depth_offset:.1f} m below the surface, where the barometer was "
-                    "calibrated: bring the vehicle to the surface and give --calibrate-depth"
+                    f"depth counts from {self._zero}, where the barometer was calibrated: bring the vehicle to the "
+                    "surface and give --calibrate-depth"
                 )
         return []
 
@@ -457,6 +478,11 @@ class MavlinkLink:
         """Depth of the place where the barometer was calibrated, by the standard atmosphere [m]."""
         weight = self.vehicle.water.density * self.vehicle.water.gravity
         return (self._surface - STANDARD_ATMOSPHERE) / weight
+
+    @property
+    def _zero(self) -> str:
+        side = "below" if self.depth_offset > 0.0 else "above"
+        return f"{abs(self.depth_offset):.1f} m {side} the surface"
 
     def _value(self, now: float, m: Any) -> list[Message]:
         if m.name == "PilotGain" and 0.0 < m.value <= 1.0:
@@ -501,6 +527,13 @@ class MavlinkLink:
             return "waiting for the autopilot's version and parameters"
         if self.calibrate_depth and self._calibrated != "done":
             return self._calibrated
+        above = self.highest - self.depth_offset
+        if above > 0.0 and abs(self._surface - STANDARD_ATMOSPHERE) > SHALLOW and not self._calibrated:
+            return (
+                f"a depth of {-self.highest:.2f} m is {above:.2f} m above the surface, since the autopilot counts "
+                f"depth from {self._zero}: bring the vehicle to the surface and give --calibrate-depth, or a goal "
+                f"below {-self.depth_offset:.2f} m"
+            )
         if self.let_in is not None and now - max(self._dvl_at, self._aided_at) > AIDED_LASTS:
             return (
                 "waiting for the autopilot's velocity: it needs a Doppler log for half a minute, and an origin; or "
@@ -640,11 +673,10 @@ class MavlinkLink:
         if self._version is None:
             version = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             frames += self._ask(now, "version", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, version))
-        if not self._origin and now - self._first(now, "origin") < ORIGIN_ASKED:
+        if self._origin != "set":
             origin = float(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-            frames += self._ask(now, "origin", 1.0, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, origin))
-        elif not self._origin:
-            self._origin = "none"
+            period = ORIGIN_PERIODS[bool(self._origin)]
+            frames += self._ask(now, "origin", period, self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, origin))
         for name in PARAMETERS:
             if name not in self._parameters and now - self._first(now, name) < 10.0:
                 read = mavlink.MAVLink_param_request_read_message(*VEHICLE, name.encode(), -1)
