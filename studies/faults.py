@@ -35,6 +35,7 @@ from finssim.evaluation.robot_trials import PoolJob, noise_seed
 from finssim.evaluation.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
+from finssim.pool.run import PoolPlan
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
@@ -190,8 +191,14 @@ class Scenario:
     """Motions of the vehicle."""
     must_fail: bool = False
     """True for the control: with its watchdogs off, the vehicle has to fail."""
-    firmware: Literal["mcu", "ardusub"] = "mcu"
+    firmware: Literal["mcu", "ardusub", "ardusub-own"] = "mcu"
     """Firmware that drives the motors."""
+    plant: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of the plant's firmware that differ."""
+    watched: float = 0.0
+    """Least time of observation after the fault [s]; that of all trials if 0."""
+    off: float = math.inf
+    """Greatest true distance from the goal at the end, horizontal [m]."""
     ends: str = ""
     """Pattern of the reason for which an autopilot's run must end; empty: it must continue."""
     limit: float = STOP_WITHIN
@@ -361,7 +368,32 @@ def _command(number: int, *values: float) -> Touch:
 
 
 def _autopilot(title: str, ends: str, limit: float, faults: Any, **more: Any) -> Scenario:
-    return _scenario(title, faults, firmware="ardusub", ends=ends, limit=limit, **more)
+    return _scenario(title, faults, **{"firmware": "ardusub", "ends": ends, "limit": limit, **more})
+
+
+def leap(bench: Bench) -> None:
+    """Let the autopilot's filter reset its position by 0.7 m."""
+    autopilot: Any = bench.pool.firmware
+    autopilot.leap(0.5, -0.5)
+
+
+def turning_north(bench: Bench) -> None:
+    """Turn the autopilot's north on by one step of 15° in 20 s."""
+    bench.pool.faults.north += math.radians(15.0) / 20.0 / RATE
+
+
+def lagging_leap(bench: Bench) -> None:
+    """Let the autopilot's position be late, and then be reset."""
+    bench.pool.faults.position_lag = 0.25
+    leap(bench)
+
+
+TURNED: Mapping[str, Any] = {"watched": 55.0, "off": 0.25, "settings": {"workspace_upper": (4.6, 2.6, 0.0)}}
+"""A vehicle that floats up while its thrust waits, and returns to its goal."""
+DECLINATION = math.radians(11.4)
+"""Magnetic declination of the place where the real autopilot was recorded [rad]."""
+OWN: Mapping[str, Any] = {"firmware": "ardusub-own", "watched": 20.0, "off": 0.15}
+"""An autopilot that locates itself, and stays where it was."""
 
 
 def low_battery(bench: Bench) -> None:
@@ -396,6 +428,22 @@ AUTOPILOT: Mapping[str, Scenario] = {
     "ap-dvl": _autopilot(
         "Doppler log lost for 10 s", WAITS, 4.0,
         Fault(begin=pool_fault(dvl_silent=True), end=pool_fault(dvl_silent=False), lasts=10.0),
+    ),
+    "ap-origin": _autopilot(
+        "an origin is set, its north turns by 11.4°", "", 0.5,
+        Fault(begin=another_station("set_gps_global_origin", 1, 338103130, -1183938670, 0, times=1), lasts=20.0),
+        plant={"declination": DECLINATION}, **TURNED,
+    ),
+    "ap-north": _autopilot(
+        "its north turns by 15° in 20 s without a word", "", 8.0,
+        Fault(begin=turning_north, during=turning_north, lasts=20.0), **TURNED,
+    ),
+    "ap-leap": _autopilot("its own position is reset by 0.7 m", "", math.inf, leap, **OWN),
+    "ap-lag": _autopilot("its own position lags by 0.25 s", "", math.inf, pool_fault(position_lag=0.25), **OWN),
+    "ap-lag-leap": _autopilot("it lags and is reset", "", math.inf, lagging_leap, **OWN),
+    "ap-own-dvl": _autopilot(
+        "its Doppler log is lost, by its own position", WAITS, 7.5, pool_fault(dvl_silent=True), firmware="ardusub-own",
+        watched=15.0,
     ),
     "ap-depth": _autopilot("depth frozen", WAITS, 4.0, pool_fault(freeze_depth=True)),
     "ap-battery": _autopilot(
@@ -459,7 +507,7 @@ WATCHED = 10.0
 """Time of observation after a permanent fault, and shortest one after a temporary fault [s]."""
 AFTERWARDS = 4.0
 """Time of observation after the end of a temporary fault [s]."""
-LONGEST = 70.0
+LONGEST = 90.0
 """Longest trial: time until the estimator has a position, and the longest fault [s]."""
 ATTEMPTS = 3
 WATCHED_ALIVE = 8.0
@@ -536,13 +584,20 @@ class FaultJob(PoolJob):
     """Motion of the vehicle: station or moving."""
     camera: str = "corners"
 
+    def plan(self, seed: int) -> PoolPlan:
+        """Return the plan of its pool, with a seed for noise; an autopilot has an origin where it locates itself."""
+        plan, scenario = super().plan(seed), SCENARIOS[self.row]
+        absent = {"origin": None} if self.firmware == "ardusub" else {}
+        firmware = plan.spec.firmware.model_copy(update={**absent, **scenario.plant})
+        return replace(plan, spec=plan.spec.model_copy(update={"firmware": firmware}))
+
 
 def fault_job(
     scenario: str, variant: str = "", motion: str = "station", vehicle: str = "finsrov", **settings: Any
 ) -> FaultJob:
     """Return the job of a variant of a scenario; settings are further fields."""
-    if scenario in SCENARIOS and SCENARIOS[scenario].firmware == "ardusub":
-        settings |= {"firmware": "ardusub", "site": "tank"}
+    if scenario in SCENARIOS and SCENARIOS[scenario].firmware != "mcu":
+        settings |= {"firmware": SCENARIOS[scenario].firmware, "site": "tank"}
     return FaultJob(
         row=scenario, target=f"{variant} {motion}".strip(), variant=variant, motion=motion, vehicle=vehicle,
         pool_vehicle=vehicle, **settings,
@@ -561,7 +616,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         `record_lost_s` and `record_problem`; `ok`.
     """
     start_warp()
-    scenario, aided = SCENARIOS[job.row], job.firmware == "ardusub"
+    scenario, aided = SCENARIOS[job.row], job.aided
     vehicle = job.equipped()
     start, goal, when, _ = (TANK_MOTIONS if aided else MOTIONS)[job.motion]
     box = inset(vehicle.safety.workspace_lower, vehicle.safety.workspace_upper)
@@ -583,7 +638,8 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
                 runtime.attach(link_of("mavlink", vehicle))
             bench = Bench(pool, FaultyWire(pool, RATE), runtime, recorder)
             limit = scenario.limit if math.isfinite(scenario.limit) else 0.0
-            script = _Script(bench, scenario.faults[job.variant], when, max(WATCHED, limit + AFTERWARDS))
+            watched = max(WATCHED, limit + AFTERWARDS, scenario.watched)
+            script = _Script(bench, scenario.faults[job.variant], when, watched)
             raised = script.run()
         if math.isnan(script.began):
             raise RuntimeError(f"{job.key()}: the vehicle was never armed: {runtime.refusal}")
@@ -596,6 +652,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         )
     result = {
         **measured(course, script.began, ended, box),
+        "off_m": float(np.linalg.norm(course.position[-1, :2] - station_of(goal).position[:2])),
         "state": script.state,
         "reason": script.reason,
         "raised": raised,
@@ -607,14 +664,12 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
 
 def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
     """Return whether an autopilot's trial ended for the reason and in the time of its scenario, or continued."""
-    if not scenario.ends:
-        return bool(result["state"] == "armed")
     ended_after = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
-    return (
-        ended_after is not None
-        and ended_after <= scenario.limit
-        and re.search(scenario.ends, result["reason"]) is not None
-    )
+    stopped = ended_after is not None and ended_after <= scenario.limit
+    if not scenario.ends:
+        paused = stopped or math.isinf(scenario.limit)
+        return bool(result["state"] == "armed" and paused and result["off_m"] <= scenario.off)
+    return stopped and re.search(scenario.ends, result["reason"]) is not None
 
 
 class _Script:
@@ -1066,7 +1121,7 @@ def faults_experiment(
         ReliabilityError: Unknown scenario.
     """
     vehicle = vehicle or {"mcu": "finsrov", "ardusub": "bluerov2_heavy"}[firmware]
-    every = [name for name, scenario in SCENARIOS.items() if scenario.firmware == firmware]
+    every = [name for name, scenario in SCENARIOS.items() if scenario.firmware.startswith(firmware)]
     every = [*KILLS, *every] if firmware == "mcu" else every
     names = list(scenarios or every)
     check_choices(names, every, "scenario", ReliabilityError)

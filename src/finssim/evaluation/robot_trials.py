@@ -11,7 +11,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -33,6 +33,7 @@ from finssim.evaluation.records import DriveError, read_record
 from finssim.evaluation.trials import PERIOD, GoalTrial, VehicleMotion, guide_of, localization_errors
 from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.pool import read_truth
+from finssim.pool.plant_spec import HOME
 from finssim.pool.run import PoolPlan, make_plan
 from finssim.robot.goals import check_reachable, place_of
 from finssim.robot.links.transports import DEFAULT_BIND
@@ -612,9 +613,10 @@ class FirmwareTrials(NamedTuple):
 FIRMWARES = {
     "mcu": FirmwareTrials(None, "pool", "corners"),
     "ardusub": FirmwareTrials("pilot6", "tank", "none"),
+    "ardusub-own": FirmwareTrials("pilot6", "tank", "none"),
 }
-"""Firmwares: a controller that takes shaft speeds, in the pool under a camera, or an autopilot that takes axes, in a
-tank by Doppler log, depth and compass."""
+"""Firmwares: a controller that takes shaft speeds, in the pool under a camera; an autopilot that takes axes, in a tank
+by Doppler log, depth and compass; or one whose log nobody else hears, by its own position."""
 
 
 def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> str:
@@ -647,19 +649,33 @@ class PoolJob(campaign.Job):
     site: str = "pool"
     """pool, tank or open-water."""
     firmware: str = "mcu"
-    """mcu or ardusub: an autopilot, on whose vehicle a Doppler log and a compass take the camera's place."""
+    """mcu, ardusub or ardusub-own: an autopilot, on whose vehicle a Doppler log and a compass take the camera's
+    place."""
 
     def plan(self, seed: int) -> PoolPlan:
-        """Return the plan of its pool, with a seed for noise."""
-        camera: Any = "none" if self.firmware == "ardusub" else self.camera
-        return make_plan(
+        """Return the plan of its pool, with a seed for noise.
+
+        An autopilot has an origin; one that locates itself has heard its Doppler log for half a minute.
+        """
+        camera: Any = "none" if self.aided else self.camera
+        plan = make_plan(
             self.pool_vehicle, str(self.plant), self.severity, camera=camera, seed=seed, site=self.site,
-            firmware=self.firmware,
+            firmware="ardusub" if self.aided else "mcu",
         )  # type: ignore[arg-type]  # fmt: skip
+        if not self.aided:
+            return plan
+        own = {"aiding_delay": 0.0, "log_shared": False} if self.firmware == "ardusub-own" else {}
+        firmware = plan.spec.firmware.model_copy(update={"origin": HOME, **own})
+        return replace(plan, spec=plan.spec.model_copy(update={"firmware": firmware}))
+
+    @property
+    def aided(self) -> bool:
+        """Return whether an autopilot drives the motors."""
+        return self.firmware != "mcu"
 
     def equipped(self) -> Vehicle:
         """The vehicle as the robot knows it there."""
-        return vehicle_at(self.site, load_vehicle(self.vehicle), navigation=self.firmware == "ardusub")
+        return vehicle_at(self.site, load_vehicle(self.vehicle), navigation=self.aided)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -108,10 +108,12 @@ COMPASS_SHARE = 0.05
 """Part of the difference to a heading that one reading of the compass takes away [-]."""
 BIAS_SHARE, SETTLED = (0.02, 0.0005), 10.0
 """Part of that difference that the gyroscope's bias takes [1/s], before and after the time since the start [s]."""
+LATE = 30
+"""Samples for which attitudes are remembered, which is longer than a Doppler log is late [-]."""
 TURNING = 20.0
 """Time in which the heading turns from magnetic to true north, once there is an origin [s]."""
-POSITION_LASTS = 6.0
-"""A position is given so long after the last velocity [s]."""
+POSITION_LASTS, INERTIAL = 6.0, 0.5
+"""A position is given so long after the last velocity [s]; the accelerometer gives velocity after the second."""
 
 FTP_NAK, FTP_UNKNOWN = 129, 7
 """Answer to an operation of file transfer, and its reason."""
@@ -192,6 +194,9 @@ class ArduSub:
         self._clock_start = spec.firmware.clock_start
         self._calibrate_at_start = False
         self._start(now)
+        if spec.firmware.origin is not None:
+            latitude, longitude = spec.firmware.origin
+            self._origin, self._origin_at = (round(1e7 * latitude), round(1e7 * longitude)), -math.inf
 
     def _default_parameters(self, vehicle: Vehicle) -> dict[str, tuple[int, float]]:
         """Types and values, by name, sorted: the recorded ones, and what a user sets for this vehicle.
@@ -255,6 +260,7 @@ class ArduSub:
         self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
         self._aided_since = math.inf
         self._places: deque[tuple[float, Array, Array]] = deque()
+        self._attitudes: deque[tuple[float, Array]] = deque(maxlen=LATE)
         self._origin: tuple[int, int] | None = None
         self._origin_at = math.inf
         self._battery, self._used = (0.0, 0.0), 0.0
@@ -343,7 +349,9 @@ class ArduSub:
             plant: Battery, and distance to the floor.
             faults: What is wrong.
         """
-        lines = [] if faults.dvl_silent or self._dvl is None else self._dvl_lines(now, aids, plant)
+        aids = [aid for aid in aids if aid.kind != VELOCITY or not faults.dvl_silent]
+        silent = faults.dvl_silent or self._dvl is None or not self._spec.log_shared
+        lines = [] if silent else self._dvl_lines(now, aids, plant)
         if not self.running(now):
             return lines
         self._now, self._faults = max(self._now, now), faults
@@ -386,8 +394,12 @@ class ArduSub:
         for aid in aids:
             if aid.kind == HEADING and self.parameters["COMPASS_USE"]:
                 # Our angles count to the left; the magnetic heading is short of the true one by the declination.
-                missing = self._spec.declination * (1.0 - self._true_north(now))
-                share, settled = COMPASS_SHARE if self._headed else 1.0, now - self._boot > SETTLED
+                disturbed = self._faults.north if self._faults else 0.0
+                missing = self._spec.declination * (1.0 - self._true_north(now)) + disturbed
+                # A turn of the north is no offset of the gyroscope.
+                turning = disturbed or (self._spec.declination and 0.0 < self._true_north(now) < 1.0)
+                settled = bool(turning) or now - self._boot > SETTLED
+                share = COMPASS_SHARE if self._headed else 1.0
                 learned = 0.0 if not self._headed else BIAS_SHARE[settled]
                 self._filter.turn(aid.values[0] + missing, share, learned)
                 self._headed = True
@@ -395,18 +407,23 @@ class ArduSub:
                 velocities.append(aid)
         q = np.array(self._filter.quaternion)
         self._quaternion = np.append(FRD @ q[:3], q[3])
+        self._attitudes.append((now, self._quaternion))
         self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
         self._gyro = FRD @ gyro
         self._rates = FRD @ (gyro - self._filter.bias)
         self._force = FRD @ accel
         self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
         if self.parameters["VISO_TYPE"] and self._dvl is not None:
+            if now - self._velocity_time > INERTIAL:
+                self._velocity = self._velocity + dt * (FRD @ quat_rotate(q, accel))[:2]
             self._position += dt * self._velocity * (now - self._velocity_time < POSITION_LASTS)
             for aid in velocities:
                 over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
                 if now - self._velocity_time > POSITION_LASTS:
                     self._aided_since = now
-                self._velocity, self._velocity_time = quat_rotate(self._quaternion, over_floor)[:2], now
+                # By the attitude of then: its filter is as late as the slowest instrument.
+                then = next(q for at, q in self._attitudes if at >= now - aid.age or at == now)
+                self._velocity, self._velocity_time = quat_rotate(then, over_floor)[:2], now
             self._places.append((now, self._position.copy(), self._velocity))
             while now - self._places[0][0] > POSITION_LASTS:
                 self._places.popleft()

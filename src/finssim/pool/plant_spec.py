@@ -234,6 +234,10 @@ Severity = Literal["nominal", "realistic", "hard"]
 T = TypeVar("T")
 
 
+HOME = (33.810313, -118.393867)
+"""Latitude and longitude of ArduSub's own test place [deg]: its origin where nothing else is said."""
+
+
 class PlantSpecError(ValueError):
     """A plant file that cannot be used, or a vehicle that the plant does not fit."""
 
@@ -384,6 +388,10 @@ class FirmwareSpec(Section):
     """Version of ArduSub, where the vehicle has an autopilot."""
     aiding_delay: float = Field(default=30.0, ge=0.0)
     """Time of velocities by a Doppler log after which an autopilot has a position [s]; recorded: 28 to 36 s."""
+    origin: tuple[float, float] | None = None
+    """Latitude and longitude that an autopilot has been given as its origin before the start [deg]; None: none."""
+    log_shared: bool = True
+    """Whether reports of an autopilot's Doppler log reach the robot too, as over the vehicle's network."""
     declination: float = Field(default=0.0, ge=-math.pi, le=math.pi)
     """Magnetic declination, east positive [rad]: without an origin an autopilot gives the magnetic heading."""
     attitude_gain: float = Field(default=0.5, ge=0.0)

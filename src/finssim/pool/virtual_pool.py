@@ -209,7 +209,9 @@ class Faults:
     freeze_depth: bool = False
     """True if the pressure gauge is frozen."""
     dvl_silent: bool = False
-    """The Doppler log of an `ArduSub` sends nothing."""
+    """The Doppler log of an `ArduSub` sends nothing, to nobody."""
+    north: float = 0.0
+    """Turn of the north of an `ArduSub`, east positive, as by a disturbed compass [rad]."""
     no_heartbeat: bool = False
     """HEARTBEAT of an `ArduSub` is lost, and nothing else."""
     no_ground_heartbeat: bool = False

@@ -684,7 +684,7 @@ class _Demonstration:
             robot = f"{self.robot.options} --arm"
             evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
             return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
-        if self.firmware == "ardusub":
+        if self.firmware != "mcu":
             tank = f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --firmware ardusub"
             robot = f"--robot mavlink --site {self.site} --pool-file none --let-in 0,0 --arm"
             tank += f" --site {self.site} --truth truth.fst"

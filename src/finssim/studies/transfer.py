@@ -221,9 +221,9 @@ def transfer_experiment(
         severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
         camera (MODE): corners (projected through the rippling water, with noise), or pictures (rendered, with tag
             detection: several times slower).
-        firmware (NAME): Firmware of the vehicle: mcu or ardusub (an autopilot over MAVLink: policies use its axes,
+        firmware (NAME): Firmware of the vehicle: mcu, ardusub (an autopilot over MAVLink: policies use its axes,
             in a tank with a DVL and a compass instead of the pool and its camera, with setpoints three times as
-            far).
+            far), or ardusub-own (the same, by the autopilot's own position: no DVL on the network).
         estimator (MODE): State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
             the paper.
         rows (NAMES): Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given.
@@ -266,8 +266,8 @@ def transfer_experiment(
     )  # fmt: skip
     if robot is not None:  # there is one plant, whose severity was not chosen
         pools, severity, camera = range(1), HARDWARE, HARDWARE
-        site = robot.site if firmware == "ardusub" else site
-    elif firmware == "ardusub":
+        site = robot.site if firmware != "mcu" else site
+    elif firmware != "mcu":
         camera = sees
     jobs = [
         RobotJob(
