@@ -110,6 +110,7 @@ HOMES = {
     "pymavlink": {
         "trials/importers/ardusub.py",
         "pool/ardusub.py",
+        "pool/ardusub_sitl.py",
         "robot/links/mavlink.py",
     },
     "pyulog": {"trials/importers/ulog.py"},

@@ -2,7 +2,8 @@
 
 import json
 import math
-import runpy
+import os
+import select
 import socket
 import struct
 import subprocess
@@ -10,15 +11,18 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.pool import ardusub
 from finssim.pool.ardusub_sitl import (
     GRAVITY,
+    Forwarder,
     Pulses,
     SitlServer,
     SitlWorld,
@@ -28,7 +32,8 @@ from finssim.pool.ardusub_sitl import (
 )
 from finssim.pool.plant_spec import Battery, PlantSpecError
 from finssim.robot.links.frames import LinkError
-from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line, encode_velocity
+from finssim.robot.links.transports import TcpServer
+from finssim.robot.links.water_linked import DvlClient, DvlServer, decode_line
 from finssim.sim import RectangularPool, Simulator, Water
 from finssim.vehicles import load_vehicle
 
@@ -462,39 +467,132 @@ def test_the_doppler_log_beside_it_measures_the_same_world():
     log.close()
 
 
-@pytest.mark.slow
-def test_velocities_reach_ardusub_as_vision_position_deltas(monkeypatch):
-    """The example passes reports on: velocity times the time since the last, forward-right-down, with confidence."""
-    monkeypatch.setenv("MAVLINK20", "1")
-    example = runpy.run_path(str(Path(__file__).parents[2] / "examples/bluerov2/dvl_to_ardusub.py"))
-    ardusub = example["mavutil"].mavlink_connection("udpin:127.0.0.1:0", dialect="ardupilotmega")
-    port = ardusub.port.getsockname()[1]
-    out = example["mavutil"].mavlink_connection(f"udpout:127.0.0.1:{port}", dialect="ardupilotmega")
-    log, clock = DvlServer(("127.0.0.1", 0)), [time.monotonic()]
-    client = DvlClient(*log.address)
+class Autopilot:
+    """ArduSub's end of a serial port over TCP: takes an origin once, and keeps what came."""
 
-    def enough(sent):
-        """Reports at 10 Hz until two were sent."""
-        if time.monotonic() >= clock[0]:
-            clock[0] += 0.1
-            now = time.time()
-            log.send(
-                encode_velocity(
-                    [0.5, -0.2, 0.1], measured=now - 0.06, sent=now, interval=0.1, std=(0.1, 0, 0)
-                )
-            )
-        return sent == 2
+    def __init__(self):
+        self.server, self.mav = TcpServer(("127.0.0.1", 0), bytearray), mavlink.MAVLink(None)
+        self.out, self.deltas, self.origins, self.asked = mavlink.MAVLink(None, 1, 1), [], [], 0
 
-    example["forward"](client, out, enough)
-    message = ardusub.recv_match(type="VISION_POSITION_DELTA", blocking=True, timeout=5.0)
-    dt = 1e-6 * message.time_delta_usec
-    assert 0.05 < dt < 0.3
-    assert message.position_delta == pytest.approx([0.5 * dt, 0.2 * dt, -0.1 * dt], rel=1e-4)
-    assert message.confidence == pytest.approx(75.0, abs=0.1)
-    for end in (ardusub, out, client, log):
+    def restart(self):
+        self.origins.clear()
+
+    def poll(self):
+        for client, _, data in self.server.receive():
+            for message in self.mav.parse_buffer(data):
+                self.asked += message.get_type() == "COMMAND_LONG"
+                if message.get_type() == "VISION_POSITION_DELTA":
+                    self.deltas.append(message)
+                elif message.get_type() == "SET_GPS_GLOBAL_ORIGIN" and not self.origins:
+                    self.origins.append((message.latitude, message.longitude))
+                    report = mavlink.MAVLink_gps_global_origin_message(*self.origins[0], 0)
+                    self.server.send(bytes(report.pack(self.out)), client)
+
+
+def until(done, *turns):
+    """Turn until it is done, for at most 20 s."""
+    end = time.monotonic() + 20.0
+    while not done() and time.monotonic() < end:
+        for turn in turns:
+            turn()
+        time.sleep(0.002)
+    assert done()
+
+
+def test_ardusub_gets_its_origin_and_the_velocities_of_the_log():
+    """One origin per start of SITL; velocity times the time since the last, forward-right-down, with confidence; none
+    after a gap, and none faster than 20 Hz."""
+    autopilot = Autopilot()
+    forwarder = Forwarder(autopilot.server.address)
+    until(lambda: forwarder.counts["origins"] == 1, forwarder.poll, autopilot.poll)
+    assert autopilot.origins == [(338103130, -1183938670)] and autopilot.asked == 1
+    for at in (1.0, 1.1, 1.13, 1.2, 3.0, 3.1):
+        forwarder.velocity(at, np.array([0.5, -0.2, 0.1]), 0.1)
+    until(lambda: len(autopilot.deltas) == 3, autopilot.poll)
+    for message in autopilot.deltas:
+        assert message.time_delta_usec == 100_000
+        assert message.position_delta == pytest.approx([0.05, 0.02, -0.01], rel=1e-5)
+        assert message.confidence == pytest.approx(75.0)
+    assert [message.time_usec for message in autopilot.deltas] == [1_100_000, 1_200_000, 3_100_000]
+    autopilot.restart()
+    forwarder.restart()
+    until(lambda: forwarder.counts["origins"] == 2, forwarder.poll, autopilot.poll)
+    forwarder.close()
+    autopilot.server.close()
+
+
+def test_both_ends_may_start_again(shared):
+    """SITL's new process counts from 0 from another port, after a silence: the world and the origin begin again. Our
+    new process takes the frame that SITL waits for: its time has gone back once, which SITL calls a physics reset."""
+    shared.restart()
+    now, pulses = [0.0], mixed(throttle=-1.0)
+    server = SitlServer(shared, ("127.0.0.1", 0), clock=lambda: now[0])
+    restarted = []
+    server.forwarder = SimpleNamespace(restart=lambda: restarted.append(1), poll=lambda: None)
+
+    def frames(client, count):
+        for _ in range(count):
+            client.send(pulses)
+            until(lambda: select.select([client.socket], [], [], 0.0)[0], server.serve_once)
+            client.buffer += client.socket.recv(65536)
+            client.advance(client.parse())
+            now[0] += 1 / 400
+
+    first = StandIn(server.address)
+    frames(first, 40)
+    assert first.sitl_time == pytest.approx(0.1) and first.frame == 40
+    second = StandIn(server.address)  # after the reboot that VISO_TYPE needs
+    now[0] += 4.0
+    frames(second, 20)
+    assert restarted == [1] and second.timestamp == pytest.approx(0.05) and second.resets == 0
+    assert server.counts == {"frames": 60, "restarts": 1}
+    address = server.address
+    server.close()
+    shared.restart()
+    server = SitlServer(shared, address)
+    frames(second, 20)
+    assert second.resets == 1 and second.frame == 40 and second.timestamp == pytest.approx(0.05)
+    assert server.counts == {"frames": 20}
+    for end in (first.socket, second.socket, server):
         end.close()
-    monkeypatch.undo()
-    example["mavutil"].set_dialect("ardupilotmega")
+
+
+@pytest.mark.slow
+def test_a_session_by_the_commands_of_the_page(tmp_path):
+    """A stand-in for ArduSub flies by its own position, which the forwarded log gives it; SIGTERM ends the physics with
+    its summary, and the true motion scores the record."""
+    with socket.socket() as one, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        one.bind(("127.0.0.1", 0))
+        other.bind(("127.0.0.1", 0))
+        tcp, udp = one.getsockname()[1], other.getsockname()[1]
+    program = tmp_path / "ardusub"
+    script = Path(__file__).parents[1] / "reference/ardusub_standin.py"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} {script} {tcp} "$@"\n')
+    program.chmod(0o755)
+    slowly = os.environ | {"FINSSIM_CLOCK_RATE": "0.3"}
+    finssim = [sys.executable, "-m", "finssim"]
+    physics = [*finssim, *"ardusub-sitl --vehicle bluerov2_heavy --site tank --truth truth.mcap".split(),
+               "--exec", "./ardusub", "--dvl", "127.0.0.1:0", "--bind", f"127.0.0.1:{udp}",
+               "--mavlink", f"127.0.0.1:{tcp + 2}"]  # fmt: skip
+    drive = [*finssim, "run", "--robot", f"mavlink://tcp:127.0.0.1:{tcp}", "--vehicle", "bluerov2_heavy",
+             *"--site tank --pool-file none --let-in 0,0 --policy pid --goal 0.4,0,-0.6,0 --arm --duration 15".split(),
+             "--record", "run.mcap"]  # fmt: skip
+    process = subprocess.Popen(physics, cwd=tmp_path, env=slowly, stdout=subprocess.PIPE, text=True)
+    try:
+        run = subprocess.run(drive, cwd=tmp_path, env=slowly, capture_output=True, text=True, timeout=300.0)
+        process.terminate()
+        told, _ = process.communicate(timeout=60.0)
+    finally:
+        process.kill()
+    assert run.returncode == 0, run.stderr
+    assert process.returncode == 0 and "1 origins" in told and " velocities" in told
+    score = [
+        *finssim,
+        *"evaluate run.mcap --task t1 --vehicle bluerov2_heavy --truth truth.mcap --json".split(),
+    ]
+    scored = subprocess.run(score, cwd=tmp_path, capture_output=True, text=True, timeout=120.0)
+    (trial,) = json.loads(scored.stdout)["per_trial"]
+    assert trial["localization"]["position_m"] < 0.15 and trial["fault"] in ("", "ended early")
 
 
 @pytest.mark.slow
@@ -529,8 +627,8 @@ def test_the_command_serves_until_its_time_is_over(capsys, tmp_path, monkeypatch
         ("4.1", ["SIM_GPS_DISABLE 1", "BARO_SPEC_GRAV 1.024"], ["ORIGIN_LAT", "SIM_GPS1_ENABLE"]),
         (
             "4.5",
-            ["SIM_GPS_DISABLE 1", "GPS_TYPE 0", "ORIGIN_LAT 33.810313"],
-            ["SIM_GPS1_ENABLE", "VISO_TYPE"],
+            ["SIM_GPS_DISABLE 1", "GPS_TYPE 0"],
+            ["SIM_GPS1_ENABLE", "VISO_TYPE", "ORIGIN_LAT"],
         ),
         ("4.6", ["SIM_GPS1_ENABLE 0", "GPS1_TYPE 0"], ["SIM_GPS_DISABLE", "SURFACE_MAX_THR"]),
         ("4.7", ["SIM_GPS1_ENABLE 0", "SURFACE_MAX_THR 1"], ["SIM_GPS_DISABLE"]),

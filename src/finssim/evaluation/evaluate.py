@@ -345,7 +345,8 @@ def evaluate_in_plants(
             circle, figure_eight, helix, or a YAML or CSV file. May be repeated.
         trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
         truth (TABLE): Truth for scoring records, instead of the robot's own estimate: a table (.csv, .parquet) of
-            motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool.
+            motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool
+            or of finssim ardusub-sitl (.mcap).
         seed: Seed of every random number; equal seeds give equal results.
         out: Directory for evaluation.json, trajectories and, for t1 and t2, a figure.
 

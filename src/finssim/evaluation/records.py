@@ -124,15 +124,12 @@ def read_drive(path: Path, vehicle: Vehicle) -> RecordedDecisions:
     began, guide = next(
         ((t, str(event["text"])) for t, event in events if event["kind"] == "trial_start"), (math.nan, "")
     )
-    poses, twists = ([getattr(m, k) for m in rows["odom"]] for k in ("pose", "twist"))
     goals = [message.pose for message in rows["goal"]]
     actions = [np.asarray(message.action, dtype=float) for message in rows["policy_info"]]
     alike = len({len(action) for action in actions}) == 1
     motion = VehicleMotion(
         t=time - began,
-        position=np.array([_xyz(p.pose.position) for p in poses]),
-        quaternion=np.array([(*_xyz(p.pose.orientation), p.pose.orientation.w) for p in poses]),
-        nu=np.array([(*_xyz(t.twist.linear), *_xyz(t.twist.angular)) for t in twists]),
+        **_states(rows["odom"]),
         thrust=np.array([message.force for message in rows["thruster_cmd"]], dtype=float),
         action=np.array(actions) if alike else np.zeros((len(complete), 0)),
     )
@@ -662,9 +659,10 @@ def read_record(
         task: Of one vehicle: its name, or FILE.py:CLASS of one's own.
         vehicle: The very one that was driven.
         guide: What was followed, of a task that follows a reference; by the record's own words if None.
-        truth: Truth file of a virtual pool, or a table (.csv, .parquet) of motion capture, world frame: columns t [s],
-            x, y, z of the body origin [m], and qx, qy, qz, qw or yaw [rad]. Its clock may be any: it is laid over the
-            robot's where the distance between the two motions is least.
+        truth: Truth file of a virtual pool, record of `finssim ardusub-sitl --truth` (.mcap), or a table (.csv,
+            .parquet) of motion capture, world frame: columns t [s], x, y, z of the body origin [m], and qx, qy, qz, qw
+            or yaw [rad]. Its clock may be any: it is laid over the robot's where the distance between the two motions
+            is least.
         duration: Of a trial of t1 [s].
 
     Raises:
@@ -757,6 +755,16 @@ def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
     return next(near, ",".join(f"{x:.3g}" for x in (*goal[:3], math.degrees(goal[3]))))
 
 
+def _states(odometry: Sequence[Any]) -> dict[str, Array]:
+    """Return position, quaternion and nu of messages of odometry, as `VehicleMotion` takes them."""
+    poses, twists = ([getattr(m, k) for m in odometry] for k in ("pose", "twist"))
+    return {
+        "position": np.array([_xyz(p.pose.position) for p in poses]),
+        "quaternion": np.array([(*_xyz(p.pose.orientation), p.pose.orientation.w) for p in poses]),
+        "nu": np.array([(*_xyz(t.twist.linear), *_xyz(t.twist.angular)) for t in twists]),
+    }
+
+
 def _truth(path: Path, drive: RecordedDecisions, until: float) -> tuple[VehicleMotion, float]:
     """The true motion from the guide's start to a time after it [s], and what was added to its times."""
     motion = _table(path)
@@ -770,6 +778,14 @@ def _truth(path: Path, drive: RecordedDecisions, until: float) -> tuple[VehicleM
 
 def _table(path: Path) -> VehicleMotion:
     """A truth, by its own clock."""
+    if path.suffix.lower() == ".mcap":
+        with open_record(path) as record:
+            entries = list(record.messages(("odom",)))
+        if len(entries) < 2:
+            raise DriveError(
+                f"{path}: holds no motion: give the file that finssim ardusub-sitl --truth wrote"
+            )
+        return VehicleMotion(t=np.array([e.time for e in entries]), **_states([e.message for e in entries]))
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
         truth = read_truth(path)
         return VehicleMotion(t=truth.time, position=truth.position, quaternion=truth.quaternion, nu=truth.nu)

@@ -27,19 +27,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.ardusub import Mixer, motors_of
+from finssim.core import realtime
 from finssim.core.frames import TO_FOSSEN, wxyz_from_xyzw
 from finssim.core.rotations import cross, matrix_to_quat, quat_from_yaw, quat_to_euler, quat_to_matrix
-from finssim.pool.plant_spec import Battery, PlantSpecError
+from finssim.pool.plant_spec import HOME, Battery, PlantSpecError
 from finssim.robot.goals import station_of
 from finssim.robot.interrupt import interrupting
 from finssim.robot.links.frames import LinkError
-from finssim.robot.links.transports import host_port
+from finssim.robot.links.transports import TcpTransport, host_port
 from finssim.robot.links.water_linked import DeadReckoning, DvlServer, encode_velocity, serve_about
+from finssim.robot.reading import Reading
+from finssim.robot.recorder import Recorder, recording
 from finssim.sim import RectangularPool, Simulator, Water, Wave
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import POOL, SITES, with_navigation
 
-__all__ = ["Pulses", "SitlServer", "SitlWorld", "decode_pulses", "run"]
+__all__ = ["Forwarder", "Pulses", "SitlServer", "SitlWorld", "decode_pulses", "run"]
 
 Array = NDArray[np.float64]
 
@@ -88,6 +91,8 @@ _LONGEST_PULSE = 2500
 _RANGE = 100.0
 """Reach of the rangefinder, and of its tilt the cosine [m, -]."""
 _LEAST_COSINE = 0.5
+TRUTH_PERIOD = 0.02
+"""Least time between two true states in their record [s]."""
 
 
 class SitlWorld:
@@ -146,6 +151,9 @@ class SitlWorld:
         self._floor = pool.depth if pool is not None else math.inf
         self._forces = lru_cache(maxsize=512)(self._forces_at)
         self._fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in self._thrusters]) * (math.tau / 60.0)
+        self.truth: Recorder | None = None
+        """Takes the true motion down, by this machine's clock, which a robot's record has too."""
+        self._noted = -math.inf
         self.log = None if dvl is None else _DopplerLog(with_navigation(vehicle), dvl, self._floor, seed)
         imu, self._seed = vehicle.sensors.imu, seed
         self._noise = (
@@ -191,6 +199,10 @@ class SitlWorld:
         self.voltage = max(self.battery.full_voltage * faded - self.battery.resistance * self.current, 1.0)
         if self.log is not None:
             self.log.look(self.time, self._position, quat_to_matrix(self._quaternion), self._nu)
+        if self.truth is not None and (now := realtime.now()) - self._noted >= TRUTH_PERIOD:
+            self._noted = now
+            p, q, nu = (part.astype(float) for part in (self._position, self._quaternion, self._nu))
+            self.truth.reading(now, Reading(now, p, q, nu, ready=True))
 
     def _forces_at(self, twentieths: int) -> tuple[Array, Array]:
         """Steady thrust [N] and electric power [W] at every pulse width, (n, 2501), at a voltage of so many 0.05 V."""
@@ -229,10 +241,93 @@ class SitlWorld:
         return b"\n" + json.dumps(state, separators=(",", ":")).encode() + b"\n"
 
 
+class Forwarder:
+    """The companion computer beside ArduSub: over MAVLink it sets the origin and passes on velocities of the log.
+
+    Velocities go as VISION_POSITION_DELTA, which ArduSub 4.5.0 took in this form, the origin as SET_GPS_GLOBAL_ORIGIN
+    until ArduSub reports it.
+
+    Attributes:
+        counts: `velocities` that were sent, and `origins` that ArduSub reported.
+    """
+
+    def __init__(self, address: Address) -> None:
+        """Connect as soon as ArduSub listens.
+
+        Args:
+            address: TCP server of one of its serial ports.
+
+        Raises:
+            LinkError: There is no such host, or pymavlink is not installed.
+        """
+        try:
+            from pymavlink.dialects.v20 import ardupilotmega
+        except ModuleNotFoundError:
+            raise LinkError(
+                "--mavlink needs pymavlink, which is not installed: pip install 'finssim[hardware]', or give "
+                "--mavlink none and set ArduSub's origin yourself"
+            ) from None
+        self._dialect, self._wire = ardupilotmega, TcpTransport(address)
+        self._mav = ardupilotmega.MAVLink(None, COMPANION, ardupilotmega.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY)
+        self._mav.robust_parsing = True
+        self.counts = Counter[str]()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with an ArduSub that has started again, without an origin."""
+        self._has_origin, self._asked, self._last = False, -math.inf, math.nan
+
+    def poll(self) -> None:
+        """Read what ArduSub says, and give it an origin while it reports none."""
+        for data in self._wire.receive():
+            for message in self._mav.parse_buffer(data) or ():
+                if message.get_type() == "GPS_GLOBAL_ORIGIN" and not self._has_origin:
+                    self._has_origin = True
+                    self.counts["origins"] += 1
+        if not self._has_origin and self._wire.connected and (now := time.monotonic()) - self._asked > 1.0:
+            self._asked = now
+            latitude, longitude = (round(1e7 * angle) for angle in HOME)
+            self._send(self._dialect.MAVLink_set_gps_global_origin_message(1, latitude, longitude, 0))
+            number = self._dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+            command = 1, 1, self._dialect.MAV_CMD_REQUEST_MESSAGE, 0, float(number), *[0.0] * 6
+            self._send(self._dialect.MAVLink_command_long_message(*command))
+
+    def velocity(self, measured: float, velocity: Array, std: float) -> None:
+        """Pass on a velocity over the floor.
+
+        Args:
+            measured: When, by the world's clock [s].
+            velocity: Vehicle's axes, forward, left, up [m/s], (3,).
+            std: Its standard deviation [m/s].
+        """
+        dt = measured - self._last
+        if dt < SHORTEST:
+            return
+        self._last = measured
+        if not dt <= LONGEST:  # after a gap the distance is unknown
+            return
+        delta = (dt * TO_FOSSEN.vector(velocity)).tolist()
+        confidence = 100.0 * (1.0 - min(std, WORST) / WORST)
+        times = round(1e6 * measured), round(1e6 * dt)
+        self._send(
+            self._dialect.MAVLink_vision_position_delta_message(*times, [0.0, 0.0, 0.0], delta, confidence)
+        )
+        self.counts["velocities"] += self._wire.connected
+
+    def _send(self, message: Any) -> None:
+        self._wire.send(bytes(message.pack(self._mav)))
+        self._mav.seq = (self._mav.seq + 1) % 256
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._wire.close()
+
+
 class _DopplerLog:
     """The vehicle's Doppler log, sampled once per frame; its reports are sent when their latency is over."""
 
     def __init__(self, vehicle: Vehicle, server: DvlServer, floor: float, seed: int) -> None:
+        self.forwarder: Forwarder | None = None
         log = vehicle.sensors.dvl
         assert log is not None  # with_navigation gives one
         self.entry, self.server, self._floor = log, server, floor
@@ -271,6 +366,8 @@ class _DopplerLog:
                 self.server.send(report)
         while self._waiting and now >= self._waiting[0][0] + log.latency - 1e-9:
             at, velocity, altitude = self._waiting.popleft()
+            if velocity is not None and self.forwarder is not None:
+                self.forwarder.velocity(at, self._R_bs @ velocity, log.noise_std)
             self.server.send(
                 encode_velocity(
                     velocity,
@@ -293,6 +390,13 @@ _AWAY = 1.5
 """A SITL that is silent for so long may be followed by another one [s]."""
 
 
+COMPANION = 1
+"""System of the companion computer, which is that of the vehicle."""
+SHORTEST, LONGEST = 0.05, 1.0
+"""Time between two velocities that are passed on [s]: ArduSub's filter drops them below the first; beyond the second
+the floor was lost."""
+WORST = 0.4
+"""Standard deviation that means no confidence [m/s]."""
 SETTLING = 0.5
 """Time of the world after a restart of SITL in which its counts may jump without a lost answer [s]."""
 
@@ -323,6 +427,7 @@ class SitlServer:
             LinkError: It cannot be bound.
         """
         self.world, self.counts = world, Counter[str]()
+        self.forwarder: Forwarder | None = None
         self._clock, self._heard = clock, -math.inf
         self._peer: Address | None = None
         self._last, self._answer = -1, b""
@@ -359,6 +464,8 @@ class SitlServer:
                 self._socket.sendto(self.answer(newest), self._peer)
         elif self.world.log is not None:
             self.world.log.server.poll()
+        if self.forwarder is not None:
+            self.forwarder.poll()
 
     def _accepted(self, data: bytes, sender: Address) -> Pulses | None:
         packet = decode_pulses(data)
@@ -384,6 +491,8 @@ class SitlServer:
         if count < self._last:
             self._note("restarts", "SITL has started again: the world starts again too")
             self.world.restart()
+            if self.forwarder is not None:
+                self.forwarder.restart()
             self._settling = True
         elif (
             self._last >= 0 and count > self._last + 1 and not (self._settling and self.world.time < SETTLING)
@@ -424,6 +533,8 @@ def run(
     resistance: Annotated[float, (0.0, 1.0)] = 0.02,
     dvl: str | None = None,
     dvl_page: str | None = None,
+    mavlink: str = "127.0.0.1:5762",
+    truth: Path | None = None,
     version: Literal["4.1", "4.5", "4.6", "4.7"] = "4.5",
     parm: str = "finssim.parm",
     exec: str | None = None,
@@ -448,9 +559,12 @@ def run(
         dvl (HOST:PORT): Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
             16171.
         dvl_page (HOST:PORT): Address of the DVL's web page, by which BlueOS' driver finds it; none if not given.
+        mavlink (HOST:PORT): TCP address of one of SITL's serial ports, by which it is given its origin and, with --dvl,
+            the DVL's velocities; SITL's second port if not given; none: nothing is sent.
+        truth (FILE): MCAP file of the true motion, for finssim evaluate --truth; an existing one is refused.
         version (VERSION): ArduSub's, which decides the names of parameters.
-        parm (FILE): Parameters for SITL, written at the start: frame, rate, barometers, satellites, origin and, with
-            --dvl, the DVL. A file that was not written by this command is not replaced.
+        parm (FILE): Parameters for SITL, written at the start: frame, rate, barometers, satellites and, with --dvl,
+            the DVL. A file that was not written by this command is not replaced.
         exec (FILE): ArduSub's SITL program, started with these parameters in the folder of --parm and ended with this
             command; if not given, start it yourself.
         duration: Simulated duration [s]; until Ctrl-C or SIGTERM if not given.
@@ -492,6 +606,12 @@ def run(
         )
         server = SitlServer(world, host_port(bind, "--bind"))
         stack.callback(server.close)
+        world.truth = stack.enter_context(recording(truth, known, {"command": "finssim ardusub-sitl"}))
+        if mavlink != "none":
+            forwarder = server.forwarder = Forwarder(host_port(mavlink, "--mavlink"))
+            stack.callback(forwarder.close)
+            if world.log is not None:
+                world.log.forwarder = forwarder
         print(
             f"{world.vehicle.title}: waiting for SITL on {server.address[0]}:{server.address[1]}", flush=True
         )
@@ -503,12 +623,11 @@ def run(
             stack.callback(_end, _started(command, file.parent))
         with suppress(KeyboardInterrupt), interrupting():
             server.serve(math.inf if duration is None else duration)
-        summary = ", ".join(f"{count} {kind}" for kind, count in sorted(server.counts.items()) if count)
+        counts = server.counts + (server.forwarder.counts if server.forwarder is not None else Counter())
+        summary = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()) if count)
         print(f"ended after {world.time:.1f} s: {summary or 'SITL sent nothing'}")
 
 
-HOME = (33.810313, -118.393867)
-"""Latitude and longitude of ArduSub's own test place [deg]."""
 WRITTEN = "# written by finssim ardusub-sitl"
 
 
@@ -520,6 +639,9 @@ def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, f
         version: Of ArduSub: 4.1, 4.5, 4.6 or 4.7.
         dvl: Whether a Doppler log gives velocities.
 
+    Note:
+        Its origin is no parameter: ORIGIN_LAT would set it at the moment of arming, and turn the heading then.
+
     Raises:
         ControlError: The vehicle has no autopilot.
     """
@@ -530,6 +652,11 @@ def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, f
         "BARO_SPEC_GRAV": 1.024,
         "SIM_BARO_RND": 0.01,
         "SIM_BAR2_RND": 0.01,
+        "BATT_MONITOR": 4,
+    }
+    # The offsets of its simulated compasses.
+    values |= {
+        f"COMPASS_OFS{n}_{axis}": x for n in ("", 2, 3) for axis, x in zip("XYZ", (5, 13, -18), strict=True)
     }
     values |= {f"MOT_{i}_DIRECTION": float(sign) for i, sign in enumerate(mixer.directions, 1)}
     values |= (
@@ -537,14 +664,15 @@ def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, f
         if at_least >= (4, 6)
         else {"SIM_GPS_DISABLE": 1, "GPS_TYPE": 0}
     )
-    if at_least >= (4, 5):
-        values |= {"ORIGIN_LAT": HOME[0], "ORIGIN_LON": HOME[1], "ORIGIN_ALT": 0}
     if at_least >= (4, 7):
         values["SURFACE_MAX_THR"] = 1
     if dvl:
         values |= {"AHRS_EKF_TYPE": 3, "EK3_ENABLE": 1, "EK2_ENABLE": 0, "VISO_TYPE": 1}
         values |= {"EK3_SRC1_POSXY": 6, "EK3_SRC1_VELXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_VELZ": 0}
-        values |= {"EK3_SRC1_YAW": 1}
+        log: Any = with_navigation(vehicle).sensors.dvl
+        values |= {"EK3_SRC1_YAW": 1, "VISO_DELAY_MS": round(1e3 * log.latency)}
+        mounted = TO_FOSSEN.vector(log.position).tolist()
+        values |= {f"VISO_POS_{axis}": x for axis, x in zip("XYZ", mounted, strict=True) if x}
     return values
 
 
