@@ -29,6 +29,7 @@ COMMANDS = [
     "trials import",
     "excite",
     "calibrate",
+    "calibrate changes",
     "calibrate thruster",
     "calibrate motor",
     "calibrate hydrodynamics",

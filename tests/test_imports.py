@@ -33,7 +33,7 @@ ARROWS = {
     "identification": {"trials", "sim"},
     "survey": {"identification", "localization"},
     "bench": {"identification"},
-    "robot": {"agents", "localization"},
+    "robot": {"agents", "localization", "identification"},
     "pool": {"robot"},
     "evaluation": {"identification", "learning", "pool"},
     "studies": {"evaluation", "survey"},

@@ -187,6 +187,31 @@ def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):
 
 
 @pytest.mark.slow
+def test_changes_are_followed_while_it_runs(capsys, tmp_path):
+    """A window of 10 s is fitted beside the run, and the vehicle is written; unarmed, nothing is."""
+    pool, now = tmp_path / "pool.yaml", tmp_path / "now.yaml"
+    words = (
+        "--policy",
+        "pid",
+        "--goal",
+        "0.8,0.3,-0.6,60",
+        "--pool-file",
+        pool,
+        "--lockstep",
+        "--identify",
+        now,
+    )
+    with lockstep_pool(load_vehicle("finsrov"), pool, sessions=2) as wiring:
+        unarmed = told(capsys, *words, "--robot", wiring.robot, "--duration", "11")[1]
+        assert unarmed["windows"] == 0 and not now.exists()
+        status, summary = told(capsys, *words, "--robot", wiring.robot, "--duration", "12", "--arm")
+    assert status == 0 and summary["windows"] == 1 and summary["changes"]["drag"]["unit"] == "-"
+    assert load_vehicle(now).body.mass == load_vehicle("finsrov").body.mass
+    assert finssim(*words[:-1], tmp_path / "now.txt", "--robot", "127.0.0.1:9") == 2
+    assert "expected .yaml" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
     """In real time, over UDP, without a camera: disarmed, and why."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:

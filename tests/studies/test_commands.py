@@ -15,6 +15,7 @@ from reference.programs import study
 ROOT = Path(__file__).resolve().parents[2]
 STUDIES = {
     "anatomy": "anatomy",
+    "changes": "changes",
     "faults": "faults_experiment",
     "open_water": "open_water",
     "soak": "soak",

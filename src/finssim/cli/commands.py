@@ -34,6 +34,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "trials import": "finssim.trials.importers.dispatch:import_trials",
         "trials check": "finssim.trials.check:check",
         "calibrate hydrodynamics": "finssim.identification.hydrodynamics:calibrate_hydrodynamics",
+        "calibrate changes": "finssim.identification.adaptation:calibrate_changes",
         "calibrate thruster": "finssim.bench.thruster:calibrate_thruster",
         "calibrate motor": "finssim.bench.motor:calibrate_motor",
         "calibrate camera": "finssim.survey.camera:run",

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -38,6 +38,9 @@ from finssim.robot.team import Team
 from finssim.robot.wiring import POOL_ADDRESS, RobotDriver, Wiring, connected
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
+
+if TYPE_CHECKING:
+    from finssim.identification.adaptation import Follower
 
 __all__ = [
     "APART",
@@ -193,6 +196,10 @@ def show(report: dict[str, Any], console: Console) -> None:
             f"{1e3 * figures_of_pictures['p50']:.0f} ms, 99 % within {1e3 * figures_of_pictures['p99']:.0f} ms"
         )
         rows["inference"] = f"{1e3 * decided['p50']:.1f} ms, 99 % within {1e3 * decided['p99']:.1f} ms"
+    for name, change in report.get("changes", {}).items():
+        if change["identifiable"]:
+            low, high = change["ci95"]
+            rows[f"changed: {name}"] = f"{change['estimate']:.3g} [{low:.3g}, {high:.3g}] {change['unit']}"
     for name, value in rows.items():
         table.add_row(name, Text(value))
     console.print(table)
@@ -388,6 +395,7 @@ def run(
     localization: Annotated[Localization, "options"],
     *,
     record: Path | None = None,
+    identify: Path | None = None,
     arm: bool = False,
     as_json: bool = False,
 ) -> int:
@@ -404,6 +412,8 @@ def run(
         wiring: Connection of the robot.
         localization: Vehicle, and what locates it.
         record (FILE): Record everything to this file (.mcap); with --team a folder with a file for each.
+        identify (FILE): Estimate while it runs what has changed on the vehicle (payload, drag, thrusters), print it,
+            and write the vehicle with these changes (.yaml).
         arm: Arm, as soon as the state is known. Without it the thrusters never turn.
         as_json: Print one JSON object instead of tables.
 
@@ -418,10 +428,12 @@ def run(
             "no controller: give --policy for this vehicle, or --team for all agents of a task"
         )
     if mission.team is not None:
+        if identify is not None:
+            raise ControlError("--identify is for one vehicle: run each agent with --policy and --agent")
         outcome = run_team(mission, wiring, localization, record=record, arm=arm)
         _tell(outcome.reports, as_json)
         return outcome.status
-    report = run_alone(mission, wiring, localization, record=record, arm=arm)
+    report = run_alone(mission, wiring, localization, record=record, identify=identify, arm=arm)
     if as_json:
         print(json.dumps(report))
     else:
@@ -432,7 +444,13 @@ def run(
 
 
 def run_alone(
-    mission: Mission, wiring: Wiring, localization: Localization, *, record: Path | None, arm: bool
+    mission: Mission,
+    wiring: Wiring,
+    localization: Localization,
+    *,
+    record: Path | None,
+    arm: bool,
+    identify: Path | None = None,
 ) -> dict[str, Any]:
     """Run one vehicle; return the result as plain data. Arguments and errors as of `run`."""
     assert mission.policy is not None
@@ -451,6 +469,7 @@ def run_alone(
             highlight=False,
             markup=False,
         )
+    follower = None if identify is None else _follower(filed, identify)
     let_in = None if localization.let_in is None else place_of(localization.let_in)
     perception = Perception(ours, pool, mode=localization.estimator, let_in=let_in)
     team = _team(pilot, wiring)
@@ -476,13 +495,42 @@ def run_alone(
         def look(runtime: Runtime) -> None:
             if heard is not None:
                 heard.started = runtime.started
+            reading = runtime.reading
+            if (
+                follower is not None
+                and reading is not None
+                and reading.ready
+                and runtime.bridge.state == "armed"
+            ):
+                follower.add(
+                    reading.time, reading.nu, reading.quaternion, reading.position, runtime.bridge.force
+                )
             monitor.look(runtime)
 
         line = console.status("waiting for the vehicle", refresh_per_second=2.0)
         with line if console.is_terminal else nullcontext() as monitor.status:
             longest = math.inf if mission.duration is None else mission.duration
             took = drive(runtime, duration=longest, show=look, until=monitor.over)
-    return monitor.report(runtime, took)
+    report = monitor.report(runtime, took)
+    if follower is not None and identify is not None:
+        from finssim.identification.vehicle_file import write_vehicle
+
+        adaptation = follower.finish()
+        report |= adaptation.as_json()
+        if adaptation.windows:
+            write_vehicle(adaptation.adapted, identify)
+        else:
+            console.print(f"{identify}: not written, the vehicle was not armed for 10 s", highlight=False)
+    return report
+
+
+def _follower(vehicle: Vehicle, out: Path) -> Follower:
+    """Return the estimator of what has changed on a vehicle, ready to start; refuse a file that cannot be written."""
+    from finssim.identification.adaptation import Follower
+    from finssim.identification.report import refuse_places
+
+    refuse_places(out, None, "vehicle")
+    return Follower(vehicle)
 
 
 def _guide(mission: Mission, wiring: Wiring, pilot: Pilot, vehicle: Vehicle) -> Guide:
