@@ -150,7 +150,7 @@ def test_rosbags_reads_back_what_the_robot_did(full):
     assert (echo.accepted, echo.reject_flags, list(echo.applied)) == (False, 8, [0.4] * 8)
     event = json.loads(found["/finsrov/events"][0][1].data)
     assert (event["kind"], event["text"], event["source"]) == ("arm", "by hand", "keyboard")
-    _, health = found["/finsrov/diagnostics"][0]
+    _, health = found["/diagnostics"][0]
     assert (health.status[0].level, health.status[0].values[0].value) == (1, "3")
     tags = json.loads(found["/finsrov/camera/tags"][0][1].data)["tags"]
     assert tags == [{"id": 15, "corners": [[0, 1], [2, 3], [4, 5], [6, 7]]}]

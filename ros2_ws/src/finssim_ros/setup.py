@@ -24,7 +24,6 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/finssim_ros"]),
         ("share/finssim_ros", ["package.xml"]),
         ("share/finssim_ros/launch", glob("launch/*.launch.py")),
-        ("share/finssim_ros/config", glob("config/*.yaml")),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

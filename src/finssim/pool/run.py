@@ -51,8 +51,8 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = [
-    "Ends", "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "SiteChoice", "make_plan",
-    "run", "serve_realtime", "swimming",
+    "Ends", "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "SiteChoice", "Timing",
+    "make_plan", "run", "serve_realtime", "swimming",
 ]  # fmt: skip
 
 
@@ -310,6 +310,32 @@ RATE = 60.0
 """Steps a second of the software of vehicles that the task commands [Hz]."""
 
 
+class Messages(Protocol):
+    """The medium's end for robots in other processes."""
+
+    def poll(self, now: float) -> None:
+        """Take what was sent and deliver what has arrived, at the site's clock [s]."""
+
+
+class Timing:
+    """Clock of a pool, and the medium of a team: those of this machine. A program that has its own derives a class."""
+
+    paced = False
+    """True if time waits for the pool, so that its cameras draw within a step."""
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        return realtime.now()
+
+    def wait(self, duration: float, until: Callable[[], bool]) -> None:
+        """Wait for a duration [s], or until a function returns true."""
+        realtime.wait(duration)
+
+    def messages(self, fleet: Fleet) -> Messages | None:
+        """Return the medium's end for the robots of a team; None: they exchange nothing."""
+        return None
+
+
 class MediumServer:
     """A medium's end for robots in other processes: who sends under a name is answered under it."""
 
@@ -353,7 +379,7 @@ class MediumServer:
 def serve_realtime(
     site: Fleet,
     transports: Mapping[str, Transport],
-    messages: MediumServer | None = None,
+    messages: Messages | None = None,
     *,
     sinks: Sequence[UdpSender] = (),
     camera: Clocked | None = None,
@@ -666,6 +692,7 @@ def run(
     pool_file: Path | None = None,
     truth: Path | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
+    timing: Annotated[Timing | None, "python"] = None,
 ) -> None:
     """Simulate a vehicle and its pool for a robot on this machine, until Ctrl-C.
 
@@ -684,6 +711,7 @@ def run(
         pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
         truth (FILE): File for the true states, for scoring; for a team a folder.
         duration: Duration, pool's clock [s]; until Ctrl-C if not given.
+        timing: Clock of the pool; that of this machine if not given.
 
     Raises:
         PlantSpecError, LinkError, GoalError, VehicleError, OutputError: What cannot be used.
@@ -691,6 +719,7 @@ def run(
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     positioning_of(choice.positioning, choice.seed)  # refuses what is none
     longest = math.inf if duration is None else duration
+    timing = timing or Timing()
     if task is not None or team is not None:
         if choice.firmware == "ardusub":
             raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
@@ -705,7 +734,7 @@ def run(
         fleet, calibrated = (
             _playing(task, bodies, choice) if task is not None else swimming(bodies, choice, truth)
         )
-        _serve_team(fleet, calibrated, ends, pool_file, longest)
+        _serve_team(fleet, calibrated, ends, pool_file, longest, timing)
         return
     plan, begin = choice.plan()
     port, ardusub = ends.port, choice.firmware == "ardusub"
@@ -726,11 +755,16 @@ def run(
         _lockstep(plan, make_world, (ends.bind, port + 2), longest)
     else:
         links = ends.ground_links() if ardusub else None
-        _realtime(plan, make_world, ends.ours, ends.theirs, longest, links)
+        _realtime(plan, make_world, ends.ours, ends.theirs, longest, links, timing)
 
 
 def _serve_team(
-    fleet: Fleet, calibrated: Pool | None, ends: Ends, pool_file: Path | None, duration: float
+    fleet: Fleet,
+    calibrated: Pool | None,
+    ends: Ends,
+    pool_file: Path | None,
+    duration: float,
+    timing: Timing,
 ) -> None:
     """Serve several vehicles, each to a separate robot, from their first addresses on ten ports apart."""
     (bind, port), (host, first) = ends.ours, ends.theirs
@@ -739,10 +773,11 @@ def _serve_team(
         raise LinkError(f"port {port}: expected room for ten ports to each of {len(names)} vehicles after it")
     with interruptible() as interrupted, ExitStack() as stack:
         stack.callback(fleet.close)
-        messages, sinks = None, []
+        messages = timing.messages(fleet)
+        sinks: list[UdpSender] = []
         if isinstance(fleet, TaskSite):
-            messages = MediumServer((bind, port + MESSAGES), fleet.carrier, names)
-            stack.callback(messages.close)
+            messages = server = MediumServer((bind, port + MESSAGES), fleet.carrier, names)
+            stack.callback(server.close)
         transports = {}
         for i, name in enumerate(names):
             transports[name] = UdpTransport((bind, port + 10 * i), (host, first + 10 * i))
@@ -754,12 +789,20 @@ def _serve_team(
         if calibrated is not None and pool_file is not None:
             write_pool(calibrated, pool_file)
             _say(f"pool file: {pool_file}")
-        if messages is not None and isinstance(fleet, TaskSite):
+        if isinstance(fleet, TaskSite):
             _tell_goal(fleet)
-            _say(f"messages: {_name(messages.address)}")
+            _say(f"messages: {_name(server.address)}")
         notify = partial(_tell_episode, fleet)
         pace = serve_realtime(
-            fleet, transports, messages, sinks=sinks, duration=duration, until=interrupted, over=notify
+            fleet,
+            transports,
+            messages,
+            sinks=sinks,
+            duration=duration,
+            until=interrupted,
+            over=notify,
+            clock=timing.now,
+            wait=lambda duration: timing.wait(duration, interrupted),
         )
     if not fleet.over:
         _tell_episode(fleet)
@@ -893,11 +936,12 @@ def _realtime(
     robot: tuple[str, int],
     duration: float,
     links: Callable[[], GroundLinks] | None,
+    timing: Timing,
 ) -> None:
     with interruptible() as interrupted, ExitStack() as stack:
         transport = UdpTransport(bind, robot) if links is None else links()
         stack.callback(transport.close)
-        drawn, sink, eye = _camera(plan, _next(bind), _next(robot))
+        drawn, sink, eye = _camera(plan, _next(bind), _next(robot), paced=timing.paced)
         for end in (drawn, sink):
             if end is not None:
                 stack.callback(end.close)
@@ -913,15 +957,22 @@ def _realtime(
         site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
         transports = {plan.vehicle.name: transport}
         pace = serve_realtime(
-            site, transports, sinks=sinks, camera=drawn, duration=duration, until=interrupted
+            site,
+            transports,
+            sinks=sinks,
+            camera=drawn,
+            duration=duration,
+            until=interrupted,
+            clock=timing.now,
+            wait=lambda duration: timing.wait(duration, interrupted),
         )
-        _say(pace.sentence)
+        _say(f"ended after {pace.duration:.1f} s" if timing.paced else pace.sentence)
         if drawn is not None and drawn.dropped:
             _say(drawn.complaint)
 
 
 def _camera(
-    plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int]
+    plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int], *, paced: bool
 ) -> tuple[PictureProcess | None, UdpSender | None, Any]:
     """The process that draws, or the sink for what is computed here, and the camera for the world."""
     plans: list[PictureSourcePlan] = [
@@ -929,8 +980,8 @@ def _camera(
     ]
     if not plans:
         return None, None, None
-    if plan.onboard is None and plan.camera is not None and plan.camera.mode == "corners":
-        return None, UdpSender(bind, peer), plan.camera.camera()
+    if paced or (plan.onboard is None and plan.camera is not None and plan.camera.mode == "corners"):
+        return None, UdpSender(bind, peer), plan.eye()
     drawn = PictureProcess(plans, bind, peer)
     return drawn, None, drawn
 

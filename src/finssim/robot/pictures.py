@@ -294,11 +294,12 @@ class UdpPictures:
     A picture's time is that of its reception, less what its sender says that sending was late.
     """
 
-    def __init__(self, bind: tuple[str, int], peer: tuple[str, int]) -> None:
+    def __init__(self, bind: tuple[str, int], peer: tuple[str, int], *, polled: bool = False) -> None:
         """
         Args:
             bind: Address and port of this end; port 0 takes a free one (see `address`).
             peer: Address and port of the camera's end.
+            polled: Read the wire in `receive` alone, whose time is then that of reception, by whatever clock.
 
         Raises:
             LinkError: An address cannot be found or bound.
@@ -309,12 +310,15 @@ class UdpPictures:
         self._wire = UdpTransport(bind, peer, longest=65536, buffer=_BUFFER)
         self.address, self.peer, self.refused = self._wire.address, self._wire.peer, self._wire.refused
         self._open = True
-        self._thread = threading.Thread(target=self._listen, name="pictures", daemon=True)
-        self._thread.start()
+        self._thread = None if polled else threading.Thread(target=self._listen, name="pictures", daemon=True)
+        if self._thread is not None:
+            self._thread.start()
 
     def receive(self, now: float) -> list[Picture]:
         """Pictures since the last call, oldest first, with times on the clock of `now` [s]."""
-        received, later = [], realtime.now() - now
+        received, later = [], 0.0 if self._thread is None else realtime.now() - now
+        for data in self._wire.receive() if self._thread is None else ():
+            self._add(now, data)
         while self._waiting:
             came, picture = self._waiting.popleft()
             received.append(replace(picture, time=came - later))
@@ -323,7 +327,8 @@ class UdpPictures:
     def close(self) -> None:
         """Let go of the socket."""
         self._open = False
-        self._thread.join(timeout=2.0)
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
         self._wire.close()
 
     def describe(self) -> str:
@@ -336,9 +341,12 @@ class UdpPictures:
     def _listen(self) -> None:
         while self._open:
             for data in self._wire.receive(wait=0.2):
-                complete = self.assembler.add(data)
-                if complete is not None:
-                    self._take(realtime.now(), complete)
+                self._add(realtime.now(), data)
+
+    def _add(self, came: float, data: bytes) -> None:
+        complete = self.assembler.add(data)
+        if complete is not None:
+            self._take(came, complete)
 
     def _take(self, came: float, data: bytes) -> None:
         posted = decode_picture(data)
@@ -385,19 +393,20 @@ class NoPictures:
         return "no pictures"
 
 
-def open_pictures(address: str, bind: str = DEFAULT_PICTURES) -> PictureSource:
+def open_pictures(address: str, bind: str = DEFAULT_PICTURES, *, polled: bool = False) -> PictureSource:
     """The source that an address names.
 
     Args:
         address: "udp://HOST:PORT" of the camera's end, or "none".
         bind: "ADDRESS:PORT" of this end, for UDP.
+        polled: As of `UdpPictures`.
 
     Raises:
         LinkError: It names no source, or the source cannot be opened.
     """
     kind, _, rest = address.partition(":")
     if kind == "udp" and rest.startswith("//"):
-        return UdpPictures(host_port(bind, "bind"), host_port(rest[2:], address))
+        return UdpPictures(host_port(bind, "bind"), host_port(rest[2:], address), polled=polled)
     if address == "none":
         return NoPictures()
     raise LinkError(f"unknown source of pictures {address!r}: give udp://HOST:PORT or none")

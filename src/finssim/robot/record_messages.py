@@ -175,15 +175,21 @@ TOPICS = {
     "tags": Topic("camera/tags", "std_msgs/msg/String", STREAM, "", "camera, localizer",
         "tags found in a picture, JSON"),
     "event": Topic("events", "std_msgs/msg/String", STREAM, "", "every node", "what happened, JSON"),
-    "diagnostics": Topic("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", STREAM, "", "every node",
-        "health of each part"),
+    "diagnostics": Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", STREAM, "", "every node",
+        "health of each part once a second: localization, link, watchdogs, pictures, control, record"),
     "transform": Topic("/tf", "tf2_msgs/msg/TFMessage", STREAM, "map", "state_estimation, sim",
         "map to odom, odom to base_link"),
     "fixed_transform": Topic("/tf_static", "tf2_msgs/msg/TFMessage", LATCHED, "base_link", "state_estimation, sim",
         "base_link to all that is mounted on it, map to camera_link, camera_link to camera_optical"),
     "robot": Topic("robot_description", "std_msgs/msg/String", LATCHED, "", "state_estimation, sim",
         "URDF of the vehicle file"),
-    "clock": Topic("/clock", "rosgraph_msgs/msg/Clock", SENSOR, "", "sim", "simulated time"),
+    "clock": Topic("/clock", "rosgraph_msgs/msg/Clock", SENSOR, "", "sim, virtual_pool", "simulated time"),
+    "done": Topic("/clock_done", "std_msgs/msg/Header", STREAM, "", "every node in lock-step",
+        "the node named by frame_id has done its work of a time of /clock"),
+    "sent": Topic("messages/sent", "finssim_msgs/msg/TeamMessage", STREAM, "", "you",
+        "message to the other vehicles of a team"),
+    "received": Topic("messages/received", "finssim_msgs/msg/TeamMessage", STREAM, "", "virtual_pool",
+        "message of another vehicle, as late as sound and processing make it, if it is not lost"),
 }  # fmt: skip
 """Key -> topic."""
 OWN_TOPICS = {
@@ -606,11 +612,15 @@ class Messages:
         return self._of["std_msgs/msg/String"](json.dumps(values, default=str))
 
     def diagnostics(self, stamp: int, name: str, level: str, message: str, values: Mapping[str, Any]) -> Any:
-        """One status; level is one of ok, warn, error, stale."""
+        """One status of the vehicle; level is one of ok, warn, error, stale."""
         of = self._of
         pairs = [of["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in values.items()]
         status = of["diagnostic_msgs/msg/DiagnosticStatus"](
-            level=LEVELS.index(level), name=name, message=message, hardware_id="", values=pairs
+            level=LEVELS.index(level),
+            name=name,
+            message=message,
+            hardware_id=self._vehicle.name,
+            values=pairs,
         )
         return of["diagnostic_msgs/msg/DiagnosticArray"](self.header(stamp, ""), [status])
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from finssim.extensions.ros2 import Ros2Error
-from finssim.extensions.ros2.up import GRAPHS, NODES, GraphPlan, Options, plan_of, topics_of
+from finssim.extensions.ros2.up import EVERYWHERE, GRAPHS, NODES, TAKES, Options, plan_of, topics_of
 from finssim.robot.goals import GoalError
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "ros2_nodes.md").read_text()
@@ -36,17 +36,21 @@ def test_graphs_are_made_of_nodes():
 
 
 def told(graph, tmp_path, **choices):
-    """Parameters of the file that nodes are started with: node -> parameters."""
-    plan_of(graph, Options(**choices), FILE).write(tmp_path / "p.yaml")
+    """Parameters of the file that nodes are started with: node -> parameters; ** what all have."""
+    plan = plan_of(graph, Options(**choices), FILE)
+    plan.write(tmp_path / "p.yaml")
     tree = yaml.safe_load((tmp_path / "p.yaml").read_text())
-    return {key.rsplit("/", 1)[-1]: value["ros__parameters"] for key, value in tree.items()}
+    found = {key.rsplit("/", 1)[-1]: value["ros__parameters"] for key, value in tree.items()}
+    robots = [found[node] for node in found if node not in ("sim", "virtual_pool")]
+    alike = set.intersection(*(set(parameters) for parameters in robots))
+    return {"**": {name: robots[0][name] for name in alike & set(EVERYWHERE.split())}, **found}
 
 
 @pytest.mark.parametrize(
     ("graph", "choices", "node", "parameters"),
     [
         ("sim", {}, "**", {"vehicle": "finsrov", "use_sim_time": True}),
-        ("sim", {"start": "0,0,-1,0"}, "sim", {"use_sim_time": False, "start": "0,0,-1,0", "seed": 1}),
+        ("sim", {"start": "0,0,-1,0"}, "sim", {"start": "0,0,-1,0", "seed": 1}),
         ("sim", {"hydrodynamics": "mesh", "seed": 4}, "sim", {"hydrodynamics": "mesh", "seed": 4}),
         ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper"}),
         ("sim", {"goal": "0,0,-0.5,0"}, "controller", {"goal": "0,0,-0.5,0"}),
@@ -85,11 +89,57 @@ def test_choices_reach_their_node(tmp_path, graph, choices, node, parameters):
 
 def test_extra_nodes_are_started_where_asked_for():
     """Recorder and teleoperation."""
-    assert plan_of("sim", Options(), FILE).nodes == GRAPHS["sim"]
-    blind = plan_of("robot", Options(site="open-water"), FILE).nodes
-    assert blind == ("hardware_bridge", "state_estimation", "controller")
-    both = plan_of("sim", Options(record=Path("r.mcap"), teleop="joy"), FILE)
-    assert both.nodes == (*GRAPHS["sim"], "recorder", "teleop")
+
+    def nodes(graph, **choices):
+        return tuple(one.node for one in plan_of(graph, Options(**choices), FILE).nodes)
+
+    assert nodes("sim") == GRAPHS["sim"]
+    assert nodes("robot", site="open-water") == ("hardware_bridge", "state_estimation", "controller")
+    assert nodes("sim", record=Path("r.mcap"), teleop="joy") == (*GRAPHS["sim"], "recorder", "teleop")
+
+
+def test_each_vehicle_of_a_team_has_its_own_names_ports_and_share():
+    """One world for all; namespaces, frames, tag ids, ports ten apart, goals and records by vehicle."""
+    goals = "0,0,-1,0; 2,0,-1,0; 4,0,-1,0"
+    choices = {"team": "finsrov,finsrov,lauv", "site": "open-water", "goal": goals, "record": Path("r")}
+    plan = plan_of("pool", Options(**choices, lockstep=True), FILE)
+    assert plan.namespaces == ("robot_1", "robot_2", "robot_3")
+    found = {one.full_name: one.parameters for one in plan.nodes}
+    assert [name for name in found if "virtual_pool" in name] == ["/team/virtual_pool"]
+    assert found["/team/virtual_pool"]["team"] == "finsrov,finsrov,lauv"
+    waited = found["/team/virtual_pool"]["waits_for"].split()
+    assert set(waited) == found.keys() - {"/team/virtual_pool"} and len(waited) == 12
+    third = {node: found[f"/robot_3/{node}"] for node in ("hardware_bridge", "controller", "recorder")}
+    wire = {"bind": "127.0.0.1:54341", "robot": "udp://127.0.0.1:58786"}
+    assert {**wire, "number": 2, "frame_prefix": "robot_3/"}.items() <= third["hardware_bridge"].items()
+    assert {"goal": "4,0,-1,0", "vehicle": "lauv"}.items() <= third["controller"].items()
+    assert third["recorder"]["record"] == str(Path("r/robot_3.mcap"))
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_time_of_a_graph_is_that_of_its_world(graph):
+    """In lock-step and with a factor all nodes but the world live by /clock; otherwise those of a simulator alone."""
+
+    def lives(**choices):
+        file = {} if graph != "robot" else {"pool_file": FILE}
+        nodes = plan_of(graph, Options(**file, **choices), FILE).nodes
+        return {
+            bool(one.parameters.get("use_sim_time"))
+            for one in nodes
+            if one.node not in ("sim", "virtual_pool")
+        }
+
+    assert lives() == {graph == "sim"}
+    assert lives(lockstep=True) == lives(real_time_factor=0.5) == {True}
+
+
+def test_every_option_of_a_node_is_a_parameter_of_it():
+    """By its name, in the node's source or in that of every node."""
+    for node, names in TAKES.items():
+        assert not [name for name in names.split() if f'self.parameter("{name}"' not in source(node)]
+    common = Path(importlib.util.find_spec("finssim.extensions.ros2.nodes.robot_node").origin).read_text()
+    names = set(EVERYWHERE.split()) - {"use_sim_time", "frame_prefix"}
+    assert not [name for name in names if f'self.parameter("{name}"' not in common]
 
 
 @pytest.mark.parametrize(
@@ -101,6 +151,16 @@ def test_extra_nodes_are_started_where_asked_for():
         ("robot", {"site": "open-water", "let_in": "here"}, GoalError, "two numbers x,y"),
         ("sim", {"goal": "9,9,-9,0"}, GoalError, "outside the workspace"),
         ("sim", {"goal": "0,0,-0.5,0", "trajectory": "helix"}, GoalError, "not both"),
+        ("sim", {"plant": "3"}, Ros2Error, "--plant has no effect in the graph sim"),
+        ("robot", {"pool_file": FILE, "message_loss": 0.5}, Ros2Error, "--message-loss has no effect"),
+        ("robot", {"robot": "serial:/dev/x", "pool_file": FILE, "lockstep": True}, Ros2Error, "real time"),
+        ("sim", {"team": "finsrov,finsrov"}, Ros2Error, "--team is for the graph pool"),
+        (
+            "pool",
+            {"team": "finsrov,finsrov", "goal": "0,0,-1,0"},
+            Ros2Error,
+            "expected 2 separated by semicolons",
+        ),
     ],
 )
 def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, words):
@@ -111,7 +171,7 @@ def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, 
 
 def test_topics_are_those_of_the_nodes():
     """Full names; a simulator has no camera."""
-    names = {name for name, _ in topics_of(GraphPlan("sim", "finsrov", "rov"))}
+    names = {name for name, _ in topics_of(plan_of("sim", Options(namespace="rov"), None))}
     assert {"/rov/odom", "/clock", "/rov/arm", "/rov/thruster_cmd"} <= names
     assert "/rov/camera/image" not in names and "/rov/telemetry" not in names
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import types
 import xml.etree.ElementTree as ElementTree
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -130,7 +131,10 @@ def launched(monkeypatch, tmp_path):
     names and parameters: a dictionary becomes a file, below the node's full name if name and namespace are given.
     """
 
+    names = []
+
     def node(**told):
+        names.append(f"/{told['namespace']}/{told['name']}")
         named = {"name", "namespace"} <= told.keys()
         full = f"/{told['namespace'].strip('/')}/{told['name']}" if named else "/**"
         line = ["--ros-args", "-r", f"__node:={told['name']}", "-r", f"__ns:=/{told['namespace'].strip('/')}"]
@@ -151,10 +155,6 @@ def launched(monkeypatch, tmp_path):
         "launch_ros": {},
         "launch_ros.actions": {"Node": node},
         "launch_ros.parameter_descriptions": {"ParameterValue": lambda value, value_type: value_type(value)},
-        "ament_index_python": {},
-        "ament_index_python.packages": {
-            "get_package_share_directory": lambda package: str(WORKSPACE / package)
-        },
     }
     for name, contents in parts.items():
         module = types.ModuleType(name)
@@ -172,6 +172,8 @@ def launched(monkeypatch, tmp_path):
         assert set(given) <= set(values), f"{graph}.launch.py does not declare {set(given) - set(values)}"
         return dict(function(types.SimpleNamespace(launch_configurations={**values, **given})))
 
+    start.named = names
+
     return start
 
 
@@ -185,8 +187,8 @@ def parameters_of(lines, node, namespace="finsrov"):
     [
         ("robot", {"robot": "udp://1.2.3.4:5"}, "hardware_bridge", {"robot": "udp://1.2.3.4:5"}),
         ("robot", {"record": "a.mcap"}, "recorder", {"record": "a.mcap"}),
-        ("robot", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "vehicle": "finsrov"}),
-        ("robot", {"policy": "runs/hold", "teleop": "true"}, "teleop", {"other": "policy", "device": "joy"}),
+        ("robot", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper"}),
+        ("robot", {"policy": "runs/hold", "teleop": "joy"}, "teleop", {"other": "policy", "device": "joy"}),
         ("robot", {"teleop": "gamepad"}, "hardware_bridge", {"need_reading": False}),
         ("robot", {"bind": "10.0.0.1:6000"}, "hardware_bridge", {"bind": "10.0.0.1:6000"}),
         ("robot", {"bind": "10.0.0.1:6000"}, "camera", {"pictures_bind": "10.0.0.1:6001"}),
@@ -197,20 +199,25 @@ def parameters_of(lines, node, namespace="finsrov"):
         ("robot", {"namespace": "robot_1", "frame_prefix": "a/"}, "camera", {"frame_prefix": "a/"}),
         ("pool", {"positioning": "usbl", "site": "open-water"}, "virtual_pool", {"positioning": "usbl"}),
         ("pool", {"port": "6000", "seed": "4"}, "virtual_pool", {"port": 6000, "seed": 4}),
-        ("pool", {}, "virtual_pool", {"pool_file": "pool.yaml"}),
-        ("sim", {"start": "0,0,-1,0"}, "sim", {"start": "0,0,-1,0", "use_sim_time": False}),
+        ("pool", {"lockstep": "true"}, "virtual_pool", {"lockstep": True, "real_time_factor": 0.0}),
+        ("pool", {"lockstep": "True"}, "controller", {"lockstep": True, "use_sim_time": True}),
+        ("sim", {"real_time_factor": "0.5"}, "sim", {"real_time_factor": 0.5}),
+        ("sim", {"start": "0,0,-1,0"}, "sim", {"start": "0,0,-1,0"}),
         ("robot", {"pool_file": "1.yaml"}, "localizer", {"pool_file": "1.yaml"}),
         ("robot", {"vehicle": "warpauv"}, "camera", {"vehicle": "warpauv"}),
-        ("robot", {}, "controller", {"policy": "pid", "vehicle": "finsrov"}),
         ("sim", {"policy": "pid-paper"}, "controller", {"policy": "pid-paper", "use_sim_time": True}),
-        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy", "seed": 1}),
-        ("pool", {"plant": "7"}, "virtual_pool", {"plant": "7", "severity": "realistic"}),
+        ("sim", {"vehicle": "bluerov2_heavy"}, "sim", {"vehicle": "bluerov2_heavy"}),
+        ("pool", {"plant": "7"}, "virtual_pool", {"plant": "7"}),
     ],
 )
-def test_launch_arguments_win_over_parameter_files(launched, graph, given, node, parameters):
-    """Files that begin with /**, as ours do, lose against what is given at launch, and win over what is not."""
+def test_launch_arguments_win_over_parameter_files(launched, tmp_path, graph, given, node, parameters):
+    """Files that begin with /** lose against what is given at launch, and win over what is not."""
+    file = tmp_path / "own.yaml"
+    file.write_text("/**:\n  ros__parameters: {policy: a, robot: b, goal: c, port: 1, seed: 9, rate: 30.0}\n")
+    given = {**given, "params_file": str(file)}
     namespace = given.get("namespace") or given.get("vehicle", "finsrov")
-    assert parameters.items() <= parameters_of(launched(graph, **given), node, namespace).items()
+    found = parameters_of(launched(graph, **given), node, namespace)
+    assert {**parameters, "rate": 30.0}.items() <= found.items()
 
 
 def defaults_of(node):
@@ -238,6 +245,11 @@ EQUAL = [
     ("robot", {"pool_file": "none", "robot": "udp://192.168.0.2:58766", "bind": "192.168.0.10:54321"}),
     ("robot", {"pool_file": "/a/pool.yaml", "robot": "serial:/dev/x", "pictures": "udp://b:2"}),
     ("robot", {"site": "open-water", "let_in": "1,-2", "trajectory": "helix", "teleop": "gamepad"}),
+    (
+        "pool",
+        {"pool_file": "/a/pool.yaml", "lockstep": "true", "record": "x.mcap", "real_time_factor": "2.0"},
+    ),
+    ("sim", {"lockstep": "true"}),
     ("pool", {"pool_file": "/a/pool.yaml"}),
     ("pool", {"pool_file": "/a/pool.yaml", "site": "tank", "plant": "7", "severity": "hard", "port": "6000"}),
     ("pool", {"site": "open-water", "positioning": "usbl", "world": "dock", "start": "0,1,-3,0"}),
@@ -246,32 +258,49 @@ EQUAL = [
 
 @pytest.mark.parametrize(("graph", "given"), EQUAL)
 def test_launch_files_start_what_up_starts(launched, graph, given):
-    """The same namespace, the same nodes, each parameter the same; the pool's robot is its own launch file."""
+    """The same namespace, the same nodes, each parameter the same."""
     pytest.importorskip("cyclonedds")
     activate(announce=False)
-    typed = {name: int(text) if name in ("seed", "port") else text for name, text in given.items()}
+    convert = {"seed": int, "port": int, "real_time_factor": float, "record": Path, "lockstep": bool}
+    typed = {name: convert.get(name, str)(text) for name, text in given.items()}
     plan = plan_of(graph, Options(**typed), given.get("pool_file", "pool.yaml"))
     lines = launched(graph, **given)
-    if graph == "pool":
-        shared = {"namespace", "site", "bind", "port", "pool_file"} & given.keys()
-        assert set(lines) == {"virtual_pool"}
-        pictures = {"pictures": "udp://127.0.0.1:58767"} if "world" in given else {}
-        lines |= launched("robot", **{name: given[name] for name in shared}, robot="pool", **pictures)
-    assert set(lines) == set(plan.nodes)
-    for node in plan.nodes:
-        wanted = {**defaults_of(node), **plan.parameters["/**"], **plan.parameters.get(node, {})}
-        found = {**defaults_of(node), **parameters_of(lines, node, plan.namespace)}
+    assert launched.named == [one.full_name for one in plan.nodes]
+    for one in plan.nodes:
+        wanted = {**defaults_of(one.node), **one.parameters}
+        found = {**defaults_of(one.node), **parameters_of(lines, one.node, one.namespace)}
         for values in (wanted, found):
             values["robot"] = POOL_ADDRESS if values["robot"] == "pool" else values["robot"]
-            if node == "sim":
-                values.pop("real_time_factor")
-        assert found == wanted, node
+            values.pop("pool_since")
+        assert found == wanted, one.node
+
+
+def test_one_launch_file_starts_a_team(launched):
+    """One world, and the nodes of each vehicle in its namespace."""
+    launched("pool", team="finsrov,finsrov,finsrov", site="open-water", message_loss="0.2")
+    robot = ("hardware_bridge", "state_estimation", "controller")
+    wanted = {f"/robot_{i}/{node}" for i in (1, 2, 3) for node in robot}
+    assert set(launched.named) == wanted | {"/team/virtual_pool"}
+
+
+def test_every_launch_file_takes_the_options_of_up(launched):
+    """All but arming, which needs a message, and the duration."""
+    for graph in ("sim", "robot", "pool"):
+        *declared, _ = runpy.run_path(str(NODES / f"launch/{graph}.launch.py"))[
+            "generate_launch_description"
+        ]()
+        options = {field.name for field in fields(Options)} - {"arm", "duration"}
+        assert {name for name, _ in declared} == options | {"params_file"}
 
 
 def test_a_number_that_is_none_is_refused(launched):
     """At launch, before any process."""
-    with pytest.raises(Ros2Error, match="seed:=x: expected an integer"):
-        launched("sim", seed="x")
+    for given, sentence in (
+        ({"seed": "x"}, "seed:=x: expected an integer"),
+        ({"lockstep": "1"}, "lockstep:=1: expected true or false"),
+    ):
+        with pytest.raises(Ros2Error, match=sentence):
+            launched("sim", **given)
 
 
 def test_a_recorder_is_started_where_a_parameter_file_names_its_file(launched, tmp_path):
@@ -301,9 +330,9 @@ def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, t
 def test_launch_files_start_what_is_installed(launched):
     """Every executable has an entry point, and every node is one."""
     started = [set(launched(graph)) for graph in ("sim", "pool", "robot")] + [
-        set(launched("robot", teleop="true", record="a.mcap"))
+        set(launched("robot", teleop="joy", record="a.mcap"))
     ]
-    assert set(launched("robot", camera="false")) == {"hardware_bridge", "state_estimation", "controller"}
+    assert set(launched("robot", camera="none")) == {"hardware_bridge", "state_estimation", "controller"}
     assert set().union(*started) == entry_points() == set(GRAPH_NODES)
     run = runpy.run_path(str(NODES / "finssim_ros/run.py"))
     with pytest.raises(AttributeError, match="available: camera"):

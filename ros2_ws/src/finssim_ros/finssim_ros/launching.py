@@ -1,10 +1,9 @@
-"""Launch files from the options of `finssim ros2 up`; arguments win over parameter files, but only where given."""
+"""Launch files from the description of graphs that `finssim ros2 up` uses; arguments win over parameter files, but only
+where given."""
 
-import os
 import re
 from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
@@ -13,38 +12,38 @@ from launch_ros.parameter_descriptions import ParameterValue
 from finssim.cli.command_line import read
 from finssim.extensions.ros2.up import launch_arguments, launched
 
-OLDER = {"camera": {"true": "", "false": "none"}, "teleop": {"true": "joy", "false": ""}}
-"""Words of earlier launch files, and what they are now."""
 FILE = "params_file"
 
 
 def description(graph):
-    """Return the launch description of a graph; an argument left empty leaves a parameter to the file."""
-    options = list(read("finssim.extensions.ros2.up:Options").all_options())
-    meanings = {option.name: f"{option.metavar or 'NUMBER'}: {option.help}" for option in options}
-    declared = {name: meanings[name] for name in launch_arguments(graph)}
-    declared[FILE] = "FILE: Your own parameter file, in place of the package's."
-    own = os.path.join(get_package_share_directory("finssim_ros"), "config", f"{graph}.yaml")
+    """Return the launch description of a graph; an argument left empty leaves a parameter to file and nodes."""
+    options = {option.name: option for option in read("finssim.extensions.ros2.up:Options").all_options()}
+    declared = {
+        name: f"{options[name].metavar or options[name].kind.__name__}: {options[name].help}"
+        for name in launch_arguments()
+    }
+    declared[FILE] = "FILE: Parameter file of all nodes."
 
     def start(context):
         words = {name: context.launch_configurations[name] for name in declared}
-        words = {name: OLDER.get(name, {}).get(word.lower(), word) for name, word in words.items()}
-        file = words.pop(FILE) or own
-        namespace, nodes = launched(graph, {name: word for name, word in words.items() if word})
-        if graph != "pool" and re.search(r"^[^#]*\brecord:", Path(file).read_text(), re.MULTILINE):
-            nodes.setdefault("recorder", {})
+        file = words.pop(FILE)
+        if file and (
+            named := re.search(r"^[^#\n]*\brecord: *([^\s,}]+)", Path(file).read_text(), re.MULTILINE)
+        ):
+            words["record"] = words["record"] or named[1].strip("\"'")
+        plan = launched(graph, {name: word for name, word in words.items() if word})
         return [
             Node(
                 package="finssim_ros",
-                executable=node,
+                executable=one.node,
                 # With name and namespace launch_ros writes the parameters below the node's full name; without, below
                 # /**, which loses against every node that a file names after a /** of its own.
-                name=node,
-                namespace=namespace,
-                parameters=[file, *([_words(parameters)] if parameters else [])],
+                name=one.node,
+                namespace=one.namespace,
+                parameters=[*([file] if file else []), *([_words(one.parameters)] if one.parameters else [])],
                 output="screen",
             )
-            for node, parameters in nodes.items()
+            for one in plan.nodes
         ]
 
     arguments = [DeclareLaunchArgument(n, default_value="", description=d) for n, d in declared.items()]

@@ -1,4 +1,7 @@
-"""The virtual pool: ros2 launch finssim_ros pool.launch.py severity:=realistic plant:=1"""
+"""The virtual pool and a robot in it: ros2 launch finssim_ros pool.launch.py severity:=realistic goal:=0.4,0,-0.5,0
+
+Several vehicles: team:=finsrov,finsrov,finsrov site:=open-water positioning:=motion-capture
+"""
 
 from finssim_ros.launching import description
 

@@ -10,11 +10,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
@@ -35,7 +35,9 @@ __all__ = [
     "GRAPHS",
     "MCU_PORT",
     "NODES",
+    "TAKES",
     "Options",
+    "GraphNode",
     "GraphPlan",
     "launch_arguments",
     "launched",
@@ -53,7 +55,9 @@ PATIENCE = 10.0
 class Child:
     """One node's process."""
 
+    what: GraphNode
     name: str
+    """Name for people."""
     process: subprocess.Popen[bytes]
     dead: bool = False
 
@@ -64,7 +68,7 @@ class Supervisor:
     def __init__(self, plan: GraphPlan, parameters: Path, notify: Callable[[str], None]) -> None:
         """
         Args:
-            plan: Nodes and namespace.
+            plan: Nodes and namespaces.
             parameters: File that `plan.write` wrote.
             notify: Takes a sentence for the person who watches.
         """
@@ -77,19 +81,20 @@ class Supervisor:
     def __exit__(self, *error: object) -> None:
         self.end()
 
-    def start(self, name: str) -> Child:
+    def start(self, one: GraphNode) -> Child:
         """Start a node; it ends with this process even if that is killed."""
-        ros = ["--ros-args", "-r", f"__ns:=/{self._plan.namespace}", "--params-file", str(self._parameters)]
-        command = [sys.executable, "-m", "finssim", "ros2", "node", name, *ros]
+        name = one.node if len(self._plan.namespaces) == 1 else one.full_name.strip("/")
+        ros = ["--ros-args", "-r", f"__ns:=/{one.namespace}", "--params-file", str(self._parameters)]
+        command = [sys.executable, "-m", "finssim", "ros2", "node", one.node, *ros]
         environment = {**os.environ, PARENT: str(os.getpid())}
         # In a separate session: Ctrl-C reaches this process alone, and the nodes end in our order.
         process = subprocess.Popen(
             command,
             env=environment,
-            stdin=subprocess.DEVNULL if name != "teleop" else None,
+            stdin=subprocess.DEVNULL if one.node != "teleop" else None,
             **SEPARATE,
         )
-        child = Child(name, process)
+        child = Child(one, name, process)
         self.children.append(child)
         self._say(f"{name}: process {process.pid}")
         return child
@@ -130,8 +135,8 @@ def _status(code: int) -> str:
 
 DIED, FAULT = 1, 3
 """Exit status where a node died, and where the bridge ended in a fault."""
-STARTING = 180.0
-"""Time for the virtual pool to write its pool file [s]; the first rendering on a machine compiles."""
+APART = 10
+"""Ports between one vehicle of a team and the next, as of a virtual pool."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,11 +144,14 @@ class Options:
     """Options of the command."""
 
     policy: str = "pid"
-    """(DIR|pid|pid-paper) A policy's directory, or pid, or pid-paper."""
+    """(DIR|pid|pid-paper|none) A policy's directory, or pid, or pid-paper; none for a controller of your own."""
     task: str | None = None
     """Task that the policy must have been trained for; its own if not given."""
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    team: str | None = None
+    """(NAME,NAME) Several vehicles of one virtual pool instead: robot_1 and so on, which are their namespaces. Of goal,
+    trajectory and let-in give one for each, separated by semicolons; record and truth are folders."""
     namespace: str | None = None
     """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
     vehicles. The vehicle's name, without prefix, if not given."""
@@ -154,6 +162,8 @@ class Options:
     world: str | None = None
     """(SITE|FILE) World for the own cameras, sonars and altimeters of a vehicle in a virtual pool; in open water
     also its water. The node camera publishes them."""
+    water: Path | None = None
+    """(FILE) Water file of a virtual pool (.yaml): currents and waves, which add to the site's own."""
     positioning: str = "none"
     """(NAME) Position fixes of a virtual pool: none, motion-capture or usbl."""
     let_in: str | None = None
@@ -195,125 +205,225 @@ class Options:
     """(FILE) Record all topics to this file (.mcap)."""
     teleop: str | None = None
     """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
+    lockstep: bool = False
+    """Let /clock advance when every node has done its work of the last step, however long it takes: for a slow machine
+    or CI. As fast as possible, unless --real-time-factor limits it."""
+    real_time_factor: Annotated[float | None, (0.0, None)] = None
+    """Seconds of /clock per second; 0: without limit, for sim and in lock-step. A virtual pool publishes /clock where
+    this or --lockstep is given; otherwise it runs in real time."""
+    message_loss: Annotated[float | None, (0.0, 1.0)] = None
+    """Probability that a vehicle of a team misses a message of another; as of training, 0.1, if not given."""
+    message_delay: Annotated[float | None, (0.0, None)] = None
+    """Time to process such a message, besides its way at the speed of sound [s]; 0.1 if not given."""
     duration: Annotated[float | None, (0.0, None)] = None
     """Duration [s]; until Ctrl-C if not given."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
 
 
-LAUNCHED = {
-    "sim": "policy task goal trajectory start hydrodynamics seed record teleop",
-    "robot": "robot bind port pictures camera pool_file let_in policy task goal trajectory record teleop",
-    "pool": "bind port plant severity camera pool_file positioning world start truth seed",
-}
-"""Graph -> options that its launch file takes besides those of every vehicle; arming needs a message there."""
+NOT_LAUNCHED = ("arm", "duration")
+"""Options that launch files lack: arming needs a message there, and Ctrl-C ends them."""
 
 
-def launch_arguments(graph: str) -> list[str]:
-    """Return the options that a graph's launch file takes as arguments."""
-    return f"vehicle namespace frame_prefix site {LAUNCHED[graph]}".split()
+def launch_arguments() -> list[str]:
+    """Return the options that every launch file takes as arguments."""
+    return [option.name for option in fields(Options) if option.name not in NOT_LAUNCHED]
 
 
-def launched(graph: str, given: Mapping[str, str]) -> tuple[str, dict[str, dict[str, Any]]]:
+def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
     """Plan a launch file: as `up` does, but what is not given is left to parameter files and nodes.
-
-    The launch file `pool` starts the virtual pool alone, and `robot` the robot in it.
 
     Args:
         graph: sim, pool or robot.
         given: Launch argument -> text, of those that a person gave.
 
-    Returns:
-        Namespace, and node -> parameters.
-
     Raises:
-        Ros2Error, VehicleError, GoalError, ControlError: As of `plan_of`, or a number that is none.
+        Ros2Error, VehicleError, GoalError, ControlError: As of `plan_of`, or a text that is no number or no flag.
     """
     values: dict[str, Any] = {**given}
-    for name in {"port", "seed"} & given.keys():
-        if not given[name].isdecimal():
-            raise Ros2Error(f"{name}:={given[name]}: expected an integer")
-        values[name] = int(given[name])
+    for option in fields(Options):
+        name, kind = option.name, str(option.type)
+        if name in given and any(word in kind for word in MEANT):
+            convert, expected = MEANT[next(word for word in MEANT if word in kind)]
+            try:
+                values[name] = convert(given[name])
+            except (KeyError, ValueError):
+                raise Ros2Error(f"{name}:={given[name]}: expected {expected}") from None
     nothing = dict.fromkeys((option.name for option in fields(Options)), None)
-    pool_file = given.get("pool_file", "pool.yaml" if graph == "pool" else None)
-    plan = plan_of(graph, Options(**{**nothing, **values}), pool_file)
-    nodes = [node for node in plan.nodes if graph != "pool" or node not in ROBOT]
-    shared = plan.parameters["/**"]
-    return plan.namespace, {node: {**shared, **plan.parameters.get(node, {})} for node in nodes}
+    pool_file = given.get("pool_file")
+    if graph == "pool" and pool_file is None:
+        pool_file = str(Path(mkdtemp(prefix="finssim-ros2-")) / "pool.yaml")
+    return plan_of(graph, Options(**{**nothing, **values}), pool_file, since=time.time())
 
 
-def plan_of(graph: str, options: Options, pool_file: Path | str | None) -> GraphPlan:
+MEANT: dict[str, tuple[Callable[[str], Any], str]] = {
+    "bool": (lambda word: {"true": True, "false": False}[word.lower()], "true or false"),
+    "float": (float, "a number"),
+    "int": (int, "an integer"),
+}
+"""Word in an option's type -> what makes the value of a launch argument's text, and what that is."""
+
+
+def plan_of(
+    graph: str, options: Options, pool_file: Path | str | None, *, since: float | None = None
+) -> GraphPlan:
     """Return nodes and parameters; an option that is None leaves a parameter to the node.
 
     Args:
         graph: sim, pool or robot.
         options: As the person chose.
         pool_file: That robot's nodes read, and the virtual pool writes; None: the nodes' own.
+        since: Time of day at which the graph starts, before which a virtual pool has not written that file [s].
 
     Raises:
-        Ros2Error: There is no such graph.
+        Ros2Error: There is no such graph, or an option that has no effect there.
         VehicleError, GoalError, ControlError: A vehicle, goal or trajectory that cannot be used.
     """
-    o, vehicle = options, vehicle_at(options.site or "pool", load_vehicle(options.vehicle or "finsrov"))
+    if graph not in GRAPHS:
+        raise Ros2Error(f"unknown graph '{graph}'; available: {', '.join(GRAPHS)}")
+    o, several = options, options.team is not None
+    names = [name.strip() for name in o.team.split(",")] if o.team is not None else [o.vehicle]
+    _check(graph, o)
     blind = o.site == "open-water" or "none" in (str(o.pool_file), o.camera)
-    if o.vehicle is not None and (o.goal is not None or o.trajectory is not None):
-        check_reachable(guide_of(o.goal, o.trajectory), vehicle)
-    extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
-    namespace = o.namespace or vehicle.name.replace("-", "_")
-    sees = o.world is not None or o.pictures not in (None, "none")
-    plan = GraphPlan(graph, o.vehicle, namespace, extra=extra, blind=blind, sees=sees)
-    if (
-        graph == "robot" and not blind and o.pool_file is None and pool_file is not None
-    ):  # our own, still unwritten
+    if graph == "robot" and not blind and o.pool_file is None and pool_file is not None:  # our own, unwritten
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
-    prefix = o.frame_prefix or (f"{o.namespace}/" if o.namespace else None)
-    plan.set("/**", site=o.site, frame_prefix=prefix)
-    plan.set("controller", policy=o.policy, task=o.task, goal=o.goal, trajectory=o.trajectory)
-    plan.set("sim", start=o.start, hydrodynamics=o.hydrodynamics, seed=o.seed)
-    if graph != "sim":
-        _wire(plan, o)
-    located = None if pool_file is None else str(pool_file)
-    for node in ("camera", "localizer", "state_estimation"):
-        plan.set(node, pool_file="none" if blind else located)
-    if o.let_in is not None:
-        place_of(o.let_in)  # refuses what is none
-        plan.set("state_estimation", let_in=o.let_in, mode="error-state")
-    if o.record is not None:
-        plan.set("recorder", record=str(o.record), pool_file=None if graph == "sim" or blind else located)
-    named = o.policy is None or o.policy.startswith("pid")
-    plan.set("teleop", device=o.teleop, other=o.policy if named else "policy")
+    simulated = graph == "sim" or o.lockstep or o.real_time_factor is not None
     camera = o.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
-    if graph == "pool":
-        plan.set(
-            "virtual_pool",
-            plant=o.plant,
-            severity=o.severity,
-            camera="none" if blind else camera,
-            port=o.port,
-            seed=o.seed,
-            positioning=o.positioning,
-            world=o.world,
-            bind=o.bind,
-            pool_file=None if blind else located,
-            start=o.start,
-            truth=None if o.truth is None else str(o.truth),
+    file = None if pool_file is None else str(pool_file)
+    factor = 0.0 if o.lockstep and o.real_time_factor is None else o.real_time_factor
+    common: dict[str, Any] = {
+        **{option.name: getattr(o, option.name) for option in fields(Options)},
+        "use_sim_time": simulated or None,
+        "lockstep": o.lockstep or None,
+        "pool_since": since if graph == "pool" and not blind else None,
+        "real_time_factor": factor,
+        "pool_file": "none" if blind else file,
+        "need_reading": False if o.teleop else None,
+        "device": o.teleop,
+        "other": o.policy if o.policy is None or o.policy.startswith("pid") else "policy",
+    }
+    nodes: list[GraphNode] = []
+    namespaces: list[str] = []
+    shares = {name: _share(name, getattr(o, name), len(names)) for name in SHARED}
+    for i, name in enumerate(names):
+        vehicle = vehicle_at(o.site or "pool", load_vehicle(name or "finsrov"))
+        own = {key: texts[i] for key, texts in shares.items()}
+        if name is not None and (own["goal"] is not None or own["trajectory"] is not None):
+            check_reachable(guide_of(own["goal"], own["trajectory"]), vehicle)
+        if own["let_in"] is not None:
+            place_of(own["let_in"])  # refuses what is none
+        namespace = f"robot_{i + 1}" if several else o.namespace or vehicle.name.replace("-", "_")
+        namespaces.append(namespace)
+        prefix = f"{namespace}/" if several or o.namespace else None
+        record = o.record and str(o.record / f"{namespace}.mcap" if several else o.record)
+        values = {
+            **common,
+            **own,
+            **_wire(graph, o, APART * i),
+            "vehicle": name,
+            "number": i or None,
+            "frame_prefix": o.frame_prefix or prefix,
+            "record": record,
+            "mode": "error-state" if own["let_in"] is not None else None,
+        }
+        for node in _members(graph, o, blind):
+            given = values
+            if node in WORLDS:
+                if i:
+                    continue  # one for all
+                given = {
+                    **values,
+                    "use_sim_time": None,
+                    "bind": o.bind,
+                    "camera": "none" if blind else camera,
+                }
+                given |= {"pool_file": None if blind else file, "frame_prefix": None if several else prefix}
+                given["truth"] = None if o.truth is None else str(o.truth)
+                given["water"] = None if o.water is None else str(o.water)
+            elif node == "recorder" and (graph == "sim" or blind):
+                given = {**values, "pool_file": None}
+            below = "team" if several and node in WORLDS else namespace
+            takes = f"{EVERYWHERE} {TAKES[node]}".split()
+            nodes.append(
+                GraphNode(node, below, {key: given[key] for key in takes if given.get(key) is not None})
+            )
+    if o.lockstep:
+        waits = " ".join(one.full_name for one in nodes if one.node not in WORLDS)
+        for one in nodes:
+            one.parameters.update({"waits_for": waits} if one.node in WORLDS else {})
+    return GraphPlan(graph, tuple(nodes), tuple(namespaces))
+
+
+def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
+    """Return the nodes of one vehicle in the order of their start."""
+    sees = o.world is not None or o.pictures not in (None, "none")
+    excluded = [*(["controller"] if o.policy == "none" else [])]
+    excluded += (["localizer"] if sees else ["camera", "localizer"]) if blind else []
+    extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
+    return (*(name for name in GRAPHS[graph] if name not in excluded), *extra)
+
+
+def _check(graph: str, o: Options) -> None:
+    """Refuse options that have no effect in a graph."""
+    if o.team is not None and (graph != "pool" or o.namespace or o.frame_prefix or o.teleop or o.start):
+        raise Ros2Error(
+            "--team is for the graph pool, which places and names its vehicles: leave --namespace, --frame-prefix, "
+            "--start and --teleop out"
         )
-    return plan
+    if graph == "robot" and (o.lockstep or o.real_time_factor is not None):
+        host = "" if o.robot is None else o.robot.rpartition("//")[2]
+        if o.robot not in (None, "pool") and not host.startswith(("127.", "localhost")):
+            raise Ros2Error(
+                f"--robot {o.robot} lives in real time: leave --lockstep and --real-time-factor out"
+            )
+    takes = {word for node in GRAPHS[graph] for word in TAKES[node].split()} | set(ALWAYS.split())
+    takes |= set(BESIDES[graph].split())
+    for option in fields(Options):
+        value = getattr(o, option.name)
+        if value not in (None, option.default) and option.name not in takes:
+            raise Ros2Error(
+                f"--{option.name.replace('_', '-')} has no effect in the graph {graph}: leave it out"
+            )
 
 
-def _wire(plan: GraphPlan, o: Options) -> None:
-    """Addresses: pictures come from the port after the motor controller's, to the port after our own end's."""
+def _share(name: str, text: str | None, n: int) -> list[str | None]:
+    """Return each vehicle's share of an option that has one for each of a team."""
+    if text is None or n == 1:
+        return [text] * n
+    parts = [part.strip() for part in text.split(";")]
+    if len(parts) != n:
+        raise Ros2Error(
+            f"--{name.replace('_', '-')} {text}: expected {n} separated by semicolons, one a vehicle"
+        )
+    return list(parts)
+
+
+def _wire(graph: str, o: Options, further: int) -> dict[str, Any]:
+    """Addresses: pictures come from the port after the motor controller's, to the port after our own end's.
+
+    Args:
+        graph: sim, pool or robot.
+        o: As the person chose.
+        further: Distance of this vehicle's ports from those of the first.
+    """
+    if graph == "sim":
+        return {"robot": None}
+    bind = camera_bind = None
     if o.bind is not None:
         host, _, port = o.bind.rpartition(":")
         if not port.isdecimal():
             raise Ros2Error(f"--bind {o.bind}: expected ADDRESS:PORT")
-        plan.set("camera", pictures_bind=f"{host}:{int(port) + 1}")
-    pool = plan.graph == "pool" or o.robot in (None, "pool")
-    here = f"udp://127.0.0.1:{o.port}" if pool and o.port is not None else None
-    eye = f"udp://127.0.0.1:{o.port + 1}" if here else None if pool else "none"
-    plan.set("/**", robot=here or o.robot)
-    plan.set("hardware_bridge", bind=o.bind, need_reading=False if o.teleop else None)
-    plan.set("camera", pictures=o.pictures or eye)
+        bind, camera_bind = f"{host}:{int(port) + further}", f"{host}:{int(port) + further + 1}"
+    pool = graph == "pool" or o.robot in (None, "pool")
+    first = MCU_PORT if o.port is None and further else o.port
+    here = f"udp://127.0.0.1:{first + further}" if pool and first is not None else None
+    eye = f"udp://127.0.0.1:{first + further + 1}" if here else None if pool else "none"
+    return {
+        "robot": here or o.robot,
+        "bind": bind,
+        "pictures": o.pictures or eye,
+        "pictures_bind": camera_bind,
+    }
 
 
 def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[str], None] = print) -> int:
@@ -342,64 +452,51 @@ def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[
 
     with TemporaryDirectory(prefix="finssim-ros2-") as folder:
         pool_file = (options.pool_file or Path(folder) / "pool.yaml").resolve()
-        plan, parameters = plan_of(graph, options, pool_file), Path(folder) / "parameters.yaml"
+        plan, parameters = (
+            plan_of(graph, options, pool_file, since=time.time()),
+            Path(folder) / "parameters.yaml",
+        )
         plan.write(parameters)
         for name, topic in topics_of(plan):
             notify(f"  {name}  {topic.type}  {topic.meaning}")
         with interruptible() as interrupted:
-            shared = plan.parameters["/**"]
-            settings = (
-                f"{name}:='{shared[name]}'" for name in ("vehicle", "site", "frame_prefix") if name in shared
-            )
-            arguments = [word for setting in settings for word in ("-p", setting)]
-            words = ["--ros-args", "-r", f"__ns:=/{plan.namespace}", *arguments]
-            rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)  # `interruptible` has them
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # `interruptible` has them
             try:
-                watcher = Watcher(plan.nodes, arm=options.arm)
+                watchers = [Watcher(plan, namespace, arm=options.arm) for namespace in plan.namespaces]
                 with Supervisor(plan, parameters, notify) as nodes:
-                    if graph == "pool":
-                        nodes.start("virtual_pool")
-                        if not plan.blind:
-                            _await(pool_file, nodes, interrupted)
-                    for name in plan.nodes:
-                        if name != "virtual_pool":
-                            nodes.start(name)
-                    return _watch(watcher, options, nodes, interrupted, notify)
+                    for one in plan.nodes:
+                        nodes.start(one)
+                    return _watch(watchers, options, nodes, interrupted, notify)
             finally:
                 rclpy.try_shutdown()
 
 
-def _await(pool_file: Path, nodes: Supervisor, interrupted: Callable[[], bool]) -> None:
-    """Wait for the pool file of a virtual pool that has just been started."""
-    begun, end = time.time() - 1.0, time.monotonic() + STARTING
-    while not (pool_file.exists() and pool_file.stat().st_mtime >= begun - 1.0):
-        if interrupted():
-            raise KeyboardInterrupt
-        if nodes.look() or time.monotonic() > end:
-            raise Ros2Error("the virtual pool did not start: see its output above")
-        time.sleep(0.05)
-
-
 def _watch(
-    watcher: Watcher,
+    watchers: Sequence[Watcher],
     options: Options,
     nodes: Supervisor,
     interrupted: Callable[[], bool],
     notify: Callable[[str], None],
 ) -> int:
-    died = False
+    died, begun = False, watchers[0].now()
     if not options.arm:
         notify("disarmed: thrusters turn only after true on the topic arm, or with --arm")
-    end = time.monotonic() + (float("inf") if options.duration is None else options.duration)
-    while not interrupted() and time.monotonic() < end:
-        watcher.turn(0.2)
-        died = bool(nodes.look()) or died
-        if all(child.dead for child in nodes.children):
+    end = float("inf") if options.duration is None else begun + options.duration
+    while not interrupted() and watchers[0].now() < end:
+        for watcher in watchers:
+            watcher.turn(0.2 / len(watchers))
+        gone = nodes.look()
+        died = died or bool(gone)
+        for child in gone:
+            watchers[0].left(child.what.full_name)
+        if any(child.what.node in WORLDS for child in gone) or all(child.dead for child in nodes.children):
             break
-    watcher.bridge.disarm(watcher.now())
-    watcher.turn(0.1)
+    for watcher in watchers:
+        watcher.bridge.disarm(watcher.now())
+        watcher.turn(0.1)
     sys.stdout.flush()
-    return DIED if died else FAULT if watcher.state == "fault" else 0
+    fault = any(watcher.state == "fault" for watcher in watchers)
+    return DIED if died else FAULT if fault else 0
 
 
 # Which nodes make up a robot, its virtual pool or a simulated vehicle, and with which parameters.
@@ -422,53 +519,67 @@ ROBOT = ("hardware_bridge", "camera", "localizer", "state_estimation", "controll
 GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool", *ROBOT)}
 """Graph -> nodes, in the order of their start; they end in the reverse order, the bridge after who commands it."""
 
+WORLDS = ("sim", "virtual_pool")
+"""Nodes that are a world, which keeps the time of its graph: it ends with them."""
+
+EVERYWHERE = "vehicle robot site frame_prefix number use_sim_time lockstep pool_since"
+"""Parameters of every node."""
+
+TAKES = {
+    "camera": "pictures pictures_bind pool_file",
+    "controller": "policy task goal trajectory",
+    "hardware_bridge": "bind need_reading",
+    "localizer": "pool_file",
+    "recorder": "record pool_file",
+    "sim": "start hydrodynamics seed real_time_factor",
+    "state_estimation": "pool_file let_in mode",
+    "teleop": "device other",
+    "virtual_pool": "plant severity camera port bind pool_file truth start positioning world water seed team "
+    "message_loss message_delay real_time_factor",
+}
+"""Node -> its parameters that options give, by the names of the options where these are the same."""
+
+ALWAYS = "vehicle namespace frame_prefix site arm record teleop duration lockstep"
+"""Options of every graph."""
+BESIDES = {"sim": "", "robot": "robot port camera real_time_factor", "pool": ""}
+"""Graph -> further options."""
+SHARED = ("goal", "trajectory", "let_in")
+"""Options that have a value for each vehicle of a team."""
+
 MCU_PORT = 58766
 """Port of a virtual pool's motor controller by default; pictures are sent from the next port."""
 
 
-@dataclass
+@dataclass(frozen=True)
+class GraphNode:
+    """One node of a graph: `up` makes it a process, a launch file a `launch_ros` node."""
+
+    node: str
+    """Name, and executable."""
+    namespace: str
+    """Namespace, without the slash before it."""
+    parameters: dict[str, Any]
+    """Those that the graph gives; the others are the node's own or a parameter file's."""
+
+    @property
+    def full_name(self) -> str:
+        """Return namespace and name."""
+        return f"/{self.namespace}/{self.node}"
+
+
+@dataclass(frozen=True)
 class GraphPlan:
     """A graph before it lives."""
 
     graph: str
-    vehicle: str | None
-    namespace: str
-    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Node, or `/**` for all -> parameters."""
-    extra: tuple[str, ...] = ()
-    """Nodes besides those of the graph: recorder, teleop."""
-    blind: bool = False
-    """True if no camera is used for localization."""
-    sees: bool = False
-    """True if pictures of the vehicle's own sensors are used nevertheless."""
-
-    def __post_init__(self) -> None:
-        if self.graph not in GRAPHS:
-            raise Ros2Error(f"unknown graph '{self.graph}'; available: {', '.join(GRAPHS)}")
-        everywhere: dict[str, Any] = {} if self.vehicle is None else {"vehicle": self.vehicle}
-        if self.graph == "sim":
-            everywhere["use_sim_time"] = True
-            self.set("sim", use_sim_time=False)
-        self.parameters["/**"] = {**everywhere, **self.parameters.get("/**", {})}
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Return the nodes in the order of their start."""
-        excluded = (("localizer",) if self.sees else ("camera", "localizer")) if self.blind else ()
-        return (*(name for name in GRAPHS[self.graph] if name not in excluded), *self.extra)
-
-    def set(self, node: str, **values: Any) -> None:
-        """Give parameters; None leaves a node's own default."""
-        stated = {name: value for name, value in values.items() if value is not None}
-        self.parameters.setdefault(node, {}).update(stated)
+    nodes: tuple[GraphNode, ...]
+    """Nodes in the order of their start; they end in the reverse order, the bridge after who commands it."""
+    namespaces: tuple[str, ...]
+    """Namespaces of the vehicles."""
 
     def write(self, path: Path) -> None:
         """The parameters as a ROS 2 parameter file."""
-        tree = {
-            key if key == "/**" else f"/{self.namespace}/{key}": {"ros__parameters": values}
-            for key, values in self.parameters.items()
-            if values
-        }
+        tree = {one.full_name: {"ros__parameters": one.parameters} for one in self.nodes if one.parameters}
         path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
 
 
@@ -510,9 +621,13 @@ _Quoting.add_representer(
 
 def topics_of(plan: GraphPlan) -> list[tuple[str, Topic]]:
     """Full names of what a graph's nodes publish, and of what they take from people."""
-    senders = {*plan.nodes, "you", "every node"}
-    return [
-        (topic.under(plan.namespace), topic)
-        for topic in TOPICS.values()
-        if senders & {word.strip() for word in topic.sender.split(",")}
-    ]
+    senders = {"you", "every node", *(one.node for one in plan.nodes)}
+    return list(
+        {
+            topic.under(namespace): topic
+            for namespace in plan.namespaces
+            for key, topic in TOPICS.items()
+            if senders & {word.strip() for word in topic.sender.split(",")}
+            and (len(plan.namespaces) > 1 or key not in ("sent", "received"))
+        }.items()
+    )

@@ -18,9 +18,12 @@ class CameraNode(RobotNode):
     def __init__(self) -> None:
         super().__init__("camera")
         file = self.parameter("pool_file", "pool.yaml")
-        self.pool = None if file == "none" else load_pool(file)
+        self.pool = None if file == "none" else load_pool(self.await_file(file))
         address = self.parameter("pictures", f"udp://{DEFAULT_CAMERA}")
-        self.source = open_pictures(address, self.parameter("pictures_bind", DEFAULT_PICTURES))
+        simulated = self.get_parameter("use_sim_time").value
+        self.source = open_pictures(
+            address, self.parameter("pictures_bind", DEFAULT_PICTURES), polled=simulated
+        )
         self.sends("diagnostics", "event")
         if self.pool is not None:
             self.sends("image", "picture", "camera_info", "tags")
@@ -62,7 +65,7 @@ class CameraNode(RobotNode):
 
     def _tell(self) -> None:
         level, self.count = ("ok" if self.count else "stale"), 0
-        self.diagnose(level, self.source.describe(), {})
+        self.diagnose("pictures", level, self.source.describe(), {})
 
     def close(self) -> None:
         """Let go of the wire."""

@@ -232,7 +232,7 @@ class ControllerNode(RobotNode):
     def _tell(self) -> None:
         counters = self.runtime.counters
         values = {"mode": self.modes.switch.mode, "decisions": counters.decisions, "missed": counters.missed}
-        self.diagnose("ok", self.bridge.state, values)
+        self.diagnose("control", "ok", self.bridge.state, values)
 
 
 def _here(reading: Reading) -> Guide:

@@ -304,6 +304,15 @@ class RosMessages(Messages):
         """Simulated time."""
         return self._of["rosgraph_msgs/msg/Clock"](self.time(stamp))
 
+    def done(self, stamp: int, name: str) -> Any:
+        """Report of a node, by its full name, in lock-step."""
+        return self._of["std_msgs/msg/Header"](self.time(stamp), name)
+
+    def team_message(self, stamp: int, sender: str, data: bytes) -> Any:
+        """Message of a vehicle to the others of its team."""
+        header = self._of["std_msgs/msg/Header"](self.time(stamp), "")
+        return self._of["finssim_msgs/msg/TeamMessage"](header, sender, np.frombuffer(data, np.uint8))
+
 
 class _Makers(dict[str, Callable[..., Any]]):
     """Type -> what makes a message of it, with fields by position or by name, and arrays as rclpy takes them."""

@@ -50,6 +50,7 @@ class BridgeTopics:
         if readings:
             RemoteReadings(node, self._on_reading)
         node.create_timer(LOOK, self._count)
+        node.create_timer(1.0, self._diagnose)
         service = SERVICES["set_armed"]
         node.create_service(ros_type(service.type), node.below(service.name), self._on_service)
 
@@ -66,6 +67,13 @@ class BridgeTopics:
         node.send("thrusters", node.make.thrusters(node.ns(now), bridge.state, {**state_values, **values}))
         for event in bridge.drain():
             node.event(event.kind, event.text, event.time)
+
+    def _diagnose(self) -> None:
+        """Report the watchdogs: the bridge's state, and why it holds or has stopped."""
+        state, reason = self._bridge.state, self._bridge.reason
+        level = {"fault": "error", "hold": "warn"}.get(state, "ok")
+        values = {"source": self._label, "publishers of commands": self._publishers}
+        self._node.diagnose("watchdogs", level, f"{state}: {reason}" if reason else state, values)
 
     def _arm(self, requested: bool) -> str:
         """Arm or disarm; "" or why it is refused."""
@@ -148,7 +156,7 @@ class HardwareBridge(RobotNode):
         self.transport, link = open_transport(address, bind), link_of(address, self.vehicle)
         self.bridge = Bridge(self.vehicle, BridgeSettings.of(self.vehicle, need_reading=located))
         self.bridge.autopilot = link
-        self.counters, self.shafts = Counters(), np.zeros(0)
+        self.counters, self._counted, self.shafts = Counters(), 0, np.zeros(0)
         self.intake = Intake(Unlocated(self.vehicle), self.bridge, self.counters, self, link)
         self.sends("imu", "pressure", "telemetry", "shafts", "echo", "positioning", "dvl", "compass")
         self.sends(*["actuators"] * bool(self.vehicle.actuators))
@@ -204,10 +212,11 @@ class HardwareBridge(RobotNode):
         self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
 
     def _tell(self) -> None:
-        state = self.bridge.state
-        counts = {"telemetry": self.counters.telemetry, "wire": self.transport.describe()}
-        level = {"fault": "error", "hold": "warn"}.get(state, "ok")
-        self.diagnose(level, state + (f": {self.bridge.reason}" if self.bridge.reason else ""), counts)
+        count, self._counted = self.counters.telemetry - self._counted, self.counters.telemetry
+        level, text = ("ok", "telemetry") if count else ("error", "no telemetry in the last second")
+        self.diagnose(
+            "link", level, text, {"frames in the last second": count, "wire": self.transport.describe()}
+        )
 
     def close(self) -> None:
         """Disarm, send that to the motor controller, and release the wire."""

@@ -36,7 +36,7 @@ class Localizer(RobotNode):
         file = self.parameter("pool_file", "pool.yaml")
         if file == "none":
             raise ValueError("pool_file is none, but a localizer needs one: start none where no camera looks")
-        self.pool = load_pool(file)
+        self.pool = load_pool(self.await_file(file))
         method = self.parameter("method", "refractive")
         self.perception = Perception(self.vehicle, self.pool, method=method)
         self.perception.fixes = self.fixes = _Kept(self.perception.fixes)
@@ -92,7 +92,7 @@ class Localizer(RobotNode):
 
     def _tell(self) -> None:
         fixes = sum(self.verdicts[word] for word in ("accepted", "initialized", "reacquired"))
-        self.diagnose("ok" if fixes else "stale", f"{fixes} fixes", dict(self.verdicts))
+        self.diagnose("fixes", "ok" if fixes else "stale", f"{fixes} fixes", dict(self.verdicts))
         self.verdicts.clear()
 
 

@@ -11,7 +11,7 @@ from finssim.extensions.ros2.nodes.robot_node import RobotNode
 from finssim.robot.recorder import Recorder
 from finssim.vehicles import Vehicle
 
-LEFT_OUT, RAW = ("clock",), "sensor_msgs/msg/Image"
+LEFT_OUT, RAW = ("clock", "done"), "sensor_msgs/msg/Image"
 """Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
 
 
@@ -29,7 +29,7 @@ class RecorderNode(RobotNode):
         if not path:
             self.get_logger().info("nothing is recorded: give a file by the parameter record")
             return
-        files = {"pool.yaml": pool_file} if pool_file not in ("", "none") else {}
+        files = {"pool.yaml": self.await_file(pool_file)} if pool_file not in ("", "none") else {}
         names = {key: self.resolve_topic_name(self.topic(key)) for key in self.table}
         self.mcap = _WireRecord(Path(path), self.filed, {"command": "ros2 recorder"}, files, names)
         for key, topic in self.table.items():
@@ -47,7 +47,7 @@ class RecorderNode(RobotNode):
         if self.mcap is not None:
             problem = self.mcap.problem
             self.diagnose(
-                "error" if problem else "ok", problem or "recording", {"dropped": self.mcap.dropped}
+                "record", "error" if problem else "ok", problem or "recording", {"dropped": self.mcap.dropped}
             )
 
     def close(self) -> None:

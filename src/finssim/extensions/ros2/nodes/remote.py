@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,8 @@ import numpy.typing as npt
 import rclpy
 
 from finssim.extensions.ros2.nodes.conversions import nanoseconds, reading_of, ros_type
-from finssim.extensions.ros2.nodes.robot_node import LISTENING, RobotNode
+from finssim.extensions.ros2.nodes.robot_node import LEFT, LISTENING, RobotNode
+from finssim.extensions.ros2.up import EVERYWHERE, GraphPlan
 from finssim.robot.bridge import Event
 from finssim.robot.messages import Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
@@ -185,18 +187,22 @@ class Watcher(RobotNode):
 
     listening = LISTENING
 
-    def __init__(self, nodes: Sequence[str], *, arm: bool) -> None:
+    def __init__(self, plan: GraphPlan, namespace: str, *, arm: bool) -> None:
         """
         Args:
-            nodes: Those that are to be started, of which there must be no others.
+            plan: Nodes that are to be started, of which there must be no others.
+            namespace: Of the vehicle.
             arm: Ask for arming as soon as the state is ready and a controller is there, until it is granted once.
 
         Raises:
             TwinError: There are others.
         """
-        super().__init__("ros2_up", nodes)
+        nodes = [one for one in plan.nodes if one.namespace == namespace]
+        alike = next((one for one in nodes if one.node == "controller"), nodes[-1])
+        rename = ["-r", f"__ns:=/{namespace}"]
+        super().__init__("ros2_up", [one.node for one in nodes], [*rename, *_words(alike.parameters)])
         self._arm, self._asked = arm, 0.0
-        self.sends("event", "diagnostics")
+        self.sends("event", "diagnostics", "done")
         self.bridge = RemoteBridge(self)
         self.state = self.bridge.state
         """Of the bridge, as it was seen last while nodes lived."""
@@ -216,5 +222,16 @@ class Watcher(RobotNode):
             if self.count_publishers(self.topic("command")):
                 self.bridge.arm(self.now(), "ros2 up")
 
+    def left(self, name: str) -> None:
+        """Report that a node has ended, so that time in lock-step does not wait for it."""
+        self.send("done", self.make.done(LEFT * 10**9, name))
+
     def _on_reading(self, reading: Reading) -> None:
         self.ready = reading.ready
+
+
+def _words(parameters: Mapping[str, Any]) -> list[str]:
+    """Return arguments that give a node the parameters which every node has."""
+    words = {name: parameters[name] for name in EVERYWHERE.split() if name in parameters}
+    texts = (f"{name}:={json.dumps(value)}" for name, value in words.items())
+    return [word for text in texts for word in ("-p", text)]

@@ -12,11 +12,13 @@ from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from finssim.core.system import follow_parent
+from finssim.extensions.ros2 import Ros2Error
 from finssim.extensions.ros2.nodes.conversions import RosMessages, nanoseconds, ros_type
 from finssim.extensions.ros2.topics import TOPICS, own_topics, quality_profile
 from finssim.vehicles import load_vehicle
@@ -30,6 +32,14 @@ FORGOTTEN = 11.0
 """When the wire has forgotten a node that was killed [s]: its lease of ten, and one to spare."""
 REFUSED = 2
 """Exit status of a node that refuses its arguments."""
+STEP = 1.0 / 60.0
+"""Between ticks of /clock, and between commands and states of a simulator [s]."""
+AGAIN = 0.5
+"""Between two reports of the same work in lock-step [s], as one may be lost."""
+LEFT = 2**31 - 1
+"""Stamp in a report for a node that has left [s]."""
+WRITING = 180.0
+"""Time for a virtual pool to write its pool file [s]; the first rendering on a machine compiles."""
 
 
 class TwinError(ValueError):
@@ -48,17 +58,18 @@ class RobotNode(Node):
     urgent = True
     """True for nodes between a sensor and a thruster, which have priority over other programs if permitted."""
 
-    def __init__(self, name: str, others: Sequence[str] = ()) -> None:
+    def __init__(self, name: str, others: Sequence[str] = (), arguments: Sequence[str] = ()) -> None:
         """
         Args:
             name: Of the node.
             others: Of nodes that there must not be yet, besides one of its own name.
+            arguments: Of this node alone, after --ros-args, besides those of the process.
 
         Raises:
             VehicleError: The parameters `vehicle` or `site` name none.
             TwinError: There is one of those nodes.
         """
-        super().__init__(name)
+        super().__init__(name, cli_args=["--ros-args", *arguments] if arguments else None)
         self.filed = load_vehicle(self.parameter("vehicle", "finsrov"))
         """The vehicle as its file has it, which policies are trained for."""
         self.robot = self.parameter("robot", "pool")
@@ -75,6 +86,9 @@ class RobotNode(Node):
         simulated = self.get_parameter("use_sim_time").value
         self.base = 0 if simulated else self.get_clock().now().nanoseconds // 10**9 * 10**9
         """What the ROS clock shows when the robot's shows 0 [ns]."""
+        self.lockstep = self.parameter("lockstep", False)
+        """True where /clock waits for the nodes that live by it."""
+        self._newer = self.parameter("pool_since", 0.0)
         self.add_on_set_parameters_callback(partial(_keep_clock, bool(simulated)))
         self._out: dict[str, Any] = {}
         self._listen_for({self.get_name(), *others})
@@ -163,9 +177,9 @@ class RobotNode(Node):
         else:
             self.get_logger().info(f"{kind}: {text}")
 
-    def diagnose(self, level: str, text: str, values: dict[str, Any]) -> None:
-        """Health, on the topic `diagnostics`; level is ok, warn, error or stale."""
-        name = f"{self.vehicle.name}: {self.get_name()}"
+    def diagnose(self, part: str, level: str, text: str, values: dict[str, Any]) -> None:
+        """Health of a part, on the topic `/diagnostics`; level is ok, warn, error or stale."""
+        name = f"{self.get_fully_qualified_name().strip('/')}: {part}"
         self.send("diagnostics", self.make.diagnostics(self.ns(self.now()), name, level, text, values))
 
     # -- a process of its own -------------------------------------------------------------------------------------
@@ -205,7 +219,39 @@ class RobotNode(Node):
 
     def spin(self) -> None:
         """Run callbacks."""
+        self.report()
         rclpy.spin(self)
+
+    def report(self) -> None:
+        """In lock-step, report the work of each time of /clock from now on, when it is done."""
+        if self.lockstep and self.get_parameter("use_sim_time").value:
+            self.sends("done")
+            self._done = self.make.done(self.ns(self.now()), self.get_fully_qualified_name())
+            self.create_timer(
+                STEP, self._tell_done
+            )  # the last one that was made: others due with it come first
+            again = Clock(clock_type=ClockType.STEADY_TIME)
+            self.create_timer(AGAIN, lambda: self.send("done", self._done), clock=again)
+
+    def _tell_done(self) -> None:
+        self._done = self.make.done(self.ns(self.now()), self.get_fully_qualified_name())
+        self.send("done", self._done)
+
+    def await_file(self, path: str) -> str:
+        """Return the path of a pool file, once it is newer than the parameter `pool_since` requires.
+
+        Raises:
+            Ros2Error: It does not come.
+        """
+        end = time.monotonic() + WRITING
+        while self._newer and self.context.ok():
+            with suppress(OSError):
+                if os.stat(path).st_mtime >= self._newer:
+                    break
+            if time.monotonic() > end:
+                raise Ros2Error(f"{path}: the virtual pool did not write it: see its output above")
+            time.sleep(0.05)
+        return path
 
     def close(self) -> None:
         """Put in order what is not the middleware's; called once at the end, however it came."""

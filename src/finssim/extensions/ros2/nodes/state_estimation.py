@@ -25,7 +25,7 @@ class StateEstimation(RobotNode):
     def __init__(self) -> None:
         super().__init__("state_estimation")
         file = self.parameter("pool_file", "pool.yaml")
-        pool = None if file == "none" else load_pool(file)
+        pool = None if file == "none" else load_pool(self.await_file(file))
         mode = self.parameter("mode", "error-state" if self.vehicle.sensors.imu else "constant-velocity")
         start = self.parameter("let_in", "")
         self.perception = Perception(self.vehicle, pool, mode=mode, let_in=place_of(start) if start else None)
@@ -72,7 +72,10 @@ class StateEstimation(RobotNode):
             for s, counts_by_word in health.counts.items()
             for word, n in counts_by_word.items()
         }
-        self.diagnose("ok" if reading.ready else "warn", reading.reason or reading.mode, counts)
+        ages = {"age of vision [s]": health.age_vision, "of inertial data [s]": health.age_imu}
+        ages |= {"of depth [s]": health.age_depth, "standard deviation [m]": max(reading.std[:3])}
+        level = "ok" if reading.ready else "warn"
+        self.diagnose("localization", level, reading.reason or reading.mode, {**ages, **counts})
 
 
 def health_values(health: Health) -> dict[str, Any]:

@@ -280,7 +280,7 @@ class Node(NodeParameters, NodeGraph, Limited):
 
     def takers(self) -> Iterator[Any]:
         """Yield the endpoints that may have work."""
-        return (end for end in list(self._ends) if hasattr(end, "take"))
+        return (end for end in list(self._ends) if not isinstance(end, Publisher))
 
     def record(self) -> NodeRecord:
         """The node as the node list has it."""

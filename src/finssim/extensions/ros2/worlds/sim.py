@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,9 @@ from finssim.core.rotations import (
 from finssim.extensions.ros2.nodes.conversions import ros_type
 from finssim.extensions.ros2.nodes.frames import Frames
 from finssim.extensions.ros2.nodes.hardware_bridge import BridgeTopics
-from finssim.extensions.ros2.nodes.robot_node import RobotNode
+from finssim.extensions.ros2.nodes.robot_node import STEP, RobotNode
 from finssim.extensions.ros2.topics import SERVICES
+from finssim.extensions.ros2.worlds.clock import Barrier, SharedClock
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.messages import Telemetry
@@ -31,11 +31,11 @@ from finssim.vehicles import Vehicle
 
 __all__ = ["Sim"]
 
-STEP = 1.0 / 60.0
-"""Between commands, states and ticks of /clock [s]."""
 SUBSTEPS = 3
 MOST_BEHIND = 5
 """Steps made up for at a time; a computer that is slower lets simulated time be slower."""
+POLL = 0.001
+"""Between two looks whether a step in lock-step may begin [s]."""
 
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -81,63 +81,6 @@ class IdealSensors:
         )
 
 
-CLAIMING = 1.0
-"""Time in which simulators that started together find each other [s]."""
-LOOK = 0.5
-"""Between two looks at who publishes /clock [s]."""
-
-
-class SharedClock:
-    """Topic /clock of a domain: one simulator publishes it and every other one follows it.
-
-    A simulator that finds another publisher follows it. Of simulators that began to publish within `CLAIMING` of each
-    other, the first by name continues. One that follows takes over, without a jump, when the publisher has left.
-    """
-
-    def __init__(self, node: RobotNode, follow: Callable[[float], None], lead: Callable[[], None]) -> None:
-        """
-        Args:
-            node: Node of the simulator.
-            follow: Takes each time of the other's clock [s].
-            lead: Called when time becomes the node's own.
-        """
-        self._node, self._follow, self._lead = node, follow, lead
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.ours = False
-        self._claimed = 0.0
-        self._heard: Any = None
-        self.look()
-        node.create_timer(LOOK, self.look, clock=self._steady)
-
-    def look(self) -> None:
-        """Claim /clock, or give way to another publisher."""
-        node, now = self._node, 1e-9 * self._steady.now().nanoseconds
-        own = node.get_fully_qualified_name()
-        infos = node.get_publishers_info_by_topic(node.topic("clock"))
-        others = sorted({f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos} - {own})
-        if self.ours:
-            if others and others[0] < own and now - self._claimed < CLAIMING:
-                self._give_way(others[0])
-        elif not others:
-            self._claim(now)
-        elif self._heard is None:
-            self._give_way(others[0])
-
-    def _claim(self, now: float) -> None:
-        self.ours, self._claimed = True, now
-        if self._heard is not None:
-            self._node.destroy_subscription(self._heard)
-            self._node.event("clock", "no other node publishes /clock any more: this simulator does")
-        self._node.sends("clock")
-        self._lead()
-
-    def _give_way(self, other: str) -> None:
-        node, self.ours = self._node, False
-        node.withdraw("clock")
-        self._heard = node.hears("clock", lambda message: self._follow(node.seconds(message.clock)))
-        node.event("clock", f"{other} publishes /clock: this simulator follows it, at its pace")
-
-
 class Sim(RobotNode):
     """Simulator node. Its time begins at 0, or follows /clock if another node publishes it already; the state is the
     truth."""
@@ -165,7 +108,10 @@ class Sim(RobotNode):
             Clock(clock_type=ClockType.STEADY_TIME),
         )
         self.clock = SharedClock(self, self._follow, self._lead)
-        self.create_timer(STEP / self._factor if self._factor > 0.0 else 0.0, self._turn, clock=self._steady)
+        nodes = self.parameter("waits_for", "")
+        self._barrier = Barrier(self, nodes.split(), self._tell_time) if self.lockstep else None
+        period = STEP / self._factor if self._factor > 0.0 else POLL if self.lockstep else 0.0
+        self.create_timer(period, self._turn, clock=self._steady)
 
     def now(self) -> float:
         """Simulated time [s]."""
@@ -191,9 +137,15 @@ class Sim(RobotNode):
             return
         passed = (self._steady.now().nanoseconds - self._began) * 1e-9 * self._factor / STEP
         due = int(passed) - self._made if self._factor > 0.0 else 1
+        self._made += due
+        if self._barrier is not None:  # time that the nodes take is no simulated time
+            due = min(due, 0 if self._barrier.missing(self.time) else 1)
         for _ in range(min(due, MOST_BEHIND)):
             self._step()
-        self._made += due
+
+    def _tell_time(self) -> None:
+        if self.clock.ours:
+            self.send("clock", self.make.clock(self.ns(self.time)))
 
     def _step(self) -> None:
         self.bridge.reading(self.time, self._reading())
@@ -205,8 +157,7 @@ class Sim(RobotNode):
 
     def _publish(self, normalised: Any) -> None:
         stamp, reading, make = self.ns(self.time), self._reading(), self.make
-        if self.clock.ours:
-            self.send("clock", make.clock(stamp))
+        self._tell_time()
         self.send("odometry", make.odometry(stamp, reading))
         self.frames.tell(stamp, reading)
         self.send("estimator", make.estimator(stamp, reading, {}))

@@ -1,0 +1,67 @@
+# ruff: noqa: E402 - rclpy can be imported once a backend is active
+"""The example of a controller of one's own, on a simulator in lock-step, and the one clock of a domain."""
+
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finssim.extensions.ros2.backend import activate
+
+activate(announce=False)
+
+import rclpy
+from nav_msgs.msg import Odometry
+
+EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "own_controller.py"
+PATIENCE = 120.0  # [s] for processes to start on a machine that does much else
+
+
+def finssim(*words):
+    """A process of the command."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen([sys.executable, "-m", "finssim", *words], **pipes)
+
+
+@pytest.fixture(scope="module")
+def graph():
+    """The graph that the example names."""
+    line = next(line for line in EXAMPLE.read_text().splitlines() if line.startswith("finssim ros2 up"))
+    process = finssim(*line.split()[1:])
+    yield process
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60.0)
+    rclpy.try_shutdown()
+
+
+@pytest.mark.slow
+def test_a_controller_of_ones_own_holds_its_place(graph):
+    """Armed on demand, within 10 cm of the goal in 20 s of /clock, of which the node misses no step."""
+    rclpy.init(args=[])
+    node, stamps = runpy.run_path(str(EXAMPLE))["OwnController"](), []
+    node.create_subscription(
+        Odometry, "odom", lambda m: stamps.append(m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec), 10
+    )
+    end, node.error = time.monotonic() + PATIENCE, np.full(3, np.inf)
+    while np.linalg.norm(node.error) > 0.1 and time.monotonic() < end and not (stamps and stamps[-1] > 20.0):
+        rclpy.spin_once(node, timeout_sec=0.1)
+    assert node.armed and np.linalg.norm(node.error) < 0.1
+    taken = np.diff([stamp for stamp in stamps if stamp > 1.0])
+    assert len(taken) > 60 and np.abs(taken - 1.0 / 60.0).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_a_domain_has_one_clock(graph):
+    """A second world that would publish /clock does not start, and says why."""
+    words = "ros2 node virtual_pool --ros-args -r __ns:=/other -p lockstep:=true -p camera:=none"
+    second = finssim(*words.split())
+    said, _ = second.communicate(timeout=PATIENCE)
+    assert second.returncode == 2, said
+    assert f"publishes /clock on ROS domain {os.environ['ROS_DOMAIN_ID']}, and a domain has one clock" in said
