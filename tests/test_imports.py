@@ -145,7 +145,9 @@ HOMES = {
         "extensions/ros2/nodes/robot_node.py",
         "extensions/ros2/topics.py",
         "extensions/ros2/up.py",
+        "extensions/ros2/worlds/clock.py",
         "extensions/ros2/worlds/sim.py",
+        "extensions/ros2/worlds/virtual_pool.py",
     },
     "viser": {"extensions/viewer/app.py"},
 }

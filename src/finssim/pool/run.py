@@ -51,7 +51,7 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import numbered, vehicle_at
 
 __all__ = [
-    "Ends", "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "SiteChoice", "Timing",
+    "Ends", "GroundLinks", "LockstepServer", "MCU_PORT", "MediumServer", "Pace", "PoolPlan", "SiteChoice", "PoolTiming",
     "make_plan", "run", "serve_realtime", "swimming",
 ]  # fmt: skip
 
@@ -310,14 +310,14 @@ RATE = 60.0
 """Steps a second of the software of vehicles that the task commands [Hz]."""
 
 
-class Messages(Protocol):
+class MessageEnd(Protocol):
     """The medium's end for robots in other processes."""
 
     def poll(self, now: float) -> None:
         """Take what was sent and deliver what has arrived, at the site's clock [s]."""
 
 
-class Timing:
+class PoolTiming:
     """Clock of a pool, and the medium of a team: those of this machine. A program that has its own derives a class."""
 
     paced = False
@@ -331,7 +331,7 @@ class Timing:
         """Wait for a duration [s], or until a function returns true."""
         realtime.wait(duration)
 
-    def messages(self, fleet: Fleet) -> Messages | None:
+    def messages(self, fleet: Fleet) -> MessageEnd | None:
         """Return the medium's end for the robots of a team; None: they exchange nothing."""
         return None
 
@@ -379,7 +379,7 @@ class MediumServer:
 def serve_realtime(
     site: Fleet,
     transports: Mapping[str, Transport],
-    messages: Messages | None = None,
+    messages: MessageEnd | None = None,
     *,
     sinks: Sequence[UdpSender] = (),
     camera: Clocked | None = None,
@@ -692,7 +692,7 @@ def run(
     pool_file: Path | None = None,
     truth: Path | None = None,
     duration: Annotated[float | None, (0.0, None)] = None,
-    timing: Annotated[Timing | None, "python"] = None,
+    timing: Annotated[PoolTiming | None, "python"] = None,
 ) -> None:
     """Simulate a vehicle and its pool for a robot on this machine, until Ctrl-C.
 
@@ -719,7 +719,7 @@ def run(
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
     positioning_of(choice.positioning, choice.seed)  # refuses what is none
     longest = math.inf if duration is None else duration
-    timing = timing or Timing()
+    timing = timing or PoolTiming()
     if task is not None or team is not None:
         if choice.firmware == "ardusub":
             raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
@@ -764,7 +764,7 @@ def _serve_team(
     ends: Ends,
     pool_file: Path | None,
     duration: float,
-    timing: Timing,
+    timing: PoolTiming,
 ) -> None:
     """Serve several vehicles, each to a separate robot, from their first addresses on ten ports apart."""
     (bind, port), (host, first) = ends.ours, ends.theirs
@@ -936,7 +936,7 @@ def _realtime(
     robot: tuple[str, int],
     duration: float,
     links: Callable[[], GroundLinks] | None,
-    timing: Timing,
+    timing: PoolTiming,
 ) -> None:
     with interruptible() as interrupted, ExitStack() as stack:
         transport = UdpTransport(bind, robot) if links is None else links()

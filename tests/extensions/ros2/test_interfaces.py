@@ -103,11 +103,22 @@ def test_messages_depend_on_every_package_they_use():
 
 
 def test_nodes_depend_on_every_package_whose_types_they_use():
-    """Topics, services and what nodes import."""
+    """Topics, services and what nodes, launch files and examples import; nothing else, but for the environment."""
     root = ElementTree.parse(NODES / "package.xml").getroot()
     own = [topic for topics in OWN_TOPICS.values() for topic in topics.values()]
     used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values(), *own)}
-    assert used | {"rclpy", "rcl_interfaces"} <= {e.text for e in root.findall("exec_depend")}
+    ours = (INTERFACES.parents[1] / "extensions" / "ros2").glob("[nw]o*/*.py")
+    for file in (*ours, *NODES.rglob("*/*.py"), *(WORKSPACE.parents[1] / "examples" / "ros2").glob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            named = (
+                [n.name for n in node.names]
+                if isinstance(node, ast.Import)
+                else [getattr(node, "module", "")]
+            )
+            used |= {name.partition(".")[0] for name in named if name}
+    used -= {*sys.stdlib_module_names, "finssim", "finssim_ros"}
+    keys = {"python3-numpy" if name == "numpy" else name for name in used}
+    assert keys | {"python3-venv"} == {e.text for e in root.findall("exec_depend")}
 
 
 @pytest.mark.parametrize("path", sorted(NODES.rglob("*.py")), ids=lambda path: path.name)

@@ -209,8 +209,8 @@ class Options:
     """Let /clock advance when every node has done its work of the last step, however long it takes: for a slow machine
     or CI. As fast as possible, unless --real-time-factor limits it."""
     real_time_factor: Annotated[float | None, (0.0, None)] = None
-    """Seconds of /clock per second; 0: without limit, for sim and in lock-step. A virtual pool publishes /clock where
-    this or --lockstep is given; otherwise it runs in real time."""
+    """Time of /clock per real time [-]; 0: without limit, for sim and in lock-step. A virtual pool publishes /clock
+    where this or --lockstep is given; otherwise it runs in real time."""
     message_loss: Annotated[float | None, (0.0, 1.0)] = None
     """Probability that a vehicle of a team misses a message of another; as of training, 0.1, if not given."""
     message_delay: Annotated[float | None, (0.0, None)] = None

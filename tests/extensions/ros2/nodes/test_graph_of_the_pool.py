@@ -60,6 +60,9 @@ class Graph:
         )
         self.said, self._rclpy = [], rclpy
         threading.Thread(target=lambda: self.said.extend(self.process.stdout), daemon=True).start()
+        while not any(line.startswith("pool file:") for line in self.said):
+            assert self.process.poll() is None, "".join(self.said)
+            time.sleep(0.1)
         rclpy.init(args=[])
         self.example = runpy.run_path(str(EXAMPLE))
         self.driver = self.example["Driver"](["finsrov"])

@@ -311,7 +311,7 @@ def test_who_followed_takes_over_without_a_jump(pair):
 def test_of_two_that_started_together_one_gives_way(pair, monkeypatch):
     """Both published before they saw each other: the first by name continues, and soon there is one clock."""
     monkeypatch.setattr(
-        "finssim.extensions.ros2.worlds.sim.CLAIMING", math.inf
+        "finssim.extensions.ros2.worlds.clock.CLAIMING", math.inf
     )  # whatever time the test takes
     first, second = pair
     now = 1e-9 * second.clock._steady.now().nanoseconds

@@ -152,7 +152,7 @@ class PacedClock:
         """
         Args:
             node: Node of the pool.
-            factor: Simulated seconds per second; 0: without limit.
+            factor: Simulated time per real time [-]; 0: without limit.
             names: As of `Barrier`.
 
         Raises:

@@ -15,7 +15,7 @@ from finssim.extensions.ros2.nodes.robot_node import RobotNode
 from finssim.extensions.ros2.topics import TOPICS, quality_profile
 from finssim.extensions.ros2.worlds.clock import PacedClock
 from finssim.pool.fleet import Fleet, Medium
-from finssim.pool.run import MCU_PORT, Ends, SiteChoice, Timing
+from finssim.pool.run import MCU_PORT, Ends, PoolTiming, SiteChoice
 from finssim.pool.run import run as serve
 from finssim.robot.links.transports import DEFAULT_BIND
 from finssim.tasks.communication import Communication
@@ -99,7 +99,7 @@ class VirtualPoolNode(RobotNode):
         serve(self.choice, self._addresses, team=self.team, timing=_NodeTiming(self), **files)
 
 
-class _NodeTiming(Timing):
+class _NodeTiming(PoolTiming):
     """Time of the pool of a node: by /clock, or real time in which a team's messages are taken."""
 
     def __init__(self, node: VirtualPoolNode) -> None:
