@@ -160,14 +160,14 @@ def drive(driver):
     return late
 
 
-def talk(driver, period=0.1, count=20):
+def talk(driver, period=0.05, count=20):
     """Let every vehicle send numbered messages; print and return how late they come [s], by receiver."""
     sent, late = {}, {}
     for number in range(count):
         for v in driver.vehicles:
             sent[v.name, number] = driver.now
             v.message.publish(TeamMessage(sender=v.name, data=[number]))
-        end = driver.now + (period if number < count - 1 else 1.0)
+        end = driver.now + (period if number < count - 1 else 0.5)
         while driver.now < end:
             driver.step()
     for v in driver.vehicles:
