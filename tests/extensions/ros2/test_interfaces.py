@@ -352,6 +352,7 @@ def test_launch_files_start_what_is_installed(launched):
 
 def test_vehicles_that_pages_and_launch_files_name_exist():
     """After `vehicle:=` and `--vehicle`."""
-    files = [*NODES.rglob("*.py"), WORKSPACE.parents[1] / "docs" / "ros2.md"]
+    pages = WORKSPACE.parents[1] / "docs"
+    files = [*NODES.rglob("*.py"), pages / "ros2.md", pages / "reference" / "ros2_installation.md"]
     named = {m for file in files for m in re.findall(r"(?:vehicle:=|--vehicle )([\w-]+)", file.read_text())}
     assert {"finsrov", "bluerov2_heavy"} <= named <= set(catalogue())

@@ -34,6 +34,8 @@ REFUSED = 2
 """Exit status of a node that refuses its arguments."""
 STEP = 1.0 / 60.0
 """Between ticks of /clock, and between commands and states of a simulator [s]."""
+QUIET = 0.001
+"""Time without messages after which the work of a time of /clock is done [s]."""
 AGAIN = 0.5
 """Between two reports of the same work in lock-step [s], as one may be lost."""
 LEFT = 2**31 - 1
@@ -88,6 +90,7 @@ class RobotNode(Node):
         """What the ROS clock shows when the robot's shows 0 [ns]."""
         self.lockstep = self.parameter("lockstep", False)
         """True where /clock waits for the nodes that live by it."""
+        self._taken = self._noted = 0
         self._newer = self.parameter("pool_since", 0.0)
         self.add_on_set_parameters_callback(partial(_keep_clock, bool(simulated)))
         self._out: dict[str, Any] = {}
@@ -162,7 +165,12 @@ class RobotNode(Node):
     def hears(self, key: str, take: Callable[[Any], None], **options: Any) -> Any:
         """Listen to a topic; the subscription. Commands are taken from publishers of any durability, as they come."""
         kind, quality = ros_type(self.table[key].type), quality_profile(self.table[key].quality)
-        return self.create_subscription(kind, self.topic(key), take, quality, **options)
+
+        def counted(message: Any) -> None:
+            self._taken += 1
+            take(message)
+
+        return self.create_subscription(kind, self.topic(key), counted, quality, **options)
 
     # -- what every node says of itself ---------------------------------------------------------------------------
 
@@ -227,13 +235,18 @@ class RobotNode(Node):
         if self.lockstep and self.get_parameter("use_sim_time").value:
             self.sends("done")
             self._done = self.make.done(self.ns(self.now()), self.get_fully_qualified_name())
-            self.create_timer(
-                STEP, self._tell_done
-            )  # the last one that was made: others due with it come first
-            again = Clock(clock_type=ClockType.STEADY_TIME)
-            self.create_timer(AGAIN, lambda: self.send("done", self._done), clock=again)
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            self._quiet = self.create_timer(QUIET, self._tell_done, clock=steady)
+            self._quiet.cancel()
+            self.create_timer(STEP, self._quiet.reset)  # made last: others that are due with it come first
+            self.create_timer(AGAIN, lambda: self.send("done", self._done), clock=steady)
 
     def _tell_done(self) -> None:
+        """Report, unless a message was taken just now: more may wait, and unread ones would grow old."""
+        if self._noted != self._taken:
+            self._noted = self._taken
+            return
+        self._quiet.cancel()
         self._done = self.make.done(self.ns(self.now()), self.get_fully_qualified_name())
         self.send("done", self._done)
 
