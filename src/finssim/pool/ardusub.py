@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.control.ardusub import Mixer
 from finssim.core.frames import TO_FOSSEN
-from finssim.core.rotations import quat_multiply, quat_rotate, quat_to_euler, quat_to_matrix
+from finssim.core.rotations import quat_multiply, quat_rotate, quat_to_euler, quat_to_matrix, quat_yaw
 from finssim.pool.ardusub_loops import AttitudeLoop, DepthLoop, climb_rate, lean_angles, yaw_rate
 from finssim.pool.firmware import AttitudeFilter, FirmwareSample
 from finssim.pool.plant_spec import PlantSpec
@@ -401,7 +401,8 @@ class ArduSub:
                 settled = bool(turning) or now - self._boot > SETTLED
                 share = COMPASS_SHARE if self._headed else 1.0
                 learned = 0.0 if not self._headed else BIAS_SHARE[settled]
-                self._filter.turn(aid.values[0] + missing, share, learned)
+                turned = quat_yaw(self._filter.quaternion) + quat_yaw(self._attitude_at(now - aid.age))
+                self._filter.turn(aid.values[0] + float(turned) + missing, share, learned)
                 self._headed = True
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
@@ -421,12 +422,16 @@ class ArduSub:
                 over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
                 if now - self._velocity_time > POSITION_LASTS:
                     self._aided_since = now
-                # By the attitude of then: its filter is as late as the slowest instrument.
-                then = next(q for at, q in self._attitudes if at >= now - aid.age or at == now)
+                then = self._attitude_at(now - aid.age)
                 self._velocity, self._velocity_time = quat_rotate(then, over_floor)[:2], now
             self._places.append((now, self._position.copy(), self._velocity))
             while now - self._places[0][0] > POSITION_LASTS:
                 self._places.popleft()
+
+    def _attitude_at(self, time: float) -> Array:
+        """Return the attitude of a time [s], x y z w, body to north, east, down: the real filter is as late as its
+        slowest instrument."""
+        return next((q for at, q in self._attitudes if at >= time), self._quaternion)
 
     def _true_north(self, now: float) -> float:
         """Return how far the heading has turned from magnetic to true north [0, 1]."""

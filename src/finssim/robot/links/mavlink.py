@@ -310,7 +310,8 @@ class MavlinkLink:
         ]
         if self.vehicle.sensors.compass is not None and now - self._heading_at >= HEADING_PERIOD:
             self._heading_at = now
-            messages.append(self._numbered(HEADING, 0.0, (self._north - float(m.yaw), 0.0, 0.0)))
+            age = self._age(now, m.time_boot_ms)
+            messages.append(self._numbered(HEADING, age, (self._north - float(m.yaw), 0.0, 0.0)))
         return messages
 
     def _knows_surface(self, now: float) -> bool:
