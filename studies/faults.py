@@ -390,6 +390,9 @@ def lagging_leap(bench: Bench) -> None:
 
 TURNED: Mapping[str, Any] = {"watched": 55.0, "off": 0.25, "settings": {"workspace_upper": (4.6, 2.6, 0.0)}}
 """A vehicle that floats up while its thrust waits, and returns to its goal."""
+TURN_SEEN = (4.0 + 0.05 * 30.0 + 1.0) / 0.75
+"""Time until the link sees a turn of 0.75 °/s [s]: 4°, 5 % of the 30° that the vehicle turns itself, and 1° by which
+the autopilot's heading follows later."""
 DECLINATION = math.radians(11.4)
 """Magnetic declination of the place where the real autopilot was recorded [rad]."""
 OWN: Mapping[str, Any] = {"firmware": "ardusub-own", "watched": 20.0, "off": 0.15}
@@ -435,7 +438,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
         plant={"declination": DECLINATION}, **TURNED,
     ),
     "ap-north": _autopilot(
-        "its north turns by 15° in 20 s without a word", "", 8.0,
+        "its north turns by 15° in 20 s without a word", "", TURN_SEEN,
         Fault(begin=turning_north, during=turning_north, lasts=20.0), **TURNED,
     ),
     "ap-leap": _autopilot("its own position is reset by 0.7 m", "", math.inf, leap, **OWN),

@@ -133,7 +133,9 @@ def test_axes_and_attitude_turn_from_its_frame_to_ours():
     np.testing.assert_allclose(telemetry.gyro, (0.01, -0.02, -0.03), atol=1e-6)
     np.testing.assert_allclose(telemetry.accel, (0.0, 0.0, 9.80665), atol=1e-6)
     assert telemetry.depth == pytest.approx(1.0, abs=1e-3)
-    assert heading.kind == HEADING and heading.values[0] == pytest.approx(0.3, abs=1e-6) and heading.age == 0.0
+    assert (
+        heading.kind == HEADING and heading.values[0] == pytest.approx(0.3, abs=1e-6) and heading.age == 0.0
+    )
     late = mavlink.MAVLink_attitude_message(510, 0.1, 0.2, -0.3, 0.01, 0.02, 0.03)
     assert link.feed(1.54, bytes(late.pack(auto)))[1].age == pytest.approx(0.04)
 
