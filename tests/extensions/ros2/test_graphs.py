@@ -154,6 +154,12 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
         ("sim", {"plant": "3"}, Ros2Error, "--plant has no effect in the graph sim"),
         ("robot", {"pool_file": FILE, "message_loss": 0.5}, Ros2Error, "--message-loss has no effect"),
         ("robot", {"robot": "serial:/dev/x", "pool_file": FILE, "lockstep": True}, Ros2Error, "real time"),
+        (
+            "pool",
+            {"real_time_factor": 0.0},
+            Ros2Error,
+            "--real-time-factor 0: expected more than 0, or --lockstep",
+        ),
         ("sim", {"team": "finsrov,finsrov"}, Ros2Error, "--team is for the graph pool"),
         (
             "pool",

@@ -288,8 +288,8 @@ def test_launch_files_start_what_up_starts(launched, graph, given):
 
 def test_one_launch_file_starts_a_team(launched):
     """One world, and the nodes of each vehicle in its namespace."""
-    launched("pool", team="finsrov,finsrov,finsrov", site="open-water", message_loss="0.2")
-    robot = ("hardware_bridge", "state_estimation", "controller")
+    launched("pool", team="finsrov,finsrov,finsrov", site="open-water", message_loss="0.2", record="runs")
+    robot = ("hardware_bridge", "state_estimation", "controller", "recorder")
     wanted = {f"/robot_{i}/{node}" for i in (1, 2, 3) for node in robot}
     assert set(launched.named) == wanted | {"/team/virtual_pool"}
 

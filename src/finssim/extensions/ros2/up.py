@@ -315,7 +315,7 @@ def plan_of(
         namespace = f"robot_{i + 1}" if several else o.namespace or vehicle.name.replace("-", "_")
         namespaces.append(namespace)
         prefix = f"{namespace}/" if several or o.namespace else None
-        record = o.record and str(o.record / f"{namespace}.mcap" if several else o.record)
+        record = o.record and str(Path(o.record) / f"{namespace}.mcap" if several else o.record)
         values = {
             **common,
             **own,
@@ -376,6 +376,10 @@ def _check(graph: str, o: Options) -> None:
             raise Ros2Error(
                 f"--robot {o.robot} lives in real time: leave --lockstep and --real-time-factor out"
             )
+    if graph == "pool" and o.real_time_factor == 0.0 and not o.lockstep:
+        raise Ros2Error(
+            "--real-time-factor 0: expected more than 0, or --lockstep, in which 0 means without limit"
+        )
     takes = {word for node in GRAPHS[graph] for word in TAKES[node].split()} | set(ALWAYS.split())
     takes |= set(BESIDES[graph].split())
     for option in fields(Options):
