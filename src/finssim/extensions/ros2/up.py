@@ -5,6 +5,7 @@ Example: finssim ros2 up pool
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -135,6 +136,8 @@ def _status(code: int) -> str:
 
 DIED, FAULT = 1, 3
 """Exit status where a node died, and where the bridge ended in a fault."""
+STARTING = 180.0
+"""Time for a bridge to speak [s]; a virtual pool's first rendering on a machine compiles."""
 APART = 10
 """Ports between one vehicle of a team and the next, as of a virtual pool."""
 
@@ -216,7 +219,7 @@ class Options:
     message_delay: Annotated[float | None, (0.0, None)] = None
     """Time to process such a message, besides its way at the speed of sound [s]; 0.1 if not given."""
     duration: Annotated[float | None, (0.0, None)] = None
-    """Duration [s]; until Ctrl-C if not given."""
+    """Duration from the bridge's first word [s], of /clock where nodes live by it; until Ctrl-C if not given."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
 
@@ -482,17 +485,20 @@ def _watch(
     interrupted: Callable[[], bool],
     notify: Callable[[str], None],
 ) -> int:
-    died, begun = False, watchers[0].now()
+    died, first = False, watchers[0]
+    begun, patient = float("nan"), time.monotonic() + STARTING
     if not options.arm:
         notify("disarmed: thrusters turn only after true on the topic arm, or with --arm")
-    end = float("inf") if options.duration is None else begun + options.duration
-    while not interrupted() and watchers[0].now() < end:
+    longest = float("inf") if options.duration is None else options.duration
+    while not interrupted() and not first.now() - begun >= longest:
+        if math.isnan(begun) and (not first.bridge.silent or time.monotonic() > patient):
+            begun = first.now()  # the duration begins with the bridge's first word
         for watcher in watchers:
             watcher.turn(0.2 / len(watchers))
         gone = nodes.look()
         died = died or bool(gone)
         for child in gone:
-            watchers[0].left(child.what.full_name)
+            first.left(child.what.full_name)
         if any(child.what.node in WORLDS for child in gone) or all(child.dead for child in nodes.children):
             break
     for watcher in watchers:
