@@ -190,11 +190,13 @@ def changes(
         progress: Receives the completed fraction and the state.
 
     Returns:
-        Content of `changes.json`: `followed`, the estimates, and `trials`, the measures of each held setpoint.
+        Content of `changes.json`: `followed`, the estimates; `trials`, the measures of each held setpoint; and
+        `complete`, false after Ctrl-C.
     """
     start_warp()
     chosen = tuple(controllers.split(","))
     check_choices(chosen, CONTROLLERS, "controller", ValueError)
+    hardness = _severity(severity)
     body, folder = load_vehicle(vehicle), Path(out)
     weak = body.thruster_names[-1]
     followed: list[dict[str, Any]] = []
@@ -216,23 +218,28 @@ def changes(
                     measures = hold(plan, known, who, setpoint, seed=row["pool"])
                     trials.append({**row, "model": model, "controller": controller, **measures})
 
-    for pool in pools:
-        drawn = make_plan(body, str(pool), _severity(severity), camera="corners", seed=pool)
-        place = folder / f"pool{pool}"
-        known = follow(drawn, body, pool).adapted
-        held({"unchanged": known}, drawn, {"pool": pool, "change": "none"}, place)
-        for change in CHANGES:
-            plan = replace(drawn, spec=changed(drawn.spec, change, weak))
-            adaptation = follow(plan, known, pool)
-            row = {"pool": pool, "change": change}
-            followed.append({**row, **found(adaptation, change, weak, body.water.density)})
-            held({"changed": known, "followed": adaptation.adapted}, plan, row, place / change)
-    result = {
-        "experiment": "changes", "vehicle": {"name": body.name, "sha256": body.sha256}, "severity": severity,
-        "followed": followed, "trials": trials, "provenance": provenance(),
-    }  # fmt: skip
-    write_json(folder / "changes.json", result, tables_of(result))
-    return result
+    def result() -> dict[str, Any]:
+        vehicle_of = {"name": body.name, "sha256": body.sha256}
+        return {
+            "experiment": "changes", "vehicle": vehicle_of, "severity": severity, "followed": followed,
+            "trials": trials, "complete": len(trials) == total * len(SETPOINTS), "provenance": provenance(),
+        }  # fmt: skip
+
+    try:
+        for pool in pools:
+            drawn = make_plan(body, str(pool), hardness, camera="corners", seed=pool)
+            place = folder / f"pool{pool}"
+            known = follow(drawn, body, pool).adapted
+            held({"unchanged": known}, drawn, {"pool": pool, "change": "none"}, place)
+            for change in CHANGES:
+                plan = replace(drawn, spec=changed(drawn.spec, change, weak))
+                adaptation = follow(plan, known, pool)
+                row = {"pool": pool, "change": change}
+                followed.append({**row, **found(adaptation, change, weak, body.water.density)})
+                held({"changed": known, "followed": adaptation.adapted}, plan, row, place / change)
+    finally:  # after Ctrl-C with what there is
+        write_json(folder / "changes.json", result(), tables_of(result()))
+    return result()
 
 
 def _severity(word: str) -> Severity:
