@@ -30,23 +30,9 @@ CLEARLY = 0.7
 FEWEST_LEFT, MOST_LEFT_OUT = 2, 8
 """Trials that a fit without one needs, and trials up to which one fit for each is cheap."""
 
-LIKELY_SCALE, SCALE_STD = 0.88, 0.17
-"""Thrust of a battery on its way from full to empty, to that at the voltage of the thruster's table, and the standard
-deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
-one make differ by a tenth."""
-
-ADDED_MASS_STD = 0.7
-"""Standard deviation of the logarithm of a catalogue's added mass, a factor of two: published sets of one vehicle
-differ by as much."""
-
-INERTIA_STD = 0.5
-"""Standard deviation of the logarithm of a catalogue's effective moment of inertia."""
-
-GIVEN_STD = 0.03
-"""Standard deviation of the logarithm of a given inertia."""
-
-MULTIPLIED = ("m_eff", "added_mass", "d1", "d2", "bias", "k")
-"""Estimates of an axis that a thrust scale multiplies."""
+UNKNOWN_VOLTAGE = (
+    "no battery voltage: from what batteries have and the inertia that the vehicle file expects; it is in every interval"
+)
 
 Progress = Callable[[float, str], None]
 
@@ -87,30 +73,17 @@ def fit_hydrodynamics(
     from finssim.identification.simulation_error import fit_by_simulation
 
     known, show = dict(known or {}), progress or (lambda part, text: None)
-    options: dict[str, Any] = {"axes": axes, "estimate": estimate, "horizon": horizon}
-    body, scale, std, begin, part = vehicle, 1.0, 0.0, None, 0.0
-    if "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle):
-        likely = vehicle.replace(scaled_thrust(vehicle, LIKELY_SCALE))
-        both = "both" if damping == "auto" else damping
-        begin = fit_by_simulation(trials, likely, damping=both, progress=_within(show, 0.0, 0.5), **options)
-        scale, std = _thrust_scale(begin, vehicle, known)
-        body, part = vehicle.replace(scaled_thrust(vehicle, scale)), 0.5
+    likely = "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle)
     fit = fit_by_simulation(
-        trials, body, damping=damping, known=known, begin=begin, progress=_within(show, part, 0.9), **options
-    )
-    whole = fit
-    if std:
-        fit = _with_scale(fit, vehicle, scale, std, known)
-    if fit.interrupted:
-        return fit
-    show(0.9, "replay by the calibrated vehicle")
-
-    def without(k: int) -> Fit:
-        part, others = 0.9 + 0.1 * k / len(trials), [*trials[:k], *trials[k + 1 :]]
-        own = options | {"axes": whole.settings["axes"], "damping": whole.settings["drag"], "begin": whole}
-        return fit_by_simulation(others, body, known=known, progress=_within(show, part, part), **own)
-
-    return replace(fit, findings=(*fit.findings, *_worse(fit, vehicle, trials, held_out, without)))
+        trials, vehicle, axes=axes, estimate=estimate, damping=damping, known=known, horizon=horizon, likely=likely,
+        progress=lambda part, text: show(0.9 * part, text),
+    )  # fmt: skip
+    if likely:
+        scale = fit.estimates["thrust_scale"]
+        found = fit.estimates | {"thrust_scale": replace(scale, identifiable=False, note=UNKNOWN_VOLTAGE)}
+        percent = 100.0 * (scale.ci95[1] / scale.estimate - 1.0)
+        fit = replace(fit, estimates=found, findings=(finding("voltage_unknown", percent=percent), *fit.findings))
+    return fit
 
 
 def _within(progress: Progress, low: float, high: float) -> Progress:
@@ -214,76 +187,6 @@ def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
         return False
     silent = all(trial.header.voltage is None and not trial.has("voltage") for trial in driven)
     return sources == {"pwm"} and silent
-
-
-def _thrust_scale(fit: Fit, vehicle: Vehicle, known: Mapping[str, float]) -> tuple[float, float]:
-    """Return thrust over that of the file, and the standard deviation of its logarithm.
-
-    Motion shows inertia over thrust; the vehicle file expects an inertia, and batteries have a voltage:
-    ln s is the mean of ln(s_fit m_file / m_fit) over the axes and of ln `LIKELY_SCALE`, weighted by their certainty.
-
-    Args:
-        fit: Fit with thrust of `LIKELY_SCALE`, and no inertia given.
-        vehicle: Vehicle as its file has it.
-        known: Effective inertias that are known, by axis [kg, kg m²].
-    """
-    plant = matrices(vehicle)
-    logs, weight = [math.log(LIKELY_SCALE)], [SCALE_STD**-2]
-    for i, axis in enumerate(AXES):
-        found = fit.estimates.get(f"{axis}.m_eff")
-        if found is None or not found.estimate > 0.0 or (axis in ("roll", "pitch") and axis not in known):
-            continue  # an unknown stiffness is confounded with the inertia of roll and pitch
-        expected = known.get(axis, float(plant.M_RB[i, i] + plant.M_A[i, i]))
-        std = INERTIA_STD if i > 2 else ADDED_MASS_STD * float(plant.M_A[i, i]) / expected
-        std = GIVEN_STD if axis in known else std
-        half = 0.5 * (found.ci95[1] - found.ci95[0]) / found.estimate
-        if math.isfinite(half) and half < 0.5:
-            logs.append(math.log(LIKELY_SCALE * expected / found.estimate))
-            weight.append(1.0 / (std**2 + (0.5 * half) ** 2 + 1e-4))
-    total = sum(weight)
-    return math.exp(sum(w * x for w, x in zip(weight, logs, strict=True)) / total), total**-0.5
-
-
-def _with_scale(fit: Fit, vehicle: Vehicle, scale: float, std: float, known: Mapping[str, float]) -> Fit:
-    """The fit with the scale among its estimates and in its intervals."""
-    low, high = math.exp(-1.96 * std), math.exp(1.96 * std)
-    fitted = fit.settings.get("axes", ())
-    found = dict(fit.estimates)
-    for name, e in fit.estimates.items():
-        axis, _, kind = name.partition(".")
-        if axis in known and kind in ("m_eff", "added_mass"):
-            continue
-        in_term = e.path == f"hydrodynamics.calibrated.{name}"
-        if name == "buoyancy_excess" or in_term or (axis in fitted and kind in MULTIPLIED):
-            rigid = found[f"{axis}.m_eff"].estimate - e.estimate if kind == "added_mass" else 0.0
-            found[name] = _widened(e, rigid, low, high)
-    found["thrust_scale"] = Estimate(
-        name="thrust_scale", estimate=scale, ci95=(scale * low, scale * high), unit="-", identifiable=False,
-        note="no battery voltage: from what batteries have and the added mass that the vehicle file expects; it is in "
-        "every interval",
-    )  # fmt: skip
-    return replace(
-        fit,
-        before=vehicle,
-        estimates=found,
-        changes={**scaled_thrust(vehicle, scale), **fit.changes},
-        findings=(finding("voltage_unknown", percent=100.0 * (high - 1.0)), *fit.findings),
-    )
-
-
-def _widened(e: Estimate, rigid: float, low: float, high: float) -> Estimate:
-    """An estimate whose interval also holds a factor between `low` and `high` on estimate + rigid."""
-    whole, (a, b) = e.estimate + rigid, e.ci95
-    if not (math.isfinite(a) and math.isfinite(b)):
-        return e
-    down, up = (1.0 - low, high - 1.0) if whole >= 0.0 else (high - 1.0, 1.0 - low)
-    a = whole - math.hypot(e.estimate - a, down * abs(whole)) - rigid
-    b = whole + math.hypot(b - e.estimate, up * abs(whole)) - rigid
-    kind = e.name.partition(".")[2]
-    if kind in ("d1", "d2", "k"):
-        a = max(a, 0.0)
-    sure = e.identifiable and (kind in ("bias", "") or 0.5 * (b - a) <= CERTAIN * abs(e.estimate))
-    return replace(e, ci95=(a, b), identifiable=sure)
 
 
 def calibrate_hydrodynamics(

@@ -41,7 +41,14 @@ from finssim.identification.rollout import (
     streams,
     without,
 )
-from finssim.identification.uncertainty import Covariance, Evidence, degeneracy, intervals, trial_covariance
+from finssim.identification.uncertainty import (
+    Covariance,
+    Evidence,
+    correlated_samples,
+    degeneracy,
+    intervals,
+    trial_covariance,
+)
 from finssim.identification.vehicle_file import scaled_thrust
 from finssim.identification.weak_form import weak_form
 from finssim.physics.terms.composed import parameter_row, term_wrenches
@@ -93,6 +100,10 @@ class Coordinate:
     """Upper bound, in the unit of the coordinate."""
     scale: float
     """Size of a large change; finite differences take a small share of it as step."""
+    std: float | None = None
+    """Prior standard deviation about `start`; `VAGUE` times the scale if None, infinite where nothing is known."""
+    rigid: float | None = None
+    """Where it is given, the prior is that of ln(rigid + coordinate), and `std` has no unit."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,8 @@ class Plants:
     """Time constant of the motors [s], (W,)."""
     delay: Array | None
     """[s], (W,)"""
+    lower: Array | None
+    """Heights of the horizontal thrusters above those of the file [m], (W,)."""
 
 
 def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
@@ -161,6 +174,33 @@ def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, fl
     }
 
 
+LIKELY_SCALE, SCALE_STD = 0.88, 0.17
+"""Thrust of a battery on its way from full to empty, over that at the voltage of the thruster's table, and the standard
+deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
+one make differ by a tenth."""
+
+ADDED_MASS_STD, RIGID_STD, INERTIA_STD = 0.7, 0.35, 0.5
+"""Standard deviation of an added mass, as parts of the vehicle file's and of its rigid mass, whichever is more, and of
+the logarithm of an effective moment of inertia: published sets of one vehicle differ by as much."""
+
+PLACE_STD = {"measured": 0.005, "derived": 0.03, "published": 0.03, "guessed": 0.05}
+"""Standard deviation of a height or centre of the vehicle file by its origin [m]."""
+
+CENTRES = ("gravity_x", "gravity_y", "gravity_z")
+PLACES = ("thruster_height", *CENTRES)
+"""Places that are free where roll or pitch is fitted: the common height of the thrusters that push sideways, and the
+centre of gravity. The centre of buoyancy follows from it, the stiffness and the constant moments."""
+
+
+def horizontal(vehicle: Vehicle) -> list[str]:
+    """Return the names of the thrusters that push sideways."""
+    return [name for name, t in vehicle.thrusters.items() if abs(t.axis[2]) < SIDEWAYS]
+
+
+SIDEWAYS = 0.5
+"""Vertical part of the axis of a thruster below which it pushes sideways [-]."""
+
+
 class Parameters:
     """The free numbers of a fit.
 
@@ -187,6 +227,7 @@ class Parameters:
         unseen: Sequence[str] = (),
         retained: Sequence[str] = (),
         held: Mapping[str, float] | None = None,
+        likely: bool = False,
     ) -> None:
         """Choose what is free.
 
@@ -203,6 +244,7 @@ class Parameters:
             unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
             retained: Damping that is not free and stays the vehicle file's, such as `pitch.d2`.
             held: Effective inertias M_RB + M_A that are not free, by axis [kg, kg m²].
+            likely: Whether the scale of thrust is what batteries give.
 
         Raises:
             CalibrationError: The calibrated set holds no coefficients.
@@ -215,6 +257,7 @@ class Parameters:
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras, self.retained = damping, tuple(extras), tuple(retained)
+        self.likely = likely
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.actuators = {name: fields for name, fields in actuator_fields(vehicle).items() if name in extras}
         self.biases = tuple(a for a in AXES if a in biases)
@@ -258,12 +301,20 @@ class Parameters:
         tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
         late = float(np.mean([t.delay for t in w.thrusters.values()]))
         table = {
-            "thrust_scale": ("-", 1.0, 0.05, 20.0, 1.0),
+            "thrust_scale": ("-", *((LIKELY_SCALE, 0.05, 20.0, 1.0, SCALE_STD, 0.0) if self.likely else (1.0, 0.05, 20.0, 1.0, inf))),
             "thrust_lag": ("s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0),
             "thrust_delay": ("s", late, 0.0, LONGEST_DELAY, 0.2),
             "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
             "k": ("N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B)),
         }
+        sideways = horizontal(w)
+        if sideways:
+            height = float(np.mean([w.thrusters[name].position[2] for name in sideways]))
+            place = f"thrusters.{sideways[0]}.position.2"
+            table["thruster_height"] = ("m", height, -inf, inf, 0.2, PLACE_STD[str(w.origin_of(place).origin)])
+        for j, name in enumerate(CENTRES):
+            std = PLACE_STD[str(w.origin_of(f"body.center_of_gravity.{j}").origin)]
+            table[name] = ("m", float(w.body.center_of_gravity[j]), -inf, inf, 0.2, std)
         out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
         out += [Coordinate(name, "-", 1.0, 0.02, 50.0, 1.0) for name in self.actuators]
@@ -284,7 +335,11 @@ class Parameters:
             "bias": (bias, max(0.5 * m, 1e-3)),
         }[kind]
         unit = UNITS["m_eff" if kind == "added_mass" else kind][i > 2]
-        return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size)
+        std = rigid = None
+        if kind == "added_mass":
+            rigid = float(self.M_RB[i, i])
+            std = max(ADDED_MASS_STD * float(own[i, i]), RIGID_STD * rigid) / m if i < 3 else INERTIA_STD
+        return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size, std, rigid)
 
     @property
     def nuisances(self) -> int:
@@ -325,11 +380,20 @@ class Parameters:
                 {"added_mass": M_A, "d1": D1, "d2": D2}[kind][:, i, i] = x[:, c]
         return M_A, D1, D2
 
-    def buoyancy_height(self, k: Any, volume: Any) -> Any:
-        """z of the centre of buoyancy [m] that gives a stiffness k about the set's reference point [N m/rad]."""
-        water, z = self.vehicle.water, self.r_h[2]
-        gravity_part = self.vehicle.weight * (self.vehicle.body.center_of_gravity[2] - z)
-        return z + (k + gravity_part) / (water.density * water.gravity * volume)
+    def centre_of_gravity(self, x: Array) -> Array:
+        """Return the centre of gravity of vectors (W, P) [m], (W, 3)."""
+        file = np.tile(np.asarray(self.vehicle.body.center_of_gravity, float), (len(x), 1))
+        return np.stack([self.value(x, name, file[:, j]) for j, name in enumerate(CENTRES)], axis=-1)
+
+    def moved(self, x: Array) -> Vehicle:
+        """Return the vehicle with the centres of a vector (P,); the moment of weight and buoyancy stays as it is."""
+        if not set(CENTRES) & set(self.names):
+            return self.vehicle
+        body, r_g = self.vehicle.body, self.centre_of_gravity(x[None])[0]
+        shift = self.vehicle.weight / self.vehicle.buoyancy * (r_g - body.center_of_gravity)
+        return self.vehicle.replace({
+            "body.center_of_gravity": r_g.tolist(), "body.center_of_buoyancy": (body.center_of_buoyancy + shift).tolist()
+        })  # fmt: skip
 
     def plants(self, x: Array) -> Plants:
         """Return the simulator's parameters.
@@ -350,10 +414,19 @@ class Parameters:
             weight = self.vehicle.weight
             volume = (weight + self.value(x, "buoyancy_excess")) / (water.density * water.gravity)
             fields["volume"] = volume[:, None]
-        if "k" in self._at:
-            r_b = np.tile(np.asarray(body.center_of_buoyancy, float), (W, 1, 1))
-            r_b[:, 0, 2] = self.buoyancy_height(self.value(x, "k"), volume)
-            fields["r_b"] = r_b
+        free_centre = bool(set(CENTRES) & set(self.names))
+        if "k" in self._at or free_centre:
+            r_g, file, B = self.centre_of_gravity(x), body.center_of_gravity, water.density * water.gravity * volume
+            r_b = body.center_of_buoyancy + (self.vehicle.weight / B)[:, None] * (r_g - file)
+            if "k" in self._at:
+                z = self.r_h[2]
+                r_b[:, 2] = z + (self.value(x, "k") + self.vehicle.weight * (r_g[:, 2] - z)) / B
+            fields["r_b"] = r_b[:, None]
+        if free_centre:
+            outer = np.einsum("wi,wj->wij", r_g, r_g)
+            trace = np.trace(outer, axis1=1, axis2=2)[:, None, None]
+            inertia = np.asarray(body.inertia, float) + body.mass * (trace * np.eye(3) - outer)
+            fields |= {"r_g": r_g[:, None], "inertia": inertia[:, None]}
         for path in self.terms:
             fields[path] = self.value(x, path)[:, None]
         for name, numbers in self.actuators.items():
@@ -372,6 +445,7 @@ class Parameters:
             bias=bias @ self.H,
             lag=self.value(x, "thrust_lag"),
             delay=self.value(x, "thrust_delay"),
+            lower=None if (z := self.value(x, PLACES[0])) is None else z - self.expected[self._at[PLACES[0]]],
         )
 
 
@@ -444,10 +518,8 @@ def blocks_of(
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
         block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
         blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
-    known, first = problem.prior_precision, blocks[0]
-    blocks[0] = first._replace(
-        aa=first.aa + np.diag(known), a=first.a - known * (point.theta - problem.prior_mean)
-    )
+    (off, slope), first = problem.prior(point.theta), blocks[0]
+    blocks[0] = first._replace(aa=first.aa + np.diag(slope**2), a=first.a - slope * off)
     return blocks
 
 
@@ -479,7 +551,7 @@ def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut:
     Residuals and `std` have the unit of each sample; losses have none [-].
     """
     prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
-    prior = prior + (points.theta - problem.prior_mean) ** 2 @ problem.prior_precision
+    prior = prior + np.square(problem.prior(points.theta)[0]).sum(axis=-1)
     loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
     return np.asarray(np.where(np.isfinite(loss), 0.5 * (loss + prior), np.inf))
 
@@ -815,6 +887,9 @@ CONSTANT = 1e-3
 """Noise of a channel that never changes, as where a sensor was missing [m, rad, m/s, rad/s]: single precision shows no
 less."""
 
+FEWEST_CORRELATED = 20
+"""Samples of a channel from which their correlation is estimated."""
+
 FLOOR = 1e-4
 """Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
 
@@ -832,8 +907,8 @@ class Shooting:
         high: Largest theta, (P,).
         prior_std: Of z around zero, (S, q).
         prior_mean: What is known of theta beforehand, (P,).
-        prior_precision: One over its variance; 0 where nothing is known, (P,).
         judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
+        repeats: Samples per independent one.
     """
 
     def __init__(
@@ -891,6 +966,13 @@ class Shooting:
             segments,
             max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
         )
+        # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
+        vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
+        by_thruster, sideways = np.array([s.thrusters for s in segments]), horizontal(vehicle)
+        for j, (name, thruster) in enumerate(vehicle.thrusters.items()):
+            if name in sideways:
+                self._leverage[by_thruster, 3, j] = -thruster.axis[1]
+                self._leverage[by_thruster, 4, j] = thruster.axis[0]
         self.edges = self.measured.edges
         self.groups = np.array([s.index for s in segments])
         self.few = few
@@ -902,23 +984,37 @@ class Shooting:
         # solution, over short segments, nothing else keeps them finite. Streams agree on the time to hundredths
         # of a second.
         self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
-        imposed = np.arange(len(parameters.low)) >= self.judged
-        wide = [VAGUE * (name != "thrust_scale") for name in parameters.names]
-        size = np.where(imposed, 1.0, np.array(wide, float)) * parameters.scale
-        known = np.where(size > 0.0, np.maximum(size, 1e-150) ** -2.0, 0.0)
-        self.prior_precision = np.concatenate([known, 0.0 * far + LATE_STD**-2.0])
+        size = np.array([VAGUE * c.scale if c.std is None else c.std for c in parameters.coordinates])
+        size[self.judged :] = parameters.scale[self.judged :]
+        known = size**-1.0
+        rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
+        self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
+        self._known = np.concatenate([known, 0.0 * far + LATE_STD**-1.0])
         free = bool(swinging is not None and swinging.all())
         forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
         self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
         if "thrust_delay" in parameters.names or free:
             # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
-            self.prior_precision[len(parameters.names)] = EXACT_CLOCK**-2.0
+            self._known[len(parameters.names)] = EXACT_CLOCK**-1.0
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
         self._latest: tuple[Point, Linearization] | None = None
+        self.repeats = 1.0
+
+    def prior(self, theta: Array) -> tuple[Array, Array]:
+        """Return the whitened differences of vectors (..., P) from what is known beforehand, and their slopes.
+
+        Samples count as independent in a cost, so that what is known counts `repeats` times.
+        """
+        whole, mean = theta + self._rigid, self.prior_mean + self._rigid
+        logarithmic = np.isfinite(self._rigid)
+        whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
+        off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.prior_mean)
+        known = np.sqrt(self.repeats) * self._known
+        return off * known, known / whole
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -956,6 +1052,8 @@ class Shooting:
                 tail = (1,) * (own[name].ndim - 1)
                 mask = self.lagged.reshape(-1, *tail)
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
+        if p.lower is not None:
+            fields["B"] = own["B"] + p.lower[:, None, None, None] * self._leverage
         full = np.zeros((*points.z.shape[:2], 12))
         full[..., self.free] = points.z[..., : len(self.free)]
         nu, quaternion, position = (
@@ -1049,7 +1147,16 @@ class Shooting:
         return np.asarray(size[self.measured.channel])
 
     def noise(self, residual: Array) -> Array:
-        """Standard deviation of every sample: that of its channel. It has the unit of the channel."""
+        """Standard deviation of every sample: that of its channel. It has the unit of the channel.
+
+        The samples per independent one follow from the same residuals.
+        """
+        m, found = self.measured, []
+        for j in range(len(m.names)):
+            rows = np.flatnonzero((m.channel == j) & np.isfinite(residual))
+            if len(rows) > FEWEST_CORRELATED:
+                found.append(correlated_samples(residual[rows], np.flatnonzero(np.diff(m.segment[rows])) + 1))
+        self.repeats = float(np.mean(found)) if found else 1.0
         return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
 
 
@@ -1094,7 +1201,8 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     theta, low, high = solution.point.theta, problem.low, problem.high
     free = theta
     if ((theta <= low) | (theta >= high)).any():
-        normal, score = evidence.normal.sum(axis=0), evidence.score.sum(axis=0)
+        off, slope = problem.prior(theta)
+        normal, score = evidence.information, evidence.score.sum(axis=0) - slope * off / problem.repeats
         scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
         free = theta + np.linalg.lstsq(normal / np.outer(scale, scale), score / scale, rcond=1e-10)[0] / scale
     ends = intervals(free, covariance)
@@ -1123,16 +1231,14 @@ def evidence_of(problem: Shooting, solution: FitSolution) -> Evidence:
     if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
         unit, group = "blocks", _blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
-    # Prior knowledge is one more group.
-    known = problem.prior_precision
-    pull = known * (problem.prior_mean - solution.point.theta)
     normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
     score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
     return Evidence(
         names=problem.names,
-        normal=np.array([*normal, np.diag(known)]),
-        score=np.array([*score, pull]),
+        normal=np.array(normal) / problem.repeats,
+        score=np.array(score) / problem.repeats,
         unit=unit,
+        prior=np.diag(problem.prior(solution.point.theta)[1] ** 2) / problem.repeats,
     )
 
 
@@ -1177,13 +1283,15 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
         found: Evidence there.
         own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
     """
-    local, out = np.diagonal(found.covariance.local), {}
+    local, out, M_RB = np.diagonal(found.covariance.local), {}, matrices(p.moved(x)).M_RB
     half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
     for c, name in enumerate(p.names):
         low, high, value = -np.inf, np.inf, float(x[c])
         if np.isfinite(local[c]):
             free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
-            width = float(np.hypot(half[c], own_error * abs(value + rigid_part(p, name))))
+            axis, _, kind = name.partition(".")
+            rigid = M_RB[AXES.index(axis), AXES.index(axis)] if kind == "added_mass" else 0.0
+            width = float(np.hypot(half[c], own_error * abs(value + rigid)))
             low = max(min(free - width, value), p.low[c])
             high = free + width if free + width > value else value + width
             # Where a fit ended early, the truth may be where one step more would go.
@@ -1192,27 +1300,22 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
     return out
 
 
-def rigid_part(p: Parameters, name: str) -> float:
-    """Rigid inertia of the axis of an added mass [kg, kg m²]; 0 of any other coordinate."""
-    axis, _, kind = name.partition(".")
-    return float(p.M_RB[AXES.index(axis), AXES.index(axis)]) if kind == "added_mass" else 0.0
-
-
 def axis_result(
-    p: Parameters, numbers: Mapping[str, Number], first: Mapping[str, Number], axis: str, **known: Any
+    p: Parameters, x: Array, numbers: Mapping[str, Number], first: Mapping[str, Number], axis: str, **known: Any
 ) -> AxisResult:
     """The result of one axis.
 
     Args:
         p: What was free.
+        x: Where the fit ended, in the units of the coordinates, (P,).
         numbers: Of `numbers_of`.
         first: The same of the fuller model from which this one was chosen: damping that was left out has its interval.
         axis: Which.
         known: Further fields of `AxisResult`.
     """
-    own = dict[str, Number]()
+    own, file, i = dict[str, Number](), matrices(p.moved(x)), AXES.index(axis)
     if f"{axis}.added_mass" in numbers:
-        mass, rigid = numbers[f"{axis}.added_mass"], rigid_part(p, f"{axis}.added_mass")
+        mass, rigid = numbers[f"{axis}.added_mass"], float(file.M_RB[i, i])
         free = None if mass.free is None else mass.free + rigid
         own["m_eff"] = Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)
     own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
@@ -1225,7 +1328,7 @@ def axis_result(
     }
     retained = {n for n in dropped if f"{axis}.{n}" in p.retained}
     return AxisResult(
-        axis=axis, numbers=own, file=matrices(p.vehicle), dropped=dropped, retained=retained, **known
+        axis=axis, numbers=own, file=file, dropped=dropped, retained=retained, **known
     )
 
 
@@ -1234,7 +1337,9 @@ def other_estimates(
 ) -> tuple[dict[str, Estimate], list[Finding]]:
     """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
-    reported = {*PATHS, *p.terms, *p.actuators}
+    reported = {*PATHS, *PLACES, *p.terms, *p.actuators}
+    paths = PATHS | {name: f"body.center_of_gravity.{j}" for j, name in enumerate(CENTRES)}
+    paths |= {PLACES[0]: f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)[:1]}
     units = {c.name: c.unit for c in p.coordinates if c.name in reported}
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
@@ -1247,9 +1352,9 @@ def other_estimates(
             bounds.append(finding("at_bound", name, free=free, unit=unit))
         elif not np.isfinite(half):
             note = "the trials do not determine it"
-        elif half > limit:
+        elif half > limit and name not in PLACES:
             note = f"uncertain by ±{half:.2g} {unit}"
-        path = f"{SET}.{name}" if name in p.terms else PATHS.get(name)
+        path = f"{SET}.{name}" if name in p.terms else paths.get(name)
         out[name] = Estimate(
             name=name,
             estimate=value,
@@ -1568,7 +1673,15 @@ def changes(
                     # Couplings are written where the fit did away with them.
                     if i == j or matrix[i, j] != old[i, j]:
                         out[f"{path}.{i}.{j}"] = float(matrix[i, j])
-    out |= hydrostatics(found, p.vehicle)[0]
+    moved = p.moved(x)
+    at = [f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)]
+    if PLACES[0] in found:
+        lower = found[PLACES[0]].estimate - float(p.expected[p.names.index(PLACES[0])])
+        out |= {path: p.vehicle.thrusters[path.split(".")[1]].position[2] + lower for path in at}
+    if moved is not p.vehicle:
+        for name in ("center_of_gravity", "center_of_buoyancy"):
+            out |= {f"body.{name}.{j}": float(c) for j, c in enumerate(getattr(moved.body, name))}
+    out |= hydrostatics(found, moved)[0]
     for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
         if name in found and found[name].identifiable:
             out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
@@ -1578,7 +1691,7 @@ def changes(
     for name in p.actuators:
         if found[name].identifiable:
             out |= scaled_actuators(p.vehicle, name, found[name].estimate)
-    if "thrust_scale" in found and found["thrust_scale"].identifiable and scaled:
+    if "thrust_scale" in found and (found["thrust_scale"].identifiable or p.likely) and scaled:
         out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
     return out
 
@@ -1595,8 +1708,10 @@ def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: fl
     before = np.array([p.set.linear_damping[i][i], p.set.quadratic_damping[i][i]], float)
     d = np.where(np.isin(names, p.retained), before, 0.0)
     d[free] = x[at]
-    force = float(powers @ d)
-    half = 2.0 * np.sqrt(np.maximum(found.variance(powers[free], at), 0.0))
+    force, slope = float(powers @ d), powers[free]
+    if p.likely:  # in terms of the thrust, whose scale goes to the file too
+        at, slope = [*at, p.names.index("thrust_scale")], np.append(slope, -force / p.value(x[None], "thrust_scale")[0])
+    half = 2.0 * np.sqrt(np.maximum(found.variance(slope, at), 0.0))
     known = half < USEFUL_DRAG * force or abs(powers @ before - force) > half
     return bool(np.isfinite(half) and force > 0.0 and known)
 
@@ -1645,9 +1760,10 @@ class Stages:
         known: Mapping[str, float],
         length: float | None,
         say: FitProgress,
+        likely: bool,
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
-        self.given, self.known = length, dict(known)
+        self.given, self.known, self.likely = length, dict(known), likely
         self.excites = [excites(s, vehicle) for s in prepared]
         self.fitted = self._fitted_axes()
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
@@ -1671,6 +1787,9 @@ class Stages:
         self.held, self.notes = self._assumed(swinging)
         if any(a not in self.free or a in self.held for a in swinging):
             self.extras.add("k")
+        driven = {a for a in swinging if a not in self.free and a not in self.held}
+        if driven and any(s.drive.thrusters for s in prepared):
+            self.extras |= set(PLACES if horizontal(vehicle) else CENTRES)
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
@@ -1735,6 +1854,7 @@ class Stages:
                 gaps.setdefault(those[k], []).append((begin, end))
                 name = self.prepared[those[k]].trial.name
                 self.remarks.append(finding("jolt", name, axis=axis, begin=begin, end=end))
+            found = {name: (LIKELY_SCALE if self.likely else 1.0) * value for name, value in found.items()}
             start |= {f"{axis}.{name}": value for name, value in found.items()}
             if found:
                 start[f"{axis}.added_mass"] = found["m_eff"] - float(
@@ -1886,6 +2006,7 @@ class Stages:
             unseen=self.unseen,
             retained=self.retained,
             held=self.held,
+            likely=self.likely,
         )
 
     def problem(self, kinds: dict[str, str], start: Mapping[str, float]) -> Shooting:
@@ -1924,7 +2045,7 @@ class Stages:
             own = speeds([s.motion for s in self.used], axis)
             known = _drag_known(p, x, stage.found, axis, own[1])
             result = axis_result(
-                p, numbers, first, axis, speeds=own, drag_known=known, given=self.known.get(axis)
+                p, x, numbers, first, axis, speeds=own, drag_known=known, given=self.known.get(axis)
             )
             reason = ""
             worst, r2 = unexplained(stage.problem, stage.solution, axis, self.used)
@@ -2134,7 +2255,7 @@ def fit_by_simulation(
     damping: str | Mapping[str, str] = "auto",
     known: Mapping[str, float] | None = None,
     horizon: float | None = None,
-    begin: Fit | None = None,
+    likely: bool = False,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials together.
@@ -2153,7 +2274,8 @@ def fit_by_simulation(
         damping: `auto`, `linear`, `quadratic` or `both`; or one of the last three by axis.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         horizon: Length of the segments [s]; from the data if None.
-        begin: Fit whose numbers are near the answer; from the vehicle file and the weak form if None.
+        likely: Whether the thrust is known no better than by the voltages that batteries have; its scale is then fitted
+            with that as its prior, and goes to the file with the rest.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -2172,19 +2294,17 @@ def fit_by_simulation(
         )
     remarks, say = [*remarks, *more], FitProgress(progress)
     say("preparing")
+    estimate = [*estimate, "thrust_scale"] if likely else estimate
     fit = Stages(
-        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), known or {}, horizon, say
+        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), known or {}, horizon, say, likely
     )
     if isinstance(damping, str):
         kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     else:
         kinds = {axis: damping.get(axis, "both") for axis in chosen}
-    if begin is None:
-        stage = fit.rough(kinds, [{}, fit.weak_start])
-        start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
-    else:
-        start = dict(begin.settings["end"])
-    if begin is not None or not stage.solution.interrupted:
+    stage = fit.rough(kinds, [{}, fit.weak_start])
+    start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
+    if not stage.solution.interrupted:
         stage = fit.first(kinds, start)
     first: dict[str, Number] = {}
     if damping == "auto" and not stage.solution.interrupted:
