@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -68,10 +68,6 @@ class AxisResult:
     """Lowest and highest that the damping rests on [m/s, rad/s]."""
     drag_known: bool
     """True if the damping is known well enough to be written; both of its terms are written, or neither."""
-    dropped: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Damping that was left out, because the data do not show it -> its 95 % interval in the unit of the damping."""
-    retained: Set[str] = frozenset()
-    """Names of the dropped terms that stay the vehicle file's, for the data exclude it as little as zero."""
     given: float | None = None
     """Effective inertia where it is known [kg, kg m²]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -90,15 +86,14 @@ class AxisResult:
         if f"{self.axis}.m_eff" in self.estimates:
             self.added_mass(float(self.file.M_RB[self.i, self.i]))
         for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
-            if name in self.dropped:
-                value = self.value(name)
-                nor = ", nor from the file's," if value else ""
-                note = f"not distinguishable from zero{nor} at speeds of {low:.2g}-{high:.2g} {unit}"
-                self.note(name, value, self.dropped[name], False, note, self.path(family))
-            elif name in self.numbers:
-                self.add(name, self.path(family))
-            if self.drag_known and name not in self.retained:
-                self.changes[self.path(family)] = max(self.value(name), 0.0)
+            if name in self.numbers:
+                own = self.add(name, self.path(family))
+                if own.ci95[0] <= 0.0 <= own.ci95[1] < np.inf:
+                    note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
+                    self.note(name, own.estimate, own.ci95, False, note, own.path)
+            if self.drag_known:
+                value = self.numbers[name].value if name in self.numbers else 0.0
+                self.changes[self.path(family)] = max(value, 0.0)
         if not self.drag_known:
             self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
         if "k" in self.numbers:
@@ -112,12 +107,6 @@ class AxisResult:
     def path(self, family: str) -> str:
         """Return the path of the axis' own entry in a matrix of the vehicle file."""
         return f"{SET}.{family}.{self.i}.{self.i}"
-
-    def value(self, name: str) -> float:
-        """Return a fitted number in its unit; 0, or the vehicle file's, where it was not fitted."""
-        if name in self.retained:
-            return float({"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i])
-        return self.numbers[name].value if name in self.numbers else 0.0
 
     def note(
         self,

@@ -30,9 +30,7 @@ CLEARLY = 0.7
 FEWEST_LEFT, MOST_LEFT_OUT = 2, 8
 """Trials that a fit without one needs, and trials up to which one fit for each is cheap."""
 
-UNKNOWN_VOLTAGE = (
-    "no battery voltage: from what batteries have and the inertia that the vehicle file expects; it is in every interval"
-)
+UNKNOWN_VOLTAGE = "no battery voltage: from what batteries have and the inertia that the vehicle file expects; it is in every interval"
 
 Progress = Callable[[float, str], None]
 
@@ -82,7 +80,9 @@ def fit_hydrodynamics(
         scale = fit.estimates["thrust_scale"]
         found = fit.estimates | {"thrust_scale": replace(scale, identifiable=False, note=UNKNOWN_VOLTAGE)}
         percent = 100.0 * (scale.ci95[1] / scale.estimate - 1.0)
-        fit = replace(fit, estimates=found, findings=(finding("voltage_unknown", percent=percent), *fit.findings))
+        fit = replace(
+            fit, estimates=found, findings=(finding("voltage_unknown", percent=percent), *fit.findings)
+        )
     return fit
 
 

@@ -225,7 +225,6 @@ class Parameters:
         start: Mapping[str, float] | None = None,
         imposed: Sequence[str] = (),
         unseen: Sequence[str] = (),
-        retained: Sequence[str] = (),
         held: Mapping[str, float] | None = None,
         likely: bool = False,
     ) -> None:
@@ -242,7 +241,6 @@ class Parameters:
             imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
                 others. Their coordinates come last.
             unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
-            retained: Damping that is not free and stays the vehicle file's, such as `pitch.d2`.
             held: Effective inertias M_RB + M_A that are not free, by axis [kg, kg m²].
             likely: Whether the scale of thrust is what batteries give.
 
@@ -256,7 +254,7 @@ class Parameters:
         self.imposed = tuple(a for a in AXES if a in imposed)
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
-        self.damping, self.extras, self.retained = damping, tuple(extras), tuple(retained)
+        self.damping, self.extras = damping, tuple(extras)
         self.likely = likely
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.actuators = {name: fields for name, fields in actuator_fields(vehicle).items() if name in extras}
@@ -269,9 +267,9 @@ class Parameters:
             i = AXES.index(a)
             self.M_A[i, i] = m - self.M_RB[i, i]
         for a, i in zip(self.axes, self.index, strict=True):
-            if damping[a] == "linear" and f"{a}.d2" not in retained:
+            if damping[a] == "linear":
                 self.D2[i, :] = self.D2[:, i] = 0.0
-            elif damping[a] == "quadratic" and f"{a}.d1" not in retained:
+            elif damping[a] == "quadratic":
                 self.D1[i, :] = self.D1[:, i] = 0.0
         self.coordinates = tuple(self._coordinates())
         self.names = tuple(c.name for c in self.coordinates)
@@ -301,7 +299,14 @@ class Parameters:
         tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
         late = float(np.mean([t.delay for t in w.thrusters.values()]))
         table = {
-            "thrust_scale": ("-", *((LIKELY_SCALE, 0.05, 20.0, 1.0, SCALE_STD, 0.0) if self.likely else (1.0, 0.05, 20.0, 1.0, inf))),
+            "thrust_scale": (
+                "-",
+                *(
+                    (LIKELY_SCALE, 0.05, 20.0, 1.0, SCALE_STD, 0.0)
+                    if self.likely
+                    else (1.0, 0.05, 20.0, 1.0, inf)
+                ),
+            ),
             "thrust_lag": ("s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0),
             "thrust_delay": ("s", late, 0.0, LONGEST_DELAY, 0.2),
             "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
@@ -311,7 +316,14 @@ class Parameters:
         if sideways:
             height = float(np.mean([w.thrusters[name].position[2] for name in sideways]))
             place = f"thrusters.{sideways[0]}.position.2"
-            table["thruster_height"] = ("m", height, -inf, inf, 0.2, PLACE_STD[str(w.origin_of(place).origin)])
+            table["thruster_height"] = (
+                "m",
+                height,
+                -inf,
+                inf,
+                0.2,
+                PLACE_STD[str(w.origin_of(place).origin)],
+            )
         for j, name in enumerate(CENTRES):
             std = PLACE_STD[str(w.origin_of(f"body.center_of_gravity.{j}").origin)]
             table[name] = ("m", float(w.body.center_of_gravity[j]), -inf, inf, 0.2, std)
@@ -416,7 +428,11 @@ class Parameters:
             fields["volume"] = volume[:, None]
         free_centre = bool(set(CENTRES) & set(self.names))
         if "k" in self._at or free_centre:
-            r_g, file, B = self.centre_of_gravity(x), body.center_of_gravity, water.density * water.gravity * volume
+            r_g, file, B = (
+                self.centre_of_gravity(x),
+                body.center_of_gravity,
+                water.density * water.gravity * volume,
+            )
             r_b = body.center_of_buoyancy + (self.vehicle.weight / B)[:, None] * (r_g - file)
             if "k" in self._at:
                 z = self.r_h[2]
@@ -1301,7 +1317,7 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
 
 
 def axis_result(
-    p: Parameters, x: Array, numbers: Mapping[str, Number], first: Mapping[str, Number], axis: str, **known: Any
+    p: Parameters, x: Array, numbers: Mapping[str, Number], axis: str, **known: Any
 ) -> AxisResult:
     """The result of one axis.
 
@@ -1309,7 +1325,6 @@ def axis_result(
         p: What was free.
         x: Where the fit ended, in the units of the coordinates, (P,).
         numbers: Of `numbers_of`.
-        first: The same of the fuller model from which this one was chosen: damping that was left out has its interval.
         axis: Which.
         known: Further fields of `AxisResult`.
     """
@@ -1321,15 +1336,7 @@ def axis_result(
     own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
     if "k" in numbers and axis in ("roll", "pitch"):
         own["k"] = numbers["k"]
-    dropped = {
-        n: (0.0, first[f"{axis}.{n}"].ends[1])
-        for n in ("d1", "d2")
-        if n not in own and f"{axis}.{n}" in first
-    }
-    retained = {n for n in dropped if f"{axis}.{n}" in p.retained}
-    return AxisResult(
-        axis=axis, numbers=own, file=file, dropped=dropped, retained=retained, **known
-    )
+    return AxisResult(axis=axis, numbers=own, file=file, **known)
 
 
 def other_estimates(
@@ -1704,13 +1711,13 @@ def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: fl
     """Return whether the drag at one speed is known to `USEFUL_DRAG`, or excludes that of the vehicle file."""
     i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
     at = [p.names.index(name) for name in names if name in p.names]
-    free, powers = np.isin(names, p.names), np.array([speed, speed**2])
+    powers = np.array([speed, speed**2])
+    slope = powers[np.isin(names, p.names)]
     before = np.array([p.set.linear_damping[i][i], p.set.quadratic_damping[i][i]], float)
-    d = np.where(np.isin(names, p.retained), before, 0.0)
-    d[free] = x[at]
-    force, slope = float(powers @ d), powers[free]
+    force = float(slope @ x[at])
     if p.likely:  # in terms of the thrust, whose scale goes to the file too
-        at, slope = [*at, p.names.index("thrust_scale")], np.append(slope, -force / p.value(x[None], "thrust_scale")[0])
+        scale = p.names.index("thrust_scale")
+        at, slope = [*at, scale], np.append(slope, -force / x[scale])
     half = 2.0 * np.sqrt(np.maximum(found.variance(slope, at), 0.0))
     known = half < USEFUL_DRAG * force or abs(powers @ before - force) > half
     return bool(np.isfinite(half) and force > 0.0 and known)
@@ -1748,6 +1755,177 @@ class Stage:
         return self.solution.point.theta[: len(self.problem.parameters.names)]
 
 
+SHAPES = {"linear": 0.1, "quadratic": 0.45, "both": 0.45}
+"""Prior probability of the shapes of drag: at the Reynolds numbers of vehicles, above 10⁴, it is hardly ever linear."""
+
+SIZE_STD = 1.5
+"""Standard deviation of quadratic drag, as a part of that of a bluff body of the vehicle's size (drag coefficient 1)."""
+
+NARROW = 2.0
+"""Ratio of the speeds of stretches below which they show one drag, but not its shape."""
+
+WIDER = 2.5
+"""Factor on the standard deviations for the intervals then."""
+
+WHITE = np.linspace(-5.0, 5.0, 61)
+"""Grid of the densities, in standard deviations."""
+
+
+class Shape(NamedTuple):
+    """Drag of an axis as the average over its shapes."""
+
+    value: Array
+    """d1 and d2 in their units, (2,)."""
+    ends: list[tuple[float, float]]
+    """Their 95 % intervals."""
+    weights: dict[str, float]
+    """Probability of each shape [-]."""
+
+
+def drag_of_size(vehicle: Vehicle, axis: str) -> float:
+    """Return the quadratic drag of a bluff box of the vehicle's size, in the unit of d2."""
+    i, size = AXES.index(axis), np.asarray(vehicle.body.size, float)
+    others = np.delete(size, i % 3)
+    area = np.prod(others) if i < 3 else size[i - 3] * np.sum(others**4) / 32.0
+    return 0.5 * vehicle.water.density * float(area)
+
+
+def levels_of(problem: Shooting, axis: str) -> list[float]:
+    """Return the speeds that stretches of the trials reach on an axis, of those that move it [m/s, rad/s]."""
+    i, tops = AXES.index(axis), []
+    for s in problem.segments:
+        own = s.measured.get(DETERMINED_BY[axis][0])
+        values = np.abs(s.held[:, i]) if s.held is not None and np.isfinite(s.held[:, i]).all() else None
+        values = np.abs(own[1]) if own is not None and values is None else values
+        if values is not None and len(values):
+            tops.append(float(np.percentile(values, 95.0)))
+    return [top for top in tops if top > 0.2 * max(tops)]
+
+
+def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) -> Shape:
+    """Return the average over linear and quadratic drag and both, by their evidence, for the thrust that was found.
+
+    Args:
+        stage: The fit of both.
+        axis: Which.
+        size: Quadratic drag that the size of the vehicle lets expect, in the unit of d2.
+        levels: Speeds of the stretches [m/s, rad/s]; their range widens the intervals if it is below `NARROW`.
+    """
+    from scipy.stats import norm, t
+
+    C, names = stage.found.covariance, stage.problem.parameters.names
+    at, common = (
+        [names.index(n) for n in some if n in names] for some in ((f"{axis}.d1", f"{axis}.d2"), COMMON)
+    )
+    S, whole = (matrix[np.ix_(at, at)] for matrix in (_given(C, at, common), _given(C, at, [])))
+    if not np.isfinite(S).all() or np.linalg.det(S) <= 0.0:
+        return Shape(stage.x[at], [(-np.inf, np.inf)] * 2, dict(SHAPES))
+    factor = float(t.ppf(0.975, min(float(np.min(C.dof[at])), 1e6)) / norm.ppf(0.975))
+    far = 4.0 * np.sqrt(np.diagonal(S))
+    mean = stage.x[at] + np.clip(stage.found.free[at] - stage.x[at], -far, far)
+    top = max(levels, default=1.0)
+    value, _, weights = _average(mean, S * factor**2, size, top)
+    wide = factor * (WIDER if top < NARROW * min(levels, default=top) else 1.0)
+    ends = _average(mean, S * wide**2, size, top)[1]
+    # What the thrust and its lever add to the spread of both together.
+    more = 1.96 * factor * np.sqrt(np.maximum(np.diagonal(whole - S), 0.0))
+    pairs = [
+        (max(v - np.hypot(v - a, m), 0.0), v + np.hypot(b - v, m))
+        for v, (a, b), m in zip(value, ends, more, strict=True)
+    ]
+    return Shape(value, [(float(a), float(b)) for a, b in pairs], weights)
+
+
+COMMON = ("thrust_scale", *PLACES)
+"""Coordinates that scale all drag together."""
+
+
+def _given(C: Covariance, at: Sequence[int], known: Sequence[int]) -> Array:
+    """Return the covariance (P, P) given some coordinates, in the units of theta."""
+    matrix = C.local if C.alone[at].any() else C.trials
+    if not known or not np.isfinite(matrix[np.ix_(known, known)]).all():
+        return matrix
+    scale = np.sqrt(np.diagonal(matrix)[known])
+    inner = matrix[np.ix_(known, known)] / np.outer(scale, scale)
+    side = matrix[:, known] / scale
+    return np.asarray(matrix - side @ np.linalg.pinv(inner, rcond=1e-8) @ side.T)
+
+
+def _average(
+    mean: Array, S: Array, size: float, top: float
+) -> tuple[Array, list[tuple[float, float]], dict[str, float]]:
+    """Return mean and 95 % intervals of d1 and d2 over the shapes, and the probability of each shape.
+
+    Args:
+        mean: Of the likelihood of d1 and d2, in their units, (2,).
+        S: Its covariance, (2, 2).
+        size: Quadratic drag that the size of the vehicle lets expect, in the unit of d2.
+        top: Speed at which linear drag is expected to be no larger [m/s, rad/s].
+    """
+    from scipy.stats import norm
+
+    prior = norm(0.0, size * max(top, 2.0 * USUAL_SPEED)), norm(size, SIZE_STD * size)
+    share = 2.0, 1.0 / norm.cdf(1.0 / SIZE_STD)  # of densities that are not negative
+    root = np.linalg.cholesky(S)
+    white = np.stack(np.meshgrid(WHITE, WHITE, indexing="ij"), axis=-1).reshape(-1, 2)
+    parts = {"both": (mean + white @ root.T, np.abs(np.linalg.det(root)) * (WHITE[1] - WHITE[0]) ** 2)}
+    for j, name in enumerate(("linear", "quadratic")):
+        k = 1 - j
+        centre, std = mean[j] - S[j, k] / S[k, k] * mean[k], float(np.sqrt(S[j, j] - S[j, k] ** 2 / S[k, k]))
+        grid = np.zeros((len(WHITE), 2))
+        grid[:, j] = centre + std * WHITE
+        parts[name] = grid, std * (WHITE[1] - WHITE[0])
+    inverse, logs = np.linalg.inv(S), {}
+    for name, (grid, cell) in parts.items():
+        off = grid - mean
+        log = np.log(SHAPES[name] * cell) - 0.5 * np.einsum("ni,ij,nj->n", off, inverse, off)
+        for j, absent in enumerate(("quadratic", "linear")):
+            if name != absent:
+                log = log + np.where(
+                    grid[:, j] >= 0.0, prior[j].logpdf(grid[:, j]) + np.log(share[j]), -np.inf
+                )
+        logs[name] = log
+    highest = max(float(log.max()) for log in logs.values())
+    density = {name: np.exp(log - highest) for name, log in logs.items()}
+    weights = {name: float(w.sum()) for name, w in density.items()}
+    total = sum(weights.values())
+    grid, density_of = (
+        np.concatenate([g for g, _ in parts.values()]),
+        np.concatenate([density[n] for n in parts]) / total,
+    )
+    ends = [_quantiles(grid[:, j], density_of) for j in range(2)]
+    return density_of @ grid, ends, {name: w / total for name, w in weights.items()}
+
+
+def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
+    """Return the 2.5 % and 97.5 % points of weighted values in their unit; weights add up to 1."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weight[order])
+    low, high = np.searchsorted(total, (0.025, 0.975 - 1e-12))
+    return float(values[order[low]]), float(values[order[min(high, len(order) - 1)]])
+
+
+def averaged(stage: Stage, shapes: Mapping[str, Shape]) -> Stage:
+    """Return a fit with its drag at the average over shapes, and the other numbers where they then are best."""
+    names, solution = stage.problem.parameters.names, stage.solution
+    at = [names.index(f"{axis}.{name}") for axis in shapes for name in ("d1", "d2")]
+    value = np.concatenate([shape.value for shape in shapes.values()]) if shapes else np.empty(0)
+    local = replace(stage.found.covariance, trials=stage.found.covariance.local)
+    C = _given(local, at, [names.index(name) for name in COMMON if name in names])
+    if not len(at) or not np.isfinite(C[:, at]).all():
+        return stage
+    scale = np.sqrt(np.diagonal(C)[at])
+    inner = C[np.ix_(at, at)] / np.outer(scale, scale)
+    theta = solution.point.theta
+    shift = C[:, at] / scale @ np.linalg.lstsq(inner, (value - theta[at]) / scale, rcond=1e-10)[0]
+    moved = np.clip(theta + shift, stage.problem.low, stage.problem.high)
+    shift = moved - theta
+    found = stage.found._replace(
+        free=stage.found.free + shift, interval=stage.found.interval + shift[:, None]
+    )
+    return Stage(stage.problem, replace(solution, point=solution.point._replace(theta=moved)), found)
+
+
 class Stages:
     """The stages of one fit: they share trials and segments."""
 
@@ -1776,7 +1954,6 @@ class Stages:
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
-        self.retained: tuple[str, ...] = ()
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
         self.extras = set(estimate)
@@ -1929,14 +2106,6 @@ class Stages:
         problem = self.problem(kinds, start)
         return self.finish(problem, problem.start(), 0.6)
 
-    def next(self, kinds: dict[str, str], before: Stage) -> Stage:
-        """Another set of parameters, from where a fit ended."""
-        old, x = before.problem.parameters, before.x
-        problem = self.problem(kinds, dict(zip(old.names, x, strict=True)))
-        rest = before.solution.point.theta[len(old.names) :]
-        point = Point(np.concatenate([problem.parameters.start, rest]), before.solution.point.z)
-        return self.finish(problem, point, 0.95, before.solution.std)
-
     def finish(self, problem: Shooting, point: Point, toward: float, std: Array | None = None) -> Stage:
         """Fit with robust weights and clocks let go, after a first approach without."""
         if std is None:
@@ -1957,9 +2126,12 @@ class Stages:
         solution = solve(problem, point, std=std, report=self.report("fit", toward))
         return Stage(problem, solution, confidence(problem, solution))
 
-    def numbers(self, stage: Stage) -> dict[str, Number]:
-        """Return the numbers of a stage."""
-        return numbers_of(stage.problem.parameters, stage.x, stage.found, self.own_error)
+    def shapes(self, stage: Stage) -> dict[str, Shape]:
+        """Return what the trials show of the drag of each axis, over its shapes."""
+        return {
+            axis: drag_shape(stage, axis, drag_of_size(self.vehicle, axis), levels_of(stage.problem, axis))
+            for axis in self.axes
+        }
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
         """Return a function that reports an iteration and its residual; `toward` is the share of the work done then."""
@@ -2004,7 +2176,6 @@ class Stages:
             start=start,
             imposed=self.imposed,
             unseen=self.unseen,
-            retained=self.retained,
             held=self.held,
             likely=self.likely,
         )
@@ -2026,18 +2197,20 @@ class Stages:
     def result(
         self,
         stage: Stage,
-        first: Mapping[str, Number],
+        shapes: Mapping[str, Shape],
         remarks: list[Finding],
         *,
         damping: str,
         kinds: Mapping[str, str],
     ) -> Fit:
-        """Return the finished fit; intervals hold those of the fuller model `first` from which this one was chosen."""
+        """Return the finished fit, with the drag of `shapes`."""
         p, x = stage.problem.parameters, stage.x
-        numbers = self.numbers(stage)
-        for name in numbers.keys() & first.keys():
-            (low, high), (a, b) = numbers[name].ends, first[name].ends
-            numbers[name] = numbers[name]._replace(ends=(min(low, a), max(high, b)))
+        numbers = numbers_of(p, x, stage.found, self.own_error)
+        for axis, shape in shapes.items():
+            numbers |= {
+                f"{axis}.{n}": Number(v, ends)
+                for n, v, ends in zip(("d1", "d2"), shape.value, shape.ends, strict=True)
+            }
         figures = quality(stage.problem, stage.solution, self.axes, self.used)
         found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
         others, held = other_estimates(p, numbers)
@@ -2045,7 +2218,7 @@ class Stages:
             own = speeds([s.motion for s in self.used], axis)
             known = _drag_known(p, x, stage.found, axis, own[1])
             result = axis_result(
-                p, x, numbers, first, axis, speeds=own, drag_known=known, given=self.known.get(axis)
+                p, x, numbers, axis, speeds=own, drag_known=known, given=self.known.get(axis)
             )
             reason = ""
             worst, r2 = unexplained(stage.problem, stage.solution, axis, self.used)
@@ -2084,7 +2257,7 @@ class Stages:
         settings: dict[str, Any] = {
             "axes": list(self.axes),
             "damping": damping,
-            "drag": dict(kinds),
+            "drag": dict(kinds) | {axis: shape.weights for axis, shape in shapes.items()},
             "estimate": sorted(self.extras),
             "fix": {f"{axis}.m": m for axis, m in self.known.items()},
             "horizon": round(self.length, 3),
@@ -2176,15 +2349,8 @@ class Stages:
             drag = result.estimates.get(f"{axis}.{name}")
             if drag is None:
                 continue
-            if name in result.dropped:
-                m = plant(stage.x)[0]
-                out[f"{axis}.{name}/m_eff"] = replace(
-                    drag, name=f"{axis}.{name}/m_eff", estimate=drag.estimate / m,
-                    ci95=(drag.ci95[0] / m, drag.ci95[1] / m), unit=unit, path=None,
-                )  # fmt: skip
-            else:
-                of = (lambda m, d1, d2, k, e: d1 / m) if name == "d1" else (lambda m, d1, d2, k, e: d2 / m)
-                add(f"{name}/m_eff", of, unit, positive=False)
+            of = (lambda m, d1, d2, k, e: d1 / m) if name == "d1" else (lambda m, d1, d2, k, e: d2 / m)
+            add(f"{name}/m_eff", of, unit, positive=False)
         return out
 
 
@@ -2296,7 +2462,14 @@ def fit_by_simulation(
     say("preparing")
     estimate = [*estimate, "thrust_scale"] if likely else estimate
     fit = Stages(
-        telling(prepared, vehicle, chosen), vehicle, chosen, tuple(estimate), known or {}, horizon, say, likely
+        telling(prepared, vehicle, chosen),
+        vehicle,
+        chosen,
+        tuple(estimate),
+        known or {},
+        horizon,
+        say,
+        likely,
     )
     if isinstance(damping, str):
         kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
@@ -2306,16 +2479,8 @@ def fit_by_simulation(
     start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
     if not stage.solution.interrupted:
         stage = fit.first(kinds, start)
-    first: dict[str, Number] = {}
-    if damping == "auto" and not stage.solution.interrupted:
-        chosen_kinds = _select(kinds, stage)
-        if chosen_kinds != kinds:
-            first = fit.numbers(stage)
-            tops = {axis: speeds([t.motion for t in fit.used], axis)[1] for axis in chosen}
-            driven_kinds = {axis: kind for axis, kind in chosen_kinds.items() if axis not in fit.free}
-            fit.retained = _retained(driven_kinds, first, stage, tops)
-            stage, kinds = fit.next(chosen_kinds, stage), chosen_kinds
-    return fit.result(stage, first, remarks, damping=str(damping), kinds=kinds)
+    shapes = fit.shapes(stage) if damping == "auto" and not stage.solution.interrupted else {}
+    return fit.result(averaged(stage, shapes), shapes, remarks, damping=str(damping), kinds=kinds)
 
 
 def prepare(
@@ -2351,10 +2516,6 @@ DAMPING = ("auto", "linear", "quadratic", "both")
 
 HORIZONS = (0.5, 60.0)
 """Shortest and longest segments that can be asked for [s]."""
-
-SIGNIFICANT = 0.03
-"""Level at which a second damping term has to be significant: one that is superfluous should be rare, for it is carried
-to speeds that no trial had."""
 
 
 def _check(
@@ -2404,67 +2565,3 @@ def _axes(
     if not chosen:
         raise CalibrationError(f"no measurement that determines {', '.join(axes)} is in these trials")
     return chosen, remarks
-
-
-def _select(kinds: dict[str, str], stage: Stage) -> dict[str, str]:
-    """Damping of each axis: the weaker term goes where it is not `SIGNIFICANT`."""
-    from scipy.stats import norm
-
-    names, new = stage.problem.parameters.names, dict(kinds)
-    std = np.sqrt(np.diagonal(stage.found.covariance.local))
-    for axis in kinds:
-        p_value = {}
-        for name in ("d1", "d2"):
-            c = names.index(f"{axis}.{name}")
-            known = bool(np.isfinite(std[c]))
-            p_value[name] = (
-                2.0 * norm.sf(max(stage.found.free[c], 0.0) / max(std[c], 1e-300)) if known else 1.0
-            )
-        weakest = max(p_value, key=lambda name: p_value[name])
-        if p_value[weakest] > SIGNIFICANT:
-            new[axis] = "quadratic" if weakest == "d1" else "linear"
-    return new
-
-
-NEGLIGIBLE = 0.1
-"""Share of the drag at top speed."""
-
-
-def _retained(
-    kinds: dict[str, str], first: Mapping[str, Number], stage: Stage, tops: Mapping[str, float]
-) -> tuple[str, ...]:
-    """Damping that was left out and stays the vehicle file's, because the data exclude that no more than zero.
-
-    Slow swings show no quadratic drag, and a vehicle without any would tumble at speeds that no trial had. None where
-    the scale of thrust is free: the file's number would decide that; nor where the interval holds no more than
-    `NEGLIGIBLE` of the drag at the top speed: there the axis was seen to have one shape alone; nor where the file's
-    number is as significantly off as zero is not.
-
-    Args:
-        kinds: Damping of each axis.
-        first: Estimates with both dampings.
-        stage: The fit of both dampings.
-        tops: Top speed of each axis [m/s, rad/s].
-    """
-    from scipy.stats import norm
-
-    p, found = stage.problem.parameters, stage.found
-    std = np.sqrt(np.diagonal(found.covariance.local))
-    if "thrust_scale" in p.names:
-        return ()
-    absent = {"linear": ("d2", p.set.quadratic_damping), "quadratic": ("d1", p.set.linear_damping)}
-    out = []
-    for axis, kind in kinds.items():
-        if kind in absent:
-            name, D = absent[kind]
-            i = AXES.index(axis)
-            high, other = (
-                first[f"{axis}.{name}"].ends[1],
-                first[f"{axis}.{'d1' if name == 'd2' else 'd2'}"].value,
-            )
-            drag, rest = (high * tops[axis], other) if name == "d2" else (high, other * tops[axis])
-            c = p.names.index(f"{axis}.{name}")
-            off = abs(D[i][i] - found.free[c]) > norm.isf(0.5 * SIGNIFICANT) * std[c]
-            if 0.0 < D[i][i] <= high and drag > NEGLIGIBLE * rest and not off:
-                out.append(f"{axis}.{name}")
-    return tuple(out)
