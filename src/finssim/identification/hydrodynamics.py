@@ -6,31 +6,23 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from finssim.core.progress import progress_bar
-from finssim.identification.axis_result import CERTAIN
-from finssim.identification.fit import Estimate, Fit
+from finssim.identification.axis_result import SET
+from finssim.identification.fit import Fit
 from finssim.identification.plant_terms import matrices
 from finssim.identification.report import finish, refuse_places, usable_trials
-from finssim.identification.vehicle_file import calibrated, scaled_thrust
-from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.identification.vehicle_file import calibrated
+from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.inputs import drive, require_axes
 from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
-WORSE = 1.05
-"""Factor on the vehicle file's NRMSE above which the fit replays an axis worse than the file."""
-
-CLEARLY = 0.7
-"""Factor on the vehicle file's NRMSE of the fitted trials below which other trials are not replayed worse either."""
-
-FEWEST_LEFT, MOST_LEFT_OUT = 2, 8
-"""Trials that a fit without one needs, and trials up to which one fit for each is cheap."""
-
-UNKNOWN_VOLTAGE = "no battery voltage: from what batteries have and the inertia that the vehicle file expects; it is in every interval"
+UNKNOWN_VOLTAGE = (
+    "no battery voltage: from what batteries have and the file's inertia; it is in every interval"
+)
 
 Progress = Callable[[float, str], None]
 
@@ -61,8 +53,8 @@ def fit_hydrodynamics(
         damping: `auto`, `linear`, `quadratic` or `both`.
         known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
         horizon: Longest stretch that is simulated without a restart [s].
-        held_out: Further trials that show whether the calibrated vehicle replays worse than the file. Without any, a
-            fit that does not replay the fitted trials much better is judged by trials left out in turn.
+        held_out: Further trials that judge the fit. Without any, it is judged by trials, or stretches of them, left out
+            in turn. The vehicle file keeps its numbers of each axis that it predicts as well or better.
         progress: Called with the part done and a few words.
 
     Raises:
@@ -86,16 +78,6 @@ def fit_hydrodynamics(
     return fit
 
 
-def _within(progress: Progress, low: float, high: float) -> Progress:
-    """Return the progress of a part of the work."""
-    return lambda part, text: progress(low + (high - low) * part, text)
-
-
-def _scores(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, float]:
-    """NRMSE of the replay by axis, the median over the trials; none where nothing can be replayed."""
-    return {axis: float(np.median(found)) for axis, found in _values(vehicle, trials).items()}
-
-
 def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]:
     """NRMSE of the replay of each trial by axis."""
     from finssim.identification.prediction import replay
@@ -114,65 +96,61 @@ def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]
     return values
 
 
-def _worse(
-    fit: Fit,
-    vehicle: Vehicle,
-    trials: Sequence[Trial],
-    held_out: Sequence[Trial],
-    without: Callable[[int], Fit],
-) -> list[Finding]:
-    """Return a finding for each axis that the calibrated vehicle replays worse than the file it came from.
+JUDGED_TOGETHER = ("roll", "pitch")
+"""Axes of one stiffness and one height of the thrusters: the file's numbers stay for both, or for neither."""
+
+
+def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
+    """Return a fit that keeps the vehicle file's numbers of each axis that it predicts no better than the file does.
 
     Args:
-        fit: The fit.
-        vehicle: The file.
-        trials: Trials that were fitted.
-        held_out: Trials that were not, which judge alone where there are any.
-        without: Fits without one of the trials.
+        fit: The fit, whose quality holds the NRMSE over what was left out of it in turn, and that of the file.
+        held_out: Trials that judge instead, as far as they show an axis.
     """
-    if not fit.changes:
-        return []
+    quality = {axis: dict(figures) for axis, figures in fit.quality.items()}
     if held_out:
-        judged, before = "the held-out trials", _scores(vehicle, held_out)
-        after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), held_out)
-    else:
-        judged, before = "the fitted trials", _scores(vehicle, trials)
-        after = dict.fromkeys(before, math.inf) | _scores(calibrated(fit), trials)
-        doubtful = [axis for axis, value in after.items() if value > CLEARLY * before.get(axis, math.inf)]
-        if doubtful and FEWEST_LEFT < len(trials) <= MOST_LEFT_OUT:
-            judged, after = "trials left out of the fit in turn", _left_out(without, trials, _limits(before))
-    limits = _limits(before)
-    return [
-        finding("replays_worse", axis, judged=judged, after=value, before=before[axis])
-        for axis, value in after.items()
-        if axis in before and value > limits[axis]
-    ]
+        before = _values(fit.before, held_out)
+        after = dict.fromkeys(before, [math.inf]) | _values(calibrated(fit), held_out)
+        for axis in before.keys() & quality.keys():
+            pair = (float(np.median(found[axis])) for found in (after, before))
+            quality[axis] |= dict(zip(("held_out", "file"), pair, strict=True))
+    fit = replace(fit, quality=quality)
+    rows = {axis: figures for axis, figures in quality.items() if "held_out" in figures}
+    lost = {axis for axis, figures in rows.items() if figures["held_out"] > figures["file"]}
+    tilted = [rows[axis] for axis in JUDGED_TOGETHER if axis in rows]
+    if tilted and lost & set(JUDGED_TOGETHER):
+        lost -= set(JUDGED_TOGETHER)
+        if sum(one["held_out"] for one in tilted) > sum(one["file"] for one in tilted):
+            lost |= {axis for axis in JUDGED_TOGETHER if axis in rows}
+    for axis in AXES:
+        fit = _file_kept(fit, axis) if axis in lost else fit
+    return fit
 
 
-def _limits(before: Mapping[str, float]) -> dict[str, float]:
-    """Return the NRMSE of each axis above which a replay is worse than that of the file."""
-    return {axis: WORSE * value + 0.01 for axis, value in before.items()}
+def _file_kept(fit: Fit, axis: str) -> Fit:
+    """Return the fit with the vehicle file's numbers of an axis, times the scale of the thrust that goes with them."""
+    i, plant, figures = AXES.index(axis), matrices(fit.before), fit.quality[axis]
+    own = {"added_mass": plant.M_A, "linear_damping": plant.D1, "quadratic_damping": plant.D2}
+    changes = {
+        path: value
+        for path, value in fit.changes.items()
+        if not any(path.startswith(f"{SET}.{name}.{i}.") for name in own)
+        and not (axis == "heave" and path == "body.displaced_volume")
+    }
+    if f"thrusters.{next(iter(fit.before.thrusters))}.c_plus" in fit.changes:
+        scale, rigid = fit.estimates["thrust_scale"].estimate, float(plant.M_RB[i, i])
+        for name, matrix in own.items():
+            value = scale * float(matrix[i, i]) + (scale - 1.0) * rigid * (name == "added_mass")
+            changes[f"{SET}.{name}.{i}.{i}"] = max(value, 0.0)
+    found = {
+        name: replace(e, identifiable=False, note=FILE_BETTER) if name.partition(".")[0] == axis else e
+        for name, e in fit.estimates.items()
+    }
+    worse = finding("replays_worse", axis, after=figures["held_out"], before=figures["file"])
+    return replace(fit, changes=changes, estimates=found, findings=(*fit.findings, worse))
 
 
-def _left_out(
-    without: Callable[[int], Fit], trials: Sequence[Trial], limits: Mapping[str, float]
-) -> dict[str, float]:
-    """NRMSE by axis, the median over the trials, each replayed by the fit of the others.
-
-    No more trials are left out once most of them are replayed within the limits: the medians are then too.
-    """
-    values: dict[str, list[float]] = {}
-    for k, trial in enumerate(trials):
-        try:
-            fit = without(k)
-        except CalibrationError:
-            continue  # the others excite nothing
-        for axis, found in _values(calibrated(fit), [trial]).items():
-            values.setdefault(axis, []).extend(found)
-        within = (sum(value <= limits[axis] for value in values.get(axis, ())) for axis in limits)
-        if all(2 * count > len(trials) for count in within):
-            break
-    return {axis: float(np.median(found)) for axis, found in values.items()}
+FILE_BETTER = "the vehicle file predicts what was not fitted as well or better"
 
 
 # -- the scale of thrust --------------------------------------------------------------------------------------------

@@ -240,6 +240,8 @@ QUALITY = {
     "nrmse": "NRMSE",
     "rmse": "RMSE",
     "rmse_held_out": "held out",
+    "held_out": "NRMSE held out",
+    "file": "by the file",
     "trials": "trials",
     "samples": "samples",
     "rejected": "rejected",

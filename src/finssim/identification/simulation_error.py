@@ -403,9 +403,10 @@ class Parameters:
             return self.vehicle
         body, r_g = self.vehicle.body, self.centre_of_gravity(x[None])[0]
         shift = self.vehicle.weight / self.vehicle.buoyancy * (r_g - body.center_of_gravity)
-        return self.vehicle.replace({
-            "body.center_of_gravity": r_g.tolist(), "body.center_of_buoyancy": (body.center_of_buoyancy + shift).tolist()
-        })  # fmt: skip
+        r_b = body.center_of_buoyancy + shift
+        return self.vehicle.replace(
+            {"body.center_of_gravity": r_g.tolist(), "body.center_of_buoyancy": r_b.tolist()}
+        )
 
     def plants(self, x: Array) -> Plants:
         """Return the simulator's parameters.
@@ -1232,8 +1233,14 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     return Confidence(evidence, covariance, free, ends)
 
 
-def evidence_of(problem: Shooting, solution: FitSolution) -> Evidence:
-    """Normal matrices and scores by trial, or by blocks of rows where fewer than `FEWEST_TRIALS` excite an axis."""
+def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int64] | None = None) -> Evidence:
+    """Normal matrices and scores by groups of rows.
+
+    Args:
+        problem: What was fitted.
+        solution: Where the fit ended.
+        group: Of every row, (N,); trials if None, or blocks where fewer than `FEWEST_TRIALS` excite an axis.
+    """
     linear = solution.linear
     weight = weights_of(linear.residual, solution.std)
     # Derivatives without what each segment's own unknowns take up of every sample.
@@ -1243,9 +1250,9 @@ def evidence_of(problem: Shooting, solution: FitSolution) -> Evidence:
         normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
         slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
     trial = problem.groups[problem.measured.segment]
-    unit, group = "trials", trial
-    if problem.few or len(np.unique(trial)) < FEWEST_TRIALS:
-        unit, group = "blocks", _blocks(problem, trial)
+    unit = "blocks" if problem.few or len(np.unique(trial)) < FEWEST_TRIALS else "trials"
+    if group is None:
+        group = trial if unit == "trials" else _blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
     normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
     score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
@@ -1346,7 +1353,8 @@ def other_estimates(
     out, bounds = dict[str, Estimate](), list[Finding]()
     reported = {*PATHS, *PLACES, *p.terms, *p.actuators}
     paths = PATHS | {name: f"body.center_of_gravity.{j}" for j, name in enumerate(CENTRES)}
-    paths |= {PLACES[0]: f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)[:1]}
+    sideways = horizontal(p.vehicle)
+    paths |= {PLACES[0]: f"thrusters.{sideways[0]}.position.2"} if sideways else {}
     units = {c.name: c.unit for c in p.coordinates if c.name in reported}
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
@@ -1561,6 +1569,87 @@ def quality(
     return out
 
 
+MOST_LEFT_OUT = 24
+"""Number of parts that are left out of a fit in turn, at most."""
+
+AXES_BIAS = ("surge.bias", "sway.bias", "yaw.bias")
+"""Biases that no vehicle file has a place for."""
+
+
+def held_out(
+    stage: Stage, file: Shooting, axes: Sequence[str], by_trial: bool
+) -> dict[str, tuple[float, float]]:
+    """Return the NRMSE of each axis over stretches that the numbers do not rest on, and that of the vehicle file [-].
+
+    Each trial, or stretch of one, is predicted by the numbers that one Gauss-Newton step from the end of the fit gives
+    without it, each from the initial state and the offsets of its sensors that suit it best.
+
+    Args:
+        stage: The finished fit.
+        file: The same problem with every number of the vehicle file free.
+        axes: Fitted axes.
+        by_trial: Whether whole trials are left out.
+    """
+    problem, point = stage.problem, stage.solution.point
+    count = len(problem.segments)
+    label = problem.groups if by_trial else np.arange(count) * min(count, MOST_LEFT_OUT) // count
+    group = np.unique(label, return_inverse=True)[1][problem.measured.segment]
+    evidence = evidence_of(problem, stage.solution, group)
+    total = evidence.information
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
+    unwritten = [
+        problem.parameters.names.index(name) for name in AXES_BIAS if name in problem.parameters.names
+    ]
+
+    def without(k: int) -> Array:
+        rest = (total - evidence.normal[k]) / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+        low, high = (
+            np.where(end == point.theta, side * 1e-12, end - point.theta) * scale
+            for end, side in ((problem.low, -1), (problem.high, 1))
+        )
+        theta = point.theta + boxed(rest, -evidence.score[k] / scale, low, high) / scale
+        theta[unwritten] = 0.0
+        return theta
+
+    known = dict(zip(problem.names, point.theta, strict=True)) | dict(
+        zip(file.parameters.names, file.parameters.expected, strict=True)
+    )
+    known |= dict.fromkeys(AXES_BIAS, 0.0) | ({"thrust_scale": 1.0} if problem.parameters.likely else {})
+    plain = np.array([known[name] for name in file.names])
+    after = _predicted_error(
+        problem, np.array([without(k) for k in range(len(evidence.normal))]), stage.solution
+    )
+    after = after[np.arange(len(group)), group]
+    before = _predicted_error(file, plain[None], stage.solution)[:, 0]
+    out = {}
+    for axis in axes:
+        _, rows, trial, spans = _shown_by(problem, axis)
+        moving = [g for g, span in spans.items() if 0.2 * max(spans.values()) < span]
+        rms = [
+            [float(np.sqrt(np.mean(error[rows[trial == g]] ** 2))) / max(spans[g], 1e-12) for g in moving]
+            for error in (after, before)
+        ]
+        if moving:
+            out[axis] = float(np.mean(rms[0])), float(np.mean(rms[1]))
+    return out
+
+
+def _predicted_error(problem: Shooting, theta: Array, solution: FitSolution) -> Array:
+    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to it, (N, C).
+
+    The unit is that of the channel.
+    """
+    z, linear = solution.point.z, solution.linear
+    error = problem.residuals(Point(theta, np.repeat(z[None], len(theta), axis=0)))
+    weight = solution.std**-2.0
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        own, stiff = linear.own[a:b], problem.prior_std[s] ** -2.0
+        normal = (own.T * weight[a:b]) @ own + np.diag(stiff)
+        right = (own.T * weight[a:b]) @ error[a:b] - (stiff * z[s])[:, None]
+        error[a:b] -= own @ np.linalg.solve(normal, np.nan_to_num(right))
+    return error
+
+
 def unexplained(
     problem: Shooting, solution: FitSolution, axis: str, used: Sequence[Streams]
 ) -> tuple[str, float]:
@@ -1759,7 +1848,7 @@ SHAPES = {"linear": 0.1, "quadratic": 0.45, "both": 0.45}
 """Prior probability of the shapes of drag: at the Reynolds numbers of vehicles, above 10⁴, it is hardly ever linear."""
 
 SIZE_STD = 1.5
-"""Standard deviation of quadratic drag, as a part of that of a bluff body of the vehicle's size (drag coefficient 1)."""
+"""Standard deviation of quadratic drag, as a part of that of a box of the vehicle's size with a drag coefficient of 1."""
 
 NARROW = 2.0
 """Ratio of the speeds of stretches below which they show one drag, but not its shape."""
@@ -2212,6 +2301,11 @@ class Stages:
                 for n, v, ends in zip(("d1", "d2"), shape.value, shape.ends, strict=True)
             }
         figures = quality(stage.problem, stage.solution, self.axes, self.used)
+        if not stage.solution.interrupted:
+            several = stage.found.evidence.unit == "trials" and not stage.found.covariance.alone.any()
+            file = self.problem(dict.fromkeys(self.axes, "both"), {})
+            for axis, (after, before) in held_out(stage, file, self.axes, several).items():
+                figures[axis] |= {"held_out": after, "file": before}
         found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
         others, held = other_estimates(p, numbers)
         for axis in self.axes:
