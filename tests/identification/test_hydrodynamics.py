@@ -8,7 +8,7 @@ import pytest
 
 from finssim.identification.axis_result import trim
 from finssim.identification.fit import Estimate
-from finssim.identification.hydrodynamics import _worse, fit_hydrodynamics
+from finssim.identification.hydrodynamics import fit_hydrodynamics, judged
 from finssim.identification.prediction import replay
 from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
@@ -89,6 +89,8 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
         )
     fit = fit_hydrodynamics(fitted, vehicle, held_out=held)
     assert "not_converged" not in {one.code for one in fit.findings}
+    moves = {"mixed_050": ("heave", "roll", "pitch", "yaw"), "yaw_050": ("yaw",)}
+    held = [replace(t, header=t.header.model_copy(update={"axis": moves[t.name]})) for t in held]
     result = replay(held, calibrated(fit), horizon=3.0)
     ahead = {axis: result.ahead[axis]["calibrated"].nrmse[-1] for axis in ("roll", "pitch", "yaw")}
     assert max(ahead.values()) < 0.15, ahead
@@ -121,26 +123,60 @@ def test_a_heading_that_decays(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_replays_worse_is_judged_by_trials_that_were_not_fitted(tmp_path):
-    """Held-out trials where there are any, else each trial by a fit of the others, and the finding says which."""
+def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
+    """By stretches left out in turn, or by held-out trials; the file keeps the axis that it predicts no worse."""
     vehicle = load_vehicle("bluerov2")
     slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
     words = []
     told = lambda part, text: words.append((part, text))  # noqa: E731
     fit = fit_hydrodynamics(slow, vehicle, progress=told)
     assert not {"replays_worse"} & {one.code for one in fit.findings}
-    assert words[0][0] <= words[-1][0] <= 1.0 and any("replay" in text for _, text in words)
+    assert words[0][0] <= words[-1][0] <= 1.0 and any("judging" in text for _, text in words)
+    figures = fit.quality["yaw"]
+    assert 0.0 < figures["held_out"] < 0.3 * figures["file"]
     (drag,) = (path for path in fit.changes if "quadratic_damping" in path)
     bad = replace(fit, changes={**fit.changes, drag: 5.0})
-    held = _worse(bad, vehicle, slow, slow, None)
-    assert [one.values["judged"] for one in held] == ["the held-out trials"]
+    kept = judged(bad, slow)
+    assert not any("damping" in path for path in kept.changes)
+    assert calibrated(kept).hydrodynamics == vehicle.hydrodynamics
+    (said,) = (one for one in kept.findings if one.code == "replays_worse")
+    assert said.subject == "yaw" and said.values["after"] > said.values["before"]
+    assert not kept.estimates["yaw.d2"].identifiable
     wild = replace(fit, changes={**fit.changes, drag: 500.0})  # no replay stays finite
-    assert _worse(wild, vehicle, slow, slow, None)
-    crossed = _worse(bad, vehicle, slow, (), lambda k: bad)
-    assert [one.values["judged"] for one in crossed] == ["trials left out of the fit in turn"]
-    left = []
-    assert not _worse(fit, calibrated(fit), slow, (), lambda k: left.append(k) or fit)
-    assert left == [0, 1]  # two of three decide the median
+    assert drag not in judged(wild, slow).changes
+    assert judged(fit, slow).changes == fit.changes
+
+
+@pytest.mark.slow
+def test_an_axis_of_the_file_goes_with_the_scale_of_thrust(by_sticks):
+    """Thrust of s and s times mass and drag move as the file does; the other axes keep their numbers."""
+    quality = by_sticks.quality | {"surge": by_sticks.quality["surge"] | {"held_out": 1.0, "file": 0.9}}
+    fit = judged(replace(by_sticks, quality=quality))
+    before, after, scale = fit.before, calibrated(fit), fit.estimates["thrust_scale"].estimate
+    old, new = (v.hydrodynamic_set("calibrated") for v in (before, after))
+    assert new.quadratic_damping[0, 0] == pytest.approx(scale * old.quadratic_damping[0, 0], rel=1e-6)
+    whole = max(scale * before.mass_matrix()[0, 0], before.body.mass)
+    assert after.mass_matrix()[0, 0] == pytest.approx(whole, rel=1e-6)
+    other = calibrated(by_sticks).hydrodynamic_set("calibrated")
+    assert new.quadratic_damping[1, 1] == other.quadratic_damping[1, 1]
+
+
+@pytest.mark.slow
+def test_places_that_the_file_has_wrong_are_found(by_sticks):
+    """Roll and pitch of the sticks' vehicle are not twice what they are, because the thrusters are too low."""
+    height = by_sticks.estimates["thruster_height"]
+    assert height.identifiable and height.ci95[0] < -0.048 < height.ci95[1] < -0.0725 + 0.04
+    said = {one.subject: one for one in by_sticks.findings if one.code == "place_contradicted"}
+    assert said["T1, T2, T3, T4"].values["file"] == -0.0725
+    vehicle = calibrated(by_sticks)
+    for name, thruster in vehicle.thrusters.items():
+        expected = height.estimate if name in ("T1", "T2", "T3", "T4") else 0.0
+        assert thruster.position[2] == pytest.approx(expected, rel=1e-6)
+    (b, g), k = (
+        (vehicle.body.center_of_buoyancy[2], vehicle.body.center_of_gravity[2]),
+        by_sticks.estimates["pitch.k"],
+    )
+    assert vehicle.buoyancy * b - vehicle.weight * g == pytest.approx(k.estimate, rel=1e-5)
 
 
 @pytest.mark.slow

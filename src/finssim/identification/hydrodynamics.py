@@ -75,25 +75,37 @@ def fit_hydrodynamics(
         fit = replace(
             fit, estimates=found, findings=(finding("voltage_unknown", percent=percent), *fit.findings)
         )
-    return fit
+    if fit.interrupted or not fit.changes:
+        return fit
+    show(0.95, "judging by what was not fitted")
+    return judged(fit, held_out)
 
 
-def _values(vehicle: Vehicle, trials: Sequence[Trial]) -> dict[str, list[float]]:
-    """NRMSE of the replay of each trial by axis."""
+def _by_replay(fit: Fit, trials: Sequence[Trial]) -> dict[str, tuple[float, float]]:
+    """Return the NRMSE by axis of the calibrated vehicle and of the file, medians over the trials [-].
+
+    Both are scored on the axes that the file's thrusters excite.
+    """
     from finssim.identification.prediction import replay
 
     try:
-        rows = replay(trials, vehicle).scores["calibrated"]
+        before = replay(trials, fit.before)
     except CalibrationError:
         return {}
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for axis, score in row.items():
+    axes = {pair.name: pair.axes for pair in before.pairs}
+    named = [
+        replace(t, header=t.header.model_copy(update={"axis": axes[t.name]}))
+        for t in trials
+        if t.name in axes
+    ]
+    after = replay(named, calibrated(fit))
+    found: dict[str, list[tuple[float, float]]] = {}
+    for new, old in zip(*(one.scores["calibrated"] for one in (after, before)), strict=True):
+        for axis, score in old.items():
             if score.value is not None:
-                values.setdefault(str(axis), []).append(
-                    score.value if math.isfinite(score.value) else math.inf
-                )
-    return values
+                value = new[axis].value
+                found.setdefault(axis, []).append((math.inf if value is None else value, score.value))
+    return {axis: tuple(np.median(pairs, axis=0).tolist()) for axis, pairs in found.items()}
 
 
 JUDGED_TOGETHER = ("roll", "pitch")
@@ -108,11 +120,8 @@ def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
         held_out: Trials that judge instead, as far as they show an axis.
     """
     quality = {axis: dict(figures) for axis, figures in fit.quality.items()}
-    if held_out:
-        before = _values(fit.before, held_out)
-        after = dict.fromkeys(before, [math.inf]) | _values(calibrated(fit), held_out)
-        for axis in before.keys() & quality.keys():
-            pair = (float(np.median(found[axis])) for found in (after, before))
+    for axis, pair in (_by_replay(fit, held_out) if held_out else {}).items():
+        if axis in quality:
             quality[axis] |= dict(zip(("held_out", "file"), pair, strict=True))
     fit = replace(fit, quality=quality)
     rows = {axis: figures for axis, figures in quality.items() if "held_out" in figures}

@@ -186,6 +186,9 @@ the logarithm of an effective moment of inertia: published sets of one vehicle d
 PLACE_STD = {"measured": 0.005, "derived": 0.03, "published": 0.03, "guessed": 0.05}
 """Standard deviation of a height or centre of the vehicle file by its origin [m]."""
 
+DETERMINED = 0.8
+"""Standard deviation of a place, as a part of that of its prior, up to which it goes to the vehicle file."""
+
 CENTRES = ("gravity_x", "gravity_y", "gravity_z")
 PLACES = ("thruster_height", *CENTRES)
 """Places that are free where roll or pitch is fitted: the common height of the thrusters that push sideways, and the
@@ -1367,7 +1370,23 @@ def other_estimates(
             bounds.append(finding("at_bound", name, free=free, unit=unit))
         elif not np.isfinite(half):
             note = "the trials do not determine it"
-        elif half > limit and name not in PLACES:
+        elif name in PLACES:
+            coordinate = p.coordinates[p.names.index(name)]
+            known, std = half / 1.96, float(coordinate.std or np.inf)
+            if known > DETERMINED * std:
+                note = "the trials determine it no better than the vehicle file"
+            else:  # what the trials alone say, without the file
+                variance = 1.0 / (known**-2.0 - std**-2.0)
+                alone = variance * (value / known**2.0 - coordinate.start / std**2.0)
+                span = 1.96 * float(np.sqrt(variance))
+                if abs(alone - coordinate.start) > span:
+                    what = (
+                        ", ".join(sideways) if name == PLACES[0] else f"{name[-1]} of the centre of gravity"
+                    )
+                    bounds.append(
+                        finding("place_contradicted", what, value=alone, half=span, file=coordinate.start)
+                    )
+        elif half > limit:
             note = f"uncertain by ±{half:.2g} {unit}"
         path = f"{SET}.{name}" if name in p.terms else paths.get(name)
         out[name] = Estimate(
@@ -1601,13 +1620,12 @@ def held_out(
         problem.parameters.names.index(name) for name in AXES_BIAS if name in problem.parameters.names
     ]
 
+    low, high = (problem.low - point.theta) * scale - 1e-12, (problem.high - point.theta) * scale + 1e-12
+
     def without(k: int) -> Array:
         rest = (total - evidence.normal[k]) / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
-        low, high = (
-            np.where(end == point.theta, side * 1e-12, end - point.theta) * scale
-            for end, side in ((problem.low, -1), (problem.high, 1))
-        )
-        theta = point.theta + boxed(rest, -evidence.score[k] / scale, low, high) / scale
+        step = boxed(rest, -evidence.score[k] / scale, low, high) / scale
+        theta = np.clip(point.theta + step, problem.low, problem.high)
         theta[unwritten] = 0.0
         return theta
 
@@ -1769,11 +1787,15 @@ def changes(
                     # Couplings are written where the fit did away with them.
                     if i == j or matrix[i, j] != old[i, j]:
                         out[f"{path}.{i}.{j}"] = float(matrix[i, j])
-    moved = p.moved(x)
+    written = x.copy()
+    for c, name in enumerate(p.names):
+        written[c] = p.expected[c] if name in PLACES and not found[name].identifiable else x[c]
+    moved = p.moved(written)
     at = [f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)]
     if PLACES[0] in found:
-        lower = found[PLACES[0]].estimate - float(p.expected[p.names.index(PLACES[0])])
-        out |= {path: p.vehicle.thrusters[path.split(".")[1]].position[2] + lower for path in at}
+        c = p.names.index(PLACES[0])
+        lower = float(written[c] - p.expected[c])
+        out |= {path: p.vehicle.thrusters[path.split(".")[1]].position[2] + lower for path in at if lower}
     if moved is not p.vehicle:
         for name in ("center_of_gravity", "center_of_buoyancy"):
             out |= {f"body.{name}.{j}": float(c) for j, c in enumerate(getattr(moved.body, name))}
@@ -1848,7 +1870,7 @@ SHAPES = {"linear": 0.1, "quadratic": 0.45, "both": 0.45}
 """Prior probability of the shapes of drag: at the Reynolds numbers of vehicles, above 10⁴, it is hardly ever linear."""
 
 SIZE_STD = 1.5
-"""Standard deviation of quadratic drag, as a part of that of a box of the vehicle's size with a drag coefficient of 1."""
+"""Standard deviation of quadratic drag, as a part of that of a box of the vehicle's size (drag coefficient 1)."""
 
 NARROW = 2.0
 """Ratio of the speeds of stretches below which they show one drag, but not its shape."""

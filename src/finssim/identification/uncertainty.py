@@ -153,7 +153,7 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     square = np.einsum("pgh,pgh->p", unit, unit)
     dof = np.where(square > 0.0, np.trace(unit, axis1=1, axis2=2) ** 2 / np.maximum(square, 1e-300), 1.0)
     # A stated variance has infinitely many degrees of freedom; Satterthwaite's sum of both.
-    mixed = (1.0 + np.diagonal(stated) / np.maximum(trace, 1e-300)) ** 2
+    mixed = (1.0 + np.minimum(np.diagonal(stated) / np.maximum(trace, 1e-300), 1e6)) ** 2
 
     variance = np.maximum(np.diagonal(T @ T.T), 1e-300)
     alone = (np.einsum("pk,gkl,pl->gp", T, B, T) / variance).max(axis=0) > ALONE
