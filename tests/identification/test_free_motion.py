@@ -99,7 +99,8 @@ def test_a_swing_gives_frequency_and_damping(axis, w2, c1, c2):
     assert found[f"{axis}.natural_frequency"].estimate == pytest.approx(np.sqrt(w2), rel=0.01)
     kind, value, other = ("d1", c1, "d2") if c1 else ("d2", c2, "d1")
     assert found[f"{axis}.{kind}/m_eff"].estimate == pytest.approx(value, rel=0.03)
-    assert found[f"{axis}.{other}/m_eff"].estimate == 0.0
+    assert found[f"{axis}.{other}/m_eff"].estimate < 0.02 * value
+    assert found[f"{axis}.{other}/m_eff"].ci95[0] == 0.0
     assert fit.quality[axis]["r2"] > 0.95
 
 
@@ -179,9 +180,10 @@ def test_a_rise_gives_terminal_speed_and_excess(quadratic):
     fit = fit_by_simulation([rise(speed, -6.0)], HEAVY)
     found = fit.estimates
     assert found["heave.terminal_speed"].estimate == pytest.approx(top, rel=0.01)
-    assert found[f"heave.{'d1' if quadratic else 'd2'}"].estimate == 0.0
+    assert found[f"heave.{'d1' if quadratic else 'd2'}"].ci95[0] == 0.0
     m = float(np.diag(HEAVY.mass_matrix())[2])
-    assert found["buoyancy_excess"].estimate == pytest.approx(e * m, rel=0.05)
+    # At one speed linear drag keeps a tenth of the probability, and draws the excess along.
+    assert found["buoyancy_excess"].estimate == pytest.approx(e * m, rel=0.1 if quadratic else 0.05)
     assert found["buoyancy_excess"].ci95[0] < e * m < found["buoyancy_excess"].ci95[1]
     assert "from the acceleration" in found["buoyancy_excess"].note
 
@@ -211,7 +213,7 @@ def test_a_coast_gives_drag_over_inertia(column, shape):
     fit = fit_by_simulation(coasts(np.random.default_rng(1), c1, c2, column=column), ROV)
     for name, value in (("d1", c1), ("d2", c2)):
         found = fit.estimates[f"{axis}.{name}/m_eff"]
-        assert found.estimate == pytest.approx(value, rel=0.05, abs=1e-9), found
+        assert found.estimate == pytest.approx(value, rel=0.05, abs=1e-4), found
         assert found.ci95[0] <= value <= found.ci95[1] or abs(found.estimate - value) < 0.02 * max(value, 0.1)
     i = AXES.index(axis)
     changed = ROV.replace(fit.changes).hydrodynamics["calibrated"]
@@ -223,7 +225,8 @@ def test_a_coast_gives_drag_over_inertia(column, shape):
 
 @pytest.mark.slow
 def test_the_shape_of_drag_is_right_and_its_interval_holds_the_truth():
-    """Linear or quadratic alone in at least 10 of 12 draws, and the ratio's interval holds the truth in at least 9.
+    """Linear or quadratic alone is most probable in at least 10 of 12 draws, and the interval of the ratio holds the
+    truth in at least 9.
 
     11.6 and 11.4 are expected; 1 in 200 and 1 in 50 have fewer.
     """
@@ -232,9 +235,10 @@ def test_the_shape_of_drag_is_right_and_its_interval_holds_the_truth():
     for k in range(12):
         c1, c2 = SHAPES[("linear", "quadratic")[k % 2]]
         c1, c2 = c1 * rng.uniform(0.5, 2.0), c2 * rng.uniform(0.5, 2.0)
-        found = fit_by_simulation(coasts(rng, c1, c2, noise=0.02, rate=10.0, count=4), ROV).estimates
-        name, value, other = ("d1", c1, "d2") if c1 > 0.0 else ("d2", c2, "d1")
-        right += found[f"yaw.{other}/m_eff"].estimate == 0.0
+        fit = fit_by_simulation(coasts(rng, c1, c2, noise=0.02, rate=10.0, count=4), ROV)
+        name, value, shape = ("d1", c1, "linear") if c1 > 0.0 else ("d2", c2, "quadratic")
+        found, weights = fit.estimates, fit.settings["drag"]["yaw"]
+        right += max(weights, key=weights.get) == shape
         low, high = found[f"yaw.{name}/m_eff"].ci95
         held += low <= value <= high
     assert right >= 10 and held >= 9

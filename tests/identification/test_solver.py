@@ -28,12 +28,14 @@ class Decays:
         self.truth = Point(np.append(1.3, rng.normal(size=G)), rng.uniform(1, 2, (segments, 1)))
         self.low, self.high = np.append(low, np.full(G, -np.inf)), np.append(10.0, np.full(G, np.inf))
         self.prior_std = np.full((segments, 1), 100.0)
-        self.prior_mean, self.prior_precision = np.zeros(1 + G), np.zeros(1 + G)
         self.judged = 1
         self.size = noise
         clean = self.predicted(Point(*(part[None] for part in self.truth)))[:, 0]
         self.value = clean + noise * rng.normal(size=len(clean))
         self.value[rng.choice(len(clean), outliers, replace=False)] += 5.0
+
+    def prior(self, theta):
+        return np.zeros_like(theta), np.zeros(theta.shape[-1])
 
     def predicted(self, points):
         theta, z = points

@@ -1894,11 +1894,13 @@ class Shape(NamedTuple):
 
 
 def drag_of_size(vehicle: Vehicle, axis: str) -> float:
-    """Return the quadratic drag of a bluff box of the vehicle's size, in the unit of d2."""
+    """Return the quadratic drag of the file, or of a bluff box of the vehicle's size, whichever is more, in the unit of
+    d2."""
     i, size = AXES.index(axis), np.asarray(vehicle.body.size, float)
     others = np.delete(size, i % 3)
     area = np.prod(others) if i < 3 else size[i - 3] * np.sum(others**4) / 32.0
-    return 0.5 * vehicle.water.density * float(area)
+    file = float(vehicle.hydrodynamic_set("calibrated").quadratic_damping[i, i])
+    return max(0.5 * vehicle.water.density * float(area), file)
 
 
 def levels_of(problem: Shooting, axis: str) -> list[float]:
@@ -1936,6 +1938,12 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     mean = stage.x[at] + np.clip(stage.found.free[at] - stage.x[at], -far, far)
     top = max(levels, default=1.0)
     value, _, weights = _average(mean, S * factor**2, size, top)
+    known = float(np.sqrt(S[1, 1])) < DETERMINED * SIZE_STD * size
+    file = float(stage.problem.parameters.expected[at[1]])
+    if (
+        not (known or stage.problem.parameters.likely) and file > 0.0
+    ):  # as the file has it, with the d1 that goes with it
+        value = np.array([max(mean[0] + S[0, 1] / S[1, 1] * (file - mean[1]), 0.0), file])
     wide = factor * (WIDER if top < NARROW * min(levels, default=top) else 1.0)
     ends = _average(mean, S * wide**2, size, top)[1]
     # What the thrust and its lever add to the spread of both together.
@@ -1953,7 +1961,8 @@ COMMON = ("thrust_scale", *PLACES)
 
 def _given(C: Covariance, at: Sequence[int], known: Sequence[int]) -> Array:
     """Return the covariance (P, P) given some coordinates, in the units of theta."""
-    matrix = C.local if C.alone[at].any() else C.trials
+    local, trials = (float(np.linalg.det(matrix[np.ix_(at, at)])) for matrix in (C.local, C.trials))
+    matrix = C.trials if trials > local and not C.alone[at].any() else C.local
     if not known or not np.isfinite(matrix[np.ix_(known, known)]).all():
         return matrix
     scale = np.sqrt(np.diagonal(matrix)[known])
@@ -2004,7 +2013,12 @@ def _average(
         np.concatenate([g for g, _ in parts.values()]),
         np.concatenate([density[n] for n in parts]) / total,
     )
-    ends = [_quantiles(grid[:, j], density_of) for j in range(2)]
+    ends = []
+    for j in range(2):  # nobody knows that a term is absent: they hold those of both terms too
+        some = [_quantiles(grid[:, j], density_of)]
+        if weights["both"] > 0.0:
+            some.append(_quantiles(parts["both"][0][:, j], density["both"] / weights["both"]))
+        ends.append((min(low for low, _ in some), max(high for _, high in some)))
     return density_of @ grid, ends, {name: w / total for name, w in weights.items()}
 
 
@@ -2029,12 +2043,24 @@ def averaged(stage: Stage, shapes: Mapping[str, Shape]) -> Stage:
     inner = C[np.ix_(at, at)] / np.outer(scale, scale)
     theta = solution.point.theta
     shift = C[:, at] / scale @ np.linalg.lstsq(inner, (value - theta[at]) / scale, rcond=1e-10)[0]
-    moved = np.clip(theta + shift, stage.problem.low, stage.problem.high)
-    shift = moved - theta
+    problem = stage.problem
+    moved = np.clip(theta + shift, problem.low, problem.high)
+    kept = problem.low, problem.high
+    problem.low, problem.high = kept[0].copy(), kept[1].copy()
+    problem.low[at] = problem.high[at] = moved[at]
+    end = solve(problem, Point(moved, solution.point.z), iterations=POLISH, std=solution.std)
+    problem.low, problem.high = kept
+    if not np.isfinite(end.cost):
+        return stage
+    shift = end.point.theta - theta
     found = stage.found._replace(
         free=stage.found.free + shift, interval=stage.found.interval + shift[:, None]
     )
-    return Stage(stage.problem, replace(solution, point=solution.point._replace(theta=moved)), found)
+    return Stage(problem, replace(end, converged=solution.converged, step=solution.step), found)
+
+
+POLISH = 2
+"""Iterations with which the other numbers follow the drag."""
 
 
 class Stages:
@@ -2049,7 +2075,7 @@ class Stages:
         known: Mapping[str, float],
         length: float | None,
         say: FitProgress,
-        likely: bool,
+        likely: bool = False,
     ) -> None:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known, self.likely = length, dict(known), likely

@@ -181,7 +181,8 @@ def intervals(theta: Array, covariance: Covariance) -> Array:
 
     finite = np.isfinite(covariance.dof)
     quantile = np.where(finite, t.ppf(0.975, np.where(finite, covariance.dof, 1.0)), norm.ppf(0.975))
-    half = quantile * covariance.std
+    # Few trials may agree by chance: no interval is narrower than independent errors make it.
+    half = np.maximum(quantile * covariance.std, norm.ppf(0.975) * np.sqrt(np.diagonal(covariance.local)))
     return np.stack([theta - half, theta + half], axis=-1)
 
 
