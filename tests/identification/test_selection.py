@@ -47,12 +47,13 @@ def test_the_average_over_shapes_holds_what_the_data_cannot_exclude():
     )  # of a vehicle whose stronger trials give 13 and 87: 29.5 at 0.25 m/s, not 34.8
     across, along = np.array([1.0, top]), np.array([top, -1.0])
     S = 1.5**2 * np.outer(across, across) + 14.0**2 * np.outer(along, along)
-    value, ends, weights = _average(drag, WIDER**2 * S, size, top)
+    value, ends, weights, _ = _average(drag, WIDER**2 * S, size, top)
     assert all(w > 0.02 for w in weights.values()) and sum(weights.values()) == pytest.approx(1.0)
     assert ends[0][0] <= 13.0 <= ends[0][1] and ends[1][0] <= 87.0 <= ends[1][1]
     assert (value >= 0.0).all() and value @ across == pytest.approx(drag @ across, rel=0.1)
-    sure, ends, weights = _average(np.array([13.0, 87.0]), np.diag([1.0, 4.0]), size, top)
+    sure, ends, weights, spread = _average(np.array([13.0, 87.0]), np.diag([1.0, 4.0]), size, top)
     assert weights["both"] > 0.999 and sure == pytest.approx([13.0, 87.0], rel=0.02)
+    assert spread == pytest.approx(top * np.hypot(1.0, 2.0 * top), rel=0.02)
     assert ends[0] == pytest.approx((11.04, 14.96), abs=0.2) and ends[1] == pytest.approx(
         (83.1, 90.9), abs=0.4
     )

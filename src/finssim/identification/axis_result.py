@@ -92,8 +92,9 @@ class AxisResult:
                     note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
                     self.note(name, own.estimate, own.ci95, False, note, own.path)
             if self.drag_known:
-                value = self.numbers[name].value if name in self.numbers else 0.0
-                self.changes[self.path(family)] = max(value, 0.0)
+                value = max(self.numbers[name].value, 0.0) if name in self.numbers else 0.0
+                if value != {"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i]:
+                    self.changes[self.path(family)] = value
         if not self.drag_known:
             self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
         if "k" in self.numbers:

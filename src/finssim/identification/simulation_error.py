@@ -49,7 +49,7 @@ from finssim.identification.uncertainty import (
     intervals,
     trial_covariance,
 )
-from finssim.identification.vehicle_file import scaled_thrust
+from finssim.identification.vehicle_file import number_in, scaled_thrust
 from finssim.identification.weak_form import weak_form
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.physics.types import MAX_THRUSTERS
@@ -195,6 +195,22 @@ PLACES = ("thruster_height", *CENTRES)
 centre of gravity. The centre of buoyancy follows from it, the stiffness and the constant moments."""
 
 
+def places(vehicle: Vehicle) -> dict[str, str]:
+    """Return the paths of `PLACES` in the file, that of the height of the first of the thrusters that share it."""
+    paths = [f"thrusters.{name}.position.2" for name in horizontal(vehicle)[:1]]
+    return dict(zip(PLACES, paths, strict=False)) | {
+        n: f"body.center_of_gravity.{j}" for j, n in enumerate(CENTRES)
+    }
+
+
+def origin(vehicle: Vehicle, path: str) -> str:
+    """Return the origin of a number of the file; `guessed` where it states none."""
+    try:
+        return str(vehicle.origin_of(path).origin)
+    except VehicleError:
+        return "guessed"
+
+
 def horizontal(vehicle: Vehicle) -> list[str]:
     """Return the names of the thrusters that push sideways."""
     return [name for name, t in vehicle.thrusters.items() if abs(t.axis[2]) < SIDEWAYS]
@@ -315,21 +331,8 @@ class Parameters:
             "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
             "k": ("N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B)),
         }
-        sideways = horizontal(w)
-        if sideways:
-            height = float(np.mean([w.thrusters[name].position[2] for name in sideways]))
-            place = f"thrusters.{sideways[0]}.position.2"
-            table["thruster_height"] = (
-                "m",
-                height,
-                -inf,
-                inf,
-                0.2,
-                PLACE_STD[str(w.origin_of(place).origin)],
-            )
-        for j, name in enumerate(CENTRES):
-            std = PLACE_STD[str(w.origin_of(f"body.center_of_gravity.{j}").origin)]
-            table[name] = ("m", float(w.body.center_of_gravity[j]), -inf, inf, 0.2, std)
+        for name, path in places(w).items():
+            table[name] = ("m", float(number_in(w, path) or 0.0), -inf, inf, 0.2, PLACE_STD[origin(w, path)])
         out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
         out += [Coordinate(name, "-", 1.0, 0.02, 50.0, 1.0) for name in self.actuators]
@@ -1106,7 +1109,7 @@ class Shooting:
             if name in EULER:
                 which = self.measured.channel == j
                 rise[which] = wrap_angle(rise[which])
-        slopes = np.nan_to_num(rise / wide)
+        slopes = np.nan_to_num(rise / np.where(wide > 0.0, wide, np.inf))
         rate = np.nan_to_num(rate[:, :1])
         late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
         P = len(self.parameters.names)
@@ -1355,9 +1358,7 @@ def other_estimates(
     """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
     reported = {*PATHS, *PLACES, *p.terms, *p.actuators}
-    paths = PATHS | {name: f"body.center_of_gravity.{j}" for j, name in enumerate(CENTRES)}
-    sideways = horizontal(p.vehicle)
-    paths |= {PLACES[0]: f"thrusters.{sideways[0]}.position.2"} if sideways else {}
+    paths = PATHS | places(p.vehicle)
     units = {c.name: c.unit for c in p.coordinates if c.name in reported}
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
@@ -1381,7 +1382,9 @@ def other_estimates(
                 span = 1.96 * float(np.sqrt(variance))
                 if abs(alone - coordinate.start) > span:
                     what = (
-                        ", ".join(sideways) if name == PLACES[0] else f"{name[-1]} of the centre of gravity"
+                        ", ".join(horizontal(p.vehicle))
+                        if name == PLACES[0]
+                        else f"{name[-1]} of the centre of gravity"
                     )
                     bounds.append(
                         finding("place_contradicted", what, value=alone, half=span, file=coordinate.start)
@@ -1818,7 +1821,9 @@ USEFUL_DRAG = 0.5
 """Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
 
 
-def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: float) -> bool:
+def _drag_known(
+    p: Parameters, x: Array, found: Confidence, axis: str, speed: float, shape: Shape | None
+) -> bool:
     """Return whether the drag at one speed is known to `USEFUL_DRAG`, or excludes that of the vehicle file."""
     i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
     at = [p.names.index(name) for name in names if name in p.names]
@@ -1829,7 +1834,7 @@ def _drag_known(p: Parameters, x: Array, found: Confidence, axis: str, speed: fl
     if p.likely:  # in terms of the thrust, whose scale goes to the file too
         scale = p.names.index("thrust_scale")
         at, slope = [*at, scale], np.append(slope, -force / x[scale])
-    half = 2.0 * np.sqrt(np.maximum(found.variance(slope, at), 0.0))
+    half = 2.0 * (np.sqrt(np.maximum(found.variance(slope, at), 0.0)) if shape is None else shape.spread)
     known = half < USEFUL_DRAG * force or abs(powers @ before - force) > half
     return bool(np.isfinite(half) and force > 0.0 and known)
 
@@ -1891,6 +1896,8 @@ class Shape(NamedTuple):
     """Their 95 % intervals."""
     weights: dict[str, float]
     """Probability of each shape [-]."""
+    spread: float = np.inf
+    """Standard deviation of the drag at the top speed, for the thrust that was found [N, N m]."""
 
 
 def drag_of_size(vehicle: Vehicle, axis: str) -> float:
@@ -1937,7 +1944,7 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     far = 4.0 * np.sqrt(np.diagonal(S))
     mean = stage.x[at] + np.clip(stage.found.free[at] - stage.x[at], -far, far)
     top = max(levels, default=1.0)
-    value, _, weights = _average(mean, S * factor**2, size, top)
+    value, _, weights, spread = _average(mean, S * factor**2, size, top)
     known = float(np.sqrt(S[1, 1])) < DETERMINED * SIZE_STD * size
     file = float(stage.problem.parameters.expected[at[1]])
     if (
@@ -1952,7 +1959,7 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
         (max(v - np.hypot(v - a, m), 0.0), v + np.hypot(b - v, m))
         for v, (a, b), m in zip(value, ends, more, strict=True)
     ]
-    return Shape(value, [(float(a), float(b)) for a, b in pairs], weights)
+    return Shape(value, [(float(a), float(b)) for a, b in pairs], weights, spread)
 
 
 COMMON = ("thrust_scale", *PLACES)
@@ -1973,8 +1980,9 @@ def _given(C: Covariance, at: Sequence[int], known: Sequence[int]) -> Array:
 
 def _average(
     mean: Array, S: Array, size: float, top: float
-) -> tuple[Array, list[tuple[float, float]], dict[str, float]]:
-    """Return mean and 95 % intervals of d1 and d2 over the shapes, and the probability of each shape.
+) -> tuple[Array, list[tuple[float, float]], dict[str, float], float]:
+    """Return mean and 95 % intervals of d1 and d2 over the shapes, the probability of each shape, and the standard
+    deviation of the drag at the top speed.
 
     Args:
         mean: Of the likelihood of d1 and d2, in their units, (2,).
@@ -2019,7 +2027,9 @@ def _average(
         if weights["both"] > 0.0:
             some.append(_quantiles(parts["both"][0][:, j], density["both"] / weights["both"]))
         ends.append((min(low for low, _ in some), max(high for _, high in some)))
-    return density_of @ grid, ends, {name: w / total for name, w in weights.items()}
+    drag, value = grid @ [1.0, top] * top, density_of @ grid
+    spread = float(np.sqrt(density_of @ (drag - density_of @ drag) ** 2))
+    return value, ends, {name: w / total for name, w in weights.items()}, spread
 
 
 def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
@@ -2103,7 +2113,7 @@ class Stages:
             self.extras.add("k")
         driven = {a for a in swinging if a not in self.free and a not in self.held}
         if driven and any(s.drive.thrusters for s in prepared):
-            self.extras |= set(PLACES if horizontal(vehicle) else CENTRES)
+            self.extras |= set(places(vehicle))
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
@@ -2358,7 +2368,7 @@ class Stages:
         others, held = other_estimates(p, numbers)
         for axis in self.axes:
             own = speeds([s.motion for s in self.used], axis)
-            known = _drag_known(p, x, stage.found, axis, own[1])
+            known = _drag_known(p, x, stage.found, axis, own[1], shapes.get(axis))
             result = axis_result(
                 p, x, numbers, axis, speeds=own, drag_known=known, given=self.known.get(axis)
             )
