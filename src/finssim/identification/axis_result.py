@@ -211,7 +211,7 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
     changes |= trim(found, buoyancy, body.center_of_buoyancy)
     stiffness = float(matrices(vehicle).arm[2])
     some = [found[name] for name in ("roll.k", "pitch.k") if name in found]
-    some = [e for e in some if e.identifiable or (e.estimate > 0.0 and outside(stiffness, e.ci95))]
+    some = [e for e in some if e.estimate > 0.0 and (useful(e) or outside(stiffness, e.ci95))]
     if not some:
         return changes, findings
     half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in some])
@@ -223,6 +223,11 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
     gravity_part = vehicle.weight * (float(body.center_of_gravity[2]) - reference)
     changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
     return changes, findings
+
+
+def useful(e: Estimate) -> bool:
+    """Return whether an estimate is known to `USEFUL`."""
+    return 0.5 * (e.ci95[1] - e.ci95[0]) < USEFUL * e.estimate
 
 
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:

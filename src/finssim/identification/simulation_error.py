@@ -1303,6 +1303,11 @@ PATHS = {
 """Reported coordinates besides those of the axes, and their places in the vehicle file."""
 
 
+LEVER = 1.0
+"""Size that the simulation's own error counts against in a place [m]: a lever of some centimetres shows in the small
+difference of large accelerations."""
+
+
 def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
     """Every coordinate with its 95 % interval, by name.
 
@@ -1320,7 +1325,8 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
             free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
             axis, _, kind = name.partition(".")
             rigid = M_RB[AXES.index(axis), AXES.index(axis)] if kind == "added_mass" else 0.0
-            width = float(np.hypot(half[c], own_error * abs(value + rigid)))
+            size = LEVER if name in PLACES else abs(value + rigid)
+            width = float(np.hypot(half[c], own_error * size))
             low = max(min(free - width, value), p.low[c])
             high = free + width if free + width > value else value + width
             # Where a fit ended early, the truth may be where one step more would go.
@@ -1901,13 +1907,11 @@ class Shape(NamedTuple):
 
 
 def drag_of_size(vehicle: Vehicle, axis: str) -> float:
-    """Return the quadratic drag of the file, or of a bluff box of the vehicle's size, whichever is more, in the unit of
-    d2."""
+    """Return the quadratic drag of a bluff box of the vehicle's size, in the unit of d2."""
     i, size = AXES.index(axis), np.asarray(vehicle.body.size, float)
     others = np.delete(size, i % 3)
     area = np.prod(others) if i < 3 else size[i - 3] * np.sum(others**4) / 32.0
-    file = float(vehicle.hydrodynamic_set("calibrated").quadratic_damping[i, i])
-    return max(0.5 * vehicle.water.density * float(area), file)
+    return 0.5 * vehicle.water.density * float(area)
 
 
 def levels_of(problem: Shooting, axis: str) -> list[float]:
@@ -2042,34 +2046,29 @@ def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
 
 def averaged(stage: Stage, shapes: Mapping[str, Shape]) -> Stage:
     """Return a fit with its drag at the average over shapes, and the other numbers where they then are best."""
-    names, solution = stage.problem.parameters.names, stage.solution
-    at = [names.index(f"{axis}.{name}") for axis in shapes for name in ("d1", "d2")]
-    value = np.concatenate([shape.value for shape in shapes.values()]) if shapes else np.empty(0)
-    local = replace(stage.found.covariance, trials=stage.found.covariance.local)
-    C = _given(local, at, [names.index(name) for name in COMMON if name in names])
-    if not len(at) or not np.isfinite(C[:, at]).all():
-        return stage
-    scale = np.sqrt(np.diagonal(C)[at])
-    inner = C[np.ix_(at, at)] / np.outer(scale, scale)
-    theta = solution.point.theta
-    shift = C[:, at] / scale @ np.linalg.lstsq(inner, (value - theta[at]) / scale, rcond=1e-10)[0]
-    problem = stage.problem
-    moved = np.clip(theta + shift, problem.low, problem.high)
+    problem, solution = stage.problem, stage.solution
+    value = {
+        f"{axis}.{n}": v
+        for axis, shape in shapes.items()
+        for n, v in zip(("d1", "d2"), shape.value, strict=True)
+    }
+    at, theta = [problem.names.index(name) for name in value], solution.point.theta.copy()
+    theta[at] = list(value.values())
     kept = problem.low, problem.high
     problem.low, problem.high = kept[0].copy(), kept[1].copy()
-    problem.low[at] = problem.high[at] = moved[at]
-    end = solve(problem, Point(moved, solution.point.z), iterations=POLISH, std=solution.std)
+    problem.low[at] = problem.high[at] = theta[at]
+    end = solve(problem, solution.point._replace(theta=theta), iterations=POLISH, std=solution.std)
     problem.low, problem.high = kept
-    if not np.isfinite(end.cost):
+    if not at or not np.isfinite(end.cost):
         return stage
-    shift = end.point.theta - theta
+    shift = end.point.theta - solution.point.theta
     found = stage.found._replace(
         free=stage.found.free + shift, interval=stage.found.interval + shift[:, None]
     )
     return Stage(problem, replace(end, converged=solution.converged, step=solution.step), found)
 
 
-POLISH = 2
+POLISH = 3
 """Iterations with which the other numbers follow the drag."""
 
 
