@@ -124,7 +124,7 @@ def test_a_heading_that_decays(tmp_path):
 
 @pytest.mark.slow
 def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
-    """By stretches left out in turn, or by held-out trials; the file keeps the axis that it predicts no worse."""
+    """By stretches left out in turn, or by held-out trials; the file keeps the axis that it predicts better."""
     vehicle = load_vehicle("bluerov2")
     slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
     words = []
