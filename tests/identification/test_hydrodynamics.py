@@ -9,11 +9,12 @@ import pytest
 from finssim.identification.axis_result import trim
 from finssim.identification.fit import Estimate
 from finssim.identification.hydrodynamics import fit_hydrodynamics, judged
-from finssim.identification.prediction import replay
+from finssim.identification.prediction import _remarks, replay
 from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials
+from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import load_vehicle
 
@@ -190,6 +191,30 @@ def test_a_known_inertia_tells_the_thrust(joystick, by_sticks):
     assert scale.estimate == pytest.approx(0.9 / ratio, rel=0.03)
     assert scale.ci95[1] < 1.2 * scale.ci95[0]
     assert fit.estimates["yaw.m_eff"].ci95 == (0.9, 0.9)
+
+
+@pytest.mark.slow
+def test_published_numbers_are_data(joystick, by_sticks):
+    """A bollard pull makes the thrust surer and draws it there; a replay at twice the speed says that it extrapolates;
+    a top speed without surge and a pull where the thrust is known are refused."""
+    fitted, held = joystick
+    vehicle = load_vehicle("bluerov2_heavy")
+    before, pull = by_sticks.estimates["thrust_scale"], 0.8 * float(vehicle.wrench_limits[0])
+    fit = fit_hydrodynamics(
+        fitted, vehicle, published={"bollard_pull": pull, "top_speed": 1.0}, held_out=held
+    )
+    after = fit.estimates["thrust_scale"]
+    assert before.estimate < after.estimate < 0.8
+    assert np.diff(after.ci95)[0] < 0.9 * np.diff(before.ci95)[0]
+    assert fit.settings["published"] == {"bollard_pull": pull, "top_speed": 1.0}
+    said = " ".join(_remarks(replay([t for t in held if t.name == "surge_060"], calibrated(fit))))
+    assert "surge reaches 0.79 m/s, the fitted trials 0.4" in said and "extrapolated" in said
+    yaw = [t for t in fitted if t.name.startswith("yaw")]
+    told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in yaw]
+    with pytest.raises(CalibrationError, match="a top speed shows the drag of surge"):
+        fit_hydrodynamics(yaw, vehicle, axes=["yaw"], published={"top_speed": 1.0})
+    with pytest.raises(CalibrationError, match="a bollard pull shows the thrust"):
+        fit_hydrodynamics(told, vehicle, axes=["yaw"], published={"bollard_pull": pull})
 
 
 def test_a_vehicle_that_lies_tilted_keeps_its_tilt():

@@ -35,7 +35,7 @@ class Decays:
         self.value[rng.choice(len(clean), outliers, replace=False)] += 5.0
 
     def prior(self, theta):
-        return np.zeros_like(theta), np.zeros(theta.shape[-1])
+        return np.zeros_like(theta), np.zeros((theta.shape[-1], theta.shape[-1]))
 
     def predicted(self, points):
         theta, z = points

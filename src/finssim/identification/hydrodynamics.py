@@ -37,6 +37,7 @@ def fit_hydrodynamics(
     known: Mapping[str, float] | None = None,
     horizon: float | None = None,
     held_out: Sequence[Trial] = (),
+    published: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
@@ -55,6 +56,7 @@ def fit_hydrodynamics(
         horizon: Longest stretch that is simulated without a restart [s].
         held_out: Further trials that judge the fit. Without any, it is judged by trials, or stretches of them, left out
             in turn. The vehicle file keeps its numbers of each axis that it predicts better.
+        published: `top_speed` [m/s] and `bollard_pull` [N] of the vehicle, both ahead, as data.
         progress: Called with the part done and a few words.
 
     Raises:
@@ -66,6 +68,7 @@ def fit_hydrodynamics(
     likely = "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle)
     fit = fit_by_simulation(
         trials, vehicle, axes=axes, estimate=estimate, damping=damping, known=known, horizon=horizon, likely=likely,
+        published=published,
         progress=lambda part, text: show(0.9 * part, text),
     )  # fmt: skip
     if likely:
@@ -188,6 +191,8 @@ def calibrate_hydrodynamics(
     estimate: str = "",
     damping: str = "auto",
     fix: str = "",
+    top_speed: float | None = None,
+    bollard_pull: float | None = None,
     horizon: float | None = None,
     report: Path | None = None,
     ranges: Path | None = None,
@@ -206,6 +211,8 @@ def calibrate_hydrodynamics(
             parameters of the vehicle's terms, such as lift.coefficient.
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
         fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24.
+        top_speed: Published or measured top speed ahead at full thrust [m/s], as data on thrust and drag.
+        bollard_pull: Published or measured bollard pull ahead at full thrust [N], as data on an unknown thrust.
         horizon: Longest segment simulated without a restart [s].
         report (DIR): Directory for report.html, report.md, figures and fit.json.
         ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
@@ -225,6 +232,11 @@ def calibrate_hydrodynamics(
     refuse_places(out, report, "vehicle")
     if ranges is not None:
         refuse_places(ranges, None, "ranges")
+    stated = {"top_speed": top_speed, "bollard_pull": bollard_pull}
+    published = {name: value for name, value in stated.items() if value is not None}
+    for name, value in published.items():
+        if not 0.0 < value < math.inf:
+            raise CalibrationError(f"--{name.replace('_', '-')} is {value:g}, expected a number above 0")
     body = load_vehicle(vehicle)
     used, held_out = usable_trials(trials)
     with progress_bar("calibrate hydrodynamics") as progress:
@@ -237,6 +249,7 @@ def calibrate_hydrodynamics(
             known=known,
             horizon=horizon,
             held_out=held_out,
+            published=published,
             progress=progress,
         )
     return finish("hydrodynamics", fit, options)

@@ -1207,6 +1207,9 @@ def _trial(replay: Replay, i: int, pair: Pair) -> dict[str, Any]:
 
 REPLAY_FILE = "replay.json"
 
+BEYOND = 1.1
+"""Factor on the top speed of the fit above which a replay extrapolates."""
+
 Rows = list[list[str]]
 
 
@@ -1327,6 +1330,8 @@ def _remarks(replay: Replay) -> list[str]:
     """Return remarks: what could not be scored or replayed, what was derived, and missing intervals; equal ones
     together."""
     findings: list[Finding] = [*replay.left_out]
+    records = [one.settings for one in replay.vehicle.calibrations if "speeds" in one.settings]
+    fitted = dict(records[-1]["speeds"]) if records else {}
     for model in replay.models:
         reason = replay.aggregate(model).why
         findings += [finding("no_interval", _label(model), reason=reason)] if reason else []
@@ -1337,6 +1342,14 @@ def _remarks(replay: Replay) -> list[str]:
             source = pair.source.get(pair.response(axis), "")
             if source not in ("", "measured"):
                 findings.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
+            top = np.nanpercentile(np.abs(pair.measured.get(pair.response(axis), np.zeros(1))), 99.0)
+            if 0.0 < BEYOND * fitted.get(axis, 0.0) < top:
+                unit = UNITS[pair.response(axis)]
+                findings.append(
+                    finding(
+                        "extrapolates", pair.name, axis=axis, top=float(top), fitted=fitted[axis], unit=unit
+                    )
+                )
         if not scores:
             findings.append(finding("no_axis", pair.name))
         for model, late in pair.late.items():

@@ -189,6 +189,9 @@ PLACE_STD = {"measured": 0.005, "derived": 0.03, "published": 0.03, "guessed": 0
 DETERMINED = 0.8
 """Standard deviation of a place, as a part of that of its prior, up to which it goes to the vehicle file."""
 
+PUBLISHED_STD = 0.1
+"""Standard deviation of a published top speed or bollard pull, as a part of the largest thrust."""
+
 CENTRES = ("gravity_x", "gravity_y", "gravity_z")
 PLACES = ("thruster_height", *CENTRES)
 """Places that are free where roll or pitch is fitted: the common height of the thrusters that push sideways, and the
@@ -246,6 +249,7 @@ class Parameters:
         unseen: Sequence[str] = (),
         held: Mapping[str, float] | None = None,
         likely: bool = False,
+        published: Mapping[str, float] | None = None,
     ) -> None:
         """Choose what is free.
 
@@ -262,6 +266,7 @@ class Parameters:
             unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
             held: Effective inertias M_RB + M_A that are not free, by axis [kg, kg m²].
             likely: Whether the scale of thrust is what batteries give.
+            published: `top_speed` [m/s] and `bollard_pull` [N], both ahead, as far as they are known.
 
         Raises:
             CalibrationError: The calibrated set holds no coefficients.
@@ -274,7 +279,7 @@ class Parameters:
         self.unseen = tuple(a for a in self.imposed if a in unseen)
         self.index = np.array([AXES.index(a) for a in self.axes], int)
         self.damping, self.extras = damping, tuple(extras)
-        self.likely = likely
+        self.likely, self.published = likely, dict(published or {})
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.actuators = {name: fields for name, fields in actuator_fields(vehicle).items() if name in extras}
         self.biases = tuple(a for a in AXES if a in biases)
@@ -358,6 +363,24 @@ class Parameters:
             rigid = float(self.M_RB[i, i])
             std = max(ADDED_MASS_STD * float(own[i, i]), RIGID_STD * rigid) / m if i < 3 else INERTIA_STD
         return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size, std, rigid)
+
+    def published_rows(self) -> tuple[Array, Array]:
+        """Return rows (R, P) and targets (R,) of what is published of the vehicle, each over its standard deviation.
+
+        Drag at the top speed equals the largest thrust, and so does a bollard pull; scale 1 where it is not free.
+        """
+        largest = float(self.vehicle.wrench_limits[0]) if self.published else 1.0
+        rows, target = np.zeros((len(self.published), len(self.names))), np.zeros(len(self.published))
+        scale = self._at.get("thrust_scale")
+        for row, (name, value), k in zip(rows, self.published.items(), range(len(target)), strict=True):
+            if name == "top_speed":
+                for key, power in (("surge.d1", 1), ("surge.d2", 2)):
+                    row[self._at[key] if key in self._at else []] = value**power
+                target[k] = largest if scale is None else 0.0
+            else:
+                target[k] = -value
+            row[[] if scale is None else scale] = -largest
+        return rows / (PUBLISHED_STD * largest), target / (PUBLISHED_STD * largest)
 
     @property
     def nuisances(self) -> int:
@@ -542,7 +565,7 @@ def blocks_of(
         block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
         blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
     (off, slope), first = problem.prior(point.theta), blocks[0]
-    blocks[0] = first._replace(aa=first.aa + np.diag(slope**2), a=first.a - slope * off)
+    blocks[0] = first._replace(aa=first.aa + slope.T @ slope, a=first.a - slope.T @ off)
     return blocks
 
 
@@ -1026,9 +1049,12 @@ class Shooting:
         self.first_noise = np.maximum(noise, self._floor)
         self._latest: tuple[Point, Linearization] | None = None
         self.repeats = 1.0
+        rows, target = parameters.published_rows()
+        self._published = np.pad(rows, ((0, 0), (0, len(self.streams)))), target
 
     def prior(self, theta: Array) -> tuple[Array, Array]:
-        """Return the whitened differences of vectors (..., P) from what is known beforehand, and their slopes.
+        """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
+        of one vector, (R, P).
 
         Samples count as independent in a cost, so that what is known counts `repeats` times.
         """
@@ -1036,8 +1062,10 @@ class Shooting:
         logarithmic = np.isfinite(self._rigid)
         whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
         off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.prior_mean)
-        known = np.sqrt(self.repeats) * self._known
-        return off * known, known / whole
+        rows, target = self._published
+        weight = np.sqrt(self.repeats)
+        off = weight * np.concatenate([off * self._known, theta @ rows.T - target], axis=-1)
+        return off, weight * np.concatenate([np.diag(np.atleast_2d(self._known / whole)[0]), rows])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -1225,7 +1253,7 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     free = theta
     if ((theta <= low) | (theta >= high)).any():
         off, slope = problem.prior(theta)
-        normal, score = evidence.information, evidence.score.sum(axis=0) - slope * off / problem.repeats
+        normal, score = evidence.information, evidence.score.sum(axis=0) - slope.T @ off / problem.repeats
         scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
         free = theta + np.linalg.lstsq(normal / np.outer(scale, scale), score / scale, rcond=1e-10)[0] / scale
     ends = intervals(free, covariance)
@@ -1260,6 +1288,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
     if group is None:
         group = trial if unit == "trials" else _blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
+    known = problem.prior(solution.point.theta)[1]
     normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
     score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
     return Evidence(
@@ -1267,7 +1296,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
         normal=np.array(normal) / problem.repeats,
         score=np.array(score) / problem.repeats,
         unit=unit,
-        prior=np.diag(problem.prior(solution.point.theta)[1] ** 2) / problem.repeats,
+        prior=known.T @ known / problem.repeats,
     )
 
 
@@ -2085,7 +2114,9 @@ class Stages:
         length: float | None,
         say: FitProgress,
         likely: bool = False,
+        published: Mapping[str, float] | None = None,
     ) -> None:
+        self.published = dict(published or {})
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known, self.likely = length, dict(known), likely
         self.excites = [excites(s, vehicle) for s in prepared]
@@ -2116,6 +2147,22 @@ class Stages:
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
+
+    def require_shown(self) -> None:
+        """Refuse a published number that is not of what is fitted.
+
+        Raises:
+            CalibrationError: Surge is not fitted, or the thrust is known.
+        """
+        if "top_speed" in self.published and ("surge" not in self.axes or "surge" in self.free):
+            raise CalibrationError(
+                "a top speed shows the drag of surge, which no trial here drives: leave it out"
+            )
+        if "bollard_pull" in self.published and "thrust_scale" not in self.extras:
+            raise CalibrationError(
+                "a bollard pull shows the thrust, which is taken as known here: leave it out, or give --estimate "
+                "thrust_scale"
+            )
 
     def _fitted_axes(self) -> list[list[str]]:
         """Return the axes of each trial whose motion is simulated and compared; the others move as they were seen to.
@@ -2324,6 +2371,7 @@ class Stages:
             unseen=self.unseen,
             held=self.held,
             likely=self.likely,
+            published=self.published,
         )
 
     def problem(self, kinds: dict[str, str], start: Mapping[str, float]) -> Shooting:
@@ -2411,6 +2459,8 @@ class Stages:
             "drag": dict(kinds) | {axis: shape.weights for axis, shape in shapes.items()},
             "estimate": sorted(self.extras),
             "fix": {f"{axis}.m": m for axis, m in self.known.items()},
+            "published": self.published,
+            "speeds": {axis: round(figures[axis]["speed_high"], 4) for axis in self.axes if axis in figures},
             "horizon": round(self.length, 3),
             "step": STEP,
             "segments": len(self.segments),
@@ -2573,6 +2623,7 @@ def fit_by_simulation(
     known: Mapping[str, float] | None = None,
     horizon: float | None = None,
     likely: bool = False,
+    published: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials together.
@@ -2593,6 +2644,7 @@ def fit_by_simulation(
         horizon: Length of the segments [s]; from the data if None.
         likely: Whether the thrust is known no better than by the voltages that batteries have; its scale is then fitted
             with that as its prior, and goes to the file with the rest.
+        published: `top_speed` [m/s] and `bollard_pull` [N], both ahead: data on drag and thrust.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -2621,7 +2673,9 @@ def fit_by_simulation(
         horizon,
         say,
         likely,
+        published,
     )
+    fit.require_shown()
     if isinstance(damping, str):
         kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)
     else:
