@@ -93,7 +93,8 @@ class AxisResult:
                     self.note(name, own.estimate, own.ci95, False, note, own.path)
             if self.drag_known:
                 value = max(self.numbers[name].value, 0.0) if name in self.numbers else 0.0
-                if value != {"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i]:
+                file = {"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i]
+                if name not in self.numbers or value != file:
                     self.changes[self.path(family)] = value
         if not self.drag_known:
             self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
