@@ -1686,7 +1686,8 @@ def held_out(
             for error in (after, before)
         ]
         if moving:
-            out[axis] = float(np.mean(rms[0])), float(np.mean(rms[1]))
+            after_mean, before_mean = np.nan_to_num(np.mean(rms, axis=1), nan=np.inf).tolist()
+            out[axis] = after_mean, before_mean
     return out
 
 
@@ -1928,7 +1929,7 @@ class Shape(NamedTuple):
     value: Array
     """d1 and d2 in their units, (2,)."""
     ends: list[tuple[float, float]]
-    """Their 95 % intervals."""
+    """Their 95 % intervals in the same units."""
     weights: dict[str, float]
     """Probability of each shape [-]."""
     spread: float = np.inf
