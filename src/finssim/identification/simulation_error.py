@@ -1626,9 +1626,6 @@ def quality(
     return out
 
 
-MOST_LEFT_OUT = 24
-"""Number of parts that are left out of a fit in turn, at most."""
-
 AXES_BIAS = ("surge.bias", "sway.bias", "yaw.bias")
 """Biases that no vehicle file has a place for."""
 
@@ -1648,9 +1645,8 @@ def held_out(
         by_trial: Whether whole trials are left out.
     """
     problem, point = stage.problem, stage.solution.point
-    count = len(problem.segments)
-    label = problem.groups if by_trial else np.arange(count) * min(count, MOST_LEFT_OUT) // count
-    group = np.unique(label, return_inverse=True)[1][problem.measured.segment]
+    trial = problem.groups[problem.measured.segment]
+    group = np.unique(trial if by_trial else _blocks(problem, trial), return_inverse=True)[1]
     evidence = evidence_of(problem, stage.solution, group)
     total = evidence.information
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
