@@ -1854,7 +1854,7 @@ USEFUL_DRAG = 0.5
 
 
 def _drag_known(
-    p: Parameters, x: Array, found: Confidence, axis: str, speed: float, shape: Shape | None
+    p: Parameters, x: Array, found: Confidence, axis: str, speed: float, shape: DragShape | None
 ) -> bool:
     """Return whether the drag at one speed is known to `USEFUL_DRAG`, or excludes that of the vehicle file."""
     i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
@@ -1919,7 +1919,7 @@ WHITE = np.linspace(-5.0, 5.0, 61)
 """Grid of the densities, in standard deviations."""
 
 
-class Shape(NamedTuple):
+class DragShape(NamedTuple):
     """Drag of an axis as the average over its shapes."""
 
     value: Array
@@ -1952,7 +1952,7 @@ def levels_of(problem: Shooting, axis: str) -> list[float]:
     return [top for top in tops if top > 0.2 * max(tops)]
 
 
-def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) -> Shape:
+def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) -> DragShape:
     """Return the average over linear and quadratic drag and both, by their evidence, for the thrust that was found.
 
     Args:
@@ -1969,7 +1969,7 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     )
     S, whole = (matrix[np.ix_(at, at)] for matrix in (_given(C, at, common), _given(C, at, [])))
     if not np.isfinite(S).all() or np.linalg.det(S) <= 0.0:
-        return Shape(stage.x[at], [(-np.inf, np.inf)] * 2, dict(SHAPES))
+        return DragShape(stage.x[at], [(-np.inf, np.inf)] * 2, dict(SHAPES))
     factor = float(t.ppf(0.975, min(float(np.min(C.dof[at])), 1e6)) / norm.ppf(0.975))
     far = 4.0 * np.sqrt(np.diagonal(S))
     mean = stage.x[at] + np.clip(stage.found.free[at] - stage.x[at], -far, far)
@@ -1989,7 +1989,7 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
         (max(v - np.hypot(v - a, m), 0.0), v + np.hypot(b - v, m))
         for v, (a, b), m in zip(value, ends, more, strict=True)
     ]
-    return Shape(value, [(float(a), float(b)) for a, b in pairs], weights, spread)
+    return DragShape(value, [(float(a), float(b)) for a, b in pairs], weights, spread)
 
 
 COMMON = ("thrust_scale", *PLACES)
@@ -2070,7 +2070,7 @@ def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
     return float(values[order[low]]), float(values[order[min(high, len(order) - 1)]])
 
 
-def averaged(stage: Stage, shapes: Mapping[str, Shape]) -> Stage:
+def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     """Return a fit with its drag at the average over shapes, and the other numbers where they then are best."""
     problem, solution = stage.problem, stage.solution
     value = {
@@ -2316,7 +2316,7 @@ class Stages:
         solution = solve(problem, point, std=std, report=self.report("fit", toward))
         return Stage(problem, solution, confidence(problem, solution))
 
-    def shapes(self, stage: Stage) -> dict[str, Shape]:
+    def shapes(self, stage: Stage) -> dict[str, DragShape]:
         """Return what the trials show of the drag of each axis, over its shapes."""
         return {
             axis: drag_shape(stage, axis, drag_of_size(self.vehicle, axis), levels_of(stage.problem, axis))
@@ -2388,7 +2388,7 @@ class Stages:
     def result(
         self,
         stage: Stage,
-        shapes: Mapping[str, Shape],
+        shapes: Mapping[str, DragShape],
         remarks: list[Finding],
         *,
         damping: str,
@@ -2462,7 +2462,6 @@ class Stages:
             "step": STEP,
             "segments": len(self.segments),
             "iterations": stage.solution.iterations,
-            "end": dict(zip(p.names, x.tolist(), strict=True)),
         }
         self.say("done")
         return Fit(
