@@ -1977,9 +1977,8 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     value, _, weights, spread = _average(mean, S * factor**2, size, top)
     known = float(np.sqrt(S[1, 1])) < DETERMINED * SIZE_STD * size
     file = float(stage.problem.parameters.expected[at[1]])
-    if (
-        not (known or stage.problem.parameters.likely) and file > 0.0
-    ):  # as the file has it, with the d1 that goes with it
+    # What slow trials leave open stays as the file has it, with the d1 that goes with it.
+    if not (known or stage.problem.parameters.likely) and file > 0.0:
         value = np.array([max(mean[0] + S[0, 1] / S[1, 1] * (file - mean[1]), 0.0), file])
     wide = factor * (WIDER if top < NARROW * min(levels, default=top) else 1.0)
     ends = _average(mean, S * wide**2, size, top)[1]
@@ -2052,7 +2051,7 @@ def _average(
         np.concatenate([density[n] for n in parts]) / total,
     )
     ends = []
-    for j in range(2):  # nobody knows that a term is absent: they hold those of both terms too
+    for j in range(2):  # no one knows that a term is absent: the intervals of both terms are in them too
         some = [_quantiles(grid[:, j], density_of)]
         if weights["both"] > 0.0:
             some.append(_quantiles(parts["both"][0][:, j], density["both"] / weights["both"]))
@@ -2072,6 +2071,8 @@ def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
 
 def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     """Return a fit with its drag at the average over shapes, and the other numbers where they then are best."""
+    if not shapes:
+        return stage
     problem, solution = stage.problem, stage.solution
     value = {
         f"{axis}.{n}": v
@@ -2085,7 +2086,7 @@ def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     problem.low[at] = problem.high[at] = theta[at]
     end = solve(problem, solution.point._replace(theta=theta), iterations=POLISH, std=solution.std)
     problem.low, problem.high = kept
-    if not at or not np.isfinite(end.cost):
+    if not np.isfinite(end.cost):
         return stage
     shift = end.point.theta - solution.point.theta
     found = stage.found._replace(
