@@ -31,7 +31,7 @@ from finssim.identification.fit import Estimate
 from finssim.identification.plant_terms import matrices
 from finssim.identification.report import refuse_places
 from finssim.identification.rollout import CHANNELS, Segment, segments, streams
-from finssim.identification.simulation_error import CUT, Plants, Shooting, blocks_of, solve
+from finssim.identification.simulation_error import CUT, Coordinate, Plants, Shooting, blocks_of, solve
 from finssim.identification.vehicle_file import SCALED, write_vehicle
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.conversion import EULER
@@ -93,6 +93,11 @@ class _Coordinates:
         self.start = self.expected = np.zeros(n)
         self.low, self.high = np.full(n, -FAR), np.full(n, FAR)
         self.scale = np.full(n, COARSE_STEP)
+        self.coordinates = [Coordinate(name, "-", 0.0, -FAR, FAR, COARSE_STEP, 1.0) for name in of.names]
+
+    def published_rows(self) -> tuple[Array, Array]:
+        """Return no rows (0, P) and no targets (0,): nothing else is known of the vehicle."""
+        return np.zeros((0, len(self.names))), np.zeros(0)
 
     def plants(self, y: Array) -> Plants:
         """Return the simulator's parameters of vectors (W, P)."""
@@ -208,8 +213,8 @@ class Adaptation:
     def _learned(self, window: Sequence[Segment]) -> tuple[Array, Array]:
         """Return the information J of a window and J x of its own solution x, beside the vehicle file's prior alone."""
         n, std = len(self.names), np.sqrt(np.diag(self._prior))
-        problem = Shooting([_thinned(s) for s in window], _Coordinates(self, self._start, std), CHANNELS)  # type: ignore[arg-type]
-        problem.prior_precision[:n] = 1.0
+        unknowns: Any = _Coordinates(self, self._start, std)
+        problem = Shooting([_thinned(s) for s in window], unknowns, CHANNELS, correlated=False)
         start = problem.start()
         start.theta[:n] = (self.mean - self._start) / std
         start.theta[n - 2 : n] = 0.0

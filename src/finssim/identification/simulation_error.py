@@ -118,7 +118,7 @@ class Plants:
     """Time constant of the motors [s], (W,)."""
     delay: Array | None
     """[s], (W,)"""
-    lower: Array | None
+    lower: Array | None = None
     """Heights of the horizontal thrusters above those of the file [m], (W,)."""
 
 
@@ -966,6 +966,7 @@ class Shooting:
         lagged: NDArray[np.bool_] | None = None,
         swinging: NDArray[np.bool_] | None = None,
         few: bool = False,
+        correlated: bool = True,
     ) -> None:
         """Set up.
 
@@ -976,6 +977,7 @@ class Shooting:
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
             swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
             few: Whether some axis is excited by too few trials to show how trials differ.
+            correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
         """
         self.segments, self.parameters = tuple(segments), parameters
         self.measured = Residuals(segments, channels)
@@ -1048,7 +1050,7 @@ class Shooting:
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
         self._latest: tuple[Point, Linearization] | None = None
-        self.repeats = 1.0
+        self.repeats, self._correlated = 1.0, correlated
         rows, target = parameters.published_rows()
         self._published = np.pad(rows, ((0, 0), (0, len(self.streams)))), target
 
@@ -1203,7 +1205,7 @@ class Shooting:
         The samples per independent one follow from the same residuals.
         """
         m, found = self.measured, []
-        for j in range(len(m.names)):
+        for j in range(len(m.names) if self._correlated else 0):
             rows = np.flatnonzero((m.channel == j) & np.isfinite(residual))
             if len(rows) > FEWEST_CORRELATED:
                 found.append(correlated_samples(residual[rows], np.flatnonzero(np.diff(m.segment[rows])) + 1))
