@@ -210,8 +210,11 @@ def report(rows: list[dict]) -> None:
     )
     print(f"axes better than the file: {better.sum()} of {better.size}; of those with something to gain "
           f"{(better & gain).sum()} of {gain.sum()}")  # fmt: skip
-    print(f"worst loss on an axis: {np.nanmax(after / before) - 1.0:+.1%}; more than 2 % worse: "
-          f"{(after > 1.02 * before).sum()}; {np.median([r['seconds'] for r in rows]):.0f} processor-seconds a fit")  # fmt: skip
+    spent = np.median([r["seconds"] for r in rows])
+    print(
+        f"worst loss on an axis: {np.nanmax(after / before) - 1.0:+.1%}, {spent:.0f} processor-seconds a fit"
+    )
+    print(f"more than 2 % worse than the file: {(after > 1.02 * before).sum()} axes")
     for axis, a, b, c in zip(FITTED, after.T, before.T, true.T, strict=True):
         print(f"  {axis:6s} NRMSE, median: calibrated {np.nanmedian(a):.3f}, file {np.nanmedian(b):.3f}, "
               f"plant itself {np.nanmedian(c):.3f}")  # fmt: skip
