@@ -152,7 +152,9 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
         ("sim", {"goal": "9,9,-9,0"}, GoalError, "outside the workspace"),
         ("sim", {"goal": "0,0,-0.5,0", "trajectory": "helix"}, GoalError, "not both"),
         ("sim", {"plant": "3"}, Ros2Error, "--plant has no effect in the graph sim"),
-        ("robot", {"pool_file": FILE, "message_loss": 0.5}, Ros2Error, "--message-loss has no effect"),
+        ("robot", {"pool_file": FILE, "positioning": "usbl"}, Ros2Error, "--positioning has no effect"),
+        ("pool", {"message_loss": 0.5}, Ros2Error, "for the messages of a team: give --team"),
+        ("pool", {"team": "lauv,lauv", "vehicle": "lauv"}, Ros2Error, "leave --vehicle out"),
         ("robot", {"robot": "serial:/dev/x", "pool_file": FILE, "lockstep": True}, Ros2Error, "real time"),
         (
             "pool",

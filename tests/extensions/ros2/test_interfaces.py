@@ -23,6 +23,7 @@ from finssim.extensions.ros2.shim.arguments import overrides_for, parse_argument
 from finssim.extensions.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
 from finssim.extensions.ros2.up import NODES as GRAPH_NODES
 from finssim.extensions.ros2.up import Options, plan_of
+from finssim.extensions.ros2.up import launched as graph_launched
 from finssim.robot.wiring import POOL_ADDRESS
 from finssim.vehicles.loader import catalogue
 
@@ -288,6 +289,13 @@ def test_launch_files_start_what_up_starts(launched, graph, given):
 
 def test_one_launch_file_starts_a_team(launched):
     """One world, and the nodes of each vehicle in its namespace."""
+    plan = graph_launched(
+        "pool",
+        {"team": "finsrov,finsrov,finsrov", "site": "open-water", "message_loss": "0.2", "record": "runs"},
+    )
+    bridges = [one.parameters for one in plan.nodes if one.node == "hardware_bridge"]
+    assert [p.get("bind") for p in bridges] == [None, "127.0.0.1:54331", "127.0.0.1:54341"]
+    assert [p.get("robot") for p in bridges] == [None, "udp://127.0.0.1:58776", "udp://127.0.0.1:58786"]
     launched("pool", team="finsrov,finsrov,finsrov", site="open-water", message_loss="0.2", record="runs")
     robot = ("hardware_bridge", "state_estimation", "controller", "recorder")
     wanted = {f"/robot_{i}/{node}" for i in (1, 2, 3) for node in robot}

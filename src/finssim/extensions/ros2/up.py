@@ -26,6 +26,7 @@ from finssim.extensions.ros2.backend import activate
 from finssim.extensions.ros2.topics import TOPICS, Topic
 from finssim.robot.goals import check_reachable, guide_of, place_of
 from finssim.robot.interrupt import interruptible
+from finssim.robot.links.transports import DEFAULT_BIND
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
 
@@ -373,6 +374,10 @@ def _check(graph: str, o: Options) -> None:
             "--team is for the graph pool, which places and names its vehicles: leave --namespace, --frame-prefix, "
             "--start and --teleop out"
         )
+    if o.team is not None and o.vehicle not in (None, "finsrov"):
+        raise Ros2Error("--team names its vehicles: leave --vehicle out")
+    if o.team is None and (o.message_loss is not None or o.message_delay is not None):
+        raise Ros2Error("--message-loss and --message-delay are for the messages of a team: give --team")
     if graph == "robot" and (o.lockstep or o.real_time_factor is not None):
         host = "" if o.robot is None else o.robot.rpartition("//")[2]
         if o.robot not in (None, "pool") and not host.startswith(("127.", "localhost")):
@@ -416,10 +421,11 @@ def _wire(graph: str, o: Options, further: int) -> dict[str, Any]:
     if graph == "sim":
         return {"robot": None}
     bind = camera_bind = None
-    if o.bind is not None:
-        host, _, port = o.bind.rpartition(":")
+    ours = DEFAULT_BIND if o.bind is None and further else o.bind
+    if ours is not None:
+        host, _, port = ours.rpartition(":")
         if not port.isdecimal():
-            raise Ros2Error(f"--bind {o.bind}: expected ADDRESS:PORT")
+            raise Ros2Error(f"--bind {ours}: expected ADDRESS:PORT")
         bind, camera_bind = f"{host}:{int(port) + further}", f"{host}:{int(port) + further + 1}"
     pool = graph == "pool" or o.robot in (None, "pool")
     first = MCU_PORT if o.port is None and further else o.port
