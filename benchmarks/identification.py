@@ -7,8 +7,6 @@ Parts:
     slow        5 Hz, wrench and velocity alone
     replay      half of the trials fitted, the other half replayed
     published   trials simulated with FinsROV's published raw fits, and what its published noise lets anyone tell
-    shape       plants whose drag is linear or quadratic alone: is that what `auto` chooses where the other shape alone
-                fits worse by a factor of 1.5 (RMSE)? Decays of a heading, and driven trials
 
 The fits start from a file whose hydrodynamics are wrong by a factor of two.
 """
@@ -32,7 +30,7 @@ from finssim.identification.prediction import replay
 from finssim.identification.programme import Programme, programmes
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, simulate_programme, trials_of
-from finssim.trials.trial import Header, Trial
+from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 from finssim.vehicles.vehicle import moved_to_origin
 
@@ -184,62 +182,6 @@ def held_out(vehicle: Vehicle, axes: str) -> dict[str, Any]:
     return report.as_json()
 
 
-APART = 1.5
-"""RMSE with the wrong shape of drag over that with the right one from which a choice is expected to be right."""
-
-
-def spins(rng: np.random.Generator, d1: float, d2: float, noise: float = 0.02) -> list[Trial]:
-    """Headings at 10 Hz of four spins that die out, r_dot = -d1 r - d2 |r| r, d1 [1/s], d2 [1/rad], noise [rad]."""
-    out = []
-    for k in range(4):
-        t = np.arange(0.0, 15.0, 0.1)
-        side, r0 = rng.choice([-1.0, 1.0]), rng.uniform(0.8, 1.8)
-        turned = np.log1p(d2 * r0 * t) / d2 if d2 > 0.0 else r0 * -np.expm1(-d1 * t) / d1
-        yaw = rng.uniform(-3.0, 3.0) + side * turned + noise * rng.standard_normal(len(t))
-        out.append(Trial(name=f"spin_{k}", t=t, channels={"yaw": yaw}, header=Header(passive=True)))
-    return out
-
-
-def of_one_shape(vehicle: Vehicle, axis: str, shape: str, size: float) -> Vehicle:
-    """The vehicle whose drag on an axis is of one shape: `size` times the file's at the speed of half thrust."""
-    i, chosen = AXES.index(axis), vehicle.hydrodynamics["calibrated"]
-    d1, d2 = float(chosen.linear_damping[i, i]), float(chosen.quadratic_damping[i, i])
-    push = 0.5 * float(vehicle.wrench_limits[i])
-    # d1 v + d2 v² = push
-    speed = 2.0 * push / (d1 + math.sqrt(d1**2 + 4.0 * d2 * push))
-    drag = {"linear_damping": size * push / speed, "quadratic_damping": size * push / speed**2}
-    off = "quadratic_damping" if shape == "linear" else "linear_damping"
-    return vehicle.replace(
-        {f"hydrodynamics.calibrated.{name}.{i}.{i}": x for name, x in (drag | {off: 0.0}).items()}
-    )
-
-
-def shapes(vehicle: Vehicle, axes: str, count: int, kind: str) -> dict[str, Any]:
-    """How often the shape of drag is right, over draws of plant and noise: `right` alone, `both`, or `wrong` alone."""
-    rng, guess = np.random.default_rng(5), blind(vehicle)
-    counts = dict.fromkeys(("right", "both", "wrong"), 0)
-    cycle = (FOUR if axes == "all" else axes).split(",")
-    for k in range(count):
-        shape, other = ("linear", "quadratic")[:: 1 if k % 2 else -1]
-        size, axis = rng.uniform(0.5, 2.0), "yaw" if kind == "decay" else cycle[k // 2 % len(cycle)]
-        if kind == "decay":
-            trials = spins(rng, *((0.25 * size, 0.0) if shape == "linear" else (0.0, 0.7 * size)))
-        else:
-            plant = of_one_shape(vehicle, axis, shape, size)
-            trials = simulate_programme(programmes(axis, plant), plant, seed=k)
-        fit = fit_by_simulation(trials, guess)
-        separate = {name: fit_by_simulation(trials, guess, damping=name) for name in (shape, other)}
-        rmse = {name: one.quality[axis]["rmse"] for name, one in separate.items()}
-        if rmse[other] < APART * rmse[shape]:
-            continue
-        selected = {
-            name: any(e.estimate > 0.0 for n, e in fit.estimates.items() if n.startswith(f"{axis}.{term}"))
-            for name, term in (("linear", "d1"), ("quadratic", "d2"))
-        }
-        counts["wrong" if not selected[shape] else "both" if selected[other] else "right"] += 1
-    return {"trials": kind, "draws": count, **counts}
-
-
 def raw_fits(vehicle: Vehicle) -> Vehicle:
     """FinsROV with the raw fits of its own identification."""
     changes: dict[str, float] = {}
@@ -270,7 +212,7 @@ def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the parts asked for, print tables, write JSON."""
-    parts = ("coverage", "slow", "replay", "published", "shape")
+    parts = ("coverage", "slow", "replay", "published")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help="which parts; all if none")
     parser.add_argument("--vehicle", default="finsrov", help="name or file")
@@ -310,16 +252,6 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
         for axis, by_trial in out["nrmse"].items():
             scores = [x for x in by_trial.values() if x is not None]
             print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
-        return out
-    if part == "shape":
-        kinds = ("decay", "driven")
-        out = {kind: shapes(vehicle, given.axes, given.repetitions, kind) for kind in kinds}
-        for kind, one in out.items():
-            apart = sum(one[key] for key in ("right", "both", "wrong"))
-            print(
-                f"{kind}: in {apart} of {one['draws']} draws the shapes differ by a factor of {APART}; the right one "
-                f"alone {one['right']}, both {one['both']}, the wrong one alone {one['wrong']}"
-            )
         return out
     raw = raw_fits(load_vehicle("finsrov"))
     out = {"raw": coverage(raw, FOUR, given.repetitions)}
