@@ -263,7 +263,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     """Return the estimates, and the measures of the held setpoints by change, model and controller."""
     estimates = [
         [
-            f["pool"], f["change"], f["name"], f"{f['truth']:.3g}", f"{f['estimate']:.3g}",
+            str(f["pool"]), f["change"], f["name"], f"{f['truth']:.3g}", f"{f['estimate']:.3g}",
             f"[{f['ci95'][0]:.3g}, {f['ci95'][1]:.3g}]", f["unit"], "yes" if f["differs"] else "no",
             ", ".join(f["others"]) or "none",
         ]

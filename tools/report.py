@@ -17,7 +17,7 @@ from finssim.studies import transfer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from studies import anatomy, faults, soak
+from studies import anatomy, changes, faults, soak
 
 SEEING_HEADS = (
     "task",
@@ -77,6 +77,7 @@ SEEING_KEYS = ("stack", "batch")
 TABLES: Mapping[str, Callable[[Mapping[str, Any]], Sequence[Table]]] = {
     **dict.fromkeys(transfer.SPECS, transfer.tables_of),
     "anatomy": anatomy.tables_of,
+    "changes": changes.tables_of,
     "faults": faults.tables_of,
     "seeing": seeing_tables,
     "soak": soak.tables_of,

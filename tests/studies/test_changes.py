@@ -43,5 +43,5 @@ def test_a_minute_of_driving_finds_a_weak_thruster_and_the_tables_say_so():
     trial = {"pool": 3, "change": "thruster", "model": "changed", "controller": "pid", "success": True}
     row = {"pool": 3, "change": "thruster", **result}
     tables = study.tables_of({"followed": [row], "trials": [{**trial, "e_p_m": 0.014, "t_s_s": 4.5}]})
-    assert tables[0].rows[0][7:] == ["yes", "none"]
+    assert tables[0].rows[0][0] == "3" and tables[0].rows[0][7:] == ["yes", "none"]
     assert tables[1].rows == [["pid", "thruster", "changed", "1/1", "1.40", "4.50"]]

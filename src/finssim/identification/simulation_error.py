@@ -1973,8 +1973,11 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     if not np.isfinite(S).all() or np.linalg.det(S) <= 0.0:
         return DragShape(stage.x[at], [(-np.inf, np.inf)] * 2, dict(SHAPES))
     factor = float(t.ppf(0.975, min(float(np.min(C.dof[at])), 1e6)) / norm.ppf(0.975))
-    far = 4.0 * np.sqrt(np.diagonal(S))
-    mean = stage.x[at] + np.clip(stage.found.free[at] - stage.x[at], -far, far)
+    x, mean = stage.x[at], stage.x[at].copy()
+    for j in np.flatnonzero(x <= stage.problem.low[at]):
+        # Without the bound the term would be lower, and the other one with it as they are correlated.
+        lower = np.clip(stage.found.free[at][j] - x[j], -4.0 * np.sqrt(S[j, j]), 0.0)
+        mean += S[:, j] / S[j, j] * lower
     top = max(levels, default=1.0)
     value, _, weights, spread = _average(mean, S * factor**2, size, top)
     known = float(np.sqrt(S[1, 1])) < DETERMINED * SIZE_STD * size
@@ -1982,6 +1985,8 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     # What slow trials leave open stays as the file has it, with the d1 that goes with it.
     if not (known or stage.problem.parameters.likely) and file > 0.0:
         value = np.array([max(mean[0] + S[0, 1] / S[1, 1] * (file - mean[1]), 0.0), file])
+    if known and x[0] <= stage.problem.low[at[0]]:
+        value = x  # the trials show a quadratic drag alone; the intervals allow for a linear one
     wide = factor * (WIDER if top < NARROW * min(levels, default=top) else 1.0)
     ends = _average(mean, S * wide**2, size, top)[1]
     # What the thrust and its lever add to the spread of both together.
