@@ -251,11 +251,12 @@ def test_the_command_in_lockstep(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_lockstep_in_order(number):
     """Ctrl-C too where a script that started it in the background had it ignored."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN), signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         pool = Process("--lockstep", "--camera", "none")
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGHUP, before[1])  # ignored where the tests run under nohup
     with pool:
         pool.until("lock-step")
         assert pool.end(number) == 0
