@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_from_euler
-from finssim.identification.adaptation import WINDOW, Adaptation, Follower, calibrate_changes, windows_of
+from finssim.identification.adaptation import (
+    WINDOW,
+    Adaptation,
+    Follower,
+    _whitened,
+    calibrate_changes,
+    windows_of,
+)
 from finssim.identification.programme import multisine
 from finssim.identification.synthetic import simulate_programme
 from finssim.sim.plant_arrays import vehicle_parameters
@@ -143,3 +150,12 @@ def test_a_trial_without_motion_and_a_vehicle_without_coefficients_are_refused(t
     mesh = VEHICLE.model_copy(update={"hydrodynamics": {}})
     with pytest.raises(CalibrationError, match="no calibrated hydrodynamics"):
         Adaptation(mesh)
+
+
+def test_what_a_window_does_not_show_moves_nothing_and_is_no_contradiction():
+    """A direction whose information is rounding, of either sign, keeps the state however large the quotient is."""
+    J, right = np.diag([4.0, 1e-12, -1e-12]), np.array([8.0, 1e-3, 1e-3])
+    size, along, y = _whitened(np.eye(3), J, right)
+    moved = along @ (y * size / (1.0 + size))
+    assert moved == pytest.approx([2.0 * 4.0 / 5.0, 0.0, 0.0])
+    assert np.max(y**2 * size / (1.0 + size)) == pytest.approx(4.0 * 4.0 / 5.0)

@@ -54,13 +54,16 @@ APART = 0.1
 """Least time between compared samples of a channel [s]."""
 
 CORRELATED = 1.5
-"""Time over which errors of a robot's estimate are alike [s]: so many samples count as one."""
+"""Correlation time of the errors of a robot's estimate [s]: samples within it count as one."""
 
 MEMORY = 20.0
 """Time constant τ with which windows are forgotten [s]."""
 
 UNLIKE = 25.0
 """Square of the largest normalised innovation above which a window belongs to a vehicle that has changed [-]."""
+
+BLIND = 1e-6
+"""Information along a direction, in the prior's units, below which the data say nothing and rounding decides."""
 
 GAP = 0.5
 """Gap between states that ends a window [s]."""
@@ -211,7 +214,7 @@ class Adaptation:
         self.windows += 1
 
     def _learned(self, window: Sequence[Segment]) -> tuple[Array, Array]:
-        """Return the information J of a window and J x of its own solution x, beside the vehicle file's prior alone."""
+        """Return the information J of a window, and J x for the solution x that the window gives by itself."""
         n, std = len(self.names), np.sqrt(np.diag(self._prior))
         unknowns: Any = _Coordinates(self, self._start, std)
         problem = Shooting([_thinned(s) for s in window], unknowns, CHANNELS, correlated=False)
@@ -304,12 +307,13 @@ def _whitened(root: Array, J: Array, right: Array) -> tuple[Array, Array, Array]
         right: J times the solution of the data, from the prior's mean on.
     """
     size, along = np.linalg.eigh(root.T @ J @ root)
-    size = np.maximum(size, 1e-9)
-    return size, along, (along.T @ root.T @ right) / size
+    seen = size > BLIND
+    size = np.where(seen, size, 0.0)
+    return size, along, np.where(seen, along.T @ root.T @ right, 0.0) / np.where(seen, size, 1.0)
 
 
 def _thinned(segment: Segment) -> Segment:
-    """Return a segment with samples of each channel `APART` or more."""
+    """Return a segment whose samples of each channel are at least `APART` from each other."""
     measured: Mapping[str, tuple[Array, Array]] = {
         name: (t[rows], values[rows])
         for name, (t, values) in segment.measured.items()
@@ -377,7 +381,7 @@ class Follower:
         return Trial.from_frame(columns, name="driving")
 
     def finish(self) -> Adaptation:
-        """Wait for the windows that were begun, and return what has changed.
+        """Wait until all windows are fitted, and return what has changed.
 
         Raises:
             CalibrationError: A window could not be simulated.

@@ -103,7 +103,7 @@ class Coordinate:
     std: float | None = None
     """Prior standard deviation about `start`; `VAGUE` times the scale if None, infinite where nothing is known."""
     rigid: float | None = None
-    """Where it is given, the prior is that of ln(rigid + coordinate), and `std` has no unit."""
+    """Rigid inertia of the axis; if given, the prior is that of ln(rigid + coordinate), and `std` has no unit."""
 
 
 @dataclass(frozen=True)

@@ -235,7 +235,7 @@ T = TypeVar("T")
 
 
 HOME = (33.810313, -118.393867)
-"""Latitude and longitude of ArduSub's own test place [deg]: its origin where nothing else is said."""
+"""Latitude and longitude of ArduSub's own test place [deg], the default origin."""
 
 
 class PlantSpecError(ValueError):
@@ -391,7 +391,7 @@ class FirmwareSpec(Section):
     origin: tuple[float, float] | None = None
     """Latitude and longitude that an autopilot has been given as its origin before the start [deg]; None: none."""
     log_shared: bool = True
-    """Whether reports of an autopilot's Doppler log reach the robot too, as over the vehicle's network."""
+    """True if the robot receives the reports of an autopilot's Doppler log too, as over the vehicle's network."""
     declination: float = Field(default=0.0, ge=-math.pi, le=math.pi)
     """Magnetic declination, east positive [rad]: without an origin an autopilot gives the magnetic heading."""
     attitude_gain: float = Field(default=0.5, ge=0.0)

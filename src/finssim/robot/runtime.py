@@ -154,9 +154,9 @@ class Link(MotorDevice, Protocol):
     let_in: tuple[float, float] | None
     """x, y of where the vehicle begins, world frame [m]; None: not given."""
     calibrate_depth: bool
-    """Whether the device calibrates its barometer, at the surface, before it arms."""
+    """True if the device calibrates its barometer, at the surface, before it arms."""
     highest: float
-    """Greatest z of what is to be followed, world frame [m], for a device that counts depth by itself."""
+    """Greatest z of the goal or trajectory, world frame [m], for a device that measures depth by itself."""
     notes: list[str]
     """Sentences for the user since they were last taken."""
 

@@ -138,7 +138,7 @@ def _status(code: int) -> str:
 DIED, FAULT = 1, 3
 """Exit status where a node died, and where the bridge ended in a fault."""
 STARTING = 180.0
-"""Time for a bridge to speak [s]; a virtual pool's first rendering on a machine compiles."""
+"""Longest wait for the first message of a bridge [s]; the first rendering on a machine compiles."""
 APART = 10
 """Ports between one vehicle of a team and the next, as of a virtual pool."""
 
@@ -575,7 +575,7 @@ class GraphNode:
     namespace: str
     """Namespace, without the slash before it."""
     parameters: dict[str, Any]
-    """Those that the graph gives; the others are the node's own or a parameter file's."""
+    """Parameters that the graph sets; all others keep the default of the node or of a parameter file."""
 
     @property
     def full_name(self) -> str:

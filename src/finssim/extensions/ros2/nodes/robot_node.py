@@ -231,7 +231,7 @@ class RobotNode(Node):
         rclpy.spin(self)
 
     def report(self) -> None:
-        """In lock-step, report the work of each time of /clock from now on, when it is done."""
+        """Report, in lock-step, the finished work of each time of /clock from now on."""
         if self.lockstep and self.get_parameter("use_sim_time").value:
             self.sends("done")
             self._done = self.make.done(self.ns(self.now()), self.get_fully_qualified_name())
