@@ -260,7 +260,7 @@ class ArduSub:
         self._position, self._velocity, self._velocity_time = np.zeros(2), np.zeros(2), -math.inf
         self._aided_since = math.inf
         self._places: deque[tuple[float, Array, Array]] = deque()
-        self._attitudes: deque[tuple[float, Array]] = deque(maxlen=LATE)
+        self._attitudes: deque[tuple[float, Array, Array]] = deque(maxlen=LATE)
         self._origin: tuple[int, int] | None = None
         self._origin_at = math.inf
         self._battery, self._used = (0.0, 0.0), 0.0
@@ -401,17 +401,17 @@ class ArduSub:
                 settled = bool(turning) or now - self._boot > SETTLED
                 share = COMPASS_SHARE if self._headed else 1.0
                 learned = 0.0 if not self._headed else BIAS_SHARE[settled]
-                turned = quat_yaw(self._filter.quaternion) + quat_yaw(self._attitude_at(now - aid.age))
+                turned = quat_yaw(self._filter.quaternion) + quat_yaw(self._attitude_at(now - aid.age)[0])
                 self._filter.turn(aid.values[0] + float(turned) + missing, share, learned)
                 self._headed = True
             elif aid.kind == VELOCITY:
                 velocities.append(aid)
         q = np.array(self._filter.quaternion)
         self._quaternion = np.append(FRD @ q[:3], q[3])
-        self._attitudes.append((now, self._quaternion))
         self._attitude = np.array(quat_to_euler(self._quaternion)).ravel()
         self._gyro = FRD @ gyro
         self._rates = FRD @ (gyro - self._filter.bias)
+        self._attitudes.append((now, self._quaternion, self._rates))
         self._force = FRD @ accel
         self._climb_by(float(quat_rotate(q, accel)[2]) - self._gravity, dt)
         if self.parameters["VISO_TYPE"] and self._dvl is not None:
@@ -422,16 +422,18 @@ class ArduSub:
                 over_floor = FRD @ quat_to_matrix(self._dvl.orientation) @ aid.values
                 if now - self._velocity_time > POSITION_LASTS:
                     self._aided_since = now
-                then = self._attitude_at(now - aid.age)
-                self._velocity, self._velocity_time = quat_rotate(then, over_floor)[:2], now
+                then, rates = self._attitude_at(now - aid.age)
+                of_body = over_floor - np.cross(rates, FRD @ self._dvl.position)
+                self._velocity, self._velocity_time = quat_rotate(then, of_body)[:2], now
             self._places.append((now, self._position.copy(), self._velocity))
             while now - self._places[0][0] > POSITION_LASTS:
                 self._places.popleft()
 
-    def _attitude_at(self, time: float) -> Array:
-        """Return the attitude of a time [s], x y z w, body to north, east, down: the real filter is as late as its
-        slowest instrument."""
-        return next((q for at, q in self._attitudes if at >= time), self._quaternion)
+    def _attitude_at(self, time: float) -> tuple[Array, Array]:
+        """Return the attitude of a time [s], x y z w, body to north, east, down, and the rates of the body [rad/s]: the
+        real filter is as late as its slowest instrument."""
+        then = ((q, rates) for at, q, rates in self._attitudes if at >= time)
+        return next(then, (self._quaternion, self._rates))
 
     def _true_north(self, now: float) -> float:
         """Return how far the heading has turned from magnetic to true north [0, 1]."""

@@ -83,7 +83,7 @@ class NavigationAid:
     """VELOCITY: over the floor, log's axes [m/s]. HEADING: left positive from world x [rad], 0, 0. POSITION: x, y, z
     and POSE: x, y, yaw of the body origin, world frame [m, rad]."""
     std: tuple[float, float]
-    """Standard deviation of a position, per axis [m], and of its yaw [rad]; 0 if the instrument does not give it."""
+    """Standard deviation of a velocity [m/s] or position [m], per axis, and of a yaw [rad]; 0 if it is not given."""
 
 
 VELOCITY, HEADING, POSITION, POSE = 1, 2, 3, 4

@@ -157,7 +157,7 @@ class VehicleSensors:
             velocity = self._R_bl @ np.array(aid.values)
             if not _within(aid.values, FASTEST):
                 return "implausible"
-            return VelocitySample(time, (velocity[0], velocity[1], velocity[2]), arrival)
+            return VelocitySample(time, (velocity[0], velocity[1], velocity[2]), arrival, aid.std[0])
         if aid.kind == HEADING:
             return HeadingSample(time, math.remainder(x, math.tau), arrival)
         if aid.kind not in (POSITION, POSE):

@@ -392,7 +392,7 @@ class Messages:
         of, none = self._of, np.array([-1.0, *[0.0] * 8])
         if aid.kind == VELOCITY:
             twist = of["geometry_msgs/msg/Twist"](self.vector(aid.values), self.vector((0.0, 0.0, 0.0)))
-            covariance = np.diag([*[self._log_std**2] * 3, *[UNKNOWN] * 3]).ravel()
+            covariance = np.diag([*[max(aid.std[0], self._log_std) ** 2] * 3, *[UNKNOWN] * 3]).ravel()
             measured = of["geometry_msgs/msg/TwistWithCovariance"](twist, covariance)
             kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
             return "dvl", of[kind](self.header(stamp, LOG), measured)

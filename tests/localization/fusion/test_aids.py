@@ -146,6 +146,23 @@ def test_without_log_and_compass_nothing_is_added():
         assert estimator.add(VelocitySample(0.2, (math.nan, 0.0, 0.0))) == "not finite"
 
 
+@pytest.mark.parametrize("std", [0.0, 0.5 * AIDS.velocity_std, 5.0 * AIDS.velocity_std])
+def test_a_velocity_may_be_less_certain_than_the_log(std):
+    """Never more certain: its own variance is that of its residual, where it is greater."""
+    distances = []
+    for own in (0.0, std):
+        estimator = Estimator(SETTINGS, SITE)
+        estimator.add(VisionSample(0.0, (1.0, 2.0), None))
+        for k in range(200):
+            estimator.add(ImuSample(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0)))
+            estimator.add(HeadingSample(0.01 * k, 0.0))
+            estimator.add(VelocitySample(0.01 * k, (0.3, 0.0, 0.0)))
+        estimator.add(VelocitySample(2.0, (0.35, 0.0, 0.0), std=own))
+        distances.append(estimator.health(estimator.estimate()).mahalanobis["velocity"])
+    more = 0.05**2 / distances[1] - 0.05**2 / distances[0]  # r² / S
+    assert more == pytest.approx(max(std**2 - AIDS.velocity_std**2, 0.0), abs=1e-8)
+
+
 def test_a_compass_starts_the_heading_and_its_offset_stays_in_doubt():
     """However many samples of it there are; and a velocity is then turned into the pool frame."""
     estimator = Estimator(Settings(aids=Aids(heading_bias=0.05, heading_std=0.01)), SITE)

@@ -124,7 +124,7 @@ SENSORS: dict[str, SensorModel] = {
         stream="velocity",
         quantity="velocity",
         reading=lambda sample: sample.velocity,
-        noise=lambda _, s: _aids(s).velocity_std ** 2 * np.eye(3),
+        noise=lambda sample, s: max(sample.std, _aids(s).velocity_std) ** 2 * np.eye(3),
         drift=1.0,
     ),
 }

@@ -87,6 +87,8 @@ class VelocitySample:
     """Velocity at the log's position, body axes [m/s]."""
     arrival: float | None = None
     """When it was delivered [s]; None: with its time."""
+    std: float = 0.0
+    """Standard deviation per axis [m/s], where it is greater than that of the vehicle's log."""
     stream: str = field(default="velocity", init=False)
 
 

@@ -364,7 +364,9 @@ NAVIGATION = Layout(
             "by kind: velocity [m/s]; heading [rad], 0, 0; x y z [m]; x y [m] yaw [rad]",
             values=3,
         ),
-        Field("std", "f", "of a position per axis [m] and of its yaw [rad]; 0: not known", values=2),
+        Field(
+            "std", "f", "of a velocity [m/s] or position [m] per axis, of yaw [rad]; 0: not known", values=2
+        ),
     ),
 )
 LAYOUTS = (COMMAND, COMMAND_2, TELEMETRY, TELEMETRY_2, ECHO, NAVIGATION, DEBUG_CONFIG)

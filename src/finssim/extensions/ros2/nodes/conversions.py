@@ -84,7 +84,8 @@ def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | st
     if message.header.frame_id not in ("", frame):
         return "of another frame"
     if key == "dvl":
-        return NavigationAid(0, VELOCITY, age, xyz(message.twist.twist.linear), (0.0, 0.0))
+        std = math.sqrt(max(0.0, message.twist.covariance[0]))
+        return NavigationAid(0, VELOCITY, age, xyz(message.twist.twist.linear), (std, 0.0))
     if key == "compass":
         heading = float(quat_yaw(np.array(xyzw(message.orientation))))
         return NavigationAid(0, HEADING, age, (heading, 0.0, 0.0), (0.0, 0.0))
