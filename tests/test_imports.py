@@ -101,7 +101,7 @@ HOMES = {
     "matplotlib": {
         "identification/fit.py",
         "identification/report.py",
-        "identification/prediction.py",
+        "identification/replay_report.py",
         "survey/camera.py",
         "survey/pool_fit.py",
         "evaluation/figures.py",

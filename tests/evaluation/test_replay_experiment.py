@@ -82,12 +82,12 @@ class _Replay:
     pairs = ()
 
     def __init__(self, **values):
-        from finssim.identification.prediction import Score
+        from finssim.identification.replay_metrics import Score
 
         self.scores = {"calibrated": [{axis: Score(v)} for axis, several in values.items() for v in several]}
 
     def aggregate(self, model):
-        from finssim.identification.prediction import aggregate
+        from finssim.identification.replay_metrics import aggregate
 
         return aggregate([{a: s.value for a, s in row.items()} for row in self.scores[model]])
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finssim.identification.axis_result import trim
+from finssim.identification.estimates import trim
 from finssim.identification.fit import Estimate
 from finssim.identification.hydrodynamics import fit_hydrodynamics, judged
-from finssim.identification.prediction import _remarks, replay
+from finssim.identification.prediction import replay
 from finssim.identification.programme import programmes
+from finssim.identification.replay_report import _remarks
 from finssim.identification.synthetic import simulate_programme
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials

@@ -7,7 +7,8 @@ import pytest
 
 from finssim.evaluation.excitation import excite
 from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
-from finssim.identification.simulation_error import actuator_fields, fit_by_simulation, scaled_actuators
+from finssim.identification.parameters import actuator_fields, scaled_actuators
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import load_vehicle
 from reference.torpedo import FIN, hull

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.identification.simulation_error import Parameters
+from finssim.identification.parameters import Parameters
 from finssim.sim.plant_arrays import vehicle_parameters
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import AXES, load_vehicle

@@ -135,7 +135,7 @@ def test_a_velocity_from_position_is_labelled_as_derived(surge):
     result = replay(derived, FINSROV)
     assert result.as_json()["trials"][surge[0].name]["source"]["u"] == "derived from position"
     console = Console(width=140, record=True, file=io.StringIO())
-    from finssim.identification.prediction import print_replay
+    from finssim.identification.replay_report import print_replay
 
     print_replay(result, console)
     assert "not measured but derived from position" in console.export_text()

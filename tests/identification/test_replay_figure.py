@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.identification.prediction import (
-    Pair,
-    draw_overlay,
-    draw_response_envelopes,
-    find_phases,
-    normalised,
-)
+from finssim.identification.replay_metrics import Pair, find_phases
+from finssim.identification.replay_report import draw_overlay, draw_response_envelopes, normalised
 
 T = np.arange(501) / 50.0
 MODELS = (("calibrated", 0.8), ("mesh", 1.5))

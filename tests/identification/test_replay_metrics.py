@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from finssim.identification.prediction import (
+from finssim.identification.replay_metrics import (
     Pair,
     aggregate,
     error_ahead,

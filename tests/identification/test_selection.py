@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from finssim.identification.drag_shape import WIDER, _average
 from finssim.identification.programme import programmes
-from finssim.identification.simulation_error import WIDER, _average, fit_by_simulation
+from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import record, trials_of
 from finssim.identification.vehicle_file import number_in
 from finssim.trials.findings import CalibrationError

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.identification.excitation import compared, excites
 from finssim.identification.programme import programmes
 from finssim.identification.rollout import segments, streams
 from finssim.identification.simulation_error import (
     FitProgress,
     Stages,
-    compared,
-    excites,
     fit_by_simulation,
 )
 from finssim.identification.synthetic import simulate_programme

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finssim.core.least_squares import Block, arrow_reduced
-from finssim.identification.simulation_error import (
+from finssim.identification.shooting import (
     Linearization,
     Point,
     blocks_of,

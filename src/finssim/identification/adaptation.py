@@ -28,10 +28,11 @@ from rich.table import Table
 from finssim.core.least_squares import arrow_reduced
 from finssim.core.rotations import quat_to_euler
 from finssim.identification.fit import Estimate
+from finssim.identification.parameters import Coordinate, Plants
 from finssim.identification.plant_terms import matrices
 from finssim.identification.report import refuse_places
 from finssim.identification.rollout import CHANNELS, Segment, segments, streams
-from finssim.identification.simulation_error import CUT, Coordinate, Plants, Shooting, blocks_of, solve
+from finssim.identification.shooting import CUT, Shooting, blocks_of, solve
 from finssim.identification.vehicle_file import SCALED, write_vehicle
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.conversion import EULER
@@ -85,7 +86,7 @@ RELEVANT_WEIGHT = 0.005
 
 
 class _Coordinates:
-    """The unknowns in standard deviations of the prior, in the form of `simulation_error.Parameters`."""
+    """The unknowns in standard deviations of the prior, in the form of `parameters.Parameters`."""
 
     nuisances = 0
 

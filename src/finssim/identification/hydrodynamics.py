@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from finssim.core.progress import progress_bar
-from finssim.identification.axis_result import SET
 from finssim.identification.fit import Fit
-from finssim.identification.plant_terms import matrices
+from finssim.identification.plant_terms import SET, matrices
 from finssim.identification.report import finish, refuse_places, usable_trials
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import CalibrationError, finding

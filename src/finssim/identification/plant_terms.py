@@ -14,6 +14,18 @@ from finssim.vehicles import HydrodynamicSet, Vehicle
 Array = NDArray[np.float64]
 
 
+SET = "hydrodynamics.calibrated"
+
+UNITS = {
+    "m_eff": ("kg", "kg m²"),
+    "d1": ("N s/m", "N m s"),
+    "d2": ("N s²/m²", "N m s²"),
+    "bias": ("N", "N m"),
+    "k": ("N m/rad", "N m/rad"),
+}
+"""Units of the numbers of an axis, along it and about it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Matrices:
     """6x6 matrices and hydrostatics about one point of the body."""

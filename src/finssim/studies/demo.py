@@ -44,8 +44,9 @@ from finssim.evaluation.robot_trials import (
 from finssim.evaluation.tables import Table, cells, html_of, print_tables
 from finssim.evaluation.trials import GoalTrial
 from finssim.identification.fit import Fit
-from finssim.identification.prediction import Replay, draw_response_envelopes, replay
+from finssim.identification.prediction import Replay, replay
 from finssim.identification.programme import RATE, STEADY, Programme, programmes, which_axes
+from finssim.identification.replay_report import draw_response_envelopes
 from finssim.identification.report import interval_text, number_text, state_text, write_report
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle

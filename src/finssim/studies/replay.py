@@ -22,14 +22,9 @@ from finssim.evaluation.metrics import PAPER
 from finssim.evaluation.statistics import RESAMPLES, SEED, bootstrap
 from finssim.evaluation.tables import Table, figure_text
 from finssim.identification.fit import Fit
-from finssim.identification.prediction import (
-    DEFINITION,
-    MODEL_LABELS,
-    Replay,
-    draw_response_envelopes,
-    replay,
-)
+from finssim.identification.prediction import Replay, replay
 from finssim.identification.programme import Programme, programmes
+from finssim.identification.replay_report import DEFINITION, MODEL_LABELS, draw_response_envelopes
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, trials_of
 from finssim.identification.vehicle_file import calibrated, write_vehicle

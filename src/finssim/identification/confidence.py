@@ -1,0 +1,138 @@
+"""Evidence of trials on the numbers of a fit, and the intervals that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.identification.shooting import FitSolution, Shooting, weights_of
+from finssim.identification.uncertainty import (
+    Covariance,
+    Evidence,
+    intervals,
+    trial_covariance,
+)
+
+Array = NDArray[np.float64]
+
+
+FEWEST_TRIALS = 4
+"""Trials below which they are cut into blocks to estimate the spread."""
+
+BLOCKS = 24
+"""Number of blocks of all trials together."""
+
+
+class Confidence(NamedTuple):
+    """Uncertainty of theta at a solution."""
+
+    evidence: Evidence
+    covariance: Covariance
+    free: Array
+    """Result of the last step without bounds, in the units of theta, (P,)."""
+    interval: Array
+    """95 % interval in the units of theta, around `free` and containing theta, (P, 2)."""
+
+    def variance(self, slope: Array, at: Sequence[int]) -> float:
+        """Return the variance of a sum of some parameters.
+
+        It has the unit of the sum squared.
+
+        Args:
+            slope: Factor of each, (n,).
+            at: Their places in theta, (n,).
+        """
+        C = self.covariance
+        matrix = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
+        with np.errstate(invalid="ignore"):
+            return float(slope @ matrix @ slope) if len(slope) else 0.0
+
+
+def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
+    """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
+    evidence = evidence_of(problem, solution)
+    covariance = trial_covariance(evidence)
+    theta, low, high = solution.point.theta, problem.low, problem.high
+    free = theta
+    if ((theta <= low) | (theta >= high)).any():
+        off, slope = problem.prior(theta)
+        normal, score = evidence.information, evidence.score.sum(axis=0) - slope.T @ off / problem.repeats
+        scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+        free = theta + np.linalg.lstsq(normal / np.outer(scale, scale), score / scale, rcond=1e-10)[0] / scale
+    ends = intervals(free, covariance)
+    ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], theta), np.maximum(ends[:, 1], theta)
+    ends = np.clip(ends, low[:, None], high[:, None])
+    if np.isfinite(solution.step).all():  # the truth may be where one step more would go
+        goes = np.clip(theta + solution.step, low, high)
+        ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], goes), np.maximum(ends[:, 1], goes)
+    unknown = ~np.isfinite(np.diagonal(covariance.local))
+    ends[unknown] = [-np.inf, np.inf]
+    return Confidence(evidence, covariance, free, ends)
+
+
+def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int64] | None = None) -> Evidence:
+    """Normal matrices and scores by groups of rows.
+
+    Args:
+        problem: What was fitted.
+        solution: Where the fit ended.
+        group: Of every row, (N,); trials if None, or blocks where fewer than `FEWEST_TRIALS` excite an axis.
+    """
+    linear = solution.linear
+    weight = weights_of(linear.residual, solution.std)
+    # Derivatives without what each segment's own unknowns take up of every sample.
+    slopes = linear.shared.copy()
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
+        normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
+        slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
+    trial = problem.groups[problem.measured.segment]
+    unit = "blocks" if problem.few or len(np.unique(trial)) < FEWEST_TRIALS else "trials"
+    if group is None:
+        group = trial if unit == "trials" else time_blocks(problem, trial)
+    parts = [np.flatnonzero(group == label) for label in np.unique(group)]
+    known = problem.prior(solution.point.theta)[1]
+    normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
+    score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
+    return Evidence(
+        names=problem.names,
+        normal=np.array(normal) / problem.repeats,
+        score=np.array(score) / problem.repeats,
+        unit=unit,
+        prior=known.T @ known / problem.repeats,
+    )
+
+
+def time_blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Block of every sample: each trial in equal spans of time, the longer the trial the more of them."""
+    start = np.array([s.t0 for s in problem.segments])[problem.measured.segment]
+    t = start + problem.measured.time
+    present = np.unique(trial)
+    span = {g: (float(t[trial == g].min()), float(np.ptp(t[trial == g]))) for g in present}
+    total = sum(length for _, length in span.values())
+    out = np.zeros(len(t), int)
+    for g in present:
+        begin, length = span[g]
+        pieces = max(2, round(BLOCKS * length / max(total, 1e-9)))
+        rows = trial == g
+        part = (t[rows] - begin) / max(length, 1e-9)
+        out[rows] = 1000 * g + np.minimum((part * pieces).astype(int), pieces - 1)
+    return out
+
+
+@dataclass
+class Stage:
+    """One fit of one set of parameters."""
+
+    problem: Shooting
+    solution: FitSolution
+    found: Confidence
+
+    @property
+    def x(self) -> Array:
+        """Return the final parameters, (P,). They have the units of the coordinates."""
+        return self.solution.point.theta[: len(self.problem.parameters.names)]

@@ -1,0 +1,461 @@
+"""Estimates, changes of the vehicle file and findings of one axis, from its fitted numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.identification.confidence import Confidence, Stage
+from finssim.identification.fit import Estimate
+from finssim.identification.parameters import (
+    DETERMINED,
+    PLACES,
+    Parameters,
+    horizontal,
+    places,
+    scaled_actuators,
+)
+from finssim.identification.plant_terms import SET, UNITS, Matrices, matrices
+from finssim.identification.uncertainty import intervals
+from finssim.identification.vehicle_file import scaled_thrust
+from finssim.trials.findings import Finding, finding
+from finssim.vehicles import AXES, Vehicle
+
+Array = NDArray[np.float64]
+
+CERTAIN = 0.2
+"""Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
+
+USEFUL = 0.5
+"""Half width, as a part of the estimate, up to which an inertia is written to the vehicle file: better than a guess."""
+
+DECADE = 10.0
+
+BIAS_NOTE = (
+    "a constant force; above zero it opposes motion in the positive direction, as damping does: tether, trim or the "
+    "offset of a sensor"
+)
+
+
+class Number(NamedTuple):
+    """A number of an axis as it was fitted."""
+
+    value: float
+    ends: tuple[float, float]
+    """95 % interval in the unit of the number; not finite where the trials do not determine it."""
+    free: float | None = None
+    """Estimate without the bound that it rests on, in the unit of the number; None where it rests on none."""
+
+
+@dataclass(kw_only=True)
+class AxisResult:
+    """Estimates, changes of the vehicle file and findings of one axis, from its numbers.
+
+    What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
+    interval: a wide interval is a better answer than a number that it excludes.
+    """
+
+    axis: str
+    numbers: Mapping[str, Number]
+    """Fitted numbers by name, of `UNITS`."""
+    file: Matrices
+    """The vehicle as its file has it."""
+    speeds: tuple[float, float]
+    """Lowest and highest that the damping rests on [m/s, rad/s]."""
+    drag_known: bool
+    """True if the damping is known well enough to be written; both of its terms are written, or neither."""
+    given: float | None = None
+    """Effective inertia where it is known [kg, kg m²]."""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    changes: dict[str, Any] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Estimate term by term."""
+        self.i = AXES.index(self.axis)
+        low, high = self.speeds
+        unit = "m/s" if self.i < 3 else "rad/s"
+        if self.given is not None:
+            self.note("m_eff", self.given, (self.given, self.given), True, "given")
+        elif "m_eff" in self.numbers:
+            self.add("m_eff")
+        if f"{self.axis}.m_eff" in self.estimates:
+            self.added_mass(float(self.file.M_RB[self.i, self.i]))
+        for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
+            if name in self.numbers:
+                own = self.add(name, self.path(family))
+                if own.ci95[0] <= 0.0 <= own.ci95[1] < np.inf:
+                    note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
+                    self.note(name, own.estimate, own.ci95, False, note, own.path)
+            if self.drag_known:
+                value = max(self.numbers[name].value, 0.0) if name in self.numbers else 0.0
+                file = {"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i]
+                if name not in self.numbers or value != file:
+                    self.changes[self.path(family)] = value
+        if not self.drag_known:
+            self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
+        if "k" in self.numbers:
+            self.add("k", "body.center_of_buoyancy.2")
+        if "bias" in self.numbers:  # identifiable wherever it has an interval, for it may well be zero
+            bias = self.add("bias")
+            self.note("bias", bias.estimate, bias.ci95, bool(np.isfinite(bias.ci95).all()), BIAS_NOTE)
+        if 0.0 < low and high < DECADE * low:
+            self.findings.append(finding("few_speeds", self.axis, low=low, high=high, unit=unit))
+
+    def path(self, family: str) -> str:
+        """Return the path of the axis' own entry in a matrix of the vehicle file."""
+        return f"{SET}.{family}.{self.i}.{self.i}"
+
+    def note(
+        self,
+        name: str,
+        value: float,
+        ends: tuple[float, float],
+        sure: bool,
+        note: str,
+        path: str | None = None,
+    ) -> Estimate:
+        """Take an estimate. Value and interval are in `unit`."""
+        unit = UNITS["m_eff" if name == "added_mass" else name][self.i > 2]
+        name, ends = f"{self.axis}.{name}", (float(ends[0]), float(ends[1]))
+        self.estimates[name] = Estimate(
+            name=name, estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note, path=path
+        )
+        return self.estimates[name]
+
+    def add(self, name: str, path: str | None = None) -> Estimate:
+        """Take the estimate of a number, and a finding where it rests on its bound."""
+        value, (low, high), free = self.numbers[name]
+        unit, note, sure = UNITS[name][self.i > 2], "", False
+        if free is not None:
+            note = "held at its bound" + (
+                f"; free, it would be {free:.3g} {unit}" if np.isfinite(free) else ""
+            )
+            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=free, unit=unit))
+        elif not np.isfinite([low, high]).all():
+            note = "the trials do not determine it"
+        elif 0.5 * (high - low) > CERTAIN * abs(value):
+            size = f"±{min(50.0 * (high - low) / abs(value), 9999.0):.0f} %" if value else "its own size"
+            note = f"uncertain by {size}"
+        else:
+            sure = True
+        return self.note(name, value, (low, high), sure, note, path)
+
+    def added_mass(self, rigid: float) -> None:
+        """m_eff less the rigid part. The rigid part is in [kg] or [kg m²]."""
+        whole = self.estimates[f"{self.axis}.m_eff"]
+        value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
+        sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
+        if value <= 0.0:
+            sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {whole.unit}"
+            fields = {"effective": whole.estimate, "rigid": rigid, "unit": whole.unit}
+            self.findings.append(finding("inertia_too_small", self.axis, **fields))
+        elif ends[0] <= 0.0:
+            sure, note = False, "not distinguishable from zero"
+        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
+        before, path = float(self.file.M_A[self.i, self.i]), self.path("added_mass")
+        if value > 0.0 and (half < USEFUL * whole.estimate or outside(before, ends)):
+            self.changes[path] = value
+        self.note("added_mass", value, ends, sure, note, path)
+
+    def believe_nothing(self, reason: str) -> None:
+        """Leave the numbers as they are, call none of them identifiable and write none."""
+        self.estimates = {
+            name: replace(e, identifiable=False, note=reason) for name, e in self.estimates.items()
+        }
+        self.changes = {}
+        self.findings.append(finding("axis_refused", self.axis, reason=reason))
+
+
+def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
+    """Return the centre of buoyancy that gives the constant moments of roll and pitch of a vehicle that lies tilted.
+
+    B r_b - W r_g = (b_pitch, -b_roll, k), of which the centre of gravity stays.
+
+    Places are in [m].
+
+    Args:
+        found: Estimates, `roll.bias` and `pitch.bias` among them.
+        buoyancy: B [N].
+        centre: r_b of the vehicle file [m].
+    """
+    out = {}
+    for name, i, sign in (("pitch.bias", 0, 1.0), ("roll.bias", 1, -1.0)):
+        bias = found.get(name)
+        if bias is not None and bias.identifiable and outside(0.0, bias.ci95):
+            out[f"body.center_of_buoyancy.{i}"] = float(centre[i]) + sign * bias.estimate / buoyancy
+    return out
+
+
+def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[str, float], list[Finding]]:
+    """Buoyancy excess, stiffness and constant moments as volume and centre of buoyancy; weight and its centre stay.
+
+    Args:
+        found: Estimates by name.
+        vehicle: As its file has it.
+
+    Returns:
+        Changes of the vehicle file in its units, and a finding where roll and pitch disagree.
+    """
+    body, water, findings = vehicle.body, vehicle.water, list[Finding]()
+    changes: dict[str, float] = {}
+    volume = float(body.displaced_volume)
+    excess = found.get("buoyancy_excess")
+    if excess is not None and excess.identifiable:
+        volume = (vehicle.weight + excess.estimate) / (water.density * water.gravity)
+        changes["body.displaced_volume"] = volume
+    buoyancy = water.density * water.gravity * volume
+    changes |= trim(found, buoyancy, body.center_of_buoyancy)
+    stiffness = float(matrices(vehicle).arm[2])
+    some = [found[name] for name in ("roll.k", "pitch.k") if name in found]
+    some = [e for e in some if e.estimate > 0.0 and (useful(e) or outside(stiffness, e.ci95))]
+    if not some:
+        return changes, findings
+    half = np.array([0.5 * (e.ci95[1] - e.ci95[0]) for e in some])
+    value = np.array([e.estimate for e in some])
+    if len(some) == 2 and abs(value[0] - value[1]) > float(np.hypot(*half)):
+        findings.append(finding("stiffness_disagrees", roll=value[0], pitch=value[1]))
+    k = float(np.sum(value / half**2) / np.sum(1.0 / half**2))
+    reference = float(vehicle.hydrodynamic_set("calibrated").reference_point[2])
+    gravity_part = vehicle.weight * (float(body.center_of_gravity[2]) - reference)
+    changes["body.center_of_buoyancy.2"] = reference + (k + gravity_part) / buoyancy
+    return changes, findings
+
+
+def useful(e: Estimate) -> bool:
+    """Return whether an estimate is known to `USEFUL`."""
+    return 0.5 * (e.ci95[1] - e.ci95[0]) < USEFUL * e.estimate
+
+
+def outside(value: float, ends: Array | tuple[float, float]) -> bool:
+    """Return whether a number lies outside an interval of the same unit that has two ends."""
+    return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
+
+
+LAG_CERTAIN = 0.05
+"""Half width of the interval of a delay up to which it counts as identifiable [s]."""
+
+EXCESS_CERTAIN = 0.02
+"""Half width of the interval of buoyancy less weight, as a part of the weight, up to which it is identifiable."""
+
+PATHS = {
+    "buoyancy_excess": "body.displaced_volume",
+    "thrust_scale": None,
+    "thrust_lag": "thrusters.*.time_constant",
+    "thrust_delay": "thrusters.*.delay",
+}
+"""Reported coordinates besides those of the axes, and their places in the vehicle file."""
+
+
+LEVER = 1.0
+"""Size that the simulation's own error counts against in a place [m]: a lever of some centimetres shows in the small
+difference of large accelerations."""
+
+
+def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
+    """Every coordinate with its 95 % interval, by name.
+
+    Args:
+        p: What was free.
+        x: Where the fit ended, in the units of the coordinates, (P,).
+        found: Evidence there.
+        own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
+    """
+    local, out, M_RB = np.diagonal(found.covariance.local), {}, matrices(p.moved(x)).M_RB
+    half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
+    for c, name in enumerate(p.names):
+        low, high, value = -np.inf, np.inf, float(x[c])
+        if np.isfinite(local[c]):
+            free = value + float(np.clip(found.free[c] - value, -1e6, 1e6))
+            axis, _, kind = name.partition(".")
+            rigid = M_RB[AXES.index(axis), AXES.index(axis)] if kind == "added_mass" else 0.0
+            size = LEVER if name in PLACES else abs(value + rigid)
+            width = float(np.hypot(half[c], own_error * size))
+            low = max(min(free - width, value), p.low[c])
+            high = free + width if free + width > value else value + width
+            # Where a fit ended early, the truth may be where one step more would go.
+            low, high = min(low, float(found.interval[c, 0])), max(high, float(found.interval[c, 1]))
+        out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
+    return out
+
+
+def axis_result(
+    p: Parameters, x: Array, numbers: Mapping[str, Number], axis: str, **known: Any
+) -> AxisResult:
+    """The result of one axis.
+
+    Args:
+        p: What was free.
+        x: Where the fit ended, in the units of the coordinates, (P,).
+        numbers: Of `numbers_of`.
+        axis: Which.
+        known: Further fields of `AxisResult`.
+    """
+    own, file, i = dict[str, Number](), matrices(p.moved(x)), AXES.index(axis)
+    if f"{axis}.added_mass" in numbers:
+        mass, rigid = numbers[f"{axis}.added_mass"], float(file.M_RB[i, i])
+        free = None if mass.free is None else mass.free + rigid
+        own["m_eff"] = Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)
+    own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
+    if "k" in numbers and axis in ("roll", "pitch"):
+        own["k"] = numbers["k"]
+    return AxisResult(axis=axis, numbers=own, file=file, **known)
+
+
+def other_estimates(
+    p: Parameters, numbers: Mapping[str, Number]
+) -> tuple[dict[str, Estimate], list[Finding]]:
+    """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
+    out, bounds = dict[str, Estimate](), list[Finding]()
+    reported = {*PATHS, *PLACES, *p.terms, *p.actuators}
+    paths = PATHS | places(p.vehicle)
+    units = {c.name: c.unit for c in p.coordinates if c.name in reported}
+    for name, unit in units.items():
+        value, (low, high), free = numbers[name]
+        half, note = 0.5 * (high - low), ""
+        # Delay and excess may well be zero, so that their uncertainty is not judged as a part of them.
+        limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": EXCESS_CERTAIN * p.vehicle.weight}
+        limit = limits.get(name, CERTAIN * abs(value))
+        if free is not None:
+            note = f"held at its bound; free, it would be {free:.3g} {unit}"
+            bounds.append(finding("at_bound", name, free=free, unit=unit))
+        elif not np.isfinite(half):
+            note = "the trials do not determine it"
+        elif name in PLACES:
+            coordinate = p.coordinates[p.names.index(name)]
+            known, std = half / 1.96, float(coordinate.std or np.inf)
+            if known > DETERMINED * std:
+                note = "the trials determine it no better than the vehicle file"
+            else:  # what the trials alone say, without the file
+                variance = 1.0 / (known**-2.0 - std**-2.0)
+                alone = variance * (value / known**2.0 - coordinate.start / std**2.0)
+                span = 1.96 * float(np.sqrt(variance))
+                if abs(alone - coordinate.start) > span:
+                    what = (
+                        ", ".join(horizontal(p.vehicle))
+                        if name == PLACES[0]
+                        else f"{name[-1]} of the centre of gravity"
+                    )
+                    bounds.append(
+                        finding("place_contradicted", what, value=alone, half=span, file=coordinate.start)
+                    )
+        elif half > limit:
+            note = f"uncertain by ±{half:.2g} {unit}"
+        path = f"{SET}.{name}" if name in p.terms else paths.get(name)
+        out[name] = Estimate(
+            name=name,
+            estimate=value,
+            ci95=(low, high),
+            unit=unit,
+            identifiable=not note,
+            note=note,
+            path=path,
+        )
+    return out, bounds
+
+
+def changes(
+    p: Parameters,
+    x: Array,
+    found: Mapping[str, Estimate],
+    axes: dict[str, Any],
+    *,
+    unmeasured: Sequence[str],
+    scaled: bool,
+) -> dict[str, Any]:
+    """Changes of the vehicle file.
+
+    Args:
+        p: What was free.
+        x: Where the fit ended, in the units of the coordinates, (P,).
+        found: All estimates.
+        axes: Changes of the axes' own numbers.
+        unmeasured: Axes that were simulated because no trial measured them: the others hold with their numbers.
+        scaled: Whether a thrust scale belongs to the thrusters' curves.
+    """
+    out = dict(axes)
+    for path, matrix in matrix_changes(p, x).items():
+        old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
+        for i, axis in enumerate(AXES):
+            if f"{path}.{i}.{i}" in axes or axis in unmeasured:
+                for j in range(6):
+                    # Couplings are written where the fit did away with them.
+                    if i == j or matrix[i, j] != old[i, j]:
+                        out[f"{path}.{i}.{j}"] = float(matrix[i, j])
+    written = x.copy()
+    for c, name in enumerate(p.names):
+        written[c] = p.expected[c] if name in PLACES and not found[name].identifiable else x[c]
+    moved = p.moved(written)
+    at = [f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)]
+    if PLACES[0] in found:
+        c = p.names.index(PLACES[0])
+        lower = float(written[c] - p.expected[c])
+        out |= {path: p.vehicle.thrusters[path.split(".")[1]].position[2] + lower for path in at if lower}
+    if moved is not p.vehicle:
+        for name in ("center_of_gravity", "center_of_buoyancy"):
+            out |= {f"body.{name}.{j}": float(c) for j, c in enumerate(getattr(moved.body, name))}
+    out |= hydrostatics(found, moved)[0]
+    for name, path in (("thrust_lag", "time_constant"), ("thrust_delay", "delay")):
+        if name in found and found[name].identifiable:
+            out[f"thrusters.*.{path}"] = max(found[name].estimate, 1e-4 if path == "time_constant" else 0.0)
+    for path in p.terms:
+        if found[path].identifiable:
+            out[str(found[path].path)] = found[path].estimate
+    for name in p.actuators:
+        if found[name].identifiable:
+            out |= scaled_actuators(p.vehicle, name, found[name].estimate)
+    if "thrust_scale" in found and (found["thrust_scale"].identifiable or p.likely) and scaled:
+        out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
+    return out
+
+
+def terminal_speed(d1: float, d2: float, excess: float) -> float:
+    """Return the speed at which drag equals an excess of buoyancy [m/s].
+
+    Args:
+        d1: Linear damping of heave [N s/m].
+        d2: Quadratic damping of heave [N s²/m²].
+        excess: Buoyancy less weight [N].
+    """
+    e = max(excess, 0.0)
+    return 2.0 * e / max(d1 + float(np.sqrt(d1**2 + 4.0 * d2 * e)), 1e-12)
+
+
+def derived(
+    stage: Stage, of: Callable[[Array], float], own_error: float, positive: bool
+) -> tuple[float, tuple[float, float]]:
+    """Return a function of the parameters and its 95 % interval, to first order.
+
+    It has the unit of the function.
+
+    Args:
+        stage: A finished fit.
+        of: Vector of parameters (P,) -> the number.
+        own_error: Of the simulation itself, as a part of the number.
+        positive: Whether the interval is that of the logarithm.
+    """
+    from scipy.stats import t
+
+    p, x, C = stage.problem.parameters, stage.x, stage.found.covariance
+    h = 1e-4 * np.maximum(np.abs(x), 1e-2 * p.scale)
+    value, steps = of(x), np.diag(h)
+    slope = np.array([(of(x + s) - of(np.maximum(x - s, p.low))) for s in steps])
+    slope /= x + h - np.maximum(x - h, p.low)
+    at = np.flatnonzero(slope).tolist()
+    dof = float(np.min(C.dof[at], initial=np.inf))
+    half = float(t.ppf(0.975, min(dof, 1e6))) * float(np.sqrt(stage.found.variance(slope[at], at)))
+    half = float(np.hypot(half, own_error * value))
+    if positive and value > 0.0:
+        factor = float(np.exp(min(half / value, 50.0)))
+        return value, (value / factor, value * factor)
+    return value, (max(value - half, 0.0), value + half)
+
+
+def matrix_changes(p: Parameters, x: Array) -> dict[str, Any]:
+    """Return the changes of the vehicle file to the matrices of a vector in the units of the coordinates, (P,)."""
+    names = ("added_mass", "linear_damping", "quadratic_damping")
+    return {f"{SET}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}

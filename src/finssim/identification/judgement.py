@@ -1,0 +1,230 @@
+"""Figures of a fit besides its estimates: quality by axis, prediction of what was left out, curves, findings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.least_squares import boxed
+from finssim.identification.confidence import Confidence, Stage, evidence_of, time_blocks
+from finssim.identification.excitation import speeds
+from finssim.identification.fit import Curve
+from finssim.identification.rollout import (
+    DETERMINED_BY,
+    Streams,
+)
+from finssim.identification.shooting import CUT, FitSolution, Point, Shooting
+from finssim.identification.uncertainty import (
+    intervals,
+)
+from finssim.trials.findings import Finding, finding
+from finssim.trials.trial import COLUMNS
+
+Array = NDArray[np.float64]
+
+
+LATE = 0.03
+"""Lag of a stream that leads to a warning [s]."""
+
+SHOWN = 4
+"""Trials in the curve of an axis."""
+
+
+def _shown_by(
+    problem: Shooting, axis: str
+) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
+    """Return the most direct used channel that determines an axis, its samples (n,), their trials (n,), and the range
+    of the channel in each trial, from the 5th to the 95th percentile; no samples without such a channel."""
+    m = problem.measured
+    name = next((c for c in DETERMINED_BY[axis] if c in m.names), "")
+    rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
+    trial = problem.groups[m.segment][rows]
+    spans = {
+        int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
+    }
+    return name, rows, trial, spans
+
+
+def quality(
+    problem: Shooting, solution: FitSolution, axes: Sequence[str], used: Sequence[Streams]
+) -> dict[str, dict[str, float]]:
+    """Figures of each axis over the trials that move it: the simulated against the measured channel.
+
+    Units are those of the channel; R² and NRMSE have none.
+    """
+    out = {}
+    for axis in axes:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        if not name:
+            continue
+        moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
+        inside = np.isin(trial, moving)
+        rows, trial = rows[inside], trial[inside]
+        residual, value = solution.linear.residual[rows], problem.measured.value[rows]
+        rms = {g: float(np.sqrt(np.mean(residual[trial == g] ** 2))) for g in moving}
+        low, high = speeds([s.motion for s in used], axis)
+        out[axis] = {
+            "r2": 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300),
+            "rmse": float(np.sqrt(np.mean(residual**2))),
+            "nrmse": float(np.mean([rms[g] / max(spans[g], 1e-12) for g in moving])),
+            "samples": float(len(rows)),
+            "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
+            "trials": float(len(moving)),
+            "speed_low": low,
+            "speed_high": high,
+            "noise": float(np.median(solution.std[rows])),
+        }
+    return out
+
+
+AXES_BIAS = ("surge.bias", "sway.bias", "yaw.bias")
+"""Biases that no vehicle file has a place for."""
+
+
+def held_out(
+    stage: Stage, file: Shooting, axes: Sequence[str], by_trial: bool
+) -> dict[str, tuple[float, float]]:
+    """Return the NRMSE of each axis over stretches that the numbers do not rest on, and that of the vehicle file [-].
+
+    Each trial, or stretch of one, is predicted by the numbers that one Gauss-Newton step from the end of the fit gives
+    without it, each from the initial state and the offsets of its sensors that suit it best.
+
+    Args:
+        stage: The finished fit.
+        file: The same problem with every number of the vehicle file free.
+        axes: Fitted axes.
+        by_trial: Whether whole trials are left out.
+    """
+    problem, point = stage.problem, stage.solution.point
+    trial = problem.groups[problem.measured.segment]
+    group = np.unique(trial if by_trial else time_blocks(problem, trial), return_inverse=True)[1]
+    evidence = evidence_of(problem, stage.solution, group)
+    total = evidence.information
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
+    unwritten = [
+        problem.parameters.names.index(name) for name in AXES_BIAS if name in problem.parameters.names
+    ]
+
+    low, high = (problem.low - point.theta) * scale - 1e-12, (problem.high - point.theta) * scale + 1e-12
+
+    def without(k: int) -> Array:
+        rest = (total - evidence.normal[k]) / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+        step = boxed(rest, -evidence.score[k] / scale, low, high) / scale
+        theta = np.clip(point.theta + step, problem.low, problem.high)
+        theta[unwritten] = 0.0
+        return theta
+
+    known = dict(zip(problem.names, point.theta, strict=True)) | dict(
+        zip(file.parameters.names, file.parameters.expected, strict=True)
+    )
+    known |= dict.fromkeys(AXES_BIAS, 0.0) | ({"thrust_scale": 1.0} if problem.parameters.likely else {})
+    plain = np.array([known[name] for name in file.names])
+    after = _predicted_error(
+        problem, np.array([without(k) for k in range(len(evidence.normal))]), stage.solution
+    )
+    after = after[np.arange(len(group)), group]
+    before = _predicted_error(file, plain[None], stage.solution)[:, 0]
+    out = {}
+    for axis in axes:
+        _, rows, trial, spans = _shown_by(problem, axis)
+        moving = [g for g, span in spans.items() if 0.2 * max(spans.values()) < span]
+        rms = [
+            [float(np.sqrt(np.mean(error[rows[trial == g]] ** 2))) / max(spans[g], 1e-12) for g in moving]
+            for error in (after, before)
+        ]
+        if moving:
+            after_mean, before_mean = np.nan_to_num(np.mean(rms, axis=1), nan=np.inf).tolist()
+            out[axis] = after_mean, before_mean
+    return out
+
+
+def _predicted_error(problem: Shooting, theta: Array, solution: FitSolution) -> Array:
+    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to it, (N, C).
+
+    The unit is that of the channel.
+    """
+    z, linear = solution.point.z, solution.linear
+    error = problem.residuals(Point(theta, np.repeat(z[None], len(theta), axis=0)))
+    weight = solution.std**-2.0
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        own, stiff = linear.own[a:b], problem.prior_std[s] ** -2.0
+        normal = (own.T * weight[a:b]) @ own + np.diag(stiff)
+        right = (own.T * weight[a:b]) @ error[a:b] - (stiff * z[s])[:, None]
+        error[a:b] -= own @ np.linalg.solve(normal, np.nan_to_num(right))
+    return error
+
+
+def unexplained(
+    problem: Shooting, solution: FitSolution, axis: str, used: Sequence[Streams]
+) -> tuple[str, float]:
+    """Return the trial of a free motion that the fit explains least, and its R²; infinite without any.
+
+    R² has no unit.
+    """
+    _, rows, trial, _ = _shown_by(problem, axis)
+    worst, least = "", np.inf
+    for g, one in enumerate(used):
+        those = rows[trial == g]
+        if axis in one.released and len(those):
+            residual, value = solution.linear.residual[those], problem.measured.value[those]
+            r2 = 1.0 - float(np.mean(residual**2)) / max(float(np.var(value)), 1e-300)
+            worst, least = min((worst, least), (one.trial.name, r2), key=lambda pair: pair[1])
+    return worst, least
+
+
+def pictures(problem: Shooting, solution: FitSolution, axes: Sequence[str]) -> tuple[Curve, ...]:
+    """Measured and simulated channel of each axis, over the trials that move it most."""
+    m, out = problem.measured, []
+    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    for axis in axes:
+        name, rows, trial, spans = _shown_by(problem, axis)
+        parts = []
+        for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
+            those = rows[trial == g]
+            those = those[np.argsort(clock[those], kind="stable")]
+            value = m.value[those]
+            parts.append((clock[those], value, value - solution.linear.residual[those]))
+        if name:
+            title = f"{axis}: {name}, simulated from the inputs alone"
+            out.append(Curve.joined(title, f"{name} [{COLUMNS[name].unit}]", parts))
+    return tuple(out)
+
+
+def fit_findings(
+    problem: Shooting,
+    solution: FitSolution,
+    found: Confidence,
+    used: Sequence[Streams],
+) -> list[Finding]:
+    """Return findings that a reader needs before using the numbers."""
+    out = []
+    if solution.interrupted:
+        out.append(finding("interrupted"))
+    elif not (solution.converged or _close(solution, found, problem.judged)):
+        out.append(finding("not_converged", iterations=solution.iterations))
+    P = len(problem.parameters.names)
+    for stream, late, (low, high) in zip(
+        problem.streams, solution.point.theta[P:], found.interval[P:], strict=True
+    ):
+        if abs(late) > LATE and (low > 0.0 or high < 0.0):
+            sense = "lags" if late > 0.0 else "leads"
+            given = {"sense": sense, "lag": abs(late), "low": low, "high": high}
+            if all(one.released for one in used):
+                out.append(finding("streams_apart", stream, other=problem.streams[0], **given))
+            else:
+                out.append(finding("motion_late", stream, **given))
+    if found.evidence.unit == "blocks":
+        out.append(finding("block_intervals", trials=len(used)))
+    return out
+
+
+def _close(solution: FitSolution, found: Confidence, judged: int) -> bool:
+    """Return whether one step more would keep every parameter within its 95 % interval.
+
+    Trials differ by more than independent noise, so that a step far above the error that such noise leaves may still be
+    far below what can be known.
+    """
+    low, high = intervals(solution.point.theta, found.covariance).T
+    return bool(np.all(np.abs(solution.step[:judged]) <= 0.5 * (high - low)[:judged]))

@@ -1,0 +1,369 @@
+"""Trials beside their replays, and the scores of a replay: NRMSE by axis, its aggregate, errors some seconds ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finssim.trials.findings import Finding
+from finssim.trials.trial import COLUMNS, NU, Array
+from finssim.vehicles.vehicle import AXES, Axis
+
+if TYPE_CHECKING:
+    pass
+
+
+RESPONSES = (*NU, "roll", "pitch", "depth")
+"""Compared columns: body velocities, and attitude and depth if they were measured."""
+
+UNITS = {name: COLUMNS[name].unit for name in RESPONSES}
+"""Response -> unit."""
+
+EXCITED = 0.3
+"""An axis counts as excited where its input reaches this share of that of the most excited axis."""
+
+ONSET = 0.1
+"""Share of its greatest magnitude at which the input has begun, and has ended."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """One trial and its replays. All arrays are over the same n times; numbers that are not there are NaN."""
+
+    name: str
+    sha256: str
+    t: Array
+    """Since the trial's first sample [s], uniform, (n,)."""
+    t0: float = 0.0
+    """The trial's first sample on its own clock [s]."""
+    rate: float
+    """[1/s]"""
+    axes: tuple[Axis, ...]
+    """Axes that the trial excites, which are scored."""
+    phase: NDArray[np.str_]
+    """Words of `PHASES`, (n,)."""
+    tau: Array
+    """Wrench that acted, from the log, about the vehicle's `wrench_reference` [N, N m], (n, 6)."""
+    measured: dict[str, Array]
+    """Response (of `RESPONSES`) -> values in the unit of the response, (n,); velocities and angles smoothed as for a
+    fit."""
+    raw: dict[str, Array] = field(default_factory=dict)
+    """Measured values in the unit of the response, not smoothed."""
+    source: dict[str, str] = field(default_factory=dict)
+    """Response -> "measured", or what it was derived from."""
+    noise: dict[str, float] = field(default_factory=dict)
+    """Response -> standard deviation of the noise of one measured sample, in its unit."""
+    simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
+    """Model -> response -> values in the unit of the response, (n,)."""
+    segment: NDArray[np.int64] | None = None
+    """Uninterrupted replay that a sample belongs to, -1 for none, (n,); None for a single one."""
+    diverged: dict[str, float] = field(default_factory=dict)
+    """Model -> time when its simulation stopped being finite [s]; only where it did."""
+    late: dict[str, float] = field(default_factory=dict)
+    """Model -> by how much the recorded motion lags the recorded commands beyond the model's motors [s], for which the
+    comparison allows; only where it shows."""
+    in_sample: bool = False
+    """True if the vehicle was fitted on this very trial."""
+    findings: tuple[Finding, ...] = ()
+
+    def response(self, axis: Axis) -> str:
+        """The velocity of an axis: `u` of surge."""
+        return NU[AXES.index(axis)]
+
+    def scored(self) -> NDArray[np.bool_]:
+        """Return the samples that a score of the trial covers: excitation and coast; all if there is neither, (n,)."""
+        inside = np.isin(self.phase, ("excitation", "coast"))
+        return inside if inside.any() else np.ones(len(self.t), dtype=bool)
+
+
+def excited_axes(tau: Array, limits: Array, named: Sequence[Axis] = ()) -> tuple[Axis, ...]:
+    """The axes that a trial excites.
+
+    Args:
+        tau: Wrench about the vehicle's `wrench_reference` [N, N m], (n, 6).
+        limits: `Vehicle.wrench_limits` [N, N m], (6,): what counts as much on each axis; 0 where the thrusters have
+            no hold on an axis.
+        named: What the header says; taken as it is where it says anything.
+
+    Returns:
+        In canonical order; empty where there is no input (a passive trial, thrusters off).
+    """
+    if named:
+        return tuple(axis for axis in AXES if axis in named)
+    # A vehicle without a limit on an axis can still be towed or pushed there: count it against 1 N or 0.1 N m of arm.
+    scale = np.where(
+        limits > 0.0, limits, max(float(limits.max(initial=0.0)), 1.0) * np.repeat([1.0, 0.1], 3)
+    )
+    share = np.sqrt(np.nanmean(np.square(tau / scale), axis=0)) if len(tau) else np.zeros(6)
+    largest = float(share.max(initial=0.0))
+    return tuple(a for a, x in zip(AXES, share, strict=True) if largest > 1e-9 and x >= EXCITED * largest)
+
+
+def find_phases(
+    t: Array, tau: Array, axes: Sequence[Axis], named: NDArray[np.str_] | None = None
+) -> NDArray[np.str_]:
+    """Phase of every sample: as the log names it, else found from the input of the excited axes.
+
+    Excitation lasts from the first to the last time that the input is above a tenth of its greatest magnitude; before
+    it is baseline, after it coast. Without input there is only coast.
+
+    Args:
+        t: [s], (n,).
+        tau: Wrench [N, N m], (n, 6).
+        axes: The excited axes.
+        named: Phases of the log, (n,), or None.
+
+    Returns:
+        Words of `PHASES`, (n,).
+    """
+    if named is not None and np.isin(named, ("excitation", "coast")).any():
+        return named.astype("<U10")
+    phase = np.full(len(t), "coast", dtype="<U10")
+    active = np.flatnonzero(_active(tau, axes))
+    if len(active):
+        phase[: active[0]] = "baseline"
+        phase[active[0] : active[-1] + 1] = "excitation"
+    return phase
+
+
+def onset(pair: Pair, axis: Axis) -> int | None:
+    """Index of the sample where the input of an axis first reaches a tenth of its greatest magnitude."""
+    active = np.flatnonzero(_active(pair.tau, (axis,)))
+    return int(active[0]) if len(active) else None
+
+
+def _active(tau: Array, axes: Sequence[Axis]) -> NDArray[np.bool_]:
+    """Return where the input of one of the axes is above a tenth of its greatest magnitude there, (n,)."""
+    magnitude = np.abs(np.nan_to_num(tau[:, [AXES.index(a) for a in axes]]))
+    greatest = magnitude.max(axis=0, initial=0.0)
+    return np.asarray(((magnitude >= ONSET * greatest) & (greatest > 0.0)).any(axis=1))
+
+
+def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
+    """The replayed models, in their order."""
+    models: Mapping[str, None] = {model: None for pair in pairs for model in pair.simulated}
+    return tuple(models)
+
+
+def resampled(t: Array, values: Array, times: Array) -> Array:
+    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none.
+
+    Units are kept.
+    """
+    if values.ndim == 2:
+        return np.stack([resampled(t, column, times) for column in values.T], axis=-1)
+    good = np.isfinite(values)
+    if not good.any():
+        return np.full(len(times), np.nan)
+    t, values = t[good], values[good]
+    out = np.interp(times, t, values, left=np.nan, right=np.nan)
+    right = np.clip(np.searchsorted(t, times), 0, len(t) - 1)
+    before = np.maximum(np.searchsorted(t, times, side="right") - 1, 0)
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    out[t[right] - t[before] > max(3.0 * usual, 0.1)] = np.nan
+    return np.asarray(out)
+
+
+RESAMPLES, SEED = 2000, 20260903
+"""Settings of the trial bootstrap, as in the paper's replay validation."""
+
+FEWEST = 8
+"""Samples that a score needs at least."""
+
+NOISE_SPAN = 2.0
+"""A smoothed response must span this many standard deviations of a sample's noise, another twice as many: noise alone
+spans 3.3 from P5 to P95, and half of that or less after smoothing."""
+
+
+STILL = 0.002
+"""Spans below this are those of a vehicle at rest, whatever the noise [m/s, rad/s, rad]."""
+
+
+class Score(NamedTuple):
+    """A number, or the reason why there is none."""
+
+    value: float | None
+    """The score [-], or None."""
+    why: str = ""
+
+
+def span(values: ArrayLike) -> float:
+    """P95 - P5 of the finite values; NaN if there are none. The unit is kept."""
+    x = np.asarray(values, dtype=np.float64)
+    x = x[np.isfinite(x)]
+    return float(np.subtract(*np.percentile(x, (95.0, 5.0)))) if len(x) else float("nan")
+
+
+def nrmse(measured: Array, simulated: Array, scale: float, mask: NDArray[np.bool_] | None = None) -> Score:
+    """RMSE / (P95 - P5 of the measurement)                                            (paper, section IV-B)
+
+    Args:
+        measured: Values in the unit of the response, (n,), NaN where there is no measurement.
+        simulated: (n,), same unit.
+        scale: P95 - P5 of the measurement over the scored part of the trial, same unit.
+        mask: Samples to take; all if None.
+    """
+    error = (simulated - measured)[mask if mask is not None else slice(None)]
+    error = error[np.isfinite(error)]
+    if len(error) < FEWEST:
+        return Score(None, f"too short: {len(error)} samples compared, at least {FEWEST} are needed")
+    if not scale > 0.0:
+        return Score(None, "the measured response does not vary: its P5 to P95 span is zero")
+    return Score(float(np.sqrt(np.mean(np.square(error)))) / scale)
+
+
+def response_span(pair: Pair, response: str) -> Score:
+    """P95 - P5 of a response over the scored part of a trial; none where it is absent or is but noise."""
+    values = pair.measured.get(response)
+    if values is None or not np.isfinite(values).any():
+        return Score(None, "not measured")
+    x = values[pair.scored()]
+    count = int(np.isfinite(x).sum())
+    if count < FEWEST:
+        return Score(None, f"too short: {count} samples measured, at least {FEWEST} are needed")
+    width, noise = span(x), pair.noise.get(response, 0.0)
+    if not width > 1e-12:
+        return Score(None, "the measured response does not vary: its P5 to P95 span is zero")
+    if width < STILL:
+        return Score(None, f"the vehicle was at rest: the measured response spans {width:.2g} from P5 to P95")
+    smoothed = pair.raw.get(response) is not values
+    if np.isfinite(noise) and width < (NOISE_SPAN if smoothed else 2.0 * NOISE_SPAN) * noise:
+        return Score(
+            None, f"the measured response, {width:.3g} from P5 to P95, is its noise (std {noise:.3g})"
+        )
+    return Score(width)
+
+
+def score(pair: Pair, model: str, response: str, phase: str | None = None) -> Score:
+    """NRMSE of one response of one model over the excitation and the coast of a trial, or over one phase.
+
+    The RMSE is of the phase, the span is that of the trial, so that phases can be compared.
+
+    Args:
+        pair: Trial and replays.
+        model: Which replay.
+        response: Of `RESPONSES`.
+        phase: Of `PHASES`; excitation and coast if None.
+    """
+    mask = pair.scored() if phase is None else pair.phase == phase
+    if not mask.any():
+        return Score(None, f"the trial has no {phase}")
+    width = response_span(pair, response)
+    if width.value is None:
+        return width
+    if model in pair.diverged:
+        return Score(
+            None, f"the simulation does not stay finite: it ends {pair.diverged[model]:.2f} s into the trial"
+        )
+    return nrmse(pair.measured[response], pair.simulated[model][response], width.value, mask)
+
+
+class Aggregate(NamedTuple):
+    """One number for many trials."""
+
+    value: float | None
+    """Mean NRMSE [-], or None."""
+    ci95: tuple[float, float] | None
+    """Trial-level bootstrap [-], 2.5 and 97.5 %."""
+    by_axis: dict[str, float]
+    """Axis -> median NRMSE [-]."""
+    trials: int
+    why: str = ""
+    """Reason why there is no number, or no interval."""
+
+
+def aggregate(
+    scores: Sequence[Mapping[Any, float | None]],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = SEED,
+) -> Aggregate:
+    """Equal-weight mean over the axes of the median over the trials of an axis.
+
+    The bootstrap draws whole trials with replacement, among those that have the same axes, so that every axis keeps as
+    many trials as it has. An axis with one trial has nothing to draw from: then there is no interval.
+
+    Args:
+        scores: For each trial, axis -> NRMSE [-] or None.
+        resamples: How many.
+        seed: Of the draws.
+    """
+    axes = list(dict.fromkeys(a for row in scores for a, x in row.items() if x is not None))
+    if not axes:
+        return Aggregate(None, None, {}, 0, "no trial has a score")
+    table = np.array(
+        [[np.nan if row.get(a) is None else row[a] for a in axes] for row in scores], dtype=float
+    )
+    table = table[np.isfinite(table).any(axis=1)]
+    by_axis = np.nanmedian(table, axis=0)
+    value = float(by_axis.mean())
+    named = {a: float(x) for a, x in zip(axes, by_axis, strict=True)}
+    lonely = [a for a, n in zip(axes, np.isfinite(table).sum(axis=0), strict=True) if n < 2]
+    if lonely:
+        return Aggregate(
+            value, None, named, len(table), f"no interval: a single trial of {', '.join(lonely)}"
+        )
+    random = np.random.default_rng(seed)
+    patterns, stratum = np.unique(np.isfinite(table), axis=0, return_inverse=True)
+    rows = np.empty((resamples, len(table)), dtype=np.int64)
+    for k in range(len(patterns)):
+        members = np.flatnonzero(stratum.reshape(-1) == k)
+        rows[:, members] = random.choice(members, (resamples, len(members)))
+    replicates = np.nanmedian(table[rows], axis=1).mean(axis=1)
+    low, high = np.percentile(replicates, (2.5, 97.5))
+    return Aggregate(value, (float(low), float(high)), named, len(table))
+
+
+class Ahead(NamedTuple):
+    """Error of predictions made from measured states, by how far they look ahead."""
+
+    seconds: Array
+    """Times ahead [s], (H,)."""
+    rmse: Array
+    """Root mean square errors in the response's unit, (H,); NaN if nothing could be compared."""
+    persistence: Array
+    """Errors of the prediction that nothing changes, in the unit of the response, (H,)."""
+    nrmse: Array
+    """Root mean square of error over span [-], (H,)."""
+    count: NDArray[np.int64]
+    """Predictions compared, (H,)."""
+
+    @property
+    def skill(self) -> Array:
+        """1 - rmse / persistence: 1 is perfect, 0 is no better than to say that nothing changes, (H,) [-]."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self.persistence > 0.0, 1.0 - self.rmse / self.persistence, np.nan))
+
+
+def error_ahead(
+    starts: Array, ahead: Array, measured: Array, simulated: Array, width: ArrayLike, seconds: ArrayLike
+) -> Ahead:
+    """Root mean square over all predictions of the error a given time after each start.
+
+    Args:
+        starts: Response, in its unit, in the state that each prediction starts from, (S,).
+        ahead: Times since the start [s], (T,).
+        measured: Response in its unit, (T, S), NaN where there is no measurement.
+        simulated: Response in its unit, (T, S).
+        width: Span that `nrmse` is relative to [unit of the response], of all or for each prediction, (S,).
+        seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
+    """
+    horizons = np.asarray(seconds, dtype=np.float64)
+    rows = np.abs(ahead[:, None] - horizons).argmin(axis=0)
+    ours, theirs = simulated[rows] - measured[rows], starts - measured[rows]
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    count = both.sum(axis=1)
+
+    def rms(x: Array) -> Array:
+        total = np.sum(np.square(x), axis=1, where=both)
+        return np.asarray(
+            np.sqrt(np.divide(total, count, out=np.full(len(horizons), np.nan), where=count > 0))
+        )
+
+    rmse = rms(ours)
+    scale = np.asarray(width, dtype=np.float64)
+    return Ahead(horizons, rmse, rms(theirs), rms(ours / scale), count)

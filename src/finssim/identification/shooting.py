@@ -1,0 +1,748 @@
+"""Simulated against measured segments: residuals, their derivatives, and the numbers that make them small."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finssim.core.least_squares import Block, arrow_reduced, block_of, boxed, huber_cost, huber_weight
+from finssim.core.rotations import (
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_rotate,
+    wrap_angle,
+)
+from finssim.identification.parameters import LONGEST_DELAY, Parameters, horizontal
+from finssim.identification.rollout import (
+    CHANNELS,
+    Response,
+    Rollouts,
+    Segment,
+)
+from finssim.identification.uncertainty import (
+    correlated_samples,
+)
+from finssim.physics.types import MAX_THRUSTERS
+from finssim.trials.conversion import EULER
+
+Array = NDArray[np.float64]
+
+
+CUT = 2.5
+"""Whitened residual above which Huber's loss grows linearly."""
+
+CLOSE = 0.25
+"""Part of a standard error (of independent noise) that a converged estimate may still be off."""
+
+DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
+"""Factors on the damping that are tried together."""
+
+SMALL = 0.05
+"""Decrease of half the sum of losses below which iteration ends: an error of a third of a standard error."""
+
+
+class Point(NamedTuple):
+    """Values of all unknowns; with a leading axis of candidates where several are evaluated together."""
+
+    theta: Array
+    """Coordinates shared by all segments in their units, (P,)."""
+    z: Array
+    """Coordinates of each segment in their units, as deviations from the prior's mean, (S, q)."""
+
+
+class Linearization(NamedTuple):
+    """Residuals at a point, sorted by segment, and derivatives of the predictions."""
+
+    residual: Array
+    """Measured minus predicted in the unit of the channel, (N,)."""
+    shared: Array
+    """d predicted / d theta in the units of both, (N, P)."""
+    own: Array
+    """d predicted / d z of the sample's own segment, in the units of both, (N, q)."""
+
+
+@dataclass(frozen=True)
+class FitSolution:
+    """End of a fit."""
+
+    point: Point
+    std: Array
+    """Standard deviation of every sample in the unit of its channel, (N,)."""
+    cost: float
+    """Half the sum of the losses [-]."""
+    linear: Linearization
+    iterations: int
+    converged: bool
+    """True if the last step is negligible relative to the error that independent noise would leave."""
+    step: Array
+    """Change of theta, in its units, by an undamped step, (P,)."""
+    interrupted: bool = False
+
+
+def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
+    """Huber's weights over the variance of the samples, (N,)."""
+    return huber_weight(np.abs(residual / std), cut) / std**2
+
+
+def blocks_of(
+    problem: Shooting, linear: Linearization, std: Array, point: Point, cut: float = CUT
+) -> list[Block]:
+    """Weighted normal equations of every segment with the prior of z; that of theta is in the first.
+
+    `std` has the unit of each sample; `cut` is in standard deviations [-].
+    """
+    root = np.sqrt(weights_of(linear.residual, std, cut))
+    shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
+    blocks = []
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
+        blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
+    (off, slope), first = problem.prior(point.theta), blocks[0]
+    blocks[0] = first._replace(aa=first.aa + slope.T @ slope, a=first.a - slope.T @ off)
+    return blocks
+
+
+def step_of(
+    problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
+) -> tuple[Array, Array, Array]:
+    """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
+
+    They have the units of the coordinates.
+
+    Args:
+        problem: For its box.
+        reduced: Normal equations of theta alone at the point, per unit of theta, and how z follows; of `arrow_reduced`.
+        point: Where the step begins.
+        damping: What the diagonal of theta's grows by, as a part of itself [-].
+    """
+    total, right, inners = reduced
+    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-30 + 1e-12 * np.diagonal(total).max()))
+    A = total / np.outer(scale, scale) + (damping + 1e-9) * np.eye(len(scale))
+    low, high = problem.low - point.theta, problem.high - point.theta
+    step = boxed(A, right / scale, np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)) / scale
+    z = np.array([inner[:, -1] - inner[:, :-1] @ step for inner in inners])
+    return step, z, np.sqrt(np.diagonal(np.linalg.inv(A))) / scale
+
+
+def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
+    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer.
+
+    Residuals and `std` have the unit of each sample; losses have none [-].
+    """
+    prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
+    prior = prior + np.square(problem.prior(points.theta)[0]).sum(axis=-1)
+    loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
+    return np.asarray(np.where(np.isfinite(loss), 0.5 * (loss + prior), np.inf))
+
+
+def solve(
+    problem: Shooting,
+    start: Point,
+    *,
+    iterations: int = 30,
+    std: Array | None = None,
+    rough: bool = False,
+    report: Callable[[int, float], None] | None = None,
+) -> FitSolution:
+    """Fit; noise and robust weights are estimated along the way.
+
+    Converged where the undamped step moves no judged parameter by more than `CLOSE` of its standard error and grain
+    together, and the noise no longer changes.
+
+    Args:
+        problem: What to fit.
+        start: Where to begin.
+        iterations: At most.
+        std: Standard deviation of every sample at the start, in the unit of its channel, (N,); from the residuals there
+            if None.
+        rough: Far from a solution: keep `std`, and let no residual count as an outlier, for that is what a wrong
+            parameter looks like too. Ends as soon as an iteration gains less than a hundredth.
+        report: Called with each iteration and the root mean square of the whitened residuals.
+
+    Returns:
+        The best point; after Ctrl-C the best until then, with `interrupted`.
+    """
+    point, damping, done = start, 1e-2, 0
+    linear = problem.linearise(point)
+    if not np.isfinite(linear.residual).all():
+        return FitSolution(
+            point, np.ones(len(linear.residual)), np.inf, linear, 0, False, np.full(len(point.theta), np.inf)
+        )
+    std = problem.noise(linear.residual) if std is None else std
+    converged, interrupted, settled, cut = False, False, rough, np.inf if rough else CUT
+    step = np.full(len(point.theta), np.inf)
+
+    def cost_at(std: Array) -> float:
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(problem, linear.residual[:, None], std, one, cut)[0])
+
+    cost = cost_at(std)
+    try:
+        for done in range(1, iterations + 1):
+            if report:
+                report(done, float(np.sqrt(2.0 * cost / max(len(std), 1))))
+            reduced = arrow_reduced(blocks_of(problem, linear, std, point, cut), 0.0)
+            step, _, error = step_of(problem, reduced, point, 0.0)
+            near = error + problem.grain(point.theta)
+            remaining = float(np.max(np.abs(step / near)[: problem.judged], initial=0.0))
+            if settled and remaining < CLOSE:
+                converged = True
+                break
+            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
+            points = Point(
+                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
+                point.z + np.array([z for _, z, _ in steps]),
+            )
+            costs = costs_of(problem, problem.residuals(points), std, points, cut)
+            best = int(np.argmin(costs))
+            if costs[best] < cost:
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
+                stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
+                point = Point(points.theta[best], points.z[best])
+                linear = problem.linearise(point)
+            else:
+                damping = min(damping * 1e5, 1e12)
+                stuck = damping >= 1e12
+            new = std if rough else problem.noise(linear.residual)
+            settled = rough or bool(np.all(np.abs(np.log(new / std)) < 0.01)) or done > 12
+            if stuck and settled:
+                converged = remaining < 1.0
+                break
+            if not settled:
+                std, damping = new, min(damping, 1e-2)
+            cost = cost_at(std)
+    except KeyboardInterrupt:
+        interrupted = True
+    return FitSolution(point, std, cost, linear, done, converged, step, interrupted)
+
+
+class Residuals:
+    """Samples of all segments in one list, sorted by segment, then by channel.
+
+    Attributes:
+        names: Channels in use.
+        channel: Index into `names` of each sample, (N,).
+        segment: Index of its segment, (N,).
+        edges: First sample of each segment, and N, (S + 1,).
+        value: Measured, (N,).
+        time: Since the segment's start [s], (N,).
+    """
+
+    def __init__(self, segments: Sequence[Segment], channels: Sequence[str]) -> None:
+        """Collect the samples of some channels."""
+        self.segments = tuple(segments)
+        self.names = tuple(c for c in CHANNELS if c in channels and any(c in s.measured for s in segments))
+        rows: dict[str, list[Array]] = {k: [] for k in ("segment", "channel", "time", "value")}
+        for i, s in enumerate(segments):
+            for j, name in enumerate(self.names):
+                t, values = s.measured.get(name, (np.empty(0), np.empty(0)))
+                rows["segment"].append(np.full(len(t), i))
+                rows["channel"].append(np.full(len(t), j))
+                rows["time"].append(t / s.step)
+                rows["value"].append(values)
+        joined = {k: np.concatenate(v) if v else np.empty(0) for k, v in rows.items()}
+        self.segment, self.channel = joined["segment"].astype(int), joined["channel"].astype(int)
+        self.value, time = joined["value"], joined["time"]
+        self.time = time * segments[0].step
+        self._steps = np.array([s.steps for s in segments])[self.segment]
+        self.edges = np.searchsorted(self.segment, np.arange(len(segments) + 1))
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
+        """Return the readings of every candidate's sensors at the samples' times, and their rate of change.
+
+        Args:
+            response: Of the candidates.
+            late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
+
+        Returns:
+            (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
+            segment's start it is extrapolated in a straight line.
+        """
+        step = self.segments[0].step
+        candidates = response.nu.shape[1]
+        value, rate = (np.empty((len(self), candidates)) for _ in range(2))
+        for j, name in enumerate(self.names):
+            which = np.flatnonzero(self.channel == j)
+            grid = channel(name, response, self.segments)
+            for c in range(late.shape[1]):
+                those = slice(None) if late.shape[1] == 1 else slice(c, c + 1)
+                at = (self.time[which] - late[which, c]) / step
+                row = np.clip(np.floor(at).astype(int), 0, self._steps[which] - 1)
+                segment = self.segment[which]
+                a = grid[row, those, segment].astype(float)
+                rise = grid[row + 1, those, segment].astype(float) - a
+                if name in EULER:
+                    rise = wrap_angle(rise)
+                value[which, those] = a + (at - row)[:, None] * rise
+                rate[which, those] = rise / step
+        return value, rate
+
+    def difference(self, predicted: Array) -> Array:
+        """Measured minus predicted, angles the short way round, (N, C). The unit is that of the channel."""
+        out = self.value[:, None] - predicted
+        for j, name in enumerate(self.names):
+            if name in EULER:
+                which = self.channel == j
+                out[which] = wrap_angle(out[which])
+        return np.asarray(out)
+
+    def noise(self, residual: Array, floor: Array) -> Array:
+        """Standard deviation of each channel from clipped residuals, (channels,).
+
+        It has the unit of the channel.
+
+        Args:
+            residual: Measured minus predicted in the unit of the channel, (N,).
+            floor: Smallest per channel, in its unit, (channels,).
+        """
+        out = np.array(floor, float)
+        for j in range(len(self.names)):
+            r = residual[self.channel == j]
+            r = np.abs(r[np.isfinite(r)])
+            sigma = 1.4826 * float(np.median(r)) if len(r) else 0.0
+            sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
+            for _ in range(10):
+                # The factor undoes the clipping for a normal distribution at 2.5 standard deviations.
+                sigma = (
+                    1.011 * float(np.sqrt(np.mean(np.minimum(r, CUT * sigma) ** 2))) if sigma > 0.0 else 0.0
+                )
+            out[j] = max(sigma, floor[j])
+        return out
+
+    def spread(self) -> Array:
+        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,).
+
+        It has the unit of the channel.
+        """
+        out = np.zeros(len(self.names))
+        for a, b in zip(self.edges, self.edges[1:], strict=False):
+            for j in np.unique(self.channel[a:b]):
+                values = self.value[a:b][self.channel[a:b] == j]
+                out[j] = max(out[j], float(np.ptp(np.percentile(values, [2.0, 98.0]))))
+        return out
+
+    def roughness(self) -> Array:
+        """Noise of each channel from third differences of successive samples, robust, (channels,).
+
+        It has the unit of the channel.
+        """
+        out = np.zeros(len(self.names))
+        for j in range(len(self.names)):
+            parts = [
+                np.diff(self.value[a:b][self.channel[a:b] == j], 3)
+                for a, b in zip(self.edges, self.edges[1:], strict=False)
+            ]
+            d = np.abs(np.concatenate(parts)) if parts else np.empty(0)
+            out[j] = (
+                float(np.sqrt(np.mean(np.minimum(d, 3.0 * 1.4826 * np.median(d) + 1e-12) ** 2) / 20.0))
+                if len(d)
+                else 0.0
+            )
+        return out
+
+
+def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArray[np.float32]:
+    """A measured column on the simulation's grid.
+
+    Args:
+        name: Of `CHANNELS`.
+        response: Of every candidate over these segments.
+        segments: Give the sensors' places.
+
+    Returns:
+        Values in the unit of the response, (n + 1, C, S).
+    """
+    nu, q = response.nu, response.quaternion
+    if name in ("p", "q", "r"):
+        return nu[..., 3 + "pqr".index(name)]
+    if name in ("u", "v", "w"):
+        i = "uvw".index(name)
+        at = np.stack([s.velocity_at for s in segments]).astype(np.float32)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out = nu[..., i] + (nu[..., 3 + j] * at[:, k] - nu[..., 3 + k] * at[:, j] if at.any() else 0.0)
+        in_water = np.array([s.velocity_in_water for s in segments])
+        if in_water.any():
+            flow = np.stack([s.current for s in segments])
+            body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
+            out = out - np.where(in_water, body, 0.0)
+        return np.asarray(out, np.float32)
+    if name in EULER:
+        return euler_angle(name, q)
+    sensor = "depth_at" if name == "depth" else "position_at"
+    at = np.stack([getattr(s, sensor) for s in segments])
+    i = 2 if name == "depth" else "xyz".index(name)
+    out = response.position[..., i] + (quat_rotate(q, at)[..., i] if at.any() else 0.0)
+    return np.asarray(-out if name == "depth" else out, np.float32)
+
+
+def euler_angle(name: str, q: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Roll, pitch or yaw of unit quaternions, in their own precision, (..., 4) -> (...)."""
+    x, y, z, w = (q[..., i] for i in range(4))
+    if name == "roll":
+        return np.asarray(np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
+    if name == "yaw":
+        return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return np.asarray(np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)))
+
+
+# Errors of sensors that a fit allows for: offsets of a stretch, and streams that come late.
+
+STREAMS = {
+    "velocity": ("u", "v", "w"),
+    "rates": ("p", "q", "r"),
+    "attitude": ("roll", "pitch", "yaw"),
+    "position": ("x", "y", "z"),
+    "depth": ("depth",),
+}
+"""Channels that share a clock."""
+
+OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
+"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes [rad/s],
+levels that were mounted askew [rad], pressure at the surface [m]."""
+
+DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
+"""Angle and rate of an equilibrium that moves at a constant speed within a segment, as while a manipulator moves."""
+
+REST_STD, DRIFT_STD = 0.3, 0.02
+"""Standard deviations of the equilibrium of a free swing [rad] and of its speed [rad/s]."""
+
+LATEST = 0.3
+"""Greatest lag or lead of a stream relative to the inputs [s]."""
+
+LATE_STD = 0.05
+"""Prior standard deviation of the lag of streams [s]: noisy data do not distinguish a lag from inertia."""
+
+
+# Where each segment begins: what was measured there, and how far a fit may move it.
+
+UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
+"""Standard deviation of unmeasured values; heading and place do not matter then."""
+
+UNMOVED = np.array([0.05] * 6 + [0.3, 0.3, *UNKNOWN[8:]])
+"""Standard deviation of unmeasured values in a free motion, where nothing drives the other axes."""
+
+LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
+"""Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
+
+TIGHT = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03])
+"""Standard deviation of measured values that are not compared."""
+
+SHOWN_BY = (
+    *(("u", "x", "y"), ("v", "x", "y"), ("w", "z", "depth"), ("p", "roll"), ("q", "pitch"), ("r", "yaw")),
+    *(("roll",), ("pitch",), ("yaw",), ("x",), ("y",), ("z", "depth")),
+)
+"""Channels that show a state, in the order of `STATES`."""
+
+STEPS = np.array([0.002] * 9 + [0.005] * 3)
+"""Steps of the finite differences: small, for instability multiplies them."""
+
+
+RELATIVE_STEP = 0.006
+"""Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
+
+FORCE_STEP = 0.15
+"""Relative step of damping and excess of a rise, which nearly trade off: the rounding of small steps would look like
+knowledge."""
+
+GRAIN = 0.004
+"""Share of a number that is negligible."""
+
+COARSE = 0.05
+"""Size of residuals relative to a channel's range that counts as small while the parameters are far off."""
+
+VAGUE = 8.0
+"""Prior standard deviation of a fitted number: the file's value within so many times its scale."""
+
+EXACT_CLOCK = 1e-3
+"""Greatest lag of the stream that serves as the clock [s]."""
+
+CONSTANT = 1e-3
+"""Noise of a channel that never changes, as where a sensor was missing [m, rad, m/s, rad/s]: single precision shows no
+less."""
+
+FEWEST_CORRELATED = 20
+"""Samples of a channel from which their correlation is estimated."""
+
+FLOOR = 1e-4
+"""Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
+
+
+class Shooting:
+    """Residuals of segments under parameters and initial states.
+
+    Attributes:
+        streams: Names of the streams in use; each may lag the inputs.
+        offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
+        free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
+            heading and place where some segment knows them and they matter.
+        edges: First sample of each segment, and N, (S + 1,).
+        low: Least theta, (P,).
+        high: Largest theta, (P,).
+        prior_std: Of z around zero, (S, q).
+        prior_mean: What is known of theta beforehand, (P,).
+        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
+        repeats: Samples per independent one.
+    """
+
+    def __init__(
+        self,
+        segments: Sequence[Segment],
+        parameters: Parameters,
+        channels: Sequence[str],
+        *,
+        lagged: NDArray[np.bool_] | None = None,
+        swinging: NDArray[np.bool_] | None = None,
+        few: bool = False,
+        correlated: bool = True,
+    ) -> None:
+        """Set up.
+
+        Args:
+            segments: What to fit.
+            parameters: What is free.
+            channels: Measured columns to compare.
+            lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
+            swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
+            few: Whether some axis is excited by too few trials to show how trials differ.
+            correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
+        """
+        self.segments, self.parameters = tuple(segments), parameters
+        self.measured = Residuals(segments, channels)
+        names = self.measured.names
+        known = np.stack([s.known for s in segments])
+        # Heading and place are free where something that is compared depends on them.
+        flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
+        turned = flat or "yaw" in names or any(s.current.any() for s in segments)
+        felt = [turned, "x" in names, "y" in names, {"z", "depth"} & set(names) or not deep]
+        self.free = np.concatenate(
+            [np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0) & [bool(x) for x in felt])]
+        )
+        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
+        unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
+        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
+        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
+        # The initial height already takes up an offset of the depth, unless z is measured too.
+        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
+        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
+        self._stream = np.array([stream_of[c] for c in names], int)[self.measured.channel]
+        rows = [names.index(name) for name in self.offsets]
+        self._offset = (self.measured.channel[:, None] == np.array(rows, int)).astype(float)
+        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
+        for name, (angle, rate) in DRIFTING_REST.items() if swinging is not None and swinging.any() else ():
+            if angle in names:
+                channel = np.array(names)[self.measured.channel]
+                column = np.where(channel == angle, self.measured.time, channel == rate)
+                self.offsets += (name,)
+                self._offset = np.column_stack([self._offset, column])
+                offsets_std = np.column_stack([offsets_std, np.where(swinging, DRIFT_STD, 1e-9)])
+                offsets_std[swinging, self.offsets.index(angle)] = REST_STD
+        self.rollouts = Rollouts(
+            parameters.vehicle,
+            segments,
+            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
+        )
+        # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
+        vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
+        by_thruster, sideways = np.array([s.thrusters for s in segments]), horizontal(vehicle)
+        for j, (name, thruster) in enumerate(vehicle.thrusters.items()):
+            if name in sideways:
+                self._leverage[by_thruster, 3, j] = -thruster.axis[1]
+                self._leverage[by_thruster, 4, j] = thruster.axis[0]
+        self.edges = self.measured.edges
+        self.groups = np.array([s.index for s in segments])
+        self.few = few
+        self.judged = len(parameters.names) - parameters.nuisances
+        far = np.full(len(self.streams), LATEST)
+        self.low = np.concatenate([parameters.low, -far])
+        self.high = np.concatenate([parameters.high, far])
+        # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
+        # solution, over short segments, nothing else keeps them finite. Streams agree on the time to hundredths
+        # of a second.
+        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
+        size = np.array([VAGUE * c.scale if c.std is None else c.std for c in parameters.coordinates])
+        size[self.judged :] = parameters.scale[self.judged :]
+        known = size**-1.0
+        rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
+        self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
+        self._known = np.concatenate([known, 0.0 * far + LATE_STD**-1.0])
+        free = bool(swinging is not None and swinging.all())
+        forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
+        self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
+        if "thrust_delay" in parameters.names or free:
+            # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
+            self._known[len(parameters.names)] = EXACT_CLOCK**-1.0
+        self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
+        self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
+        noise = self.measured.roughness()
+        self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
+        self.first_noise = np.maximum(noise, self._floor)
+        self._latest: tuple[Point, Linearization] | None = None
+        self.repeats, self._correlated = 1.0, correlated
+        rows, target = parameters.published_rows()
+        self._published = np.pad(rows, ((0, 0), (0, len(self.streams)))), target
+
+    def prior(self, theta: Array) -> tuple[Array, Array]:
+        """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
+        of one vector, (R, P).
+
+        Samples count as independent in a cost, so that what is known counts `repeats` times.
+        """
+        whole, mean = theta + self._rigid, self.prior_mean + self._rigid
+        logarithmic = np.isfinite(self._rigid)
+        whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
+        off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.prior_mean)
+        rows, target = self._published
+        weight = np.sqrt(self.repeats)
+        off = weight * np.concatenate([off * self._known, theta @ rows.T - target], axis=-1)
+        return off, weight * np.concatenate([np.diag(np.atleast_2d(self._known / whole)[0]), rows])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of theta: the parameters, then the lags of the streams [s]."""
+        return self.parameters.names + tuple(f"{stream}.late" for stream in self.streams)
+
+    def start(self) -> Point:
+        """The vehicle file's numbers, the measured initial states, no errors of sensors."""
+        rest = np.zeros(len(self.low) - len(self.parameters.names))
+        return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
+
+    def cost(self, point: Point) -> float:
+        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        one = Point(point.theta[None], point.z[None])
+        return float(costs_of(self, self.residuals(one), self.size(), one)[0])
+
+    def residuals(self, points: Point) -> Array:
+        """Measured minus predicted of several points, (N, C). They have the unit of the channel."""
+        return self._residual(points, self._predicted(points)[0])
+
+    def _residual(self, points: Point, value: Array) -> Array:
+        offset, out = points.z[..., len(self.free) :], np.zeros((len(self.measured), len(points.z)))
+        for k in range(offset.shape[2]):
+            out += self._offset[:, k : k + 1] * offset[:, self.measured.segment, k].T
+        return self.measured.difference(value + out)
+
+    def _predicted(self, points: Point) -> tuple[Array, Array]:
+        """Return the readings of sensors without offsets and their rate of change, (N, C) each."""
+        P, C = len(self.parameters.names), len(points.theta)
+        p = self.parameters.plants(points.theta[:, :P])
+        fields = dict(p.fields)
+        own = self.rollouts.own
+        for name, values in (("time_constant", p.lag), ("delay", p.delay)):
+            if values is not None:
+                tail = (1,) * (own[name].ndim - 1)
+                mask = self.lagged.reshape(-1, *tail)
+                fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
+        if p.lower is not None:
+            fields["B"] = own["B"] + p.lower[:, None, None, None] * self._leverage
+        full = np.zeros((*points.z.shape[:2], 12))
+        full[..., self.free] = points.z[..., : len(self.free)]
+        nu, quaternion, position = (
+            np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
+        )
+        initial = {
+            "nu": nu + full[..., :6],
+            "quaternion": quat_multiply(quaternion, quat_from_rotvec(full[..., 6:9])),
+            "position": position + full[..., 9:],
+        }
+        response = self.rollouts.run(fields, initial=initial, disturbance=p.bias, candidates=C)
+        late = points.theta[:, P:]
+        same = bool((late == late[:1]).all())
+        return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
+
+    def linearise(self, point: Point) -> Linearization:
+        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add.
+
+        Those of the latest point are kept, because one solution often begins where another ended.
+        """
+        if self._latest is None or not all(map(np.array_equal, self._latest[0], point)):
+            self._latest = point, self._linearised(point)
+        return self._latest[1]
+
+    def _linearised(self, point: Point) -> Linearization:
+        points, wide = self._neighbours(point)
+        value, rate = self._predicted(points)
+        rise = value[:, 1::2] - value[:, 2::2]
+        for j, name in enumerate(self.measured.names):
+            if name in EULER:
+                which = self.measured.channel == j
+                rise[which] = wrap_angle(rise[which])
+        slopes = np.nan_to_num(rise / np.where(wide > 0.0, wide, np.inf))
+        rate = np.nan_to_num(rate[:, :1])
+        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
+        P = len(self.parameters.names)
+        one = Point(*(part[:1] for part in points))
+        return Linearization(
+            self._residual(one, value[:, :1])[:, 0],
+            np.concatenate([slopes[:, :P], late], axis=1),
+            np.concatenate([slopes[:, P:], self._offset], axis=1),
+        )
+
+    def _neighbours(self, point: Point) -> tuple[Point, Array]:
+        """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
+        P = len(self.parameters.names)
+        count, steps = P + len(self.free), STEPS[self.free]
+        theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
+        up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
+        i = np.arange(P)
+        step = self._relative_step * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
+        theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
+        theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
+        wide = theta[up[:P], i] - theta[down[:P], i]
+        for k, step_k in enumerate(steps):
+            z[up[P + k], :, k] += step_k
+            z[down[P + k], :, k] -= step_k
+        return Point(theta, z), np.concatenate([wide, 2.0 * steps])
+
+    def growth(self, point: Point) -> Array:
+        """Return the largest factor by which a small change of the initial velocity grows within each segment, (S,).
+
+        It is infinite where the simulation diverges.
+        """
+        linear = self.linearise(point)
+        own = np.abs(linear.own[:, :6])
+        speeds = [
+            i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
+        ]
+        own[~np.isin(self.measured.channel, speeds)] = 0.0
+        own[~np.isfinite(linear.residual)] = np.inf
+        return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
+
+    def grain(self, theta: Array) -> Array:
+        """Return negligible differences of theta, (P,). They have the units of theta."""
+        P = len(self.parameters.names)
+        size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
+        return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
+
+    def hold_clocks(self, hold: bool) -> None:
+        """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
+        late, far = slice(len(self.parameters.names), None), 0.0 if hold else LATEST
+        self.low[late], self.high[late] = -far, far
+
+    def size(self) -> Array:
+        """Return the size of a large residual of every sample far from a solution, (N,).
+
+        It has the unit of the channel.
+        """
+        size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
+        return np.asarray(size[self.measured.channel])
+
+    def noise(self, residual: Array) -> Array:
+        """Standard deviation of every sample: that of its channel. It has the unit of the channel.
+
+        The samples per independent one follow from the same residuals.
+        """
+        m, found = self.measured, []
+        for j in range(len(m.names) if self._correlated else 0):
+            rows = np.flatnonzero((m.channel == j) & np.isfinite(residual))
+            if len(rows) > FEWEST_CORRELATED:
+                found.append(correlated_samples(residual[rows], np.flatnonzero(np.diff(m.segment[rows])) + 1))
+        self.repeats = float(np.mean(found)) if found else 1.0
+        return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
