@@ -1,6 +1,6 @@
 """Calibration of drawn plants from logs as people have them: is it better than the catalogue's file, and honest?
 
-    python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE]
+    python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE] [--passive]
 
 Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
 pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
@@ -8,7 +8,9 @@ pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion tha
 gravity up to 5 cm from where the file has them, and in every second draw no roll or
 pitch. Fitted on the lowest level, compared on two higher ones; intervals against the truth. The plant itself replays
 these trials no better than its tether, noise and clock allow; a file that does as well by chance leaves nothing to
-gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated.
+gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated. With
+--passive, five spins and five coasts of every draw instead, let go without thrust: measured at 20, 5 or 1 Hz, pulled
+at a little, with centres as in the file and the inertia given.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from finssim.identification.prediction import replay
 from finssim.identification.programme import Programme
 from finssim.identification.synthetic import NoiseProfile, record, trials_of
 from finssim.identification.vehicle_file import calibrated, scaled_thrust
-from finssim.trials.trial import Trial
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial import Header, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "yaw")
@@ -153,6 +156,73 @@ def draw(seed: int) -> dict[str, object]:
     return {"seed": seed, "scores": scores, "estimates": found, "seconds": spent}
 
 
+RELEASES, PUSHED = 5, 4.0
+"""Trials of each axis without thrust, and the time of the push before them [s]."""
+TUGS = np.array([0.2, 0.2, 0.2, 0.0, 0.0, 0.03])
+"""Standard deviation of what pulls, anew for each release [N, N m]."""
+
+
+def draw_released(seed: int) -> dict[str, object]:
+    """One plant, let go after a spin and after a run ahead: each interval with its truth, and what is written."""
+    rng = np.random.default_rng([8, seed])
+    vehicle = load_vehicle("bluerov2_heavy")
+    plant, _, _ = drawn(vehicle, rng)
+    body = plant.body
+    plant = plant.replace(
+        {
+            "body.center_of_gravity": vehicle.body.center_of_gravity.tolist(),
+            "body.center_of_buoyancy": (body.center_of_buoyancy - body.center_of_gravity).tolist(),
+            **{f"thrusters.{name}.position.2": t.position[2] for name, t in horizontal(vehicle)},
+        }
+    )
+    every = (1, 4, 20)[seed % 3]
+    found, wrote, spent = {}, {}, 0.0
+    for axis in ("yaw", "surge"):
+        i, tau = AXES.index(axis), np.zeros((RELEASES, round(20.0 * RATE), 6))
+        sign = rng.choice([-1.0, 1.0], RELEASES)
+        if axis == "yaw":
+            push = sign * rng.uniform(0.3, 0.7, RELEASES) * vehicle.wrench_limits[i]
+            tau[:, : round(PUSHED * RATE), i] = push[:, None]
+        programmes = [
+            Programme(
+                name=f"{axis}_{k}", axes=(axis,), rate=RATE, tau_desired=one, phase=np.full(len(one), "")
+            )
+            for k, one in enumerate(tau)
+        ]
+        recording = record(
+            programmes, plant, seed=seed, disturbance=TUGS * rng.standard_normal((RELEASES, 6)),
+            speed=sign * rng.uniform(0.4, 0.9, RELEASES) if axis == "surge" else 0.0,
+        )  # fmt: skip
+        columns = (*(("r",) if axis == "yaw" else ("u", "v", "w", "r")), "qx", "qy", "qz", "qw")
+        trials = trials_of(recording, programmes, plant, noise=NOISE, seed=seed, rate=20.0, columns=columns)
+        header = Header(passive=True)
+        begin = round(20.0 * (PUSHED + 0.1)) if axis == "yaw" else 0
+        cut = [slice(begin + rng.integers(every), None, every) for _ in trials]
+        trials = [
+            replace(t, t=t.t[s] - t.t[s][0], phase=None, header=header,
+                    channels={c: t.channels[c][s].copy() for c in columns})
+            for t, s in zip(trials, cut, strict=True)
+        ]  # fmt: skip
+        chosen = plant.hydrodynamics["calibrated"]
+        mass = float(np.diag(plant.mass_matrix())[i])
+        begin = time.process_time()
+        try:
+            fit = fit_hydrodynamics(trials, vehicle, axes=[axis], known={axis: mass})
+        except CalibrationError as error:
+            print(f"  {seed} {axis} at {20 // every} Hz: {error}")
+            wrote[axis] = False
+            continue
+        spent += time.process_time() - begin
+        wrote[axis] = any(path.startswith((f"{SET}.linear", f"{SET}.quadratic")) for path in fit.changes)
+        for name, matrix in (("d1", chosen.linear_damping), ("d2", chosen.quadratic_damping)):
+            e = fit.estimates.get(f"{axis}.{name}/m_eff")
+            if e is None:
+                print(f"  {seed} {axis} at {20 // every} Hz: {fit.estimates[f'{axis}.{name}'].note}")
+                continue
+            found[e.name] = [e.estimate, *e.ci95, float(matrix[i, i]) / mass]
+    return {"seed": seed, "rate": 20 // every, "estimates": found, "written": wrote, "seconds": spent}
+
+
 def _by_axis(vehicle: Vehicle, trials: list[Trial]) -> dict[str, float]:
     values: dict[str, list[float]] = {}
     for row in replay(trials, vehicle).scores["calibrated"]:
@@ -169,6 +239,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--passive", action="store_true")
     args = parser.parse_args()
     rows: list[dict[str, object]] = []
     if args.json and args.json.exists():
@@ -178,24 +249,23 @@ def main() -> None:
         if seed in done:
             continue
         begin = time.perf_counter()
-        rows.append(draw(seed))
-        scores = rows[-1]["scores"]
-        assert isinstance(scores, dict)
-        print(
-            seed,
-            {a: f"{scores['calibrated'][a]:.3f} < {v:.3f}" for a, v in scores["file"].items()},
-            f"{time.perf_counter() - begin:.0f} s",
-            flush=True,
-        )
+        rows.append((draw_released if args.passive else draw)(seed))
+        scores = rows[-1].get("scores")
+        shown = rows[-1].get("written") if scores is None else {
+            a: f"{scores['calibrated'][a]:.3f} < {v:.3f}" for a, v in scores["file"].items()
+        }  # fmt: skip
+        print(seed, shown, f"{time.perf_counter() - begin:.0f} s", flush=True)
         if args.json:
             part = args.json.with_suffix(".part")
             part.write_text(json.dumps(rows))
             part.replace(args.json)
-    report(rows)
+    if not args.passive:
+        report_scores(rows)
+    report_intervals(rows)
 
 
-def report(rows: list[dict]) -> None:
-    """Draws that are better on every axis, and how often intervals hold the truth."""
+def report_scores(rows: list[dict]) -> None:
+    """Draws that are better on every axis."""
     found = np.array(
         [
             [[r["scores"][w].get(a, math.nan) for a in FITTED] for w in ("calibrated", "file", "truth")]
@@ -218,6 +288,14 @@ def report(rows: list[dict]) -> None:
     for axis, a, b, c in zip(FITTED, after.T, before.T, true.T, strict=True):
         print(f"  {axis:6s} NRMSE, median: calibrated {np.nanmedian(a):.3f}, file {np.nanmedian(b):.3f}, "
               f"plant itself {np.nanmedian(c):.3f}")  # fmt: skip
+
+
+def report_intervals(rows: list[dict]) -> None:
+    """How often drag is written, and how often intervals hold the truth."""
+    for axis in sorted({axis for r in rows for axis in r.get("written", {})}):
+        print(
+            f"  {axis}: drag written in {np.mean([r['written'][axis] for r in rows]):.0%} of {len(rows)} draws"
+        )
     names = sorted({name for r in rows for name in r["estimates"]})
     inside = []
     for name in names:

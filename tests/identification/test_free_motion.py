@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_from_euler
-from finssim.identification.release import released
-from finssim.identification.rollout import streams
+from finssim.identification.rollout import released, streams
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Header, Trial
@@ -242,6 +241,32 @@ def test_the_shape_of_drag_is_right_and_its_interval_holds_the_truth():
         low, high = found[f"yaw.{name}/m_eff"].ci95
         held += low <= value <= high
     assert right >= 10 and held >= 9
+
+
+@pytest.mark.slow
+def test_five_spins_that_agree_are_written_with_one_scatter():
+    """Five spins at 20 Hz or 1 Hz, each pulled at otherwise: the file gets the drag, the interval of its ratio is below
+    a third of it and holds the truth."""
+    for rate in (20.0, 1.0):
+        rng = np.random.default_rng(3)
+        trials = coasts(rng, 0.1, 0.65, count=5, column="r", noise=0.01, rate=rate)
+        fit = fit_by_simulation(trials, ROV, known={"yaw": 0.3})
+        found = fit.estimates["yaw.d2/m_eff"]
+        assert found.ci95[0] <= 0.65 <= found.ci95[1]
+        assert np.diff(found.ci95)[0] < (0.3 if rate > 1.0 else 0.6) * found.estimate
+        written = fit.changes["hydrodynamics.calibrated.quadratic_damping.5.5"]
+        assert written == pytest.approx(0.3 * found.estimate)
+
+
+@pytest.mark.slow
+def test_a_damping_that_was_asked_for_is_what_a_coast_gives():
+    """Quadratic alone: no linear term is estimated, and the file's is written as zero."""
+    trials = coasts(np.random.default_rng(1), 0.0, 0.7, column="r", noise=0.01, count=5)
+    file = ROV.replace({"hydrodynamics.calibrated.linear_damping.5.5": 0.05})
+    fit = fit_by_simulation(trials, file, damping="quadratic")
+    assert "yaw.d1/m_eff" not in fit.estimates
+    assert fit.changes["hydrodynamics.calibrated.linear_damping.5.5"] == 0.0
+    assert fit.estimates["yaw.d2/m_eff"].estimate == pytest.approx(0.7, rel=0.05)
 
 
 def test_one_coast_is_enough_and_a_push_ends_it():

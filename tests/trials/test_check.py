@@ -9,9 +9,11 @@ import pytest
 from rich.console import Console
 
 from finssim.identification.programme import programmes
+from finssim.identification.simulation_error import prepare
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.check import check, check_trials, print_reports, set_findings
-from finssim.trials.trial import Trial
+from finssim.trials.findings import CalibrationError
+from finssim.trials.trial import Header, Trial
 from finssim.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
@@ -241,20 +243,32 @@ def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulat
 
 
 def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
-    """The ring-down of the roll pulse, thrusters off."""
-    trial = simulated["roll"]
-    after = np.flatnonzero(trial.phase == "coast")
-    trial = replace(
-        trial,
-        t=trial.t[after],
-        phase=None,
-        channels={c: v[after] for c, v in trial.channels.items() if not c.startswith("tau")},
-    )
-    trial = changed(trial, header={"passive": True})
+    """A swing that rings down, thrusters off."""
+    t = np.arange(0.0, 12.0, 0.02)
+    roll = 0.3 * np.exp(-0.3 * t) * np.cos(3.0 * t)
+    channels = {"roll": roll, "pitch": 0.0 * t, "p": np.gradient(roll, t), "q": 0.0 * t, "r": 0.0 * t}
+    trial = Trial(name="swing", t=t, channels=channels, header=Header(passive=True))
     told = axis(trial, "roll").tells
     assert told["m_eff"].can and "restoring moment" in told["m_eff"].why
     assert not told["k"].can
     assert not axis(trial, "surge").tells["m_eff"].can
+
+
+def test_the_check_of_a_passive_trial_agrees_with_the_fit():
+    """Twelve speeds at 1 Hz are enough for both; neither takes a spin that does not slow down."""
+    t = np.arange(0.0, 12.0)
+    for rate, reason in (
+        (0.6 / (1.0 + 0.4 * t), ""),
+        (np.full(12, 0.6), "yaw does not coast to a lower speed"),
+    ):
+        trial = Trial(name="spin", t=t, channels={"r": rate}, header=Header(passive=True))
+        assert axis(trial, "yaw").tells["d1"].why.startswith(reason)
+        assert axis(trial, "yaw").excited is not bool(reason)
+        if reason:
+            with pytest.raises(CalibrationError, match=reason):
+                prepare([trial], VEHICLE, ["yaw"])
+        else:
+            assert prepare([trial], VEHICLE, ["yaw"])[0][0].released == {"yaw"}
 
 
 def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused(simulated):

@@ -31,12 +31,13 @@ from finssim.identification.fit import Estimate
 from finssim.identification.parameters import Coordinate, Plants
 from finssim.identification.plant_terms import matrices
 from finssim.identification.report import refuse_places
-from finssim.identification.rollout import CHANNELS, Segment, segments, streams
+from finssim.identification.rollout import Segment, segments, streams
 from finssim.identification.shooting import CUT, Shooting, blocks_of, solve
 from finssim.identification.vehicle_file import SCALED, write_vehicle
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
+from finssim.trials.free_motion import CHANNELS
 from finssim.trials.trial import NU, Trial
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import HydrodynamicSet, Provenance, Vehicle, load_vehicle

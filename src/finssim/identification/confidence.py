@@ -14,6 +14,7 @@ from finssim.identification.uncertainty import (
     Covariance,
     Evidence,
     intervals,
+    pooled_covariance,
     trial_covariance,
 )
 
@@ -55,7 +56,8 @@ class Confidence(NamedTuple):
 def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
     evidence = evidence_of(problem, solution)
-    covariance = trial_covariance(evidence)
+    pooled = problem.coasts and evidence.unit == "trials"
+    covariance = pooled_covariance(evidence) if pooled else trial_covariance(evidence)
     theta, low, high = solution.point.theta, problem.low, problem.high
     free = theta
     if ((theta <= low) | (theta >= high)).any():

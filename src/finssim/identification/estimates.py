@@ -139,8 +139,10 @@ class AxisResult:
         elif not np.isfinite([low, high]).all():
             note = "the trials do not determine it"
         elif 0.5 * (high - low) > CERTAIN * abs(value):
-            size = f"±{min(50.0 * (high - low) / abs(value), 9999.0):.0f} %" if value else "its own size"
-            note = f"uncertain by {size}"
+            part = 0.5 * (high - low) / abs(value) if value else np.inf
+            note = (
+                f"uncertain by ±{100.0 * part:.0f} %" if part < 1.0 else "uncertain by more than its own size"
+            )
         else:
             sure = True
         return self.note(name, value, (low, high), sure, note, path)
@@ -426,9 +428,9 @@ def terminal_speed(d1: float, d2: float, excess: float) -> float:
 
 
 def derived(
-    stage: Stage, of: Callable[[Array], float], own_error: float, positive: bool
+    stage: Stage, of: Callable[[Array], float], own_error: float
 ) -> tuple[float, tuple[float, float]]:
-    """Return a function of the parameters and its 95 % interval, to first order.
+    """Return a positive function of the parameters and its 95 % interval, to first order in its logarithm.
 
     It has the unit of the function.
 
@@ -436,7 +438,6 @@ def derived(
         stage: A finished fit.
         of: Vector of parameters (P,) -> the number.
         own_error: Of the simulation itself, as a part of the number.
-        positive: Whether the interval is that of the logarithm.
     """
     from scipy.stats import t
 
@@ -449,10 +450,8 @@ def derived(
     dof = float(np.min(C.dof[at], initial=np.inf))
     half = float(t.ppf(0.975, min(dof, 1e6))) * float(np.sqrt(stage.found.variance(slope[at], at)))
     half = float(np.hypot(half, own_error * value))
-    if positive and value > 0.0:
-        factor = float(np.exp(min(half / value, 50.0)))
-        return value, (value / factor, value * factor)
-    return value, (max(value - half, 0.0), value + half)
+    factor = float(np.exp(min(half / max(value, 1e-12), 50.0)))
+    return value, (value / factor, value * factor)
 
 
 def matrix_changes(p: Parameters, x: Array) -> dict[str, Any]:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.identification.rollout import (
-    DETERMINED_BY,
     Segment,
     Streams,
 )
 from finssim.sim.plant_arrays import twist_shift
+from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.motion import Motion, gyroscope_bias
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 

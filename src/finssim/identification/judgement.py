@@ -12,7 +12,6 @@ from finssim.identification.confidence import Confidence, Stage, evidence_of, ti
 from finssim.identification.excitation import speeds
 from finssim.identification.fit import Curve
 from finssim.identification.rollout import (
-    DETERMINED_BY,
     Streams,
 )
 from finssim.identification.shooting import CUT, FitSolution, Point, Shooting
@@ -20,6 +19,7 @@ from finssim.identification.uncertainty import (
     intervals,
 )
 from finssim.trials.findings import Finding, finding
+from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.trial import COLUMNS
 
 Array = NDArray[np.float64]

@@ -10,35 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.core.rotations import quat_from_euler, quat_rotate, quat_to_euler
+from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.sim.simulator import Simulator
 from finssim.sim.water import Water
-from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
+from finssim.trials.free_motion import DETERMINED_BY, compared_columns, free_motion
 from finssim.trials.inputs import InputForces, drive
-from finssim.trials.motion import Motion, attitude_samples, depth_place, motion
+from finssim.trials.motion import Motion, depth_place, motion
 from finssim.trials.trial import Trial
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 
 Array = NDArray[np.float64]
 
-CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")
-"""Measured columns that a simulation is compared with."""
-
 STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
 """Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
-
-DETERMINED_BY = {
-    "surge": ("u", "x", "y"),
-    "sway": ("v", "x", "y"),
-    "heave": ("w", "z", "depth"),
-    "roll": ("p", "roll"),
-    "pitch": ("q", "pitch"),
-    "yaw": ("r", "yaw"),
-}
-"""Measured columns that determine an axis, the most direct first."""
 
 MEMORY = 1.0
 """Commands before a segment that are kept, for delay and lag of the motors [s]."""
@@ -129,13 +116,58 @@ class Streams:
 
 def streams(trial: Trial, vehicle: Vehicle) -> Streams:
     """Prepare a trial once, to cut it in several ways."""
-    measured = {c: trial.series(c) for c in CHANNELS}
-    t, q, given = attitude_samples(trial)
-    for name, angle in zip(EULER, quat_to_euler(q), strict=True):
-        if name in given and not len(measured[name][0]):
-            measured[name] = (t, angle)
-    measured = {c: pair for c, pair in measured.items() if len(pair[0])}
-    return Streams(trial=trial, drive=drive(trial, vehicle), motion=motion(trial, vehicle), measured=measured)
+    return Streams(
+        trial=trial,
+        drive=drive(trial, vehicle),
+        motion=motion(trial, vehicle),
+        measured=compared_columns(trial),
+    )
+
+
+def released(s: Streams, axes: Sequence[str]) -> Streams:
+    """Return a trial without thrust cut to its free motions.
+
+    Each axis is compared within its own free motion alone.
+
+    Args:
+        s: A trial whose header says that it is passive.
+        axes: Axes to look at.
+
+    Raises:
+        CalibrationError: No axis moves freely; the message has the reason for each measured axis.
+    """
+    windows, reasons = dict[str, tuple[float, float]](), list[str]()
+    for axis in axes:
+        try:
+            windows[axis] = free_motion(s.motion, s.measured, axis)
+        except CalibrationError as error:
+            reasons.append(error.reason)
+    if not windows:
+        raise CalibrationError("; ".join(reasons), s.trial.name)
+    begin, end = min(a for a, _ in windows.values()), max(b for _, b in windows.values())
+    spans = [(max(a, begin), min(b, end)) for a, b in s.drive.spans]
+    spans = np.array([span for span in spans if span[1] > span[0]])
+    nu, t = s.motion.nu.copy(), s.motion.t
+    measured = dict(s.measured)
+    for axis, (a, b) in windows.items():
+        i, inside = AXES.index(axis), (t >= a) & (t <= b)
+        nu[~inside, i] = np.nan
+        if (own := s.measured.get(DETERMINED_BY[axis][0])) and len(own[0]):
+            # Smoothing leaves out the first samples, which are the fastest.
+            rows = inside & np.isnan(nu[:, i])
+            nu[rows, i] = np.interp(t[rows], *own)
+    for column, (at, values) in s.measured.items():
+        own = [windows[axis] for axis in windows if column in DETERMINED_BY[axis]]
+        if own:
+            inside = np.any([(at >= a) & (at <= b) for a, b in own], axis=0)
+            measured[column] = (at[inside], values[inside])
+    return replace(
+        s,
+        drive=replace(s.drive, spans=spans),
+        motion=replace(s.motion, nu=nu),
+        measured={column: pair for column, pair in measured.items() if len(pair[0])},
+        released=frozenset(windows),
+    )
 
 
 def segments(

@@ -19,7 +19,6 @@ from finssim.core.rotations import (
 )
 from finssim.identification.parameters import LONGEST_DELAY, Parameters, horizontal
 from finssim.identification.rollout import (
-    CHANNELS,
     Response,
     Rollouts,
     Segment,
@@ -29,6 +28,8 @@ from finssim.identification.uncertainty import (
 )
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.conversion import EULER
+from finssim.trials.free_motion import CHANNELS
+from finssim.vehicles import AXES
 
 Array = NDArray[np.float64]
 
@@ -414,6 +415,10 @@ DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
 REST_STD, DRIFT_STD = 0.3, 0.02
 """Standard deviations of the equilibrium of a free swing [rad] and of its speed [rad/s]."""
 
+PULL, COASTING = 0.003, (0, 1, 5)
+"""Standard deviation of a constant pull on a vehicle that coasts, as of a tether, as a part of its weight, with half
+its length as the lever; and the axes that coast."""
+
 LATEST = 0.3
 """Greatest lag or lead of a stream relative to the inputs [s]."""
 
@@ -482,12 +487,15 @@ class Shooting:
         streams: Names of the streams in use; each may lag the inputs.
         offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
         free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
-            heading and place where some segment knows them and they matter.
+            heading and place where some segment knows them and they matter; and of the wrench that pulls at a vehicle
+            that coasts, 12 to 17.
         edges: First sample of each segment, and N, (S + 1,).
         low: Least theta, (P,).
         high: Largest theta, (P,).
         prior_std: Of z around zero, (S, q).
         prior_mean: What is known of theta beforehand, (P,).
+        released: Whether nothing drives any segment.
+        coasts: Whether, besides, the axes come to rest by drag alone.
         judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
         repeats: Samples per independent one.
     """
@@ -528,6 +536,17 @@ class Shooting:
         seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
         unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
         states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
+        if swinging is not None and swinging.any():  # unknowns 12 to 17 are pulls
+            body, coasting = parameters.vehicle.body, set(parameters.axes).difference(parameters.biases)
+            pulled = [i for i in COASTING if AXES[i] in coasting]
+            pull = (
+                PULL
+                * parameters.vehicle.weight
+                * np.where(np.array(pulled, int) < 3, 1.0, 0.5 * body.size[0])
+            )
+            self.free = np.concatenate([self.free, 12 + np.array(pulled, int)])
+            states_std = np.hstack([states_std, np.where(swinging[:, None], pull, 1e-9)])
+        self._steps = np.append(STEPS, np.full(6, 0.1 * PULL * parameters.vehicle.weight))
         self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
         # The initial height already takes up an offset of the depth, unless z is measured too.
         self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
@@ -573,7 +592,8 @@ class Shooting:
         rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
         self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
         self._known = np.concatenate([known, 0.0 * far + LATE_STD**-1.0])
-        free = bool(swinging is not None and swinging.all())
+        free = self.released = bool(swinging is not None and swinging.all())
+        self.coasts = free and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
         forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
         self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
         if "thrust_delay" in parameters.names or free:
@@ -642,7 +662,7 @@ class Shooting:
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
         if p.lower is not None:
             fields["B"] = own["B"] + p.lower[:, None, None, None] * self._leverage
-        full = np.zeros((*points.z.shape[:2], 12))
+        full = np.zeros((*points.z.shape[:2], 18))
         full[..., self.free] = points.z[..., : len(self.free)]
         nu, quaternion, position = (
             np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
@@ -650,9 +670,11 @@ class Shooting:
         initial = {
             "nu": nu + full[..., :6],
             "quaternion": quat_multiply(quaternion, quat_from_rotvec(full[..., 6:9])),
-            "position": position + full[..., 9:],
+            "position": position + full[..., 9:12],
         }
-        response = self.rollouts.run(fields, initial=initial, disturbance=p.bias, candidates=C)
+        response = self.rollouts.run(
+            fields, initial=initial, disturbance=p.bias + full[..., 12:], candidates=C
+        )
         late = points.theta[:, P:]
         same = bool((late == late[:1]).all())
         return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
@@ -688,7 +710,7 @@ class Shooting:
     def _neighbours(self, point: Point) -> tuple[Point, Array]:
         """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
         P = len(self.parameters.names)
-        count, steps = P + len(self.free), STEPS[self.free]
+        count, steps = P + len(self.free), self._steps[self.free]
         theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
         up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
         i = np.arange(P)

@@ -47,11 +47,10 @@ from finssim.identification.fit import Estimate, Fit
 from finssim.identification.judgement import fit_findings, held_out, pictures, quality, unexplained
 from finssim.identification.parameters import EXTRAS, LIKELY_SCALE, Parameters, actuator_fields, places
 from finssim.identification.plant_terms import matrices
-from finssim.identification.release import released
 from finssim.identification.rollout import (
-    DETERMINED_BY,
     Segment,
     Streams,
+    released,
     segments,
     streams,
     without,
@@ -62,6 +61,7 @@ from finssim.identification.uncertainty import (
 )
 from finssim.identification.weak_form import weak_form
 from finssim.trials.findings import CalibrationError, Finding, finding
+from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.inputs import require_axes, require_fittable
 from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
@@ -328,10 +328,13 @@ class Stages:
 
     def shapes(self, stage: Stage) -> dict[str, DragShape]:
         """Return what the trials show of the drag of each axis, over its shapes."""
-        return {
-            axis: drag_shape(stage, axis, drag_of_size(self.vehicle, axis), levels_of(stage.problem, axis))
-            for axis in self.axes
-        }
+        problem, motions, out = stage.problem, [s.motion for s in self.used], dict[str, DragShape]()
+        for axis in self.axes:
+            low, top = speeds(motions, axis)
+            top = float(np.sqrt(low * top)) if problem.coasts else top
+            levels = [low, top] if problem.released else levels_of(problem, axis)
+            out[axis] = drag_shape(stage, axis, drag_of_size(self.vehicle, axis), levels)
+        return out
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
         """Return a function that reports an iteration and its residual; `toward` is the share of the work done then."""
@@ -422,7 +425,9 @@ class Stages:
         others, held = other_estimates(p, numbers)
         for axis in self.axes:
             own = speeds([s.motion for s in self.used], axis)
-            known = is_drag_known(p, x, stage.found, axis, own[1], shapes.get(axis))
+            # A coast shows drag at all speeds, and those in the middle best.
+            speed = float(np.sqrt(own[0] * own[1])) if stage.problem.coasts else own[1]
+            known = is_drag_known(p, x, stage.found, axis, speed, shapes.get(axis))
             result = axis_result(
                 p, x, numbers, axis, speeds=own, drag_known=known, given=self.known.get(axis)
             )
@@ -526,38 +531,31 @@ class Stages:
             excess = p.value(x[None], "buoyancy_excess", file.excess)
             return float(p.M_RB[i, i] + M_A), float(D1), float(D2), float(np.max(k)), float(np.max(excess))
 
-        def add(
-            name: str, of: Callable[..., float], unit: str, note: str = "", positive: bool = True
-        ) -> None:
-            value, (low, high) = derived(stage, lambda x: of(*plant(x)), self.own_error, positive)
-            sure = bool(value > 0.0 and 0.5 * (high - low) <= CERTAIN * value)
+        def add(name: str, value: float, ends: tuple[float, float], unit: str, note: str = "") -> None:
+            sure = bool(value > 0.0 and 0.5 * (ends[1] - ends[0]) <= CERTAIN * value)
             note = note or ("" if sure else "uncertain by more than a fifth of its value")
-            out[f"{axis}.{name}"] = Estimate(
-                name=f"{axis}.{name}",
-                estimate=value,
-                ci95=(low, high),
-                unit=unit,
-                identifiable=sure,
-                note=note,
+            name = f"{axis}.{name}"
+            out[name] = Estimate(
+                name=name, estimate=value, ci95=ends, unit=unit, identifiable=sure, note=note
             )
+
+        def of(number: Callable[..., float]) -> tuple[float, tuple[float, float]]:
+            return derived(stage, lambda x: number(*plant(x)), self.own_error)
 
         if axis in SWINGING:
             rubbed = 8.0 / (3.0 * np.pi) * top
-            add("natural_frequency", lambda m, d1, d2, k, e: float(np.sqrt(k / m)), "rad/s")
+            add("natural_frequency", *of(lambda m, d1, d2, k, e: float(np.sqrt(k / m))), "rad/s")
             # A quadratic term counts as the linear one that takes as much energy out of the largest swing.
-            add(
-                "damping_ratio", lambda m, d1, d2, k, e: (d1 + rubbed * d2) / (2.0 * float(np.sqrt(k * m))), "-",
-                f"at a swing of {top:.2g} rad/s",
-            )  # fmt: skip
+            ratio = of(lambda m, d1, d2, k, e: (d1 + rubbed * d2) / (2.0 * float(np.sqrt(k * m))))
+            add("damping_ratio", *ratio, "-", f"at a swing of {top:.2g} rad/s")
         if axis == "heave":
-            add("terminal_speed", lambda m, d1, d2, k, e: terminal_speed(d1, d2, e), "m/s", "of a rise")
+            add("terminal_speed", *of(lambda m, d1, d2, k, e: terminal_speed(d1, d2, e)), "m/s", "of a rise")
             return out
+        m = plant(stage.x)[0]
         for name, unit in (("d1", "1/s"), ("d2", "1/m" if i < 3 else "1/rad")):
             drag = result.estimates.get(f"{axis}.{name}")
-            if drag is None:
-                continue
-            of = (lambda m, d1, d2, k, e: d1 / m) if name == "d1" else (lambda m, d1, d2, k, e: d2 / m)
-            add(f"{name}/m_eff", of, unit, positive=False)
+            if drag is not None:
+                add(f"{name}/m_eff", drag.estimate / m, (drag.ci95[0] / m, drag.ci95[1] / m), unit)
         return out
 
 

@@ -25,6 +25,7 @@ __all__ = [
     "correlation",
     "degeneracy",
     "intervals",
+    "pooled_covariance",
     "trial_covariance",
 ]
 
@@ -32,6 +33,9 @@ Array = NDArray[np.float64]
 
 FLOOR = 1e-13
 """Eigenvalue of the scaled normal matrix (unit diagonal) below which a direction counts as unknown."""
+
+FAINT = 0.05
+"""Share of the information on a direction, times the number of trials, below which a trial shows nothing of it."""
 
 ALONE = 0.9
 """Share of the information on a parameter above which it rests on one trial."""
@@ -163,6 +167,39 @@ def trial_covariance(evidence: Evidence) -> Covariance:
         local=local,
         trials=trials,
         dof=np.where(alone, np.inf, np.clip(dof, 1.0, len(N_g) - 1.0) * mixed),
+        alone=alone | unknown,
+    )
+
+
+def pooled_covariance(evidence: Evidence) -> Covariance:
+    """Return the covariance of the estimates with one factor on all of it, from the disagreement of all trials on all
+    parameters together.
+
+    V = max(1, Q / ν) N⁻¹,  Q = Σ_g s_gᵀ N_g⁺ s_g,  with ν the expectation of Q for independent errors.
+
+    A few equal trials tell one scatter far better than a variance for each parameter.
+
+    Args:
+        evidence: Contributions of G trials, at least 2.
+    """
+    T, unknown = _whitener(evidence.information)
+    local = T @ T.T
+    local[unknown, unknown] = np.inf
+    q = dof = 0.0
+    share = np.zeros(len(T))
+    for normal, score in zip(evidence.normal, evidence.score, strict=True):
+        values, axes = np.linalg.eigh(T.T @ normal @ T)
+        shown = values > FAINT / len(evidence.normal)
+        q += float(np.sum((axes.T @ (T.T @ score))[shown] ** 2 / values[shown]))
+        dof += float(np.sum(1.0 - values[shown]))
+        share = np.maximum(share, np.einsum("pk,kl,pl->p", T, T.T @ normal @ T, T))
+    factor, P = max(1.0, q / max(dof, 1e-9)), len(T)
+    alone = share > ALONE * np.maximum(np.diagonal(T @ T.T), 1e-300)
+    return Covariance(
+        names=evidence.names,
+        local=local,
+        trials=factor * local,
+        dof=np.where(alone, np.inf, np.full(P, max(dof, 1.0))),
         alone=alone | unknown,
     )
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from finssim.core.least_squares import boxed, huber_weight
 from finssim.identification.plant_terms import matrices
-from finssim.identification.rollout import DETERMINED_BY, Streams
+from finssim.identification.rollout import Streams
+from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.motion import spans_of, up_in_body
 from finssim.vehicles import AXES, Vehicle
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 
 from finssim.core.rotations import quat_rotate, quat_to_euler
 from finssim.trials.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
+from finssim.trials.free_motion import FEWEST_SPEEDS, compared_columns, free_motion
 from finssim.trials.inputs import InputForces, drive, implausible
 from finssim.trials.motion import (
     AttitudeSignal,
@@ -519,34 +520,46 @@ LEAST_INERTIA = 0.05
 
 
 def with_identifiability(
-    report: AxisReport, motion: Motion, inputs: InputForces, vehicle: Vehicle
+    report: AxisReport,
+    motion: Motion,
+    inputs: InputForces,
+    vehicle: Vehicle,
+    measured: Mapping[str, tuple[Array, Array]],
 ) -> AxisReport:
-    """Return the report with the identifiability of the axis."""
+    """Return the report with the identifiability of the axis; `measured` as the trial has it, in its units."""
     specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
     names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
-    if blocked := _blocked(report, inputs):
+    passive = inputs.source == "passive"
+    if blocked := _blocked(report, inputs, motion, measured):
+        report = replace(report, excited=report.excited and not passive)
         return replace(report, tells={name: Identifiability(can=False, why=blocked) for name in names})
     verdicts = (
-        _passive_identifiability(report)
-        if inputs.source == "passive"
-        else _driven_identifiability(report, motion, vehicle)
+        _passive_identifiability(report) if passive else _driven_identifiability(report, motion, vehicle)
     )
     return replace(
         report, tells={name: Identifiability(can=verdicts[name][0], why=verdicts[name][1]) for name in names}
     )
 
 
-def _blocked(report: AxisReport, inputs: InputForces) -> str:
-    """Return why the axis determines nothing at all, or nothing."""
+def _blocked(
+    report: AxisReport, inputs: InputForces, motion: Motion, measured: Mapping[str, tuple[Array, Array]]
+) -> str:
+    """Return why the axis determines nothing at all, or nothing; without thrust the fit's own reason."""
     if not report.source:
         return f"no velocity: {NO_VELOCITY[report.axis]}"
+    if inputs.source == "passive":
+        try:
+            free_motion(motion, measured, report.axis)
+        except CalibrationError as error:
+            return error.reason
+        return ""
     if not np.isfinite(report.fastest):
         return "velocity and input are never known together"
-    if report.excited and inputs.source != "passive" and report.coasts > 10.0 * report.driven:
+    if report.excited and report.coasts > 10.0 * report.driven:
         return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without: something else moves it"
     if report.excited:
         return ""
-    if inputs.source != "passive" and report.strongest < 1e-6:
+    if report.strongest < 1e-6:
         return "not driven"
     if report.fastest <= max(3.0 * report.noise, 0.005):
         return f"no motion above the noise: speeds up to {report.fastest:.2g}, noise {report.noise:.2g}"
@@ -952,7 +965,7 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport
     nu, tau, dt = motion.nu[:, i], motion.tau[:, i], 1.0 / motion.rate
     valid = np.isfinite(nu) & np.isfinite(tau)
     blank = AxisReport(axis=AXES[i], source=motion.nu_source[i])
-    if valid.sum() < 10:
+    if valid.sum() < FEWEST_SPEEDS:
         return blank
     speed, wrench = np.abs(nu[valid]), np.abs(tau[valid])
     noise = float(np.nan_to_num(motion.noise_std[i]))
@@ -1168,8 +1181,9 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     findings += input_findings(trial, vehicle, inputs)
     trial_motion = motion(trial, vehicle)
     findings += [entry for entry in trial_motion.findings if entry not in findings]
+    measured = compared_columns(trial)
     axes = [
-        with_identifiability(axis, trial_motion, inputs, vehicle)
+        with_identifiability(axis, trial_motion, inputs, vehicle, measured)
         for axis in axis_reports(trial_motion, inputs, vehicle)
     ]
     density = (trial.header.water.density or vehicle.water.density) / vehicle.water.density

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.identification.rollout import DETERMINED_BY, Streams
+from finssim.core.rotations import quat_to_euler
+from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
-from finssim.trials.motion import Motion, spans_of, white_noise, without_spikes
+from finssim.trials.motion import Motion, attitude_samples, spans_of, white_noise, without_spikes
+from finssim.trials.trial import Trial
 from finssim.vehicles import AXES
 
 Array = NDArray[np.float64]
 
-FEWEST_SAMPLES = 20
+CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")
+"""Measured columns that a simulation is compared with."""
+
+DETERMINED_BY = {
+    "surge": ("u", "x", "y"),
+    "sway": ("v", "x", "y"),
+    "heave": ("w", "z", "depth"),
+    "roll": ("p", "roll"),
+    "pitch": ("q", "pitch"),
+    "yaw": ("r", "yaw"),
+}
+"""Measured columns that determine an axis, the most direct first."""
+
+FEWEST_SAMPLES, FEWEST_SPEEDS, FEWEST_COASTING = 20, 5, 3
+"""Samples of a swing, of a coast or a rise, and of a coast until something pushes."""
 
 SLOWEST, FASTEST = 0.05, 3.0
 """Natural frequencies that are looked for [Hz]."""
@@ -32,8 +47,9 @@ LEAST_SPEED = 0.03
 FALLS_TO = 0.7
 """Part of its first speed to which a coast has to fall."""
 
-GROWS = 1.15
-"""Factor above the lowest speed so far at which something pushes again."""
+GROWS, TUGGED = 1.15, 0.1
+"""Factor above the lowest speed so far at which something pushes again, and the part of the first speed that a tether
+may add."""
 
 HELD = 0.15
 """Part of the top speed of a rise below which a smoothed speed may still be that of a vehicle that is held."""
@@ -42,59 +58,47 @@ RISING, SHORTEST_RISE = 0.01, 3.0
 """Vertical speed that counts as a rise [m/s] (published procedure), and its shortest duration [s]."""
 
 
-def released(s: Streams, axes: Sequence[str]) -> Streams:
-    """Return a trial without thrust cut to its free motions.
+def compared_columns(trial: Trial) -> dict[str, tuple[Array, Array]]:
+    """Return the columns of `CHANNELS` that a trial measures: times on its clock [s] and values in their units."""
+    measured = {c: trial.series(c) for c in CHANNELS}
+    t, q, given = attitude_samples(trial)
+    for name, angle in zip(EULER, quat_to_euler(q), strict=True):
+        if name in given and not len(measured[name][0]):
+            measured[name] = (t, angle)
+    return {c: pair for c, pair in measured.items() if len(pair[0])}
 
-    Each axis is compared within its own free motion alone.
+
+def free_motion(moved: Motion, measured: Mapping[str, tuple[Array, Array]], axis: str) -> tuple[float, float]:
+    """Return begin and end of the free motion of one axis of a trial without thrust [s].
 
     Args:
-        s: A trial whose header says that it is passive.
-        axes: Axes to look at.
+        moved: Motion of the trial.
+        measured: Column -> times [s] and values in its unit, of `compared_columns`.
+        axis: Which.
 
     Raises:
-        CalibrationError: No axis moves freely; the message has the reason for each measured axis.
+        CalibrationError: The axis does not move freely, or was hardly measured.
     """
-    windows, reasons = dict[str, tuple[float, float]](), list[str]()
-    for axis in axes:
-        try:
-            windows[axis] = _window(s, axis)
-        except CalibrationError as error:
-            reasons.append(error.reason)
-    if not windows:
-        raise CalibrationError("; ".join(reasons), s.trial.name)
-    begin, end = min(a for a, _ in windows.values()), max(b for _, b in windows.values())
-    spans = [(max(a, begin), min(b, end)) for a, b in s.drive.spans]
-    spans = np.array([span for span in spans if span[1] > span[0]])
-    nu, t = s.motion.nu.copy(), s.motion.t
-    measured = dict(s.measured)
-    for axis, (a, b) in windows.items():
-        nu[(t < a) | (t > b), AXES.index(axis)] = np.nan
-    for column, (at, values) in s.measured.items():
-        own = [windows[axis] for axis in windows if column in DETERMINED_BY[axis]]
-        if own:
-            inside = np.any([(at >= a) & (at <= b) for a, b in own], axis=0)
-            measured[column] = (at[inside], values[inside])
-    return replace(
-        s,
-        drive=replace(s.drive, spans=spans),
-        motion=replace(s.motion, nu=nu),
-        measured={column: pair for column, pair in measured.items() if len(pair[0])},
-        released=frozenset(windows),
-    )
-
-
-def _window(s: Streams, axis: str) -> tuple[float, float]:
-    """Return begin and end of the free motion of one axis [s]."""
-    count = max((len(s.measured[c][0]) for c in DETERMINED_BY[axis] if c in s.measured), default=0)
-    if count < FEWEST_SAMPLES:
-        raise CalibrationError(f"the motion of {axis} was not measured")
-    if axis in ("roll", "pitch"):
-        rate, angle = (s.measured.get(c, (np.empty(0), np.empty(0))) for c in DETERMINED_BY[axis])
+    count = max((len(measured[c][0]) for c in DETERMINED_BY[axis] if c in measured), default=0)
+    swings = axis in ("roll", "pitch")
+    fewest = FEWEST_SAMPLES if swings else FEWEST_SPEEDS
+    if count < fewest:
+        raise CalibrationError(
+            f"{axis} was measured {count} times, expected {fewest} or more"
+            if count
+            else f"the motion of {axis} was not measured"
+        )
+    if swings:
+        rate, angle = (measured.get(c, (np.empty(0), np.empty(0))) for c in DETERMINED_BY[axis])
         if len(rate[0]) < FEWEST_SAMPLES:
             rate = (angle[0], np.gradient(angle[1], angle[0]))
         good = without_spikes(rate[0], rate[1][:, None])
         return _ringing(rate[0][good], rate[1][good], axis)
-    return _rising(s.motion) if axis == "heave" else _coasting(s.motion, axis)
+    if axis == "heave":
+        return _rising(moved)
+    # A fast coast is over within a few samples, which smoothing would cut.
+    t, speed = measured.get(DETERMINED_BY[axis][0], (moved.t, moved.nu[:, AXES.index(axis)]))
+    return _coasting(t, speed, float(np.nan_to_num(moved.noise_std[AXES.index(axis)])), axis)
 
 
 def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
@@ -127,18 +131,16 @@ def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
     return begin, min(end, float(t[-1]))
 
 
-def _coasting(moved: Motion, axis: str) -> tuple[float, float]:
+def _coasting(t: Array, nu: Array, noise: float, axis: str) -> tuple[float, float]:
     """Return the stretch from the largest speed until something pushes again [s]."""
-    nu = moved.nu[:, AXES.index(axis)]
     known = np.isfinite(nu)
-    noise = float(np.nan_to_num(moved.noise_std[AXES.index(axis)]))
-    t, speed = moved.t[known], np.abs(nu[known])
+    t, speed = t[known], np.abs(nu[known])
     begin = int(np.argmax(speed)) if len(speed) else 0
     after = speed[begin:]
-    floor = max(3.0 * noise, 0.02 * float(after.max(initial=0.0)))
+    floor = max(3.0 * noise, TUGGED * float(after.max(initial=0.0)))
     pushed = np.flatnonzero(after > GROWS * np.minimum.accumulate(after) + floor)
     end = begin + (int(pushed[0]) if len(pushed) else len(after)) - 1
-    slow = end - begin < FEWEST_SAMPLES or speed[begin] < max(LEAST_SPEED, 5.0 * noise)
+    slow = end - begin < FEWEST_COASTING - 1 or speed[begin] < max(LEAST_SPEED, 5.0 * noise)
     if slow or speed[end] > FALLS_TO * speed[begin]:
         raise CalibrationError(f"{axis} does not coast to a lower speed")
     return float(t[begin]), float(t[end])
