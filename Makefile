@@ -8,6 +8,9 @@ STRICT := $(wildcard $(addprefix src/finssim/,core physics control localization)
 # Named by content and extras, so that a fresh checkout or another branch with the same requirements installs nothing again.
 STAMP := $(VENV)/.installed-$(shell { echo $(EXTRAS); cat pyproject.toml constraints.txt; } | cksum | cut -d " " -f 1)
 
+# `make demo` needs the package without its extras; where everything is installed already, that will do.
+LIGHT := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.light-$(shell cat pyproject.toml constraints.txt | cksum | cut -d " " -f 1))
+
 # Compiled modules are kept, also where the shell forbids it: hundreds of processes import the same ones.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -17,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*##/make \1\t/p' Makefile | expand -t 16
 
-demo: $(STAMP)  ## identify, train, evaluate and report: the whole loop, result in demo/
+demo: $(LIGHT)  ## identify, train, evaluate and report: the whole loop, result in demo/
 	$(BIN)/finssim demo
 
 # Some tests start processes that keep an appointment with the clock, which a busy machine can miss: what failed runs
@@ -58,13 +61,23 @@ clean:  ## remove what was built, the environment included
 	rm -rf $(VENV) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find src tests examples studies benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# An environment of the right Python; installed into by each of the two targets below.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed; name one with: make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.light-%: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable .
+	@rm -f $(VENV)/.light-*
+	@touch $@
+
 # torch goes first and alone: where a CPU wheel is at hand pip takes it, and no later step may exchange it. MAVProxy (GPLv3,
 # which a test runs as a process) goes last and alone: what it needs is there, and what it asks for exchanges OpenCV.
-$(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed; name one with: make PYTHON=python3.12")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
-	$(BIN)/python -m pip install --quiet --no-deps "$$(grep '^MAVProxy==' constraints.txt)"
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) "$$(grep '^torch==' constraints.txt)"
+	$(PIP) --editable ".[$(EXTRAS)]"
+	$(PIP) --no-deps "$$(grep '^MAVProxy==' constraints.txt)"
 	@rm -f $(VENV)/.installed-*
 	@touch $@

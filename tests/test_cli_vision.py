@@ -1,6 +1,8 @@
 """`finssim calibrate camera`, `pool` and `mounts`, as a person types them: every option, every refusal."""
 
 import json
+import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -314,8 +316,8 @@ def test_pool_as_a_table_with_a_report(surveyed, capsys):
     out = " ".join(capsys.readouterr().out.split())
     assert "camera before a water surface, from 24 surveyed places" in out and "camera_height" in out
     assert "held out (5 parts)" in out and f"written: {surveyed / 'report'}" in out
-    page = (surveyed / "report" / "report.md").read_text(encoding="utf-8")
-    (again,) = {line.strip("` ") for line in page.splitlines() if line.strip("` ").startswith("finssim ")}
+    page = (surveyed / "report" / "report.html").read_text(encoding="utf-8")
+    again = unescape(re.search(r"<pre>(finssim [^<\n]*)", page)[1])
     first = load_pool(surveyed / "p.yaml")
     (surveyed / "p.yaml").unlink()
     assert finssim(*shlex.split(again)[1:]) == 0
@@ -513,7 +515,7 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
     tags = load_vehicle(mounting / "v.yaml").tags.mounts
     apart = np.linalg.norm(np.asarray(tags[15].position) - np.asarray(tags[16].position))
     assert apart == pytest.approx(np.linalg.norm(MOUNTS[15].t - MOUNTS[16].t), abs=0.005)
-    assert "finssim calibrate mounts log" in (mounting / "report" / "report.md").read_text("utf-8")
+    assert "finssim calibrate mounts log" in (mounting / "report" / "report.html").read_text("utf-8")
 
 
 @pytest.mark.slow

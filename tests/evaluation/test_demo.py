@@ -3,8 +3,12 @@
 import contextlib
 import io
 import json
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from rich.console import Console
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from finssim.cli.doctor import EXTRA_OF_MODULE
 from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
 from finssim.evaluation.figures import new_figure, save_figure
@@ -28,6 +33,8 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import terminal_speed
 
 pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[2]
 
 SMALL = Scope(
     levels={"surge": [18.0]},
@@ -124,8 +131,9 @@ def test_the_full_demonstration_tries_all_setpoints_and_axes():
 
 
 def test_the_report_loads_nothing(folder):
-    """Pictures are inside; no script, no style sheet, no address."""
+    """It begins with a picture; pictures are inside; no script, no style sheet, no address."""
     html = (folder / "report.html").read_text(encoding="utf-8")
+    assert html.index("<figure>") < html.index('<p class="lead">') < html.index("<details")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
     assert len(sources) == 4 and all(source.startswith("data:image/png;base64,") for source in sources)
     assert "http" not in re.sub(r'"data:[^"]*"', "", html) and "<script" not in html
@@ -175,6 +183,54 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
     assert Policy.load(tmp_path / "demo" / "policy").description.training["complete"]
     with pytest.raises(RobotError, match="results of other settings"):
         demo(tmp_path / "demo", **{**options, "seed": 2})
+
+
+CORE_ALONE = """
+import sys
+from importlib.machinery import PathFinder
+
+EXTRAS = {modules!r}
+
+
+class CoreFinder(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] in EXTRAS else super().find_spec(name, path, target)
+
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = CoreFinder
+"""
+"""Hides the packages of every extra from a process and those that it starts."""
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """The environment of a process in which the wheel of this source is installed, without any extra."""
+    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist")]
+    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = (tmp_path / "dist").glob("finssim-*.whl")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target"]
+    subprocess.run([*pip, str(tmp_path / "site"), str(wheel)], check=True, capture_output=True)
+    modules = {*EXTRA_OF_MODULE, "ray", "MAVProxy"}
+    text = CORE_ALONE.format(modules=modules)
+    (tmp_path / "site" / "sitecustomize.py").write_text(text, encoding="utf-8")
+    return {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+
+
+def test_a_wheel_demonstrates_itself_without_any_extra(installed, tmp_path):
+    """`pip install .` is enough, without torch, OpenCV and TensorBoard, and what is left out is said."""
+    scope = replace(SMALL, duration=1.0)
+    program = f"from finssim.studies.demo import Scope, demo; demo('demo', steps=4096, scope={scope!r})"
+    run = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=installed, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert "OpenCV is not installed" in run.stderr
+    result = json.loads((tmp_path / "demo" / "t1" / "t1.json").read_text(encoding="utf-8"))
+    assert {trial["job"]["row"] for trial in result["trials"]} == {"calibrated-pool", "pid", "pid-paper"}
+    doctor = [sys.executable, "-m", "finssim", "doctor", "--json"]
+    found = json.loads(subprocess.run(doctor, cwd=tmp_path, env=installed, capture_output=True).stdout)
+    assert found["healthy"] and set(found["core"]) >= {"warp-lang", "matplotlib", "mcap"}
 
 
 def test_somebodys_files_are_not_replaced(tmp_path):

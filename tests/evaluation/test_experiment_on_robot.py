@@ -52,7 +52,7 @@ def test_rows_are_scored_as_virtual_ones_and_marked(held):
     assert (row["success"], row["trials"], row["stopped"]) == (2, 2, 0) and row["e_p_m"]["value"] < 0.05
     assert len(first) == 1 and all(path.stat().st_mtime_ns == time for path, time in first.items())
     assert result["robot"].startswith("127.0.0.1:") and result["severity"] == "hardware"
-    page = (out / "t1.md").read_text()
+    page = (out / "t1.html").read_text()
     assert "T1 on hardware, robot 127.0.0.1:" in page and "PID, tuned from the model, hardware" in page
     assert "paper" not in page.split("hardware")[0] and "whose error is not in it" in page
     assert (out / "t1_envelopes.png").stat().st_size > 10_000
@@ -89,7 +89,7 @@ def test_a_trajectory_is_followed_from_its_first_pose(tmp_path):
         result = experiment(T2, tmp_path / "out", wiring, rows=("pid",), targets=("straight",), seeds=1)
     row = result["rows"]["pid"]
     assert row["success"] == 1 and row["horizontal_rmse_m"]["value"] < 0.03
-    assert "T2 on hardware" in (tmp_path / "out" / "t2.md").read_text()
+    assert "T2 on hardware" in (tmp_path / "out" / "t2.html").read_text()
 
 
 def test_dead_reckoning_is_carried_from_trial_to_trial(tmp_path):

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 TINY = {"locations": (4, 3), "images": 12}
 FILES = {
-    *("localization.json", "localization.md", "error_map.png", "camera.yaml", "pool.yaml"),
+    *("localization.json", "localization.html", "error_map.png", "camera.yaml", "pool.yaml"),
     *("pool_pinhole.yaml", "detections.csv", "survey.csv", "survey.yaml"),
 }
 
@@ -91,10 +91,10 @@ def test_refraction_wins_where_it_should(done):
 def test_the_page_shows_the_same_figures(done):
     """Every RMSE of the result stands in the page beside the paper's, with the seed and the pictures' names."""
     out, result, _ = done
-    page = (out / "localization.md").read_text(encoding="utf-8")
+    page = (out / "localization.html").read_text(encoding="utf-8")
     for methods in [*result["results"].values(), result["paper"]]:
         for figures in methods.values():
-            assert f"| {figures['rmse_cm']:.2f} " in page
+            assert f">{figures['rmse_cm']:.2f}<" in page
     for name in re.findall(r"\]\((\w+\.png)\)", page):
         assert (out / name).is_file()
     assert "error_map.png" in page and "seeds [1]" in page
@@ -171,7 +171,7 @@ def test_a_method_that_locates_nothing_is_no_error(tmp_path, monkeypatch):
     figures = result["results"]["lifted"]["refractive"]
     assert figures["rmse_cm"] is None and figures["located"] == 0
     assert figures["reasons"] == {"tag not detected": figures["pictures"]}
-    assert "| – |" in (tmp_path / "out" / "localization.md").read_text(encoding="utf-8")
+    assert ">–<" in (tmp_path / "out" / "localization.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_the_folder_holds_the_result_a_table_a_figure_and_the_vehicle(small):
     result, out = small
     assert json.loads((out / "replay_experiment.json").read_text()) == json.loads(json.dumps(result))
     assert (out / "envelope.png").read_bytes().startswith(b"\x89PNG")
-    page = (out / "replay_experiment.md").read_text()
+    page = (out / "replay_experiment.html").read_text()
     assert "0.315" in page and "its vehicle in its pool" in page and "virtual plant" in page
     found = load_vehicle(out / "vehicles" / "seed_1.yaml")
     assert found.sha256 == result["fits"][0]["vehicle_sha256"]

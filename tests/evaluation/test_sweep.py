@@ -3,6 +3,7 @@
 import contextlib
 import json
 import time
+from html import escape
 from pathlib import Path
 
 import pytest
@@ -94,7 +95,7 @@ def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, cap
     assert status == 3 and not again["ok"] and len(again["rows"]) == 3
     (failed,) = [row for row in again["rows"] if "error" in row]
     assert failed["name"] == "action-soup" and "soup" in failed["error"]
-    assert failed["error"] in (out / "sweep.md").read_text(encoding="utf-8")
+    assert escape(failed["error"]) in (out / "sweep.html").read_text(encoding="utf-8")
     now = {path: path.stat().st_mtime_ns for path in out.glob("*/*/policy.onnx")}
     assert now.keys() == kept.keys()
     assert {path for path in kept if now[path] != kept[path]} == {gone / "policy.onnx"}

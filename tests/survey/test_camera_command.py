@@ -22,7 +22,7 @@ def test_photographs_become_a_camera_file(tmp_path, capsys):
     low, high = read.record["estimates"]["fx"]["ci95"]
     assert low < read.lens.fx < high
     names = {file.name for file in (tmp_path / "report").iterdir()}
-    assert names == {"report.html", "report.md", "fit.json", "coverage.png", "residuals.png"}
+    assert names == {"report.html", "fit.json", "coverage.png", "residuals.png"}
     printed = capsys.readouterr().out
     assert "6 of 6 views" in printed and "views are few" in printed
 

@@ -95,7 +95,6 @@ def test_a_report_has_its_pictures(pool):
     names = {path.name for path in (pool / "report").iterdir()}
     assert names >= {
         "report.html",
-        "report.md",
         "fit.json",
         "map.png",
         "picture.png",

@@ -10,7 +10,10 @@ from typing import Any
 from finssim.core.provenance import package_versions, revision
 from finssim.core.registry import FAMILIES, Family
 
-CORE = ("numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnxruntime")
+CORE = (
+    "numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnx", "onnxruntime", "threadpoolctl",
+    "matplotlib", "mcap", "rosbags", "pupil-apriltags",
+)  # fmt: skip
 """Distributions FinsSim cannot do without."""
 
 
@@ -31,14 +34,11 @@ EXTRAS = {
             "stable-baselines3": "stable_baselines3",
             "gymnasium": "gymnasium",
             "tensorboard": "tensorboard",
-            "threadpoolctl": "threadpoolctl",
-            "onnx": "onnx",
             "onnxscript": "onnxscript",
-            "matplotlib": "matplotlib",
             "pandas": "pandas",
             "pyarrow": "pyarrow",
         },
-        "train policies, use the Gymnasium environments, record runs, draw figures and reports",
+        "train with learners on torch, use the Gymnasium environments, watch curves, record runs as Parquet",
     ),
     "torchrl": Extra(
         {"tensordict": "tensordict", "torchrl": "torchrl"},
@@ -57,19 +57,16 @@ EXTRAS = {
     "wandb": Extra({"wandb": "wandb"}, "send the curves of a training to Weights & Biases"),
     "logs": Extra(
         {
-            "matplotlib": "matplotlib",
-            "mcap": "mcap",
             "pandas": "pandas",
             "pyarrow": "pyarrow",
             "pymavlink": "pymavlink",
             "pyulog": "pyulog",
-            "rosbags": "rosbags",
         },
-        "read Parquet, ArduSub logs and ROS 2 bags, draw the report of a calibration and the figures of a replay",
+        "read Parquet and logs of ArduSub and PX4",
     ),
     "view": Extra(
-        {"matplotlib": "matplotlib", "viser": "viser"},
-        "draw pictures of vehicles and figures of evaluations, show runs live in the browser",
+        {"viser": "viser"},
+        "show vehicles and runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "place MJCF and URDF models in described worlds"),
     "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
@@ -79,24 +76,20 @@ EXTRAS = {
         {"newton": "newton"}, "simulate cameras, sonars and altimeters in finssim.extensions.perception"
     ),
     "vision": Extra(
-        {"opencv-python-headless": "cv2", "pupil-apriltags": "pupil_apriltags", "matplotlib": "matplotlib"},
-        "detect tags, calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
+        {"opencv-python-headless": "cv2"},
+        "calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
     ),
     "render": Extra(
         {"mitsuba": "mitsuba"}, "let the tests compare the overhead camera's pictures with Mitsuba's"
     ),
-    "ros2": Extra(
-        {"cyclonedds": "cyclonedds", "rosbags": "rosbags"}, "be ROS 2 nodes without an installed ROS 2"
-    ),
+    "ros2": Extra({"cyclonedds": "cyclonedds"}, "be ROS 2 nodes without an installed ROS 2"),
     "hardware": Extra(
         {
-            "mcap": "mcap",
             "pygame": "pygame",
             "pymavlink": "pymavlink",
             "pyserial": "serial",
-            "rosbags": "rosbags",
         },
-        "reach a vehicle over a serial line or MAVLink, steer it with a gamepad, record its runs",
+        "reach a vehicle over a serial line or MAVLink, steer it with a gamepad",
     ),
 }
 

@@ -1,4 +1,4 @@
-"""Reports: one HTML file that holds its pictures and loads nothing, and the same as Markdown beside its pictures."""
+"""Reports: one HTML file that holds its pictures and loads nothing."""
 
 from __future__ import annotations
 
@@ -12,28 +12,36 @@ from typing import Any
 from finssim.core.files import atomic_directory
 
 __all__ = [
-    "RECORD_FILE", "REPORT_FILE", "Page", "Pictures", "html_page", "html_picture", "html_table", "notebook_html",
+    "RECORD_FILE", "REPORT_FILE", "Page", "Pictures", "html_code", "html_page", "html_picture", "html_section",
+    "html_table", "notebook_html",
 ]  # fmt: skip
 
-REPORT_FILE, MARKDOWN_FILE, RECORD_FILE = "report.html", "report.md", "fit.json"
+REPORT_FILE, RECORD_FILE = "report.html", "fit.json"
 
 Pictures = Mapping[str, tuple[str, bytes]]
 """File name -> what the picture shows, and the PNG."""
 
 STYLE = """
 :root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; max-width: 52rem; margin: 2rem auto;
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c2733; background: #fff; max-width: 60rem; margin: 2rem auto;
   padding: 0 1rem; }
-h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; } summary h2 { display: inline; }
+summary { cursor: pointer; margin: 1.8rem 0 .5rem; }
 p.lead { font-size: 1.05rem; color: #34495e; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
+div.table { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; font-size: .9rem; }
 th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #dde5ec; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } th { font-weight: 600; }
+th:first-child, td:first-child { text-align: left; } th { font-weight: 600; white-space: normal; }
 td.words { text-align: left; white-space: normal; } td.code { font-family: monospace; font-size: .8rem; }
 tr.theirs td { color: #6b7a89; } tr.first td { border-top: 2px solid #9fb2c3; } tr.doubt td { color: #9a5b00; }
-img { max-width: 100%; height: auto; display: block; margin: .8rem auto; }
-p.note { color: #5d6d7c; font-size: .9rem; } li.warning { color: #9a5b00; }
+figure { margin: 1rem 0; } img { max-width: 100%; height: auto; display: block; margin: 0 auto .3rem; }
+figcaption, p.note { color: #5d6d7c; font-size: .9rem; } li.warning { color: #9a5b00; }
 pre { background: #f3f6f9; padding: .8rem; overflow-x: auto; font-size: .85rem; }
+@media print {
+  body { max-width: none; margin: 0; font-size: 10pt; } table { font-size: 7pt; } pre { white-space: pre-wrap; }
+  th, td { padding: .1rem .25rem; white-space: normal; } figure, tr { break-inside: avoid; }
+  div.table { overflow: visible; } details::details-content { content-visibility: visible; }
+}
 """
 
 
@@ -49,15 +57,34 @@ def html_page(title: str, sections: Sequence[str]) -> str:
 
 
 def html_picture(png: bytes, text: str) -> str:
-    """Return a picture inside the page, with its alternative text."""
+    """Return a picture inside the page with its caption, plain text."""
     data = base64.b64encode(png).decode("ascii")
-    return f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
+    image = f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{escape(text)}</figcaption></figure>"
+
+
+def html_section(title: str, parts: Sequence[str], *, shown: bool = True) -> str:
+    """Return a section that folds at its title.
+
+    Args:
+        title: Plain text.
+        parts: HTML.
+        shown: Whether it is unfolded at first.
+    """
+    head = f"<summary><h2>{escape(title)}</h2></summary>"
+    return f"<details{' open' if shown else ''}>{head}{''.join(parts)}</details>"
+
+
+def html_code(lines: Sequence[str]) -> str:
+    """Return lines as they are."""
+    return f"<pre>{escape(chr(10).join(lines))}</pre>"
 
 
 def html_table(heads: Sequence[str], rows: Sequence[str]) -> str:
     """A table of rows that are HTML already."""
     cells = "".join(f"<th>{escape(head)}</th>" for head in heads)
-    return f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    table = f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return f'<div class="table">{table}</div>'
 
 
 def notebook_html(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -67,70 +94,69 @@ def notebook_html(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]
 
 
 class Page:
-    """A report that is written once and given out as HTML and as Markdown."""
+    """A report that is written section by section, as one HTML file beside its pictures."""
 
     def __init__(self, title: str) -> None:
         """Begin with a title, plain text."""
         self.title = title
         self._html = [f"<h1>{escape(title)}</h1>"]
-        self._markdown = [f"# {title}"]
+        self._folded = False
 
-    def _add(self, html: str, markdown: str) -> None:
-        self._html.append(html)
-        self._markdown.append(markdown)
+    def _close(self) -> None:
+        """End the section that is open."""
+        if self._folded:
+            self._html.append("</details>")
+        self._folded = False
 
     def heading(self, text: str) -> None:
-        """Add the heading of a section."""
-        self._add(f"<h2>{escape(text)}</h2>", f"## {text}")
+        """Begin a section, which folds at its heading."""
+        self._close()
+        self._folded = True
+        self._html.append(f"<details open><summary><h2>{escape(text)}</h2></summary>")
 
     def lead(self, text: str) -> None:
         """Add a paragraph that states the result."""
-        self._add(f'<p class="lead">{escape(text)}</p>', text)
+        self._html.append(f'<p class="lead">{escape(text)}</p>')
 
     def note(self, text: str) -> None:
-        """A paragraph in small print; nothing for no text."""
+        """Add a paragraph in small print; nothing for no text."""
         if text:
-            self._add(f'<p class="note">{escape(text.replace("`", ""))}</p>', text)
+            self._html.append(f'<p class="note">{escape(text.replace("`", ""))}</p>')
 
     def items(self, heading: str, sentences: Sequence[str]) -> None:
-        """A section of warnings; nothing where there are none."""
+        """Add a section of warnings; nothing where there are none."""
         if sentences:
             self.heading(heading)
             items = "".join(f'<li class="warning">{escape(sentence)}</li>' for sentence in sentences)
-            self._add(f"<ul>{items}</ul>", "\n".join(f"- {sentence}" for sentence in sentences))
+            self._html.append(f"<ul>{items}</ul>")
 
     def table(
         self, heads: Sequence[str], rows: Sequence[Sequence[str]], kinds: Sequence[str] = (), last: str = ""
     ) -> None:
-        """A table; `kinds` are classes of the style for its rows, `last` is that of its last cells."""
+        """Add a table; `kinds` are classes of the style for its rows, `last` is that of its last cells."""
         html = []
         for k, row in enumerate(rows):
             cells = "".join(f"<td>{escape(cell)}</td>" for cell in row[:-1])
             cells += f'<td class="{last}">{escape(row[-1])}</td>'
             html.append(f'<tr class="{kinds[k] if kinds else ""}">{cells}</tr>')
-        lines = [heads, ["---"] * len(heads), *rows]
-        markdown = "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-        self._add(html_table(heads, html), markdown)
+        self._html.append(html_table(heads, html))
 
     def pictures(self, pictures: Pictures) -> None:
-        """Every picture below what it shows."""
+        """Add every picture below what it shows."""
         last_text = ""
-        for name, (text, data) in pictures.items():
+        for text, data in pictures.values():
             if text != last_text:
                 self.heading(text)
-            self._add(html_picture(data, text), f"![{text}]({name})")
+            self._html.append(html_picture(data, text))
             last_text = text
 
     def code(self, heading: str, lines: Sequence[str]) -> None:
-        """A section of lines as they are."""
+        """Add a section of lines as they are."""
         self.heading(heading)
-        text = "\n".join(lines)
-        self._add(f"<pre>{escape(text)}</pre>", f"```text\n{text}\n```")
+        self._html.append(html_code(lines))
 
     def write(self, folder: str | os.PathLike[str], record: Mapping[str, Any], pictures: Pictures) -> None:
-        """Write `report.html`, `report.md`, the pictures as PNG and `fit.json`.
+        """Write `report.html`, the pictures as PNG and `fit.json`.
 
         Args:
             folder: Directory to make; an earlier report there is replaced.
@@ -140,13 +166,10 @@ class Page:
         Raises:
             OutputError: The folder holds other files, or cannot be written.
         """
-        texts = {
-            RECORD_FILE: json.dumps(record, indent=1, allow_nan=False) + "\n",
-            REPORT_FILE: html_page(self.title, self._html),
-            MARKDOWN_FILE: "\n\n".join(self._markdown) + "\n",
-        }
+        self._close()
         with atomic_directory(folder, replaces=RECORD_FILE) as temporary:
             for name, (_, data) in pictures.items():
                 (temporary / name).write_bytes(data)
-            for name, text in texts.items():
-                (temporary / name).write_text(text, encoding="utf-8")
+            text = json.dumps(record, indent=1, allow_nan=False) + "\n"
+            (temporary / RECORD_FILE).write_text(text, encoding="utf-8")
+            (temporary / REPORT_FILE).write_text(html_page(self.title, self._html), encoding="utf-8")

@@ -32,7 +32,7 @@ from finssim.core.progress import Progress, progress_bar
 from finssim.core.quiet import start_warp
 from finssim.core.system import parent_runs
 from finssim.core.yaml_file import json_value, read_json
-from finssim.evaluation.tables import Table, markdown_of, print_tables
+from finssim.evaluation.tables import Table, print_tables, write_page
 from finssim.vehicles import load_vehicle
 
 WATCH = 1.0
@@ -103,7 +103,7 @@ class ResultError(ValueError):
 
 
 def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = ()) -> None:
-    """Write a result, and beside it, with the suffix .md, its page.
+    """Write a result, and beside it, with the suffix .html, its page.
 
     Raises:
         ResultError: It holds a number that is not finite.
@@ -117,8 +117,7 @@ def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = 
     with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     if tables:
-        with atomic_write(path.with_suffix(".md")) as temporary:
-            temporary.write_text(markdown_of(tables), encoding="utf-8")
+        write_page(path.with_suffix(".html"), tables[0].title, tables)
 
 
 def keep_result(path: Path, result: Mapping[str, Any]) -> None:

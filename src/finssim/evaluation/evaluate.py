@@ -17,7 +17,7 @@ from finssim.core.provenance import provenance
 from finssim.core.quiet import start_warp
 from finssim.evaluation import campaign
 from finssim.evaluation.campaign import write_json
-from finssim.evaluation.figures import draw_envelopes, draw_tracking, save_figure
+from finssim.evaluation.figures import ENVELOPE, TRACKS, draw_envelopes, draw_tracking, save_figure
 from finssim.evaluation.metrics import (
     PAPER_T2,
     T1_SETPOINTS,
@@ -100,18 +100,20 @@ class SummaryForm(NamedTuple):
     """Name of the paper's row -> its rows by their names in our table."""
     figure: str
     """Name of its file."""
+    shows: str
+    """Caption of the figure."""
     draw: Callable[[Mapping[str, Sequence[GoalTrial]], str], Any]
 
 
 FORMS: Mapping[str, SummaryForm] = {
     "t1": SummaryForm(
         "setpoint", tuple(T1_SETPOINTS), T1_COLUMNS, CAPTION, summarize, lambda name: {"": paper_row(name)},
-        "error_envelope.png", draw_envelopes,
+        "error_envelope.png", ENVELOPE, draw_envelopes,
     ),
     "t2": SummaryForm(
         "trajectory", T2_TRAJECTORIES, T2_COLUMNS, T2_CAPTION, summarize_tracking,
         lambda name: {target: paper_t2_row(name, target) or {} for target in PAPER_T2[name]},
-        "trajectories.png", draw_tracking,
+        "trajectories.png", TRACKS, draw_tracking,
     ),
 }  # fmt: skip
 """Forms of the paper's tasks; every other task is measured in episodes as in training."""
@@ -144,7 +146,9 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     heads = [heading.replace(" [", "\n[") for heading, *_ in form.columns.values()]  # for 80 columns
     note = f"{form.caption} paper: its vehicle in its pool, {', '.join(papers)}, for orientation."
     sentences = [] if several else _remarks(first["per_trial"])
-    return [Table(title=title, heads=[form.kind, *heads], rows=rows, note=note, sentences=sentences)]
+    shown = {form.figure: form.shows}
+    heads = [form.kind, *heads]
+    return [Table(title=title, heads=heads, rows=rows, note=note, sentences=sentences, pictures=shown)]
 
 
 def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -383,9 +387,9 @@ def evaluate_in_plants(
             )
         scored = Evaluations(tuple(evaluations))
         if folder is not None:
-            write_json(folder / EVALUATION_FILE, scored.as_json())
             if task in FORMS:
                 save_figure(scored.plot(), folder / FORMS[task].figure)
+            write_json(folder / EVALUATION_FILE, scored.as_json(), tables_of(scored.as_json()))
     return scored
 
 

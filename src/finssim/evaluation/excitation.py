@@ -305,7 +305,7 @@ def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
     trial = read_trials([record], split="phase")[0]
     header = trial.header.model_copy(update={"role": role})
     trial = replace(trial, name=folder.name, header=header)
-    write_trial(trial, folder, format="parquet")
+    write_trial(trial, folder)
     return trial
 
 

@@ -32,6 +32,14 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 DPI = 130
 
 
+ENVELOPE = (
+    "Position error [m] and yaw error [°] against time [s]: median and middle half of the trials; dashed: the limits "
+    "of success; gray: where errors are measured."
+)
+TRACKS = "Paths from above [m] beside their distance to the reference [m] against time [s]."
+"""Captions of the two figures of the paper's tasks."""
+
+
 def new_figure(width: float, height: float, title: str = "", layout: Any = "constrained") -> Any:
     """An empty Matplotlib figure [inch], which is imported here, as it is slow to."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

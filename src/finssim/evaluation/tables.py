@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from rich import box
 from rich.console import Console
 from rich.text import Text
 
-from finssim.core.page import html_picture, html_table
+from finssim.core.files import atomic_write
+from finssim.core.page import html_code, html_page, html_picture, html_section, html_table
 
 Rows = Sequence[Sequence[str] | None]
 """Cells of each row; None: a line between two rows."""
@@ -122,23 +123,66 @@ def markdown_of(tables: Sequence[Table]) -> str:
 
 
 def html_of(tables: Sequence[Table], folder: Path) -> list[str]:
-    """Sections of a page; pictures that are in the folder are inside them."""
-    parts = []
+    """Return the sections of a page; pictures that are in the folder are inside them."""
+    sections = []
     for table in tables:
-        parts += [f"<h2>{escape(table.title)}</h2>", f"<p>{escape(table.headline)}</p>"]
         rows = []
         for row in filter(None, table.rows):
             kind = ' class="theirs"' if paper(row) else ""
             rows.append(f"<tr{kind}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>")
-        parts.append(html_table(table.heads, rows) if rows else "")
-        sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in table.sentences)
-        parts.append(f'<p class="note">{escape(table.note)}</p><ul>{sentences}</ul>')
-        parts += [
-            html_picture((folder / file).read_bytes(), text)
-            for file, text in table.pictures.items()
-            if (folder / file).is_file()
+        items = "".join(f"<li>{escape(sentence)}</li>" for sentence in table.sentences)
+        parts = [
+            f"<p>{escape(table.headline)}</p>" if table.headline else "",
+            html_table(table.heads, rows) if rows else "",
+            f'<p class="note">{escape(table.note)}</p>' if table.note else "",
+            f"<ul>{items}</ul>" if items else "",
+            *_pictures(table.pictures, folder),
         ]
-    return parts
+        sections.append(html_section(table.title[:1].upper() + table.title[1:], parts))
+    return sections
+
+
+def _pictures(pictures: Mapping[str, str], folder: Path) -> list[str]:
+    return [
+        html_picture((folder / file).read_bytes(), text)
+        for file, text in pictures.items()
+        if (folder / file).is_file()
+    ]
+
+
+def write_page(
+    path: Path,
+    title: str,
+    tables: Sequence[Table],
+    *,
+    lead: Sequence[str] = (),
+    first: Mapping[str, str] | None = None,
+    last: Mapping[str, Sequence[str]] | None = None,
+) -> None:
+    """Write a report as one HTML file that loads nothing: a picture, its sentences, and sections that fold.
+
+    Args:
+        path: The file; pictures are beside it.
+        title: Plain text.
+        tables: Its sections.
+        lead: Paragraphs after the first picture; the headline of the first table if there are none.
+        first: Picture -> caption; the first picture of the tables if None. It is not repeated in its section.
+        last: Title -> lines of code, in sections that are folded at first.
+    """
+    if first is None:
+        first = dict(next((list(t.pictures.items())[:1] for t in tables if t.pictures), []))
+    tables = [replace(t, pictures={k: x for k, x in t.pictures.items() if k not in first}) for t in tables]
+    if not lead and tables and tables[0].headline:
+        lead, tables = [tables[0].headline], [replace(tables[0], headline=""), *tables[1:]]
+    sections = [
+        f"<h1>{escape(title)}</h1>",
+        *_pictures(first, path.parent),
+        *(f'<p class="lead">{escape(text)}</p>' for text in lead),
+        *html_of(tables, path.parent),
+        *(html_section(name, [html_code(lines)], shown=False) for name, lines in (last or {}).items()),
+    ]
+    with atomic_write(path) as temporary:
+        temporary.write_text(html_page(title, sections), encoding="utf-8")
 
 
 Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
@@ -149,12 +193,15 @@ Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
 def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: float = 1.0) -> str:
     """A figure as text, with its interval in brackets where it has one; – where there is none.
 
+    One plant and one seed have an interval of no width, which is left out.
+
     `factor` takes the unit of the figure to that of the text.
     """
     value = figure["value"] if isinstance(figure, Mapping) else figure
     if value is None:
         return "–"
     bounds = figure["ci95"] if isinstance(figure, Mapping) else ()
+    bounds = () if len(set(bounds)) == 1 else bounds
     numbers = ["–" if x is None else format(factor * x, form) for x in (value, *bounds)]
     return f"{numbers[0]} [{numbers[1]}, {numbers[2]}]" if numbers[1:] else numbers[0]
 

@@ -165,8 +165,13 @@ def train(
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
     from finssim.learning.layers import single_thread
-    from finssim.learning.training_loop import TrainingLoop, TrainingView, last_checkpoint
+    from finssim.learning.training_loop import TrainingLoop, TrainingView, has_tensorboard, last_checkpoint
 
+    if not has_tensorboard():
+        console.print(
+            "TensorBoard is not installed (pip install 'finssim[learn]'): the curves go to curves.csv alone",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
     checkpoint = last_checkpoint(side) if resume else None
     values = _values(settings, kind, learner, the_task)
     seed, device, until = settings.seed, settings.device, settings.until

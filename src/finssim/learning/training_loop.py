@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -25,9 +26,6 @@ from rich.progress import (
 )
 from rich.table import Column
 from rich.text import Text
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from finssim.control.policy import DESCRIPTION_FILE, PolicyDescription
 from finssim.learning.export import export_policy, onnx_bytes
@@ -314,8 +312,13 @@ def after(description: PolicyDescription, steps: int, complete: bool, best: int)
     return description.model_copy(update={"training": record})
 
 
+def has_tensorboard() -> bool:
+    """Return whether TensorBoard is installed; without it a training writes its curves as CSV alone."""
+    return find_spec("tensorboard") is not None
+
+
 class _CurveLog:
-    """Rows of the curves as TensorBoard reads them, without torch; and for Weights & Biases."""
+    """Rows of the curves as TensorBoard reads them, where it is installed; and for Weights & Biases."""
 
     def __init__(self, folder: Path, steps: int, run: Any = None) -> None:
         """Continue after so many steps: TensorBoard drops what a killed or an earlier training logged later.
@@ -325,22 +328,32 @@ class _CurveLog:
             steps: Done so far.
             run: Of Weights & Biases, which takes the rows too.
         """
-        self._run = run
+        self._run, self._writer = run, None
+        if not has_tensorboard():
+            return
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
         os.makedirs(folder, exist_ok=True)
+        self._event, self._summary = Event, Summary
         self._writer = EventFileWriter(str(folder))
         start = SessionLog(status=SessionLog.START)
         self._writer.add_event(Event(wall_time=time.time(), step=steps + 1, session_log=start))
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Log a row."""
-        values = [Summary.Value(tag=_tag(name), simple_value=value) for name, value in row.items()]
-        self._writer.add_event(Event(wall_time=time.time(), step=row["steps"], summary=Summary(value=values)))
+        if self._writer is not None:
+            values = [self._summary.Value(tag=_tag(name), simple_value=value) for name, value in row.items()]
+            summary = self._summary(value=values)
+            self._writer.add_event(self._event(wall_time=time.time(), step=row["steps"], summary=summary))
         if self._run is not None:
             self._run.log({_tag(name): value for name, value in row.items()}, step=row["steps"])
 
     def close(self) -> None:
         """Write what is left."""
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
         if self._run is not None:
             self._run.finish()
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
+from importlib.util import find_spec
 from os import environ
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,8 +23,6 @@ from rich.console import Console
 
 from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
-from finssim.core.files import atomic_write
-from finssim.core.page import html_page
 from finssim.core.quiet import start_warp
 from finssim.evaluation.campaign import Progress
 from finssim.evaluation.evaluate import T1_COLUMNS
@@ -41,7 +39,7 @@ from finssim.evaluation.robot_trials import (
     played_trial,
     take_folder,
 )
-from finssim.evaluation.tables import Table, cells, html_of, print_tables
+from finssim.evaluation.tables import Table, cells, print_tables, write_page
 from finssim.evaluation.trials import GoalTrial
 from finssim.identification.fit import Fit
 from finssim.identification.prediction import Replay, replay
@@ -388,6 +386,14 @@ def _lead(result: Mapping[str, Any], spec: Spec, seconds: float) -> str:
     )
 
 
+def _known(result: Identification) -> str:
+    """Return in one sentence which numbers of the vehicle are known after its trials."""
+    estimates = [e for e in result.fit.estimates.values() if e.path is not None]
+    guesses = [e.name for e in estimates if not e.identifiable]
+    kept = f"; guesses stay for {', '.join(guesses)}" if guesses else ""
+    return f"Its trials determine {len(estimates) - len(guesses)} of {len(estimates)} numbers of the vehicle{kept}."
+
+
 def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
     """Every setpoint of every controller."""
     rows = [
@@ -564,7 +570,12 @@ class _Demonstration:
     def run(self) -> list[Table]:
         """Identify, train, deploy and report; returns the tables of what was held."""
         identification, spec = self._identified(), self._spec()
-        held = self.out / "t1"
+        title, held = f"Station keeping of {self.standing.name}", self.out / "t1"
+        found, known = _identification(identification, self.robot is not None), _known(identification)
+        write_page(
+            self.out / REPORT_FILE, title, found, lead=[known, "Training and trials are still to come."]
+        )
+        self.report(f"report so far: {self.out / REPORT_FILE}")
         with self._working("training and holding setpoints") as progress:
             result = transfer_experiment(
                 spec, out=held, seeds=1, seed=self.seed, rows=list(spec.rows), firmware=self.firmware,
@@ -578,35 +589,38 @@ class _Demonstration:
         curves = np.genfromtxt(policy / "curves.csv", delimiter=",", names=True, ndmin=1)
         save_figure(_training(curves), self.out / "training.png")
         trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
-        learnt = {"training.png": "Mean return and share of episodes held while training"}
+        learnt = {"training.png": "Success [1] and return [1] over the control steps of the training"}
         drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
         if trials:
             save_figure(_paths(trials, self.site), self.out / "paths.png")
-            paths = {"paths.png": "Paths of the trials from above and from the side"}
+            paths = {"paths.png": "Paths of the trials from above and from the side [m]"}
             drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
-        title = f"Station keeping of {self.standing.name}"
         files = dict(Policy.load(policy).description.files)
         origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
-        sections = [
-            f"<h1>{escape(title)}</h1>",
-            f'<p class="lead">{escape(_lead(result, spec, float(curves["seconds"][-1])))}</p>',
-            *html_of(_identification(identification, self.robot is not None), self.out),
-            *html_of(tables, held),
-            *html_of(drawn, self.out),
-            "<h2>How to repeat it</h2>",
-            f"<pre>{escape(chr(10).join(self._commands()))}</pre>",
-            "<h2>Provenance</h2>",
-            f"<pre>{escape(json.dumps(origin, indent=2))}</pre>",
-        ]
-        with atomic_write(self.out / REPORT_FILE) as temporary:
-            temporary.write_text(html_page(title, sections), encoding="utf-8")
+        picture, caption = spec.picture
+        write_page(
+            self.out / REPORT_FILE,
+            title,
+            [*found, *(replace(table, pictures={}) for table in tables), *drawn],
+            first={f"{held.name}/{picture}": caption},
+            lead=[_lead(result, spec, float(curves["seconds"][-1])), known],
+            last={
+                "How to repeat it": self._commands(),
+                "Provenance": json.dumps(origin, indent=2).splitlines(),
+            },
+        )
         return tables
 
     def _spec(self) -> Spec:
         """Station keeping by the policy and two PIDs; one setpoint with pictures, which takes longest, first."""
         names = (POLICY, "pid", "pid-paper")
         rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
-        if self.robot is None and self.firmware == "mcu":
+        if self.robot is None and self.firmware == "mcu" and not find_spec("cv2"):
+            self.report(
+                "OpenCV is not installed (pip install 'finssim[vision]'): tag corners are computed in every trial, "
+                "and none is played with pictures"
+            )
+        elif self.robot is None and self.firmware == "mcu":
             title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
             with_pictures = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
             rows = {WITH_PICTURES: with_pictures, **rows}
@@ -654,11 +668,18 @@ class _Demonstration:
                     f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
                 ),
             )  # fmt: skip
-            result = identify(self.out, self.name, seed=self.seed, record=record)
+
+            def recorded(*args: Any) -> Any:
+                folders = record(*args)
+                self.report("identifying the vehicle from these trials")
+                progress(1.0, "identifying the vehicle from them")
+                return folders
+
+            result = identify(self.out, self.name, seed=self.seed, record=recorded)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.report(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
-            f"{len(result.fit.estimates)} parameters told, NRMSE on {len(result.replay.pairs)} other trials "
+            f"{len(result.fit.estimates)} parameters determined, NRMSE on {len(result.replay.pairs)} other trials "
             f"{result.replay.aggregate('calibrated').value:.3f}"
         )
         return result

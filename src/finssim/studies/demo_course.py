@@ -7,18 +7,15 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from finssim.core.files import atomic_write
-from finssim.core.page import html_page
 from finssim.evaluation.campaign import keep_result, load_result
 from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
-from finssim.evaluation.tables import Table, html_of
+from finssim.evaluation.tables import Table, write_page
 from finssim.identification.fit import Fit
 from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres
@@ -154,14 +151,10 @@ def demo_course(
         _dived(rows),
     ]
     page = out / "report.html"
-    sections = [
-        f"<h1>{escape(f'Along a path by {name}')}</h1>",
-        *html_of(tables, out),
-        "<h2>How to repeat it</h2>",
-        f"<pre>{escape(chr(10).join(_commands(out, name, seed)))}</pre>",
-    ]
-    with atomic_write(page) as temporary:
-        temporary.write_text(html_page(f"Along a path by {name}", sections), encoding="utf-8")
+    repeat = {"How to repeat it": _commands(out, name, seed)}
+    write_page(
+        page, f"Along a path by {name}", tables, first=tables[-1].pictures, lead=_lead(rows), last=repeat
+    )
     return tables, page
 
 
@@ -238,8 +231,22 @@ def _dived(rows: Sequence[Mapping[str, Any]]) -> Table:
         heads=heads,
         rows=out,
         note="By the robot's complete software, in plants drawn around the vehicle in the water.",
-        pictures={"dives.png": "Paths from above, depth and fins of the first dive of each controller"},
+        pictures={
+            "dives.png": "First dive of each controller: path from above [m], depth [m] and fins [°] against time [s]"
+        },
     )
+
+
+def _lead(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the result in one sentence for each controller."""
+    sentences = []
+    for controller in ("policy", BASELINE):
+        own = [row["metrics"] for row in rows if row["controller"] == controller]
+        finished = sum(metrics["success"] == 1.0 for metrics in own)
+        errors = [metrics["error"] for metrics in own if metrics["error"] is not None]
+        off = f", {np.mean(errors):.2g} m from them on average" if errors else ""
+        sentences.append(f"{controller} followed {finished} of {len(own)} paths to their end{off}.")
+    return [" ".join(sentences)]
 
 
 def _picture(out: Path, rows: Sequence[Mapping[str, Any]]) -> Any:

@@ -22,7 +22,7 @@ from finssim.core.files import atomic_directory, plain_name
 from finssim.core.provenance import provenance
 from finssim.evaluation.campaign import Progress, Show, check_choices, spread, write_json
 from finssim.evaluation.evaluate import T1_COLUMNS
-from finssim.evaluation.figures import draw_envelopes, draw_tracking, save_figure
+from finssim.evaluation.figures import ENVELOPE, TRACKS, draw_envelopes, draw_tracking, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.evaluation.robot_trials import (
     FIRMWARES,
@@ -528,7 +528,7 @@ T1 = Spec(
     differences=("success_rate", "e_p_m", "e_psi_deg", "t_s_s", "energy"),
     paper=_paper_t1,
     draw=_draw_t1,
-    picture=("t1_envelopes.png", "Station keeping: error against time"),
+    picture=("t1_envelopes.png", ENVELOPE),
 )
 """`finssim experiment t1`."""
 T2 = Spec(
@@ -553,7 +553,7 @@ T2 = Spec(
     differences=("horizontal_rmse_m", "vertical_rmse_m", "p95_m", "energy"),
     paper=paper_t2_row,
     draw=_draw_t2,
-    picture=("t2_paths.png", "Trajectory tracking: paths from above"),
+    picture=("t2_paths.png", TRACKS),
 )
 """`finssim experiment t2`."""
 SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
