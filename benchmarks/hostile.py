@@ -477,7 +477,7 @@ def make(folder: Path, run: Callable[..., None]) -> None:
         (DATA / "hinsdale" / "traj026-0_imu.csv", "logs/small_imu.csv"),
         (DATA / "ardusub" / "small.BIN", "small.BIN"),
         (DATA / "ardusub" / "small_cut.tlog", "small.tlog"),
-        (ROOT / "examples" / "own_task_torch.py", "own.py"),
+        (ROOT / "examples" / "own/task/keep_depth.py", "own.py"),
         (source / "vehicles" / "catalogue" / "devices" / "ping.yaml", "seeing/altimeter.yaml"),
         *(
             (DATA / "opencv_chessboards" / f"left{k:02}.jpg", f"board/left{k:02}.jpg")

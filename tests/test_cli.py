@@ -24,6 +24,7 @@ COMMANDS = [
     "vehicles show",
     "vehicles import",
     "doctor",
+    "new",
     "trials",
     "trials check",
     "trials import",

@@ -177,7 +177,7 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
         read_record(record, "t2", FINSROV, truth=short)
 
 
-@pytest.mark.parametrize("task", ["t3", "own_task_torch"])
+@pytest.mark.parametrize("task", ["t3", "own/task/keep_depth"])
 def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
     """By the same referee, of the truth that the site wrote: the live score, but for the clock that is found again.
 
@@ -214,7 +214,7 @@ def test_an_episode_that_was_cut_short_counts_without_success(tmp_path, capsys):
 
 def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     """A task in torch that remembers where it began is refused by name."""
-    text = (EXAMPLES / "own_task_torch.py").read_text().split("if __name__")[0]
+    text = (EXAMPLES / "own/task/keep_depth.py").read_text().split("if __name__")[0]
     text = text.replace("class KeepDepth(TorchTask):", "class Go(TorchTask):\n    memory = {'last': 3}\n")
     start = "memory={'last': w.uniform(low, high)}, position="
     (tmp_path / "go.py").write_text(text.replace("Start(position=", f"Start({start}"))

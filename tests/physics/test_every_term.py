@@ -13,7 +13,7 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.terms import unit_of
 from reference.examples import example
 
-WING = example("own_term").WING
+WING = example("own/term/wing").WING
 EVERY = pytest.mark.parametrize("name", sorted({*TERMS, WING.name}))
 RNG = np.random.default_rng(7)
 NU = RNG.uniform(-2.0, 2.0, (64, 6))

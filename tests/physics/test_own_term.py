@@ -20,7 +20,7 @@ from reference.draws import column, draw
 from reference.examples import EXAMPLES, example
 from reference.installed import install
 
-own_term = example("own_term")
+own_term = example("own/term/wing")
 WING, Wing, wing_wrench = own_term.WING, own_term.Wing, own_term.wing_wrench
 
 FILE = """
@@ -320,14 +320,14 @@ def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
 def test_the_page_shows_the_example():
     """Word for word, so that what is read is what runs."""
     page = (EXAMPLES.parent / "docs" / "reference" / "terms.md").read_text(encoding="utf-8")
-    assert f"```py\n{(EXAMPLES / 'own_term.py').read_text(encoding='utf-8')}```" in page
+    assert f"```py\n{(EXAMPLES / 'own/term/wing.py').read_text(encoding='utf-8')}```" in page
 
 
 @pytest.mark.slow
 def test_the_example_runs():
     """The wing takes heave out."""
     run = subprocess.run(
-        [sys.executable, EXAMPLES / "own_term.py"], capture_output=True, text=True, check=True
+        [sys.executable, EXAMPLES / "own/term/wing.py"], capture_output=True, text=True, check=True
     )
     without, with_wing = (
         float(line.split()[-2]) for line in run.stdout.splitlines() if line.startswith("heave")

@@ -52,7 +52,7 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", ["own_task", "own_task_torch"])
+@pytest.mark.parametrize("example", ["own_task", "own/task/keep_depth"])
 def test_a_policy_of_ones_own_task_runs_through_the_stack(example, tmp_path):
     """In Warp and in torch; a linear policy directory holds the depth within 5 cm for 5 s."""
     words = f"{EXAMPLES / f'{example}.py'}:KeepDepth"

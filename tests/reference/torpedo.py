@@ -1,33 +1,14 @@
 """A torpedo for tests, a section of every kind of actuator, and a kind from outside the package."""
-# mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
-
-import warp as wp
+# mypy: disable-error-code="no-untyped-def"
 
 from finssim.core.registry import ACTUATORS
-from finssim.physics.types import join, vec6
-from finssim.vehicles.actuators import Actuator, ActuatorKind
-from finssim.vehicles.part import Positive, Vector3
 from finssim.vehicles.vehicle import Vehicle
+from reference.examples import example
 
 RHO, G = 1025.0, 9.81
 
 
-class Brake(Actuator):
-    """A drogue whose drag along its line is what its value says: a kind from outside the package."""
-
-    position: Vector3
-    size: Positive
-
-
-@wp.func
-def brake_wrench(value: float, nu_r: vec6, density: float, position: wp.vec3, size: float) -> vec6:
-    force = wp.vec3(-0.5 * density * size * value * wp.abs(nu_r[0]) * nu_r[0], 0.0, 0.0)
-    return join(force, wp.cross(position, force))
-
-
-BRAKE = ActuatorKind(
-    name="brake", schema=Brake, unit="1", units={"position": "m", "size": "m²"}, wrench=brake_wrench
-)
+BRAKE = example("own/actuator/brake").BRAKE
 FIN = {
     "kind": "fin", "position": [-0.6, 0.0, 0.1], "span": [0.0, 0.0, 1.0], "area": 0.02, "lift_slope": 3.0, "stall": 0.3,
     "drag": [0.01, 0.02, 1.1], "minimum": -0.5, "maximum": 0.5,

@@ -167,7 +167,7 @@ def test_a_mistake_is_named(task, sentence):
 
 
 @pytest.mark.parametrize(
-    ("name", "page"), [("own_task", "reference/task_in_warp.md"), ("own_task_torch", "own_task.md")]
+    ("name", "page"), [("own_task", "reference/task_in_warp.md"), ("own/task/keep_depth", "own_task.md")]
 )
 def test_the_page_shows_the_example(name, page):
     """Word for word, so that what is read is what runs."""

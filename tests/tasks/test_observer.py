@@ -19,7 +19,7 @@ NUMERIC = [name for name in numeric_tasks() if name != "terrain"]
 
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-OWN = [f"{EXAMPLES / 'own_task.py'}:KeepDepth", f"{EXAMPLES / 'own_task_torch.py'}:KeepDepth"]
+OWN = [f"{EXAMPLES / 'own_task.py'}:KeepDepth", f"{EXAMPLES / 'own/task/keep_depth.py'}:KeepDepth"]
 
 
 class Moment:
@@ -136,7 +136,7 @@ def test_a_trajectory_longer_than_an_episode_is_seen_to_its_end():
     np.testing.assert_allclose(seen[12:15], circle.at(t).velocity, atol=1e-3)
 
 
-TORCH = (EXAMPLES / "own_task_torch.py").read_text().split("if __name__")[0]
+TORCH = (EXAMPLES / "own/task/keep_depth.py").read_text().split("if __name__")[0]
 
 
 def in_torch(folder, heave, more=""):

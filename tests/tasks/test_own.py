@@ -6,7 +6,7 @@ import pytest
 
 from finssim.tasks import EnvironmentSetupError, task_named
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_task_torch.py"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own/task/keep_depth.py"
 
 
 def test_a_class_of_a_file_or_module_is_a_task():

@@ -38,7 +38,7 @@ def example(name):
 
 
 TorchStationKeeping = example("t1_in_torch").TorchStationKeeping
-KeepDepth = example("own_task_torch").KeepDepth
+KeepDepth = example("own/task/keep_depth").KeepDepth
 
 
 @dataclass(frozen=True, kw_only=True)

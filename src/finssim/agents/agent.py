@@ -16,6 +16,7 @@ from finssim.control.guidance import Goal, Known
 from finssim.control.modes import mode_from_dict
 from finssim.control.policy import DESCRIPTION_FILE, Policy
 from finssim.sim import StateRecorder
+from finssim.tasks.catalogue import own_class
 from finssim.tasks.environment import Environment, Step
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
@@ -159,18 +160,19 @@ class BaselineAgent(PidAgent):
         return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 
-def agent_for(
-    name_or_directory: str | Path, vehicle: Vehicle, task: Task
-) -> PolicyAgent | PidAgent | BaselineAgent:
-    """A PID or another baseline by its name, or the policy of a directory.
+def agent_for(name_or_directory: str | Path, vehicle: Vehicle, task: Task) -> Agent:
+    """A PID or another baseline by its name, the policy of a directory, or the agent of a file, FILE.py:CLASS.
 
     The PIDs of T1 and T2 are the robot's, which know state and goal; other baselines see what a policy sees.
 
     Raises:
-        AgentError: It is neither.
-        PolicyError, ControlError: It does not fit the vehicle or the task.
+        AgentError: It is none of these.
+        PolicyError, ControlError, EnvironmentSetupError: It does not fit the vehicle or the task, or its file fails.
     """
     name = str(name_or_directory)
+    if ".py:" in name:
+        own: Agent = own_class(name, object, "agent")(vehicle, task)
+        return own
     controllers = tuple(CONTROLLERS) if task.name in TASKS_OF_PIDS else ()
     baselines = baselines_of(task)
     if name in controllers:
@@ -178,10 +180,10 @@ def agent_for(
     if name in baselines:
         return BaselineAgent(name, vehicle, task)
     if not Path(name_or_directory).exists():
-        have = ", ".join([*controllers, *baselines])
+        have = ", ".join(dict.fromkeys([*controllers, *baselines]))
         raise AgentError(
             f"'{name}' is neither a policy directory nor a controller of task '{task.name}'; controllers: "
-            f"{have or 'none'}"
+            f"{have or 'none'}, or FILE.py:CLASS"
         )
     return PolicyAgent(name_or_directory, vehicle, task)
 

@@ -21,6 +21,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     "Start": {
         "demo": "finssim.studies.demo:demo",
         "doctor": "finssim.cli.doctor:doctor",
+        "new": "finssim.cli.new:new",
     },
     "Describe and simulate": {
         "vehicles": "finssim.cli.commands:vehicles",

@@ -7,7 +7,7 @@ from finssim.core.lazy import exports
 if TYPE_CHECKING:
     from finssim.control.allocation import Allocator
     from finssim.control.course import CoursePilot
-    from finssim.control.guidance import Station, Track
+    from finssim.control.guidance import Goal, Known, Station, Track
     from finssim.control.modes import action_mode
     from finssim.control.path_following import LineOfSight, Waypoints
     from finssim.control.policy import Policy
@@ -17,6 +17,8 @@ __all__ = [
     "Allocator",
     "ControlError",
     "CoursePilot",
+    "Goal",
+    "Known",
     "LineOfSight",
     "Policy",
     "Station",

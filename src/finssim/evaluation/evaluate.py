@@ -76,7 +76,7 @@ EPISODES_CAPTION = "means over episodes; in brackets 95 % of a bootstrap over th
 def paper_name(result: Mapping[str, Any]) -> str:
     """The row of the paper's table that is nearest to what was evaluated."""
     controller = result["controller"]
-    if controller["kind"] == "pid":
+    if controller["kind"] != "policy":
         return "PID"
     randomized = " + DR" if controller.get("randomization") else ""
     if result["task"] == "t2":

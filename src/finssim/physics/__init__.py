@@ -6,12 +6,13 @@ from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
     from finssim.physics.terms.composed import add_term
-    from finssim.physics.types import vec6
+    from finssim.physics.types import join, vec6
     from finssim.vehicles.terms import Term
 
 __all__ = [
     "Term",
     "add_term",
+    "join",
     "vec6",
 ]
 

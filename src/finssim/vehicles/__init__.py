@@ -5,12 +5,21 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
+    from finssim.vehicles.actuators import Actuator, ActuatorKind
     from finssim.vehicles.check import CheckResult, check_vehicle
     from finssim.vehicles.device_files import device_of, devices, load_device
     from finssim.vehicles.equipment import DepthSensor, Dvl, Imu, Mcu, Mount, Safety, Sensor, Sensors, Tags
     from finssim.vehicles.hydrodynamics import HydrodynamicSet, MeshSet
     from finssim.vehicles.loader import catalogue, catalogue_vehicle, load_vehicle
-    from finssim.vehicles.part import NonNegative, Number, Part, Positive, VehicleError, VehicleWarning
+    from finssim.vehicles.part import (
+        NonNegative,
+        Number,
+        Part,
+        Positive,
+        Vector3,
+        VehicleError,
+        VehicleWarning,
+    )
     from finssim.vehicles.thruster import Esc, Thruster
     from finssim.vehicles.vehicle import (
         AXES,
@@ -25,6 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AXES",
+    "Actuator",
+    "ActuatorKind",
     "Body",
     "CalibrationRecord",
     "DepthSensor",
@@ -48,6 +59,7 @@ __all__ = [
     "Sensors",
     "Tags",
     "Thruster",
+    "Vector3",
     "Vehicle",
     "VehicleError",
     "VehicleWarning",

@@ -16,7 +16,7 @@ from finssim.vehicles import Vehicle, load_vehicle
 from reference.examples import EXAMPLES, example
 from reference.installed import install
 
-PingerBatch = example("own_sensor").PingerBatch
+PingerBatch = example("own/sensor/pinger").PingerBatch
 MOUNT = {"rate": 5.0, "position": [0.0, 0.0, 0.0]}
 STERN = {**MOUNT, "kind": "depth", "position": [0.0, 0.0, 0.25], "rate": 4.0, "noise_std": 0.01}
 ADDED = {
@@ -47,8 +47,8 @@ TRUTH = {
 @pytest.fixture(scope="module", autouse=True)
 def _package(tmp_path_factory: Any) -> Iterator[None]:
     """Install a package with a sensor of its own, under another name than that of the program."""
-    source = (EXAMPLES / "own_sensor.py").read_text(encoding="utf-8")
-    source = source.replace('kind = "pinger"', 'kind = "ranger"').replace("\nadd_sensor", "\n# add_sensor")
+    source = (EXAMPLES / "own/sensor/pinger.py").read_text(encoding="utf-8")
+    source = source.replace('kind = "pinger"', 'kind = "ranger"')
     with pytest.MonkeyPatch.context() as patch:
         members = {"sensors": {"ranger": "acoustics:PingerBatch"}}
         install(tmp_path_factory.mktemp("site"), patch, "acoustics", source, members)

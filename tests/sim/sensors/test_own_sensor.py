@@ -17,7 +17,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 from reference.examples import EXAMPLES, example
 from reference.installed import install
 
-PingerBatch = example("own_sensor").PingerBatch
+PingerBatch = add_sensor(example("own/sensor/pinger").PingerBatch)
 SOURCE = Path(__file__).parents[3] / "src"
 
 FILE = """
@@ -119,8 +119,7 @@ def test_a_kind_is_taken_once_and_needs_a_schema():
 @pytest.mark.slow
 def test_commands_accept_a_vehicle_file_with_the_sensor_of_a_package(tmp_path, monkeypatch):
     """Show, simulate and train, in processes of their own; without the package one sentence."""
-    source = (EXAMPLES / "own_sensor.py").read_text(encoding="utf-8")
-    source = source.replace("\nadd_sensor", "\n# add_sensor")
+    source = (EXAMPLES / "own/sensor/pinger.py").read_text(encoding="utf-8")
     install(tmp_path, monkeypatch, "acoustics", source, {"sensors": {"pinger": "acoustics:PingerBatch"}})
     (tmp_path / "mine.yaml").write_text(FILE, encoding="utf-8")
 
@@ -150,10 +149,10 @@ def test_commands_accept_a_vehicle_file_with_the_sensor_of_a_package(tmp_path, m
 def test_the_example_reads_both_ranges():
     """It prints the distances of two mounts from (3, 0, -4) m, and is the code of the page."""
     run = subprocess.run(
-        [sys.executable, EXAMPLES / "own_sensor.py"], capture_output=True, text=True, timeout=300
+        [sys.executable, EXAMPLES / "own/sensor/pinger.py"], capture_output=True, text=True, timeout=300
     )
     assert run.stdout.split("\n")[:2] == [
         "pinger: 5.12 m, standard deviation 0.1 m", "stern_pinger: 4.88 m, standard deviation 0.1 m"
     ], run.stderr  # fmt: skip
     page = (EXAMPLES.parent / "docs" / "reference" / "own_sensor.md").read_text(encoding="utf-8")
-    assert f"```py\n{(EXAMPLES / 'own_sensor.py').read_text(encoding='utf-8')}```" in page
+    assert f"```py\n{(EXAMPLES / 'own/sensor/pinger.py').read_text(encoding='utf-8')}```" in page

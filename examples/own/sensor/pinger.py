@@ -61,9 +61,8 @@ class PingerBatch(SensorBatch):
     readings = ("range",)
 
 
-add_sensor(PingerBatch)  # an installed package registers it by an entry point instead
-
 if __name__ == "__main__":
+    add_sensor(PingerBatch)  # an installed package registers it by an entry point instead
     mount = {"rate": 5.0, "noise_std": 0.1}
     vehicle = load_vehicle("bluerov2").replace(
         {

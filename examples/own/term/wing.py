@@ -39,18 +39,17 @@ def check_wing(wing: Wing) -> tuple[bool, str]:
     )
 
 
-WING = add_term(
-    Term(
-        name="wing",
-        schema=Wing,
-        units={"lift": "N s²/m²", "moment": "N s²"},
-        wrench=wing_wrench,
-        slope=wing_slope,
-        check=check_wing,
-    )
+WING = Term(
+    name="wing",
+    schema=Wing,
+    units={"lift": "N s²/m²", "moment": "N s²"},
+    wrench=wing_wrench,
+    slope=wing_slope,
+    check=check_wing,
 )
 
 if __name__ == "__main__":
+    add_term(WING)  # an installed package registers it by an entry point instead
     plain = load_vehicle("bluerov2")
     winged = plain.replace({"hydrodynamics.calibrated.wing": {"lift": 40.0}})
     for vehicle in (plain, winged):
