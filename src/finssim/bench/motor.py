@@ -646,7 +646,7 @@ def calibrate_motor(
         trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
-        report (DIR): Directory for report.html, report.md, figures and fit.json.
+        report (DIR): Directory for report.html, figures and fit.json.
         as_json: Print one JSON object instead of tables.
     """
     options = dict(locals())

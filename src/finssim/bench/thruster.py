@@ -553,7 +553,7 @@ def calibrate_thruster(
         out (FILE): Vehicle file to write (.yaml).
         group (NAME): Propeller group of all tables.
         voltage: Battery voltage of the fit [V], if the tables have several; the others validate it.
-        report (DIR): Directory for report.html, report.md, figures and fit.json.
+        report (DIR): Directory for report.html, figures and fit.json.
         as_json: Print one JSON object instead of tables.
     """
     options = dict(locals())

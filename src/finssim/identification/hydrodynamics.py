@@ -213,7 +213,7 @@ def calibrate_hydrodynamics(
         top_speed: Published or measured top speed ahead at full thrust [m/s], as data on thrust and drag.
         bollard_pull: Published or measured bollard pull ahead at full thrust [N], as data on an unknown thrust.
         horizon: Longest segment simulated without a restart [s].
-        report (DIR): Directory for report.html, report.md, figures and fit.json.
+        report (DIR): Directory for report.html, figures and fit.json.
         ranges (FILE): Ranges file to write from the 95 % intervals, for `finssim train --randomize`.
         as_json: Print one JSON object instead of tables.
 

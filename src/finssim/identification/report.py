@@ -406,7 +406,7 @@ class Report:
         repeat: Sequence[str],
         tables: Mapping[str, ExtraTable] | None = None,
     ) -> None:
-        """Write `report.html`, `report.md`, the pictures as PNG and `fit.json`.
+        """Write `report.html`, the pictures as PNG and `fit.json`.
 
         Args:
             folder: Directory to make; an earlier report there is replaced.
@@ -492,7 +492,7 @@ def write_report(
     findings: Sequence[Finding] = (),
     out: Path | None = None,
 ) -> None:
-    """Write `report.html`, `report.md`, its PNG pictures and `fit.json`.
+    """Write `report.html`, its PNG pictures and `fit.json`.
 
     Args:
         fit: The fit.
