@@ -6,6 +6,7 @@ Parts:
     coverage    published levels, 50 Hz, the vehicle's sensors: errors, and how often a 95 % interval holds the truth
     slow        5 Hz, wrench and velocity alone
     replay      half of the trials fitted, the other half replayed
+    dive        a weak dive (10 and 20 % of the limits), then the one that its fit designs, or the same once more
     published   trials simulated with FinsROV's published raw fits, and what its published noise lets anyone tell
 
 The fits start from a file whose hydrodynamics are wrong by a factor of two.
@@ -26,8 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.identification.fit import Estimate, Fit
+from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.identification.prediction import replay
-from finssim.identification.programme import Programme, programmes
+from finssim.identification.programme import Programme, alternating, programmes
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.synthetic import Recording, record, simulate_programme, trials_of
 from finssim.trials.trial import Trial
@@ -182,6 +184,33 @@ def held_out(vehicle: Vehicle, axes: str) -> dict[str, Any]:
     return report.as_json()
 
 
+def second_dive(vehicle: Vehicle, axes: str, seed: int) -> dict[str, Any]:
+    """Widths of the intervals after a second dive that the first designed, over those after the first one again."""
+    chosen = _without_pulses(axes, vehicle).split(",")
+    limit = dict(zip(AXES, vehicle.wrench_limits.tolist(), strict=True))
+    plan = programmes(
+        chosen, vehicle, levels={a: (0.1 * limit[a], 0.2 * limit[a]) for a in chosen}, coast=6.0
+    )
+    file, rate = blind(vehicle), 20.0
+    first = simulate_programme(plan, vehicle, seed=seed, rate=rate)
+    dive = fit_hydrodynamics(first, file, design=True).next_dive
+    assert dive is not None
+    legs = [alternating(leg, n + 1) for leg in dive.legs for n in range(leg.times)]
+    again = simulate_programme(plan, vehicle, seed=100 + seed, rate=rate)
+    seconds = {
+        "repeated": [dataclasses.replace(t, name=f"{t.name}_again") for t in again],
+        "designed": simulate_programme(legs, vehicle, seed=100 + seed, rate=rate),
+    }
+    found = {name: fit_hydrodynamics([*first, *second], file) for name, second in seconds.items()}
+    widths = {
+        name: float(np.diff(ends)[0] / np.diff(found["repeated"].intervals[name])[0])
+        for name, ends in found["designed"].intervals.items()
+        if not name.endswith(("added_mass", "bias")) and np.isfinite(found["repeated"].intervals[name]).all()
+    }
+    times = {f"{name}_s": sum(t.duration for t in second) for name, second in seconds.items()}
+    return {"seed": seed, "median": float(np.median(list(widths.values()))), "widths": widths, **times}
+
+
 def raw_fits(vehicle: Vehicle) -> Vehicle:
     """FinsROV with the raw fits of its own identification."""
     changes: dict[str, float] = {}
@@ -212,7 +241,7 @@ def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the parts asked for, print tables, write JSON."""
-    parts = ("coverage", "slow", "replay", "published")
+    parts = ("coverage", "slow", "replay", "dive", "published")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help="which parts; all if none")
     parser.add_argument("--vehicle", default="finsrov", help="name or file")
@@ -252,6 +281,12 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
         for axis, by_trial in out["nrmse"].items():
             scores = [x for x in by_trial.values() if x is not None]
             print(f"  {axis:<8} mean {np.mean(scores):.4f}, worst trial {max(scores):.4f}")
+        return out
+    if part == "dive":
+        out = [second_dive(vehicle, given.axes, seed) for seed in range(1, given.repetitions + 1)]
+        for row in out:
+            print(f"  designed {row['designed_s']:.0f} s, repeated {row['repeated_s']:.0f} s: widths, median "
+                  f"{row['median']:.2f}, {', '.join(f'{n} {x:.2f}' for n, x in row['widths'].items())}")  # fmt: skip
         return out
     raw = raw_fits(load_vehicle("finsrov"))
     out = {"raw": coverage(raw, FOUR, given.repetitions)}

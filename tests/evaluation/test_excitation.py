@@ -120,6 +120,17 @@ def test_excite_in_a_pool_by_command(tmp_path):
     assert about["pool"] == {"vehicle": "finsrov_sim7", "plant": 3, "severity": "nominal"}
 
 
+def test_excite_plays_the_dive_that_a_report_recommends(tmp_path, capsys):
+    """By command; other kinds and levels are refused beside it."""
+    legs = [{"axis": "yaw", "level": 2.0, "hold": 1.5, "times": 2}]
+    (tmp_path / "fit.json").write_text(json.dumps({"next_dive": {"legs": legs}}))
+    command = ["excite", "all", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--from", str(tmp_path)]
+    assert boundary.run(app, [*command, "--levels", "1.0"]) == 2
+    assert "--from excludes" in capsys.readouterr().err
+    assert boundary.run(app, command) == 0
+    assert {p.name for p in (tmp_path / "t").iterdir()} == {"yaw_2_1.5s_1", "yaw_2_1.5s_2", "programmes.yaml"}
+
+
 def test_a_pool_goes_with_no_other_simulation(tmp_path):
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--pool", "1"]
     assert boundary.run(app, [*command, "--simulate"]) == 2

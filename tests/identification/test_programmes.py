@@ -1,10 +1,13 @@
 """Programmes: the published procedure, levels that fit the vehicle, multi-sines that keep axes and limits apart."""
 
+import json
+
 import numpy as np
 import pytest
 
 from finssim.control.allocation import Allocator
-from finssim.identification.programme import programmes, which_axes
+from finssim.identification.fit import Dive
+from finssim.identification.programme import Leg, alternating, programmes, read_legs, which_axes
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import PHASES
 from finssim.vehicles import AXES, load_vehicle
@@ -115,6 +118,28 @@ def test_what_cannot_be_is_refused_with_the_reason(arguments, sentence):
     axes = arguments.pop("axes")
     with pytest.raises(CalibrationError, match=sentence):
         programmes(axes, FINSROV, **arguments)
+
+
+def test_a_recommended_dive_goes_to_both_sides_and_ends_where_it_began(tmp_path):
+    """Equal pushes to both sides; read back from a report, and refused where it cannot be played."""
+    leg = Leg("yaw", 2.0, 4.0, times=3)
+    one = alternating(leg)
+    assert one.tau_desired.sum(axis=0) == pytest.approx(np.zeros(6)) and np.abs(one.tau_desired).max() == 2.0
+    assert one.duration == pytest.approx(leg.duration)
+    dive = Dive(legs=(leg,), widest="yaw.d1", factor=0.5)
+    (tmp_path / "fit.json").write_text(json.dumps({"next_dive": dive.as_json()}))
+    legs = read_legs(tmp_path)
+    assert legs == [leg]
+    assert [p.name for p in programmes("all", FINSROV, legs=legs)] == [f"yaw_2_4s_{n}" for n in (1, 2, 3)]
+    for axes, some, sentence in (
+        ("surge", legs, "no steps of surge, but of yaw"),
+        ("all", [Leg("yaw", 99.0, 4.0)], "99 N m is beyond finsrov's limit"),
+    ):
+        with pytest.raises(CalibrationError, match=sentence):
+            programmes(axes, FINSROV, legs=some)
+    (tmp_path / "fit.json").write_text("{}")
+    with pytest.raises(CalibrationError, match="recommends no next dive"):
+        read_legs(tmp_path)
 
 
 def test_an_axis_without_authority_is_refused():

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from finssim.core.files import OutputError
-from finssim.identification.fit import Curve
+from finssim.identification.fit import Curve, Dive
+from finssim.identification.programme import Leg
 from finssim.identification.report import write_report
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import finding
@@ -51,6 +52,24 @@ def test_a_reader_finds_what_they_need(folder):
         "&quot;seed&quot;: 4",
     ):
         assert words in text
+
+
+def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
+    """Curves, then what is known, what is not and the next dive, then tables."""
+    dive = Dive(legs=(Leg("yaw", 2.0, 4.0, times=3),), widest="yaw.d2", factor=0.4)
+    fit = made_fit(next_dive=dive)
+    write_report(fit, tmp_path / "report", calibrated(fit))
+    text = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    order = (
+        '<img alt="Measured and fitted',
+        "5 of 7 parameters",
+        "Not determined: yaw.d2 (hardly)",
+        "Record next: yaw at ±2 N m",
+    )
+    places = [text.index(words) for words in (*order, "<th>parameter</th>", '<img alt="Correlation')]
+    assert places == sorted(places)
+    record = json.loads((tmp_path / "report" / "fit.json").read_text(encoding="utf-8"))
+    assert record["next_dive"]["legs"] == [{"axis": "yaw", "level": 2.0, "hold": 4.0, "times": 3}]
 
 
 def test_the_pictures_are_files_too(folder):

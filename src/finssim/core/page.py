@@ -147,8 +147,12 @@ class Page:
         for text, data in pictures.values():
             if text != last_text:
                 self.heading(text)
-            self._html.append(html_picture(data, text))
+            self.picture(text, data)
             last_text = text
+
+    def picture(self, text: str, png: bytes) -> None:
+        """Add a picture with its caption, plain text."""
+        self._html.append(html_picture(png, text))
 
     def code(self, heading: str, lines: Sequence[str]) -> None:
         """Add a section of lines as they are."""

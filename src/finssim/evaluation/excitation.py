@@ -36,7 +36,7 @@ from finssim.evaluation.robot_trials import (
     take_folder,
 )
 from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres, write_manoeuvre
-from finssim.identification.programme import Programme, programmes, write_programme
+from finssim.identification.programme import Programme, programmes, read_legs, write_programme
 from finssim.identification.synthetic import simulate_programme
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
@@ -508,6 +508,7 @@ def excite(
     out: Path,
     kind: str = "published",
     levels: Sequence[str] | None = None,
+    from_fit: Annotated[Path | None, "--from"] = None,
     repeats: Annotated[int, (1, 100)] = 1,
     simulate: bool = False,
     pool: Annotated[int | None, (0, None)] = None,
@@ -533,6 +534,7 @@ def excite(
         kind (KIND): published (steps, dive-and-coast, pulses), validation, multisine, or manoeuvres (speed runs,
             zig-zags, circles, dives) of a vehicle that must move to steer, for which axes is all.
         levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
+        from_fit (FILE|DIR): Report of a calibration, or its fit.json: plays the dive that it recommends next.
         repeats: Repeats of every programme.
         simulate: Run them in the simulator and write the trials.
         pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
@@ -553,7 +555,10 @@ def excite(
     """
     plan: dict[str, Any] = {
         "kind": kind, "levels": _levels(levels or ()), "repeats": repeats, "coast": coast, "duration": duration,
+        "legs": () if from_fit is None else read_legs(from_fit),
     }  # fmt: skip
+    if from_fit is not None and (levels or kind != "published"):
+        raise CalibrationError("--from excludes --kind and --levels: the fit gives them")
     of_pool = severity is not None or pool_vehicle is not None
     if robot is not None and (simulate or pool is not None or of_pool):
         raise CalibrationError("--robot excludes --simulate, --pool and their options")

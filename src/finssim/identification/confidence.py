@@ -76,6 +76,20 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     return Confidence(evidence, covariance, free, ends)
 
 
+def shared_slopes(problem: Shooting, solution: FitSolution) -> Array:
+    """Return the derivatives of every sample without what the unknowns of its own segment take up, (N, P).
+
+    They have the units of sample and theta.
+    """
+    linear, weight = solution.linear, weights_of(solution.linear.residual, solution.std)
+    slopes = linear.shared.copy()
+    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
+        own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
+        normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
+        slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
+    return slopes
+
+
 def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int64] | None = None) -> Evidence:
     """Normal matrices and scores by groups of rows.
 
@@ -86,12 +100,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
     """
     linear = solution.linear
     weight = weights_of(linear.residual, solution.std)
-    # Derivatives without what each segment's own unknowns take up of every sample.
-    slopes = linear.shared.copy()
-    for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
-        own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
-        normal = weighted @ own + np.diag(problem.prior_std[s] ** -2.0)
-        slopes[a:b] -= own @ np.linalg.solve(normal, weighted @ slopes[a:b])
+    slopes = shared_slopes(problem, solution)
     trial = problem.groups[problem.measured.segment]
     unit = "blocks" if problem.few or len(np.unique(trial)) < FEWEST_TRIALS else "trials"
     if group is None:

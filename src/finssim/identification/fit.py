@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from finssim.core.page import notebook_html
 from finssim.trials.findings import CalibrationError, Finding, plain
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from finssim.identification.programme import Leg
 
 __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
 
@@ -59,6 +61,37 @@ class Estimate:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Dive:
+    """The next dive that a fit recommends."""
+
+    legs: tuple[Leg, ...]
+    widest: str
+    """Name of the estimate with the widest interval, relative to its value."""
+    factor: float
+    """Width of that interval after the dive, relative to the one now [-]."""
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return sum(leg.times * leg.duration for leg in self.legs)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"legs": [asdict(leg) for leg in self.legs], "widest": self.widest, "factor": self.factor}
+
+    def __str__(self) -> str:
+        legs = [
+            f"{leg.axis} at ±{leg.level:g} {'N' if leg.axis in AXES[:3] else 'N m'}, first steps of {leg.hold:g} s, "
+            f"{leg.times} times"
+            for leg in self.legs
+        ]
+        return (
+            f"record next: {'; '.join(legs)} ({self.duration:.0f} s). The widest interval, that of {self.widest}, "
+            f"would be {self.factor:.2f} times as wide; `finssim excite --from` plays it"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Correlation:
     """Correlation of the errors of the estimates."""
 
@@ -86,19 +119,25 @@ class Curve:
     """Fitted values in the unit of the label, (n,)."""
     kind: str = "line"
     """`line` (against time) or `scatter`."""
+    band: Array | None = None
+    """Half width of the 95 % band around the fitted values in the unit of the label, (n,)."""
 
     @classmethod
-    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, Array, Array]]) -> Curve:
-        """Stretches of time [s], measured and fitted values, (k,) each, one after the other with a second between."""
+    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, Array, Array, Array]]) -> Curve:
+        """Stretches of time [s], measured and fitted values and bands, (k,) each, one after the other with a second
+        between."""
         x, start = [], 0.0
-        for t, _, _ in parts:
+        for t, *_ in parts:
             x += [t - t[0] + start, [np.nan]]
             start = float(x[-2][-1]) + 1.0
-        measured, fitted = (np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in (1, 2))
+        measured, fitted, band = (
+            np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in (1, 2, 3)
+        )
         label = "time, one after the other [s]"
         return cls(
-            title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted
-        )
+            title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted,
+            band=band,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +163,8 @@ class Fit:
     """Name of a trial or table -> SHA-256 of its numbers."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Method options, seed."""
+    next_dive: Dive | None = None
+    """What to record next; None where it was not asked for."""
     interrupted: bool = False
     """True if Ctrl-C ended it before it converged; the estimates are the best until then."""
 

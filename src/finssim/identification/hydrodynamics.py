@@ -37,6 +37,7 @@ def fit_hydrodynamics(
     horizon: float | None = None,
     held_out: Sequence[Trial] = (),
     published: Mapping[str, float] | None = None,
+    design: bool = False,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
@@ -56,6 +57,7 @@ def fit_hydrodynamics(
         held_out: Further trials that judge the fit. Without any, it is judged by trials, or stretches of them, left out
             in turn. The vehicle file keeps its numbers of each axis that it predicts better.
         published: `top_speed` [m/s] and `bollard_pull` [N] of the vehicle, both ahead, as data.
+        design: Whether the next dive is designed.
         progress: Called with the part done and a few words.
 
     Raises:
@@ -67,7 +69,7 @@ def fit_hydrodynamics(
     likely = "thrust_scale" not in estimate and _unknown_voltage(trials, vehicle)
     fit = fit_by_simulation(
         trials, vehicle, axes=axes, estimate=estimate, damping=damping, known=known, horizon=horizon, likely=likely,
-        published=published,
+        published=published, design=design,
         progress=lambda part, text: show(0.9 * part, text),
     )  # fmt: skip
     if likely:
@@ -249,6 +251,7 @@ def calibrate_hydrodynamics(
             horizon=horizon,
             held_out=held_out,
             published=published,
+            design=True,
             progress=progress,
         )
     return finish("hydrodynamics", fit, options)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.least_squares import boxed
-from finssim.identification.confidence import Confidence, Stage, evidence_of, time_blocks
+from finssim.identification.confidence import Confidence, Stage, evidence_of, shared_slopes, time_blocks
 from finssim.identification.excitation import speeds
 from finssim.identification.fit import Curve
 from finssim.identification.rollout import (
@@ -85,8 +85,9 @@ AXES_BIAS = ("surge.bias", "sway.bias", "yaw.bias")
 
 def held_out(
     stage: Stage, file: Shooting, axes: Sequence[str], by_trial: bool
-) -> dict[str, tuple[float, float]]:
-    """Return the NRMSE of each axis over stretches that the numbers do not rest on, and that of the vehicle file [-].
+) -> tuple[dict[str, tuple[float, float]], Array]:
+    """Return the NRMSE of each axis over stretches that the numbers do not rest on, and that of the vehicle file [-],
+    and the errors of the former, (N,), in the units of the samples.
 
     Each trial, or stretch of one, is predicted by the numbers that one Gauss-Newton step from the end of the fit gives
     without it, each from the initial state and the offsets of its sensors that suit it best.
@@ -137,7 +138,7 @@ def held_out(
         if moving:
             after_mean, before_mean = np.nan_to_num(np.mean(rms, axis=1), nan=np.inf).tolist()
             out[axis] = after_mean, before_mean
-    return out
+    return out, after
 
 
 def _predicted_error(problem: Shooting, theta: Array, solution: FitSolution) -> Array:
@@ -174,8 +175,22 @@ def unexplained(
     return worst, least
 
 
-def pictures(problem: Shooting, solution: FitSolution, axes: Sequence[str]) -> tuple[Curve, ...]:
-    """Measured and simulated channel of each axis, over the trials that move it most."""
+def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> tuple[Curve, ...]:
+    """Return the measured and simulated channel of each axis with a 95 % band, over the trials that move it most.
+
+    Args:
+        stage: The finished fit.
+        axes: Fitted axes.
+        error: Of predictions of stretches without what they show, (N,), in the units of the samples; the fit's own
+            residuals if None.
+    """
+    problem, solution, C = stage.problem, stage.solution, stage.found.covariance
+    known = np.isfinite(np.diagonal(C.local)) & np.isfinite(np.diagonal(C.trials))
+    variance = np.where(np.outer(known, known), np.where(C.alone[:, None] | C.alone, C.local, C.trials), 0.0)
+    slopes = shared_slopes(problem, solution)
+    band = 1.96 * np.sqrt(solution.std**2 + np.einsum("ni,ij,nj->n", slopes, variance, slopes))
+    how = "simulated from the inputs alone" if error is None else "each stretch predicted without it"
+    error = solution.linear.residual if error is None else error
     m, out = problem.measured, []
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
@@ -185,9 +200,9 @@ def pictures(problem: Shooting, solution: FitSolution, axes: Sequence[str]) -> t
             those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
             value = m.value[those]
-            parts.append((clock[those], value, value - solution.linear.residual[those]))
+            parts.append((clock[those], value, value - error[those], band[those]))
         if name:
-            title = f"{axis}: {name}, simulated from the inputs alone"
+            title = f"{axis}: {name}, {how}"
             out.append(Curve.joined(title, f"{name} [{COLUMNS[name].unit}]", parts))
     return tuple(out)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -191,6 +192,63 @@ class Programme:
         return hashlib.sha256(self.tau_desired.tobytes() + "".join(self.phase).encode()).hexdigest()
 
 
+@dataclass(frozen=True)
+class Leg:
+    """Steps to both sides along one axis, each pair half as long as the one before."""
+
+    axis: Axis
+    level: float
+    """[N, N m]"""
+    hold: float
+    """Length of the first step [s]."""
+    times: int = 1
+
+    @property
+    def duration(self) -> float:
+        """Length with the rest around it, once [s]."""
+        return 1.0 + self.hold * (2.0 * sum(SHRINK) + 1.0)
+
+
+SHRINK = (1.0, 0.5, 0.25)
+"""Lengths of the pairs of steps of a `Leg`, relative to the first."""
+
+
+def alternating(leg: Leg, number: int = 1) -> Programme:
+    """Return the steps of a leg: long ones for drag, short ones for inertia, then a coast; it ends near where it began.
+
+    Args:
+        leg: Axis, level and length.
+        number: In the name.
+    """
+    lengths = [round(leg.hold * part * RATE) for part in SHRINK for _ in range(2)]
+    push = np.repeat(leg.level * np.resize([1.0, -1.0], len(lengths)), lengths)
+    parts = (("rest", round(RATE)), ("excitation", len(push)), ("coast", round(leg.hold * RATE)))
+    phase = np.repeat([word for word, _ in parts], [n for _, n in parts])
+    tau = np.zeros((len(phase), 6))
+    tau[phase == "excitation", AXES.index(leg.axis)] = push
+    name = f"{leg.axis}_{leg.level:g}_{leg.hold:g}s_{number}"
+    return Programme(name=name, axes=(leg.axis,), rate=RATE, tau_desired=tau, phase=phase)
+
+
+def read_legs(path: Path) -> list[Leg]:
+    """Return the steps of the next dive that the report of a fit recommends.
+
+    Args:
+        path: Its `fit.json`, or the directory of the report.
+
+    Raises:
+        CalibrationError: There is no such file, or it recommends no dive.
+    """
+    path = path / "fit.json" if path.is_dir() else path
+    try:
+        dive = json.loads(path.read_text(encoding="utf-8"))["next_dive"]
+        return [Leg(**leg) for leg in dive["legs"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise CalibrationError(
+            f"{path} recommends no next dive: expected fit.json of the report of finssim calibrate hydrodynamics"
+        ) from None
+
+
 def which_axes(names: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
     """Axes from words.
 
@@ -226,6 +284,7 @@ def programmes(
     coast: float = 30.0,
     duration: float = 60.0,
     band: tuple[float, float] = (0.05, 1.0),
+    legs: Sequence[Leg] = (),
 ) -> list[Programme]:
     """Programmes that excite some axes of a vehicle, in the order in which to run them.
 
@@ -247,11 +306,22 @@ def programmes(
         coast: Longest coast after a dive [s].
         duration: Of one multi-sine [s].
         band: Of a multi-sine [Hz].
+        legs: Of the dive that a fit recommends, to play those of the axes instead.
 
     Raises:
         CalibrationError: An axis, level, kind or count that cannot be.
     """
     chosen = which_axes(axes, vehicle)
+    if legs:
+        for leg in legs:
+            _levels(*which_axes([leg.axis], vehicle), vehicle, [leg.level], kind)
+        played = [leg for leg in legs if leg.axis in chosen]
+        if not played:
+            there = ", ".join(sorted({leg.axis for leg in legs}))
+            raise CalibrationError(
+                f"the recommended dive has no steps of {', '.join(chosen)}, but of {there}"
+            )
+        return [alternating(leg, n + 1) for leg in played for n in range(leg.times * repeats)]
     if kind not in KINDS:
         raise CalibrationError(f"unknown kind of programme '{kind}'; available: {', '.join(KINDS)}")
     if repeats < 1:

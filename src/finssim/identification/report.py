@@ -90,10 +90,10 @@ MAX_CURVES = 48
 def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
     pictures: dict[str, tuple[str, Figure]] = {}
-    if fit.correlation is not None and len(fit.correlation.names) > 1:
-        pictures["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
         pictures[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
+    if fit.correlation is not None and len(fit.correlation.names) > 1:
+        pictures["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     return {name: (text, png(figure)) for name, (text, figure) in pictures.items()}
 
 
@@ -161,7 +161,10 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
     else:
         above.plot(x, measured, color=GRAY, linewidth=1.6, label="measured")
         below.plot(x, measured - fitted, color=BLUE, linewidth=0.8)
-    above.plot(x, fitted, color=ORANGE, linewidth=1.2, label="fitted")
+    if curve.band is not None:
+        band = curve.band[order]
+        above.fill_between(x, fitted - band, fitted + band, color=ORANGE, alpha=0.25, linewidth=0.0)
+    above.plot(x, fitted, color=ORANGE, linewidth=1.2, label="fitted" if curve.band is None else "fit, 95 %")
     below.axhline(0.0, color=GRAY, linewidth=0.6)
     above.set_title(curve.title, fontsize=9)
     above.set_ylabel(curve.y_label, fontsize=8)
@@ -271,6 +274,7 @@ def fit_json(
         "quality": plain(fit.quality),
         "correlation": None if fit.correlation is None else fit.correlation.as_json(),
         "findings": [item.as_json() for item in findings],
+        "next_dive": None if fit.next_dive is None else fit.next_dive.as_json(),
         "trials": dict(fit.trials),
         "settings": vehicle.calibrations[-1].settings,
         "interrupted": fit.interrupted,
@@ -370,6 +374,8 @@ class Report:
     advice_title: str = "Advice"
     remarks: Sequence[str] = ()
     """Remarks on the estimates, below their table."""
+    lead: Sequence[str] = ()
+    """Sentences that the page begins with, below its first picture; the summary if empty."""
 
     @property
     def notes(self) -> list[str]:
@@ -393,7 +399,10 @@ class Report:
                 table.add_row(*map(Text, self.cells(estimate)), style=style)
         console.print(self.headline, highlight=False, markup=False)
         console.print(table)
-        for line in [*(f"  {sentence}" for sentence in self.summary), *(f"· {note}" for note in self.notes)]:
+        for line in [
+            *(f"  {sentence}" for sentence in (*self.lead, *self.summary)),
+            *(f"· {note}" for note in self.notes),
+        ]:
             console.print(line, highlight=False, markup=False)
         for sentence in self.advice:
             console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")
@@ -419,7 +428,10 @@ class Report:
             OutputError: The directory holds other files, or cannot be written.
         """
         page = Page(self.title)
-        for sentence in self.summary:
+        first = next(iter(pictures)) if self.lead and pictures else None
+        if first is not None:
+            page.picture(*pictures[first])
+        for sentence in self.lead or self.summary:
             page.lead(sentence)
         page.items(self.advice_title, self.advice)
         page.heading("Estimates")
@@ -427,7 +439,7 @@ class Report:
         page.table(self.heads, [self.cells(e) for e in self.estimates], kinds, last="words")
         for note in (*self.notes, self.reading):
             page.note(note)
-        page.pictures(pictures)
+        page.pictures({name: picture for name, picture in pictures.items() if name != first})
         for heading, (heads, rows, kinds) in (tables or {}).items():
             page.heading(heading)
             page.table(heads, rows, kinds, last="words")
@@ -451,8 +463,6 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
         vehicle: `calibrated(fit)`.
         findings: The fit's and those about the calibrated vehicle.
     """
-    identified = sum(e.identifiable for e in fit.estimates.values())
-    interrupted = " The fit was interrupted before it converged." if fit.interrupted else ""
     notes: dict[str, list[str]] = {}
     for name, estimate in fit.estimates.items():
         if estimate.note:
@@ -468,9 +478,9 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
         heads=(*HEADS, "file had", "state"),
         estimates=list(fit.estimates.values()),
         cells=lambda e: _cells(e, fit, vehicle),
+        lead=_lead(fit),
         summary=[
-            f"{identified} of {len(fit.estimates)} parameters are determined by the data.{interrupted}",
-            *(f"{subject}: {quality_text(figures, every=False)}" for subject, figures in fit.quality.items()),
+            f"{subject}: {quality_text(figures, every=False)}" for subject, figures in fit.quality.items()
         ],
         findings=findings,
         reading=READING,
@@ -481,6 +491,26 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
             *([f"{undrawn} more curves are not drawn"] if undrawn > 0 else []),
         ],
     )
+
+
+IMPLIED = (".added_mass", ".bias")
+"""Ends of the names of estimates that follow from others, or may well be zero."""
+
+
+def _lead(fit: Fit) -> list[str]:
+    """Return what is known, what is not, and what to record next."""
+    known, unknown = list[str](), list[str]()
+    for name, e in fit.estimates.items():
+        if not name.endswith(IMPLIED):
+            part = 0.5 * (e.ci95[1] - e.ci95[0]) / max(abs(e.estimate), 1e-12)
+            size = f"±{100.0 * part:.0f} %" if part < 1.0 else "hardly"
+            (known if e.identifiable else unknown).append(f"{name} ({size})")
+    count = sum(e.identifiable for e in fit.estimates.values())
+    told = f": {', '.join(known)}" if known else ""
+    out = [f"{count} of {len(fit.estimates)} parameters are determined by the data{told}."]
+    out += [f"Not determined: {', '.join(unknown)}."] if unknown else []
+    out += [f"R{str(fit.next_dive)[1:]}."] if fit.next_dive is not None else []
+    return [*out, *(["The fit was interrupted before it converged."] if fit.interrupted else [])]
 
 
 def write_report(

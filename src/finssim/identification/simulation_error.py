@@ -45,6 +45,7 @@ from finssim.identification.excitation import (
 )
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.judgement import fit_findings, held_out, pictures, quality, unexplained
+from finssim.identification.next_dive import next_dive
 from finssim.identification.parameters import EXTRAS, LIKELY_SCALE, Parameters, actuator_fields, places
 from finssim.identification.plant_terms import matrices
 from finssim.identification.rollout import (
@@ -384,17 +385,20 @@ class Stages:
             published=self.published,
         )
 
-    def problem(self, kinds: dict[str, str], start: Mapping[str, float]) -> Shooting:
-        """Return the problem of the free parameters, over the segments.
+    def problem(
+        self, kinds: dict[str, str], start: Mapping[str, float], other: Sequence[Segment] = ()
+    ) -> Shooting:
+        """Return the problem of the free parameters, over the segments or over other, driven ones.
 
         The start has the units of the coordinates.
         """
+        swinging = np.array([not other and bool(self.used[s.index].released) for s in other or self.segments])
         return Shooting(
-            self.segments,
+            other or self.segments,
             self.parameters(kinds, start),
             sorted({c for s in self.segments for c in s.measured}),
-            lagged=self.lagged,
-            swinging=np.array([bool(self.used[s.index].released) for s in self.segments]),
+            lagged=None if other else self.lagged,
+            swinging=swinging,
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
@@ -416,10 +420,12 @@ class Stages:
                 for n, v, ends in zip(("d1", "d2"), shape.value, shape.ends, strict=True)
             }
         figures = quality(stage.problem, stage.solution, self.axes, self.used)
+        error = None
         if not stage.solution.interrupted:
             several = stage.found.evidence.unit == "trials" and not stage.found.covariance.alone.any()
             file = self.problem(dict.fromkeys(self.axes, "both"), {})
-            for axis, (after, before) in held_out(stage, file, self.axes, several).items():
+            scores, error = held_out(stage, file, self.axes, several)
+            for axis, (after, before) in scores.items():
                 figures[axis] |= {"held_out": after, "file": before}
         found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
         others, held = other_estimates(p, numbers)
@@ -488,7 +494,7 @@ class Stages:
             quality=figures,
             correlation=correlation,
             findings=tuple(dict.fromkeys(remarks)),
-            curves=pictures(stage.problem, stage.solution, self.axes),
+            curves=pictures(stage, self.axes, error),
             trials={one.trial.name: one.trial.sha256 for one in self.used},
             settings=settings,
             interrupted=stage.solution.interrupted,
@@ -573,6 +579,7 @@ def fit_by_simulation(
     horizon: float | None = None,
     likely: bool = False,
     published: Mapping[str, float] | None = None,
+    design: bool = False,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit by simulation error over all trials together.
@@ -594,6 +601,7 @@ def fit_by_simulation(
         likely: Whether the thrust is known no better than by the voltages that batteries have; its scale is then fitted
             with that as its prior, and goes to the file with the rest.
         published: `top_speed` [m/s] and `bollard_pull` [N], both ahead: data on drag and thrust.
+        design: Whether the next dive is designed.
         progress: Called with the part done and a few words.
 
     Returns:
@@ -634,7 +642,12 @@ def fit_by_simulation(
     if not stage.solution.interrupted:
         stage = fit.first(kinds, start)
     shapes = fit.shapes(stage) if damping == "auto" and not stage.solution.interrupted else {}
-    return fit.result(averaged(stage, shapes), shapes, remarks, damping=str(damping), kinds=kinds)
+    end = averaged(stage, shapes)
+    result = fit.result(end, shapes, remarks, damping=str(damping), kinds=kinds)
+    if design and not result.interrupted and result.changes:
+        say("designing the next dive")
+        return replace(result, next_dive=next_dive(fit, end, result.vehicle, result.estimates))
+    return result
 
 
 def prepare(

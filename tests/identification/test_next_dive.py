@@ -1,0 +1,48 @@
+"""The next dive comes from the fit's own information: its forecast is right, and it beats a repeated dive."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finssim.identification.hydrodynamics import fit_hydrodynamics
+from finssim.identification.programme import alternating, programmes
+from finssim.identification.synthetic import simulate_programme
+from finssim.vehicles import load_vehicle
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+
+
+def dived(plan, seed, name=""):
+    """Return the trials of a plan, at 20 Hz."""
+    return [replace(t, name=t.name + name) for t in simulate_programme(plan, VEHICLE, seed=seed, rate=20.0)]
+
+
+@pytest.mark.slow
+def test_a_designed_second_dive_halves_what_a_repeated_one_leaves():
+    """Median width of the intervals, as long a dive: 0.6 of that of the first dive once more, or less."""
+    plan = programmes("surge,yaw", VEHICLE, levels={"surge": (9.0, 18.0), "yaw": (2.5, 5.0)})
+    first = dived(plan, 1)
+    fit = fit_hydrodynamics(first, VEHICLE, design=True)
+    dive = fit.next_dive
+    assert {leg.axis for leg in dive.legs} == {"surge", "yaw"}
+    assert sum(t.duration for t in first) <= dive.duration < 1.3 * sum(t.duration for t in first)
+    assert "record next: surge at" in str(dive) and dive.widest in str(dive)
+    legs = [alternating(leg, n + 1) for leg in dive.legs for n in range(leg.times)]
+    after, again = (
+        fit_hydrodynamics([*first, *second], VEHICLE).intervals
+        for second in (dived(legs, 2), dived(plan, 2, "_again"))
+    )
+    names = [f"{axis}.{name}" for axis in ("surge", "yaw") for name in ("m_eff", "d1", "d2")]
+    assert np.median([np.diff(after[n]) / np.diff(again[n]) for n in names]) < 0.6
+    # The forecast rests on independent errors; trials of one dive differ a little more.
+    width = np.diff(after[dive.widest])[0] / np.diff(fit.intervals[dive.widest])[0]
+    assert width < 2.0 * dive.factor
+
+
+def test_a_fit_without_thrust_designs_nothing():
+    """No thrust is known to follow, so that nothing can be said of steps."""
+    from identification.test_free_motion import ROV, coasts
+
+    trials = coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r", noise=0.01)
+    assert fit_hydrodynamics(trials, ROV, design=True).next_dive is None
