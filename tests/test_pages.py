@@ -117,6 +117,7 @@ def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name, example in zip(("minnow.yaml", "log.yaml", "water.yaml"), blocks(page, "yaml"), strict=True):
         Path(name).write_text(example, encoding="utf-8")
+    assert Path("minnow.yaml").read_text() == (ROOT / "examples/own/vehicle/minnow.yaml").read_text()
     (log,) = blocks(page, "text")
     Path("dive_surge.csv").write_text(log, encoding="utf-8")
     assert [found.sentence for found in check_vehicle(load_vehicle("minnow.yaml")) if not found.passed] == []

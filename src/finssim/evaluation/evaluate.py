@@ -305,8 +305,8 @@ def evaluate(controller: Sequence[str | Path] | str | Path, **arguments: Any) ->
     Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
 
     Args:
-        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper; or records of one controller
-            on a robot (.mcap).
+        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper, or a class of your own,
+            FILE.py:CLASS; or records of one controller on a robot (.mcap).
         arguments: As of `evaluation.evaluate.evaluate_in_plants`.
 
     Returns:
