@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from finssim.control import ControlError
 from finssim.extensions.ros2 import Ros2Error
 from finssim.extensions.ros2.up import EVERYWHERE, GRAPHS, NODES, TAKES, Options, plan_of, topics_of
 from finssim.robot.goals import GoalError
@@ -33,6 +34,9 @@ def test_graphs_are_made_of_nodes():
     """And the pool's is a robot in a pool."""
     assert {node for nodes in GRAPHS.values() for node in nodes} <= set(NODES)
     assert GRAPHS["pool"] == ("virtual_pool", *GRAPHS["robot"])
+
+
+AUTOPILOT = {"firmware": "ardusub", "vehicle": "bluerov2_heavy", "port": 6000}
 
 
 def told(graph, tmp_path, **choices):
@@ -77,6 +81,8 @@ def told(graph, tmp_path, **choices):
         ("pool", {"site": "tank"}, "virtual_pool", {"camera": "corners"}),
         ("pool", {"namespace": "robot_1"}, "**", {"frame_prefix": "robot_1/"}),
         ("pool", {"site": "open-water", "positioning": "usbl"}, "virtual_pool", {"camera": "none"}),
+        ("pool", AUTOPILOT, "virtual_pool", {"firmware": "ardusub", "camera": "none", "port": 6000}),
+        ("pool", AUTOPILOT, "**", {"robot": "mavlink://udpout:127.0.0.1:6000?dvl=127.0.0.1:6002"}),
         ("robot", {"robot": "serial:/dev/x", "pool_file": FILE}, "camera", {"pictures": "none"}),
         ("robot", {"pictures": "udp://a:1", "pool_file": FILE}, "camera", {"pictures": "udp://a:1"}),
     ],
@@ -163,6 +169,9 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
             "--real-time-factor 0: expected more than 0, or --lockstep",
         ),
         ("sim", {"team": "finsrov,finsrov"}, Ros2Error, "--team is for the graph pool"),
+        ("sim", {"firmware": "ardusub"}, Ros2Error, "--firmware has no effect in the graph sim"),
+        ("pool", {"firmware": "ardusub"}, ControlError, "autopilot"),
+        ("pool", {**AUTOPILOT, "camera": "corners"}, Ros2Error, "--firmware ardusub has no camera"),
         (
             "pool",
             {"team": "finsrov,finsrov", "goal": "0,0,-1,0"},

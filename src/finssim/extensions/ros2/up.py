@@ -16,10 +16,11 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
 
+from finssim.control.ardusub import Mixer
 from finssim.core.system import PARENT, SEPARATE, interrupt
 from finssim.extensions.ros2 import Ros2Error
 from finssim.extensions.ros2.backend import activate
@@ -192,6 +193,9 @@ class Options:
     """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without an overhead camera."""
     plant: str = "1"
     """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
+    firmware: Literal["mcu", "ardusub"] = "mcu"
+    """(NAME) Firmware of a virtual pool's vehicle: mcu, or ardusub, an autopilot with DVL and compass and no camera.
+    Ground stations connect by TCP to the port after --port, the DVL has the one after that."""
     severity: str = "realistic"
     """(NAME) Of a drawn plant: nominal, realistic or hard."""
     camera: str | None = None
@@ -288,7 +292,7 @@ def plan_of(
     o, several = options, options.team is not None
     names = [name.strip() for name in o.team.split(",")] if o.team is not None else [o.vehicle]
     _check(graph, o)
-    blind = o.site == "open-water" or "none" in (str(o.pool_file), o.camera)
+    blind = o.site == "open-water" or o.firmware == "ardusub" or "none" in (str(o.pool_file), o.camera)
     if graph == "robot" and not blind and o.pool_file is None and pool_file is not None:  # our own, unwritten
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
     simulated = graph == "sim" or o.lockstep or o.real_time_factor is not None
@@ -311,6 +315,8 @@ def plan_of(
     shares = {name: _share(name, getattr(o, name), len(names)) for name in SHARED}
     for i, name in enumerate(names):
         vehicle = vehicle_at(o.site or "pool", load_vehicle(name or "finsrov"))
+        if o.firmware == "ardusub":
+            Mixer.of(vehicle)  # refuses a vehicle without an autopilot
         own = {key: texts[i] for key, texts in shares.items()}
         if name is not None and (own["goal"] is not None or own["trajectory"] is not None):
             check_reachable(guide_of(own["goal"], own["trajectory"]), vehicle)
@@ -369,11 +375,14 @@ def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
 
 def _check(graph: str, o: Options) -> None:
     """Refuse options that have no effect in a graph."""
-    if o.team is not None and (graph != "pool" or o.namespace or o.frame_prefix or o.teleop or o.start):
+    single = o.namespace or o.frame_prefix or o.teleop or o.start or o.firmware == "ardusub"
+    if o.team is not None and (graph != "pool" or single):
         raise Ros2Error(
             "--team is for the graph pool, which places and names its vehicles: leave --namespace, --frame-prefix, "
-            "--start and --teleop out"
+            "--start, --firmware and --teleop out"
         )
+    if o.firmware == "ardusub" and o.camera not in (None, "none"):
+        raise Ros2Error("--firmware ardusub has no camera, but DVL and compass: leave --camera out")
     if o.team is not None and o.vehicle not in (None, "finsrov"):
         raise Ros2Error("--team names its vehicles: leave --vehicle out")
     if o.team is None and (o.message_loss is not None or o.message_delay is not None):
@@ -420,6 +429,9 @@ def _wire(graph: str, o: Options, further: int) -> dict[str, Any]:
     """
     if graph == "sim":
         return {"robot": None}
+    if o.firmware == "ardusub":
+        port = o.port or MCU_PORT
+        return {"robot": f"mavlink://udpout:127.0.0.1:{port}?dvl=127.0.0.1:{port + DVL_AFTER}"}
     bind = camera_bind = None
     ours = DEFAULT_BIND if o.bind is None and further else o.bind
     if ours is not None:
@@ -550,7 +562,7 @@ TAKES = {
     "sim": "start hydrodynamics seed real_time_factor",
     "state_estimation": "pool_file let_in mode",
     "teleop": "device other",
-    "virtual_pool": "plant severity camera port bind pool_file truth start positioning world water seed team "
+    "virtual_pool": "plant firmware severity camera port bind pool_file truth start positioning world water seed team "
     "message_loss message_delay real_time_factor",
 }
 """Node -> its parameters that options give, by the names of the options where these are the same."""
@@ -564,6 +576,8 @@ SHARED = ("goal", "trajectory", "let_in")
 
 MCU_PORT = 58766
 """Port of a virtual pool's motor controller by default; pictures are sent from the next port."""
+STATIONS_AFTER, DVL_AFTER = 1, 2
+"""Distances of an autopilot's TCP ports from it: of ground stations, and of the DVL."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,12 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The hardware bridge in front of an autopilot: armed by its service, once the autopilot is."""
+"""The hardware bridge in front of an autopilot: armed by its service, once the autopilot is; and a whole graph."""
 
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import numpy as np
 import pytest
 
 from finssim.extensions.ros2.backend import activate
@@ -12,7 +18,7 @@ from rclpy.node import Node
 
 from finssim.extensions.ros2.nodes.conversions import ros_type
 from finssim.extensions.ros2.nodes.hardware_bridge import HardwareBridge
-from finssim.pool import VirtualPool, draw_plant
+from finssim.pool import VirtualPool, draw_plant, read_truth
 from finssim.pool.drawn_plant import site_of
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.defaults import vehicle_at
@@ -77,3 +83,33 @@ def test_the_service_arms_once_the_autopilot_has_armed():
     finally:
         bridge.close()
         rclpy.shutdown()
+
+
+def three_ports():
+    """A UDP port whose next two TCP ports are free."""
+    while True:
+        with ExitStack() as stack:
+            try:
+                udp = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                udp.bind(("127.0.0.1", 0))
+                port = udp.getsockname()[1]
+                for after in (1, 2):
+                    tcp = stack.enter_context(socket.socket())
+                    tcp.bind(("127.0.0.1", port + after))
+                return port
+            except (OSError, OverflowError):
+                continue
+
+
+@pytest.mark.slow
+def test_a_whole_graph_drives_an_autopilot_to_its_goal(alone, tmp_path):
+    """In lock-step from one command: armed by the autopilot, and within 10 cm of the goal by the truth."""
+    goal, truth = (0.6, 0.0, -2.0), tmp_path / "run.truth"
+    words = "ros2 up pool --firmware ardusub --vehicle bluerov2_heavy --site tank --severity nominal --let-in 0,0 "
+    words += f"--start 0,0,-2,0 --goal 0.6,0,-2,0 --arm --lockstep --duration 25 --port {three_ports()} --truth {truth}"
+    command = [sys.executable, "-m", "finssim", *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    true = read_truth(truth)
+    before = true.position[true.time < true.time[-1] - 1.0]  # at the end it is disarmed
+    assert np.linalg.norm(before[-1] - goal) < 0.1 and abs(before[0] - goal).max() > 0.5

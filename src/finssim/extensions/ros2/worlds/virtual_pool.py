@@ -13,6 +13,7 @@ from finssim.core import realtime
 from finssim.extensions.ros2.nodes.conversions import ros_type
 from finssim.extensions.ros2.nodes.robot_node import RobotNode
 from finssim.extensions.ros2.topics import TOPICS, quality_profile
+from finssim.extensions.ros2.up import DVL_AFTER, STATIONS_AFTER
 from finssim.extensions.ros2.worlds.clock import PacedClock
 from finssim.pool.fleet import Fleet, Medium
 from finssim.pool.run import MCU_PORT, Ends, PoolTiming, SiteChoice
@@ -63,6 +64,7 @@ class VirtualPoolNode(RobotNode):
             vehicle=self.get_parameter("vehicle").value,
             plant=str(self.parameter("plant", "1")),
             severity=self.parameter("severity", "realistic"),
+            firmware=self.parameter("firmware", "mcu"),
             site=None if world is not None and site == "open-water" else site,  # as deep as the world
             world=world,
             water=_path(water),
@@ -71,9 +73,9 @@ class VirtualPoolNode(RobotNode):
             positioning=self.parameter("positioning", "none"),
             seed=self.parameter("seed", 1),
         )
-        self._addresses = Ends(
-            port=self.parameter("port", MCU_PORT), robot=self.parameter("bind", DEFAULT_BIND)
-        )
+        port = self.parameter("port", MCU_PORT)
+        stations, log = (f"127.0.0.1:{port + after}" for after in (STATIONS_AFTER, DVL_AFTER))
+        self._addresses = Ends(port=port, robot=self.parameter("bind", DEFAULT_BIND), tcp=stations, dvl=log)
         self._pool_file = _path(self.parameter("pool_file", ""))
         self._truth = _path(self.parameter("truth", ""))
         self.team = self.parameter("team", "") or None
