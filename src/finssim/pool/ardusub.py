@@ -73,6 +73,13 @@ WITHOUT_SAMPLE = {
     "meminfo",
 }
 """Messages that need no instrument."""
+CONSTANT = {
+    "power_status": (5000, 0, 0),
+    "meminfo": (0, 65535, 100000),
+    "mission_current": (0,),
+    "gps_raw_int": (0, 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0),  # none under water
+}
+"""Messages that never change, with their fields."""
 FRD = TO_FOSSEN.A
 """Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
 STANDARD_GRAVITY = 9.80665
@@ -836,27 +843,9 @@ class ArduSub:
         self._send("message_interval", int(values[0]) & 0xFFFF, round(1e6 * interval))
         return ACCEPTED
 
-    def _do_request(self, values: list[float]) -> int:
-        return _result(self._report(_name(values[0])))
-
-    def _do_request_version(self, values: list[float]) -> int:
-        return _result(values[0] == 1.0 and self._report("autopilot_version"))
-
     def _do_request_protocol(self, values: list[float]) -> int:
         self._statustext(INFO, "The protocol's version is not sent")
         return UNSUPPORTED
-
-    def _do_get_home(self, values: list[float]) -> int:
-        return _result(self._origin is not None and self._report("home_position"))
-
-    def _do_set_home(self, values: list[float]) -> int:
-        return _result(self._has_position)
-
-    def _do_surface(self, values: list[float]) -> int:
-        return _result(self._set_mode(SURFACE))
-
-    def _do_hold_position(self, values: list[float]) -> int:
-        return _result(self._set_mode(POSHOLD))
 
     def _do_calibrate(self, values: list[float]) -> int | None:
         """Gyroscope (first), ground pressure (third) or accelerometer (fifth, never here); nothing while armed."""
@@ -1016,7 +1005,8 @@ class ArduSub:
 
     def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
         """Return the function that gives the fields of a message, or of several, by its name."""
-        return getattr(self, f"_report_{name}", None)
+        constant = (lambda: CONSTANT[name]) if name in CONSTANT else None
+        return getattr(self, f"_report_{name}", constant)
 
     def _report(self, name: str) -> bool:
         """Send a message with current values, if there are any; return False if there is none of this name."""
@@ -1077,8 +1067,7 @@ class ArduSub:
     def _report_scaled_imu2(self) -> tuple[Any, ...]:
         return (self._milliseconds, *self._imu())
 
-    def _report_scaled_imu3(self) -> tuple[Any, ...]:
-        return (self._milliseconds, *self._imu())
+    _report_scaled_imu3 = _report_scaled_imu2
 
     def _report_scaled_pressure(self) -> tuple[Any, ...]:
         """The barometer of the dry hull."""
@@ -1094,18 +1083,6 @@ class ArduSub:
 
     def _report_ahrs2(self) -> tuple[Any, ...]:
         return (*self._spoiled(self._attitude, "quaternion"), self._altitude, *(self._origin or (0, 0)))
-
-    def _report_power_status(self) -> tuple[Any, ...]:
-        return 5000, 0, 0
-
-    def _report_meminfo(self) -> tuple[Any, ...]:
-        return 0, 65535, 100000
-
-    def _report_mission_current(self) -> tuple[Any, ...]:
-        return (0,)
-
-    def _report_gps_raw_int(self) -> tuple[Any, ...]:
-        return 0, 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0  # none under water
 
     def _report_nav_controller_output(self) -> tuple[Any, ...]:
         heading = 0.0 if self._attitude_loop.heading is None else math.degrees(self._attitude_loop.heading)
@@ -1209,15 +1186,19 @@ class ArduSub:
 COMMANDS: dict[int, Callable[[ArduSub, list[float]], int | None]] = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: ArduSub._do_arm,
     mavlink.MAV_CMD_DO_SET_MODE: ArduSub._do_set_mode,
-    mavlink.MAV_CMD_NAV_LAND: ArduSub._do_surface,
-    mavlink.MAV_CMD_NAV_LOITER_UNLIM: ArduSub._do_hold_position,
+    mavlink.MAV_CMD_NAV_LAND: lambda it, values: _result(it._set_mode(SURFACE)),
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: lambda it, values: _result(it._set_mode(POSHOLD)),
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: ArduSub._do_set_interval,
     mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: ArduSub._do_get_interval,
-    mavlink.MAV_CMD_REQUEST_MESSAGE: ArduSub._do_request,
-    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: ArduSub._do_request_version,
+    mavlink.MAV_CMD_REQUEST_MESSAGE: lambda it, values: _result(it._report(_name(values[0]))),
+    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda it, values: _result(
+        values[0] == 1.0 and it._report("autopilot_version")
+    ),
     mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: ArduSub._do_request_protocol,
-    mavlink.MAV_CMD_GET_HOME_POSITION: ArduSub._do_get_home,
-    mavlink.MAV_CMD_DO_SET_HOME: ArduSub._do_set_home,
+    mavlink.MAV_CMD_GET_HOME_POSITION: lambda it, values: _result(
+        it._origin is not None and it._report("home_position")
+    ),
+    mavlink.MAV_CMD_DO_SET_HOME: lambda it, values: _result(it._has_position),
     mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: ArduSub._do_calibrate,
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: ArduSub._do_reboot,
     mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_motor_test,
