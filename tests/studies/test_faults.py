@@ -1,11 +1,15 @@
 """`python -m studies.faults` and its table."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
 from reference.programs import study
-from studies.faults import row_ok, tables_of
+from studies.faults import AUTOPILOT, row_ok, tables_of
+
+ROOT = Path(__file__).resolve().parents[2]
 
 GOOD = {
     "ok": True, "thrust_gone_s": 0.4, "frames_off_s": 0.1, "margin_m": 0.2, "state": "fault", "reason": "silence",
@@ -71,3 +75,29 @@ def test_a_control_that_passes_is_wrong():
     assert not row_ok("link-cut", [trial("link-cut", ok=False)]) and not row_ok("link-cut", [])
     rows, _ = told(trial("control"))
     assert rows[0][-1] == "PASSED, which a control must not"
+
+
+def test_the_page_on_ardusub_has_the_figures_of_the_result():
+    """Every scenario passed in it, and the times of the page's table are the longest of its trials."""
+    result = json.loads((ROOT / "results" / "bluerov2_faults.json").read_text())
+    assert result["ok"] and {t["job"]["row"] for t in result["trials"]} == set(AUTOPILOT)
+    page = (ROOT / "docs" / "bluerov2.md").read_text()
+    rows = {
+        "manual input": "ap-joystick", "mode changed": "ap-mode", "disarmed": "ap-disarm", "leak": "ap-leak",
+        "an origin": "ap-origin", "its north": "ap-north", "its DVL": "ap-own-dvl", "battery low": "ap-battery",
+        "no telemetry": "ap-silence", "our frames": "ap-deaf", "only the autopilot's": "ap-heartbeat",
+        "autopilot restarted": "ap-reboot", "DVL lost": "ap-dvl", "depth frozen": "ap-depth",
+    }  # fmt: skip
+    for begin, name in rows.items():
+        (cell,) = re.findall(rf"^\| {begin}.* \| ([^|]*) \|$", page, re.MULTILINE)
+        trials = [t for t in result["trials"] if t["job"]["row"] == name]
+        keys = (
+            ["frames_off_s"]
+            if "person" in cell
+            else ["thrust_gone_s", "frames_off_s"][: 1 + ("axes" in cell)]
+        )
+        found = [max(t[key] for t in trials) for key in keys]
+        assert [float(x) for x in re.findall(r"[0-9]+\.[0-9]+", cell)] == pytest.approx(found, abs=0.0051), (
+            begin
+        )
+    assert f"{len(result['trials'])} of {len(result['trials'])} trials ended so" in page
