@@ -137,7 +137,7 @@ TOPICS = {
         "fix of motion capture (x, y, yaw) or acoustic positioning (x, y, z), by wire; what is not measured has 1e6",
     ),
     "dvl": Topic("dvl/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", SENSOR, "dvl_link", "hardware_bridge",
-        "velocity over the floor by the Doppler log, its axes"),
+        "velocity over the floor by the Doppler log, its axes; a covariance greater than the vehicle file's counts"),
     "compass": Topic("compass/imu", "sensor_msgs/msg/Imu", SENSOR, "base_link", "hardware_bridge",
         "heading in the map as an orientation; it has no rates and no specific force"),
     "goal": Topic("goal", "geometry_msgs/msg/PoseStamped", COMMAND, "map", "you", "pose to hold"),
