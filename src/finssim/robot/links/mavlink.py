@@ -81,8 +81,8 @@ assumption."""
 AIDED_LASTS = 1.0
 """Age of the newest EKF_STATUS_REPORT up to which it counts [s]."""
 PLACE_STD, SPEED_STD = 0.05, 0.03
-"""Standard deviations of the autopilot's position [m] and velocity [m/s], per axis: its filter follows 0.1 to 0.2 s late,
-at up to 0.3 m/s²."""
+"""Standard deviations of the autopilot's position [m] and velocity [m/s], per axis: its filter follows 0.1 to 0.2 s
+late, at up to 0.3 m/s²."""
 LEAP = 0.1
 """Step of the autopilot's position, beyond its velocity, that is a reset of its filter [m]."""
 TURN_WINDOW, TURN_LIMIT, TURN_OVER = 10.0, math.radians(4.0), math.radians(1.0)
