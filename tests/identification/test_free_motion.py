@@ -8,7 +8,7 @@ import pytest
 
 from finssim.core.rotations import quat_from_euler
 from finssim.identification.rollout import released, streams
-from finssim.identification.simulation_error import fit_by_simulation
+from finssim.identification.simulation_error import fit_by_simulation, prepare
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Header, Trial
 from finssim.vehicles import AXES, load_vehicle
@@ -279,6 +279,13 @@ def test_one_coast_is_enough_and_a_push_ends_it():
         found = fit_by_simulation([trial], ROV).estimates["yaw.d2/m_eff"]
         assert found.estimate == pytest.approx(0.7, rel=0.1)
         assert found.ci95[0] < 0.7 < found.ci95[1]
+
+
+def test_each_trial_is_announced_before_it_is_prepared():
+    """A person sees within a moment that something happens."""
+    names = []
+    prepare(coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r"), ROV, ["yaw"], names.append)
+    assert names == ["coast_0", "coast_1"]
 
 
 def test_what_does_not_coast_is_refused():

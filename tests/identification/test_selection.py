@@ -29,6 +29,8 @@ def test_only_absent_damping_is_improbable(name, axis, absent):
         vehicle, some = trials(name, axis, seed=seed)
         fit = fit_by_simulation(some, vehicle)
         weights = fit.settings["drag"][axis]
+        (said,) = [one for one in fit.findings if one.code == "drag_averaged"]
+        assert said.subject == axis and f"both {weights['both']:.2f}" in str(said)
         assert sum(weights.values()) == pytest.approx(1.0)
         for term, shape in (("d1", "quadratic"), ("d2", "linear")):
             estimate = fit.estimates[f"{axis}.{term}"]

@@ -239,8 +239,9 @@ def calibrate_hydrodynamics(
         if not 0.0 < value < math.inf:
             raise CalibrationError(f"--{name.replace('_', '-')} is {value:g}, expected a number above 0")
     body = load_vehicle(vehicle)
-    used, held_out = usable_trials(trials)
     with progress_bar("calibrate hydrodynamics") as progress:
+        progress(0.0, "reading the trials")
+        used, held_out = usable_trials(trials)
         fit = fit_hydrodynamics(
             used,
             body,

@@ -462,9 +462,14 @@ class Stages:
         P, local = stage.problem.judged, stage.found.covariance.local
         correlation, traded = degeneracy(p.names[:P], local[:P, :P], stage.found.free[:P])
         left_out = [one.trial.name for one in self.prepared if one not in self.used]
+        averages = [
+            finding("drag_averaged", axis, shapes=", ".join(f"{n} {w:.2f}" for n, w in shape.weights.items()))
+            for axis, shape in shapes.items()
+        ]
         remarks = [
             *remarks,
             *self.remarks,
+            *averages,
             *(finding("trial_left_out", name) for name in left_out),
             *fit_findings(stage.problem, stage.solution, stage.found, self.used),
             *bounds,
@@ -611,15 +616,16 @@ def fit_by_simulation(
         CalibrationError: No trial can be used, one is held out, or a word is unknown.
     """
     _check(trials, vehicle, axes, damping, estimate, horizon)
-    prepared, remarks = prepare(trials, vehicle, axes)
+    say = FitProgress(progress)
+    prepared, remarks = prepare(trials, vehicle, axes, lambda name: say(f"preparing {name}", 0.1))
     chosen, more = _axes(prepared, vehicle, axes)
     strange = [axis for axis in known or {} if axis not in chosen]
     if strange:
         raise CalibrationError(
             f"the inertia of {', '.join(strange)} was given, but the fitted axes are {', '.join(chosen)}"
         )
-    remarks, say = [*remarks, *more], FitProgress(progress)
-    say("preparing")
+    remarks = [*remarks, *more]
+    say("preparing the start", 0.1)
     estimate = [*estimate, "thrust_scale"] if likely else estimate
     fit = Stages(
         telling(prepared, vehicle, chosen),
@@ -651,17 +657,21 @@ def fit_by_simulation(
 
 
 def prepare(
-    trials: Sequence[Trial], vehicle: Vehicle, axes: Sequence[str] | None = None
+    trials: Sequence[Trial],
+    vehicle: Vehicle,
+    axes: Sequence[str] | None = None,
+    show: Callable[[str], None] = lambda name: None,
 ) -> tuple[list[Streams], list[Finding]]:
     """Return the trials that can be used, and findings on what was assumed of them and on those that cannot.
 
-    A trial without thrust is cut to the free motions of its axes.
+    A trial without thrust is cut to the free motions of its axes. `show` is called with the name of each.
 
     Raises:
         CalibrationError: No trial can be used.
     """
     prepared, remarks, reasons = list[Streams](), list[Finding](), list[str]()
     for trial in trials:
+        show(trial.name)
         try:
             one = streams(trial, vehicle)
             if trial.header.passive:
