@@ -337,6 +337,13 @@ def _training(curves: NDArray[Any]) -> Any:
     return figure
 
 
+def _hydrodynamic(result: Identification) -> dict[str, Any]:
+    """Return the estimates of the hydrodynamics by their names."""
+    return {
+        name: e for name, e in result.fit.estimates.items() if str(e.path or "").startswith("hydrodynamics.")
+    }
+
+
 def _identification(result: Identification, hardware: bool) -> list[Table]:
     """Return tables of what the trials determined, and of the replay of other trials."""
     score = result.replay.aggregate(result.replay.models[0]).value
@@ -348,13 +355,12 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
         f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
         f"vehicle, and tried {same}."
     )
-    estimates = {name: e for name, e in result.fit.estimates.items() if e.path is not None}
     rows = [
         [
             name, number_text(e.estimate), interval_text(e), number_text(number_in(result.truth, str(e.path))), e.unit,
             state_text(e, result.fit, result.vehicle),
         ]
-        for name, e in estimates.items() if str(e.path).startswith("hydrodynamics.")
+        for name, e in _hydrodynamic(result).items()
     ]  # fmt: skip
     return [
         Table(
@@ -364,7 +370,7 @@ def _identification(result: Identification, hardware: bool) -> list[Table]:
             rows=rows,
             note=UNSURE + ("" if hardware else POOL_VEHICLE),
             sentences=sentences(result.findings),
-            pictures={"replay.png": "Held-out trials: measured and replayed by the identified vehicle"},
+            pictures={"replay.png": "Held-out trials, measured and replayed: response [1] in time [s]"},
         )
     ]
 
@@ -387,11 +393,13 @@ def _lead(result: Mapping[str, Any], spec: Spec, seconds: float) -> str:
 
 
 def _known(result: Identification) -> str:
-    """Return in one sentence which numbers of the vehicle are known after its trials."""
-    estimates = [e for e in result.fit.estimates.values() if e.path is not None]
-    guesses = [e.name for e in estimates if not e.identifiable]
-    kept = f"; guesses stay for {', '.join(guesses)}" if guesses else ""
-    return f"Its trials determine {len(estimates) - len(guesses)} of {len(estimates)} numbers of the vehicle{kept}."
+    """Return in one sentence which numbers of the hydrodynamics are known after the trials."""
+    states = {name: state_text(e, result.fit, result.vehicle) for name, e in _hydrodynamic(result).items()}
+    kept = [name for name, state in states.items() if state == "file kept"]
+    alone = sum(state == "written" for state in states.values())
+    text = f"Its trials determine {alone} of {len(states)} hydrodynamic numbers by themselves"
+    text += f" and {len(states) - alone - len(kept)} jointly with others"
+    return f"{text}; the guess stays for {', '.join(kept)}." if kept else f"{text}."
 
 
 def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
