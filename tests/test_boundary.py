@@ -9,6 +9,7 @@ import pytest
 import typer
 
 from finssim.cli.boundary import run
+from finssim.cli.commands import app as commands
 from finssim.core.files import OutputError
 
 
@@ -71,6 +72,14 @@ def test_a_missing_extra_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     assert run(app, ["fail", "missing"]) == 2
     assert capsys.readouterr().err == "finssim: cv2 is not installed: pip install 'finssim[vision]'\n"
+
+
+def test_a_file_of_ones_own_that_needs_an_extra_names_it(capsys, monkeypatch, tmp_path):
+    """A task in torch, where only the core is installed."""
+    monkeypatch.setitem(sys.modules, "torch", None)
+    (tmp_path / "mine.py").write_text("import torch\n", encoding="utf-8")
+    assert run(commands, ["tasks", "show", f"{tmp_path / 'mine.py'}:Mine"]) == 2
+    assert "torch is not installed: pip install 'finssim[learn]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("kind", "error"), [("fault", json.JSONDecodeError), ("fault-key", KeyError)])

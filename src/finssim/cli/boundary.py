@@ -94,7 +94,9 @@ def refusal(error: Exception, script: str = "finssim") -> str | None:
     if isinstance(error, ValueError) and (
         _is_ours(type(error).__module__, script) or _raised_by_us(error.__traceback__, script)
     ):
-        return str(error)
+        cause = error.__cause__  # as of a user's file that imports what is not installed
+        missing = _missing_extra(cause) if isinstance(cause, ModuleNotFoundError) else None
+        return f"{error}; {missing}" if missing and "pip install" not in str(error) else str(error)
     return None
 
 

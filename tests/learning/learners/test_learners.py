@@ -163,13 +163,17 @@ def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sente
     assert kind.settings(Guess(), changes={"entropy_weight": 0.0}).entropy_weight == 0.0
 
 
-def test_a_library_that_is_missing_is_named(monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "library", "extras"),
+    [("rsl-rl", "rsl_rl.algorithms", "learn,rsl-rl"), ("sb3-ppo", "torch", "learn")],
+)
+def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extras):
     """With what to install."""
-    kind = learner_named("rsl-rl")
-    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
+    kind = learner_named(name)
+    monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"finssim.learning.learners.{kind.module}", raising=False)
     with pytest.raises(
-        LearningError, match=r"this learner needs rsl_rl.algorithms: pip install 'finssim\[learn,rsl-rl\]'$"
+        LearningError, match=rf"this learner needs {library}: pip install 'finssim\[{extras}\]'$"
     ):
         kind.settings(Guess())
 

@@ -130,8 +130,9 @@ class LearnerKind:
         except ModuleNotFoundError as error:
             if str(error.name).startswith("finssim"):
                 raise
+            extras = self.extra if self.extra == "learn" else f"learn,{self.extra}"
             raise LearningError(
-                f"this learner needs {error.name}: pip install 'finssim[learn,{self.extra}]'"
+                f"this learner needs {error.name}: pip install 'finssim[{extras}]'"
             ) from error
 
 
