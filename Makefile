@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := learn,torchrl,rsl-rl,skrl,pettingzoo,imitation,sweep,wandb,logs,vision,render,view,mujoco,mpc,perception,hardware,ros2,xacro,dev
+EXTRAS := learn,torchrl,rsl-rl,pettingzoo,imitation,sweep,wandb,logs,vision,render,view,mujoco,mpc,perception,hardware,ros2,xacro,dev
 STRICT := $(wildcard $(addprefix src/finssim/,core physics control localization)) studies
 # Named by content and extras, so that a fresh checkout or another branch with the same requirements installs nothing again.
 STAMP := $(VENV)/.installed-$(shell { echo $(EXTRAS); cat pyproject.toml constraints.txt; } | cksum | cut -d " " -f 1)

@@ -74,16 +74,6 @@ def rsl_rl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
     return lambda: env.step(rows)
 
 
-def skrl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """skrl's wrapper."""
-    import torch
-
-    from finssim.learning.skrl_env import SkrlEnv
-
-    env, rows = SkrlEnv(environment), torch.as_tensor(action.reshape(-1, action.shape[-1]))
-    return lambda: env.step(rows)
-
-
 def gymnasium_single(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
     """Gymnasium's `Env`: one world, reset where it ends."""
     from finssim.learning.gymnasium_env import Env
@@ -115,7 +105,7 @@ def pettingzoo(environment: Environment, action: np.ndarray) -> Callable[[], Any
     return step
 
 
-BATCHED = (gymnasium_vector, sb3, torchrl, rsl_rl, skrl)
+BATCHED = (gymnasium_vector, sb3, torchrl, rsl_rl)
 SINGLE = (gymnasium_single, pettingzoo)
 
 

@@ -29,7 +29,6 @@ SHORT = {
     "learn_with_pettingzoo.py": ("TURNS, TRIES = 30, 4", "TURNS, TRIES = 2, 2"),
     "learn_with_rsl_rl.py": ("60", "2"),
     "learn_with_sb3.py": ("500_000", "16_384"),
-    "learn_with_skrl.py": ("ROLLOUTS, STEPS, WORLDS = 60,", "ROLLOUTS, STEPS, WORLDS = 2,"),
     "learn_with_torchrl.py": ("ROLLOUTS, STEPS, WORLDS, BATCH = 60,", "ROLLOUTS, STEPS, WORLDS, BATCH = 2,"),
     "train_and_evaluate.py": ("600_000", "16_384"),
 }

@@ -8,13 +8,12 @@ from finssim.learning.pettingzoo_env import PettingZooEnv
 from finssim.learning.rsl_rl_env import RslRlVecEnv
 from finssim.learning.sb3 import Sb3VecEnv
 from finssim.learning.served import age_episodes, served
-from finssim.learning.skrl_env import SkrlEnv
 from finssim.learning.torchrl_env import TorchRlEnv
 from finssim.tasks import EnvironmentSetupError, StationKeeping, make
 from reference.pair import Pair
 
 
-@pytest.mark.parametrize("adapter", [Env, PettingZooEnv, RslRlVecEnv, Sb3VecEnv, SkrlEnv, TorchRlEnv])
+@pytest.mark.parametrize("adapter", [Env, PettingZooEnv, RslRlVecEnv, Sb3VecEnv, TorchRlEnv])
 def test_every_adapter_takes_the_arguments_of_make(adapter):
     """Vehicle, hydrodynamics, action mode, ranges, measured state and seed reach the environment."""
     options = {"vehicle": "bluerov2_heavy", "hydrodynamics": "calibrated", "action": "wrench4", "seed": 4}

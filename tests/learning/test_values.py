@@ -18,11 +18,10 @@ from finssim.learning.gymnasium_env import Env, VectorEnv
 from finssim.learning.pettingzoo_env import PettingZooEnv
 from finssim.learning.rsl_rl_env import RslRlVecEnv
 from finssim.learning.sb3 import Sb3VecEnv
-from finssim.learning.skrl_env import SkrlEnv, SkrlTeamEnv
 from finssim.learning.torchrl_env import TorchRlEnv
 from finssim.tasks import StationKeeping
 from finssim.tasks.station_keeping import Reward
-from reference.learners import mappo, ppo, rsl_rl_settings
+from reference.learners import rsl_rl_settings
 from reference.pair import constant
 
 GAMMA = 0.9
@@ -99,44 +98,6 @@ def test_torchrl_with_agents():
     estimator(data)
     np.testing.assert_allclose(data["agents", "value_target"][..., 0, 0], 10.0, rtol=1e-5)
     np.testing.assert_allclose(data["agents", "value_target"][..., 1, 0], 20.0, rtol=1e-5)
-
-
-def skrl_targets(env, agent):
-    """Play a rollout and let the agent compute its returns."""
-    agent.init(trainer_cfg=None)
-    agent.enable_training_mode(True)
-    observations, _ = env.reset()
-    for k in range(STEPS):
-        with torch.no_grad():
-            states = env.state()
-            actions, _ = agent.act(observations, states, timestep=k, timesteps=STEPS)
-            after, rewards, terminated, truncated, infos = env.step(actions)
-            agent.record_transition(
-                observations=observations, states=states, actions=actions, rewards=rewards, next_observations=after,
-                next_states=env.state(), terminated=terminated, truncated=truncated, infos=infos, timestep=k,
-                timesteps=STEPS,
-            )  # fmt: skip
-        observations = after
-        agent.post_interaction(timestep=k, timesteps=STEPS)
-
-
-@CASES
-def test_skrl(task, value):
-    env = SkrlEnv(task, worlds=3)
-    agent = ppo(env, rollouts=STEPS, discount_factor=GAMMA, learning_rate=0.0)
-    says(agent.value.net, value)
-    skrl_targets(env, agent)
-    np.testing.assert_allclose(agent.memory.get_tensor_by_name("returns"), value, rtol=1e-5)
-
-
-def test_skrl_with_agents():
-    env = SkrlTeamEnv(constant(time_limit=0.5), worlds=3)
-    agent = mappo(env, rollouts=STEPS, discount_factor=GAMMA, learning_rate=0.0)
-    for name, value in (("left", 10.0), ("right", 20.0)):
-        says(agent.values[name].net, value)
-    skrl_targets(env, agent)
-    for name, value in (("left", 10.0), ("right", 20.0)):
-        np.testing.assert_allclose(agent.memories[name].get_tensor_by_name("returns"), value, rtol=1e-5)
 
 
 def target(reward, value, done, after):

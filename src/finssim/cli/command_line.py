@@ -63,7 +63,7 @@ LARGEST = 1e9
 """Greatest magnitude of a number on the command line, in any unit."""
 CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 SETTINGS: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
-WRITTEN = ("out", "lerobot")
+WRITTEN = ("out",)
 """Options whose directories are written."""
 JSON = "Print one JSON object instead of tables."
 

@@ -45,7 +45,6 @@ EXTRAS = {
         "learn with TorchRL: PPO, IPPO, MAPPO, TensorDicts",
     ),
     "rsl-rl": Extra({"rsl-rl-lib": "rsl_rl", "tensordict": "tensordict"}, "learn with RSL-RL"),
-    "skrl": Extra({"skrl": "skrl"}, "learn with skrl"),
     "pettingzoo": Extra(
         {"pettingzoo": "pettingzoo"}, "use tasks of several agents as PettingZoo environments"
     ),

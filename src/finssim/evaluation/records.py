@@ -32,9 +32,8 @@ from finssim.evaluation.trials import (
     interpolated,
     localization_errors,
 )
-from finssim.learning.demonstrations import DatasetError, Episode, about, data_sets_in, save
+from finssim.learning.demonstrations import Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
-from finssim.learning.lerobot import export_lerobot
 from finssim.pool.task_site import Referee
 from finssim.pool.virtual_pool import read_truth
 from finssim.robot.goals import station_of
@@ -458,26 +457,15 @@ def collect(
     )  # fmt: skip
 
 
-def datasets(places: Sequence[Path], *, lerobot: Path | None = None) -> dict[str, Any]:
-    """List demonstrations: task, vehicle, expert, episodes, steps. With --lerobot, export one for LeRobot.
+def datasets(places: Sequence[Path]) -> dict[str, Any]:
+    """List demonstrations: task, vehicle, expert, episodes, steps.
 
     Example: finssim datasets demonstrations
 
     Args:
         places (PATH...): Data sets, or folders of them.
-        lerobot (DIR): Folder for the LeRobot data set (format 3.0), from a single data set.
     """
-    paths = [path for location in places for path in data_sets_in(location)]
-    if lerobot is None:
-        return {str(path): about(path) for path in paths}
-    if len(paths) != 1:
-        raise DatasetError(f"--lerobot {lerobot}: {len(paths)} data sets are named, expected one")
-    return {
-        str(paths[0]): {
-            **about(paths[0]),
-            "lerobot": {"written": str(lerobot), **export_lerobot(paths[0], lerobot)},
-        }
-    }
+    return {str(path): about(path) for location in places for path in data_sets_in(location)}
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
@@ -497,12 +485,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         for name, row in result.items()
     ]  # fmt: skip
     heads = ("data set", "task", "vehicle", "expert", "observes", "episodes", "steps")
-    written = [
-        f"{row['lerobot']['written']}: LeRobot, {row['lerobot']['frames']:,} frames at {row['lerobot']['fps']} Hz"
-        for row in result.values()
-        if "lerobot" in row
-    ]
-    return [Table(title="", heads=heads, rows=rows, left=range(5), sentences=written)]
+    return [Table(title="", heads=heads, rows=rows, left=range(5))]
 
 
 def collect_records(

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from finssim.learning.pettingzoo_env import PettingZooEnv
     from finssim.learning.rsl_rl_env import RslRlVecEnv
     from finssim.learning.sb3 import Sb3VecEnv
-    from finssim.learning.skrl_env import SkrlEnv, SkrlTeamEnv, bootstrapping
     from finssim.learning.tensors import Tensors
     from finssim.learning.torchrl_env import TorchRlEnv
 
@@ -18,11 +17,8 @@ __all__ = [
     "PettingZooEnv",
     "RslRlVecEnv",
     "Sb3VecEnv",
-    "SkrlEnv",
-    "SkrlTeamEnv",
     "Tensors",
     "TorchRlEnv",
-    "bootstrapping",
     "learner_named",
     "save_policy",
 ]

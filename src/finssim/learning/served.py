@@ -63,7 +63,7 @@ def single_agent(environment: Environment, library: str) -> Environment:
     if environment.agents > 1:
         raise EnvironmentSetupError(
             f"task '{environment.task.name}' has {environment.agents} agents, {library} takes one: "
-            "use the adapter of PettingZoo, TorchRL, RSL-RL, skrl or Stable-Baselines3"
+            "use the adapter of PettingZoo, TorchRL, RSL-RL or Stable-Baselines3"
         )
     return environment
 

@@ -190,9 +190,6 @@ class SonarDevice(Part):
     """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
     detection_db: Number = -60.0
     """Level after gain that a profiling sonar takes for a return [dB]."""
-    surface_loss: NonNegative | None = None
-    """Loss of sound at each reflection off the still water surface [dB]: 0 for a calm one, more with waves. Echoes then
-    come by it too, later than straight ones. Not given: no such echoes are computed."""
     rate: Positive
     """[Hz]"""
     mount: DeviceMount = Field(default_factory=lambda: DeviceMount())

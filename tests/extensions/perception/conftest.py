@@ -43,15 +43,6 @@ objects:
   post: {{shape: cylinder, radius: 0.1, length: 40, position: [0, 500, -5], backscatter_strength_db: -10}}
 viewpoint: {{position: [-4, 0, -5]}}
 """,
-    "shallow": f"""
-about: A small ball below the surface, and one as far away behind a plate that ends 0.45 m below it.
-{CLEAR}
-objects:
-  ball: {{shape: sphere, radius: 0.05, position: [0, 0, -0.6], backscatter_strength_db: -10}}
-  hidden: {{shape: sphere, radius: 0.05, position: [0, 100, -0.6], backscatter_strength_db: -10}}
-  plate: {{shape: box, size: [0.02, 4, 2.0], position: [-1, 100, -1.45], backscatter_strength_db: -90}}
-viewpoint: {{position: [-4, 0, -0.6]}}
-""",
 }
 
 

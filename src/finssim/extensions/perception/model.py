@@ -109,6 +109,16 @@ class Optics:
     snow_size: float  # their diameter [m]
 
 
+@wp.struct
+class Scene:
+    """Everything that light and sound meet in all worlds."""
+
+    optics: Optics
+    surfaces: wp.array(dtype=Surface)  # by shape
+    grain: wp.array2d(dtype=float)  # periodic random field of mottled surfaces [-]
+    pictures: wp.array3d(dtype=wp.vec3)  # reflectances, row 0 at the top
+
+
 class WorldBatch(WorldLayout):
     """N separate copies of a world for ray sensors.
 
@@ -146,12 +156,13 @@ class WorldBatch(WorldLayout):
                 render_order=SensorCamera.RenderOrder.VIEW_PRIORITY,
             ),
         )
-        self.optics = self._optics()
-        self.grain = wp.array(_grain(), dtype=float, device=self.device)
+        self.scene = Scene()
+        self.scene.optics = self.optics = self._optics()
+        self.scene.grain = wp.array(_grain(), dtype=float, device=self.device)
         self._pictures: list[np.ndarray] = []
         self._tables = np.stack([self._surfaces(look) for look in self.looks])
         pictures = np.float32(self._pictures or np.zeros((1, 1, 1, 3)))
-        self.pictures = wp.array(pictures, dtype=wp.vec3, device=self.device)
+        self.scene.pictures = wp.array(pictures, dtype=wp.vec3, device=self.device)
         self._table = np.tile(self._tables[0], (worlds, 1))
         self._place(np.arange(worlds))
 
@@ -195,7 +206,7 @@ class WorldBatch(WorldLayout):
         back[..., :3] = -quat_rotate(back[..., 3:], back[..., :3])
         table["inverse"] = back
         self._table[rows] = table
-        self.surfaces = wp.array(self._table.reshape(-1), dtype=Surface, device=self.device)
+        self.scene.surfaces = wp.array(self._table.reshape(-1), dtype=Surface, device=self.device)
 
     # ---- set-up
 

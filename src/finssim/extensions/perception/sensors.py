@@ -22,7 +22,7 @@ import warp as wp
 from scipy.special import ndtri
 
 from finssim.extensions.perception.description import WorldError
-from finssim.extensions.perception.model import Optics, Surface, WorldBatch
+from finssim.extensions.perception.model import Optics, Scene, WorldBatch
 from finssim.extensions.perception.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevations
 from finssim.physics.types import angular, linear, vec6
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
@@ -47,6 +47,19 @@ AUTO_MEAN = 0.42
 """Mean of a picture that automatic exposure aims at, as a share of the full scale after gamma."""
 
 
+@wp.struct
+class Traced:
+    """A bundle of rays of many views, and what each of them met."""
+
+    rays: wp.array4d(dtype=wp.vec3)  # (rows, columns, 2): origin [m] and unit direction, sensor axes
+    views: wp.array(dtype=wp.transform)  # sensor to world [m, quaternion]
+    worlds: wp.array(dtype=int)  # or SKIPPED
+    dimming: wp.array(dtype=wp.vec3)  # daylight at the view's depth as a share of that at the surface [-]
+    depth: wp.array3d(dtype=float)  # along the ray [m]
+    shape_index: wp.array3d(dtype=wp.uint32)  # or MISS
+    normal: wp.array3d(dtype=wp.vec3)  # world axes, unit
+
+
 @wp.kernel(enable_backward=False)
 def _place_views(
     poses: wp.array(dtype=wp.transform),
@@ -54,21 +67,19 @@ def _place_views(
     world_of_view: wp.array(dtype=int),
     mask: wp.array(dtype=int),
     optics: Optics,
-    views: wp.array(dtype=wp.transform),
-    worlds: wp.array(dtype=int),
-    dimming: wp.array(dtype=wp.vec3),
+    traced: Traced,
 ):
-    """Sensor poses, their worlds or SKIPPED, and daylight at their depths as a share of that at the surface."""
+    """Place views: sensor poses, their worlds or SKIPPED, and daylight at their depths."""
     v = wp.tid()
-    worlds[v] = SKIPPED
+    traced.worlds[v] = SKIPPED
     if mask.shape[0] > 0:
         if mask[v] == 0:
             return
-    worlds[v] = world_of_view[v]
-    views[v] = wp.transform_multiply(poses[v], mount)
-    depth = wp.max(-wp.transform_get_translation(views[v])[2], 0.0)
+    traced.worlds[v] = world_of_view[v]
+    traced.views[v] = wp.transform_multiply(poses[v], mount)
+    depth = wp.max(-wp.transform_get_translation(traced.views[v])[2], 0.0)
     K = optics.daylight_attenuation[world_of_view[v]]
-    dimming[v] = wp.vec3(wp.exp(-K[0] * depth), wp.exp(-K[1] * depth), wp.exp(-K[2] * depth))
+    traced.dimming[v] = wp.vec3(wp.exp(-K[0] * depth), wp.exp(-K[1] * depth), wp.exp(-K[2] * depth))
 
 
 @wp.kernel(enable_backward=False)
@@ -121,6 +132,9 @@ class RayBatch:
             self.dimming = wp.zeros(self.count, dtype=wp.vec3)
             self.worlds = wp.zeros(self.count, dtype=int)
             self._all = wp.zeros(0, dtype=int)
+        self.traced = Traced()
+        for name in Traced.vars:
+            setattr(self.traced, name, getattr(self, name))
         self._mount = wp.transform(wp.vec3(*mount.position), wp.quat(*map(float, mount.quaternion)))
 
     def _span(self, columns: int) -> int:
@@ -146,14 +160,8 @@ class RayBatch:
             raise WorldError(
                 f"{len(poses)} poses for {self.count} vehicles: give one for each, in order of world"
             )
-        inputs = [
-            poses,
-            self._mount,
-            self.world_of_view,
-            self._all if mask is None else mask,
-            self.batch.optics,
-        ]
-        inputs += [self.views, self.worlds, self.dimming]
+        inputs = [poses, self._mount, self.world_of_view, self._all if mask is None else mask]
+        inputs += [self.batch.optics, self.traced]
         wp.launch(_place_views, self.count, inputs, device=self.device)
         self.batch.caster.update(
             self.batch.state,
@@ -180,6 +188,30 @@ class Lamp:
         wp.vec3
     )  # irradiance [-] at 1 m on its axis, without water, relative to daylight at the surface
     cosine: float  # cosine of the beam's half angle
+
+
+@wp.struct
+class Film:
+    """Everything behind the lens of a camera, for all views."""
+
+    lamps: wp.array(dtype=Lamp)  # of each vehicle
+    pixel: float  # angle from pixel to pixel [rad]
+    full_well: float  # [electrons]
+    read_noise: float  # [electrons]
+    gain: wp.array(dtype=wp.vec3)  # by view: share of the full scale of radiance 1
+    code: wp.array(dtype=wp.uint8)  # numbers by level of the converter
+    quantiles: wp.array(dtype=float)  # of the normal distribution
+    radiance: wp.array3d(dtype=wp.vec3)  # [-], or empty
+    picture: wp.array4d(dtype=wp.uint8)
+
+
+@wp.struct
+class WaterRay:
+    """A ray in the water, up to a surface or the end of the water."""
+
+    origin: wp.vec3  # where it enters the water, world frame [m]
+    direction: wp.vec3  # unit, world frame
+    length: float  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,8 +377,8 @@ def rgb(light: wp.vec4) -> wp.vec3:
 
 @wp.func
 def lamps_seen(
-    origin: wp.vec3, ray: wp.vec3, path: float, normal: wp.vec3, reflectance: wp.vec3, c: wp.vec3, veil: wp.vec3,
-    lamps: wp.array(dtype=Lamp), pose: wp.transform,
+    ray: WaterRay, normal: wp.vec3, reflectance: wp.vec3, c: wp.vec3, veil: wp.vec3, lamps: wp.array(dtype=Lamp),
+    pose: wp.transform,
 ) -> wp.vec3:  # fmt: skip
     """Return the light that the vehicle's lamps add to a ray: rho E e^(-c s) of the surface, and the veil between.
 
@@ -354,9 +386,7 @@ def lamps_seen(
     the water scatters lamplight back as it does daylight.
 
     Args:
-        origin: Where the ray enters the water, world frame [m].
-        ray: Unit direction, world frame.
-        path: s, to the surface or the end of the water [m].
+        ray: The ray, of length s [m].
         normal: Of the surface, world frame, unit [-].
         reflectance: Reflectance rho; 0 where there is none.
         c: Beam attenuation [1/m].
@@ -365,22 +395,24 @@ def lamps_seen(
         pose: Pose of the vehicle, body to world [m, quaternion].
     """
     radiance = wp.vec3(0.0)
-    far = wp.min(path, 8.0)
+    far = wp.min(ray.length, 8.0)
     near = wp.min(0.15, 0.5 * far)
     ratio = wp.pow(far / near, 1.0 / float(LAMP_STEPS))
     for k in range(lamps.shape[0]):
         lamp = lamps[k]
         position = wp.transform_point(pose, lamp.position)
         axis = wp.transform_vector(pose, lamp.axis)
-        if path < 1.0e6:
-            point = origin + path * ray
+        if ray.length < 1.0e6:
+            point = ray.origin + ray.length * ray.direction
             light = lamp_light(point, lamp, position, axis, c)
             cosine = wp.max(wp.dot(normal, position - point) / light[3], 0.0)
-            radiance += through_water(wp.cw_mul(reflectance, cosine * rgb(light)), c, wp.vec3(0.0), path)
+            radiance += through_water(
+                wp.cw_mul(reflectance, cosine * rgb(light)), c, wp.vec3(0.0), ray.length
+            )
         here = near
         for _ in range(LAMP_STEPS):
             middle = here * wp.sqrt(ratio)
-            light = lamp_light(origin + middle * ray, lamp, position, axis, c)
+            light = lamp_light(ray.origin + middle * ray.direction, lamp, position, axis, c)
             glow = (here * (ratio - 1.0)) * wp.cw_mul(wp.cw_mul(c, veil), rgb(light))
             radiance += through_water(glow, c, wp.vec3(0.0), middle)
             here = here * ratio
@@ -389,53 +421,49 @@ def lamps_seen(
 
 @wp.func
 def snow_seen(
-    origin: wp.vec3, ray: wp.vec3, path: float, c: wp.vec3, daylight: wp.vec3, density: float, size: float,
-    pixel: float, lamps: wp.array(dtype=Lamp), pose: wp.transform,
-) -> wp.vec4:  # fmt: skip
+    sight: WaterRay, c: wp.vec3, daylight: wp.vec3, optics: Optics, film: Film, pose: wp.transform
+) -> wp.vec4:
     """Return the light that particles in the water add to a ray, and as fourth number the share that they cover.
 
     Each cell of a lattice holds a particle or none, by a hash of the cell; it covers a²/s² e^(-(x/s)²) of a pixel that
     it passes at x, a its radius and s² = a² + w² with the pixel's half width w there. Snow reflects 0.4 of its light.
 
     Args:
-        origin: Where the ray enters the water, world frame [m].
-        ray: Unit direction, world frame.
-        path: To the surface or the end of the water [m].
+        sight: The ray.
         c: Beam attenuation [1/m].
         daylight: Irradiance at the eye's depth [-].
-        density: Particles per volume [1/m³].
-        size: Their diameter [m].
-        pixel: Angle from pixel to pixel [rad].
-        lamps: On the vehicle.
+        optics: Has the snow's density [1/m³] and size [m].
+        film: Has the lamps and the angle from pixel to pixel [rad].
         pose: Pose of the vehicle, body to world [m, quaternion].
     """
-    cell = wp.pow(SNOW_SHARE / density, 1.0 / 3.0)
+    ray = sight.direction
+    cell = wp.pow(SNOW_SHARE / optics.snow, 1.0 / 3.0)
     light = wp.vec3(0.0)
     clear = float(1.0)
     t = float(0.05)
     for _ in range(SNOW_STEPS):
         t += 0.5 * cell
-        if t > path:
+        if t > sight.length:
             break
-        at = (origin + t * ray) / cell
+        at = (sight.origin + t * ray) / cell
         corner = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
         mixed = (int(corner[0]) * 73856093) ^ (int(corner[1]) * 19349663) ^ (int(corner[2]) * 83492791)
         state = wp.rand_init(17, mixed)
         if wp.randf(state) < SNOW_SHARE:
             inset = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
             particle = cell * (corner + wp.vec3(0.1) + 0.8 * inset)
-            way = wp.dot(particle - origin, ray)
+            way = wp.dot(particle - sight.origin, ray)
             # Half a cell's steps meet most cells twice: the step nearest to the particle counts.
             if wp.abs(way - t) <= 0.25 * cell and way > 0.05:
-                a = 0.5 * size
-                w = 0.5 * pixel * way
+                a = 0.5 * optics.snow_size
+                w = 0.5 * film.pixel * way
                 s = a * a + w * w
-                off = wp.length_sq(particle - origin - way * ray)
+                off = wp.length_sq(particle - sight.origin - way * ray)
                 cover = a * a / s * wp.exp(-off / s)
                 if cover > 1.0e-4:
                     lit = daylight
-                    for k in range(lamps.shape[0]):
-                        lamp = lamps[k]
+                    for k in range(film.lamps.shape[0]):
+                        lamp = film.lamps[k]
                         lamp_position = wp.transform_point(pose, lamp.position)
                         axis = wp.transform_vector(pose, lamp.axis)
                         lit += rgb(lamp_light(particle, lamp, lamp_position, axis, c))
@@ -446,32 +474,9 @@ def snow_seen(
 
 @wp.kernel(enable_backward=False)
 def _take_picture(
-    rays: wp.array4d(dtype=wp.vec3),
-    depth: wp.array3d(dtype=float),
-    shape_index: wp.array3d(dtype=wp.uint32),
-    normal: wp.array3d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    poses: wp.array(dtype=wp.transform),
-    worlds: wp.array(dtype=int),
-    dimming: wp.array(dtype=wp.vec3),
-    optics: Optics,
-    surfaces: wp.array(dtype=Surface),
-    grain: wp.array2d(dtype=float),
-    pictures: wp.array3d(dtype=wp.vec3),
-    lamps: wp.array(dtype=Lamp),
-    pixel: float,
-    share: float,
-    last: int,
-    gain: wp.array(dtype=wp.vec3),
-    full_well: float,
-    read_noise: float,
-    code: wp.array(dtype=wp.uint8),
-    normal_quantiles: wp.array(dtype=float),
-    key: int,
+    traced: Traced, poses: wp.array(dtype=wp.transform), scene: Scene, film: Film, share: float, last: int, key: int,
     span: int,
-    linear: wp.array3d(dtype=wp.vec3),
-    picture: wp.array4d(dtype=wp.uint8),
-):
+):  # fmt: skip
     """Radiance of every pixel, and its 8-bit numbers.
 
     With the eye at depth h and the ray rising by u per metre, daylight at path s is D e^(K u s), D = e^(-K h). The
@@ -484,14 +489,15 @@ def _take_picture(
 
         E = (1 - d) max(n . s, 0)/s_z + d (1 + n_z)/2 + B (1 - n_z)/2
 
-    Then charge with shot and read noise, 12 bits, and the code's 8. A thread takes `span` pixels of a row. `linear` may
-    be empty; without noise, which a negative key means, a number is that of the mean charge.
+    Then charge with shot and read noise, 12 bits, and the code's 8. A thread takes `span` pixels of a row.
+    `radiance` may be empty; without noise, which a negative key means, a number is that of the mean charge.
     """
     v, i, block = wp.tid()
-    w = worlds[v]
+    w = traced.worlds[v]
     if w == SKIPPED:
         return
-    view = views[v]
+    view = traced.views[v]
+    optics = scene.optics
     pose = poses[v]
     c = optics.attenuation[w]
     K = optics.daylight_attenuation[w]
@@ -499,45 +505,46 @@ def _take_picture(
     daylight = optics.daylight[w]
     diffuse = optics.diffuse
     sun = (1.0 - diffuse) / optics.sun[w][2] * optics.sun[w]
-    dim = dimming[v]
-    gains = full_well * gain[v]
-    noise_floor = read_noise * read_noise
-    digits = float(code.shape[0] - 1) / full_well
-    lit = lamps.shape[0] > 0
-    keep = linear.shape[0] > 0
-    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
-        ray = wp.transform_vector(view, rays[i, j, 0, 1])
-        origin = wp.transform_point(view, rays[i, j, 0, 0])
+    dim = traced.dimming[v]
+    gains = film.full_well * film.gain[v]
+    noise_floor = film.read_noise * film.read_noise
+    digits = float(film.code.shape[0] - 1) / film.full_well
+    lit = film.lamps.shape[0] > 0
+    keep = film.radiance.shape[0] > 0
+    for j in range(block * span, wp.min(block * span + span, traced.depth.shape[2])):
+        ray = wp.transform_vector(view, traced.rays[i, j, 0, 1])
+        origin = wp.transform_point(view, traced.rays[i, j, 0, 0])
         path = float(1.0e9)
         if ray[2] > 1.0e-6:
             path = wp.max(-origin[2], 0.0) / ray[2]
-        index = shape_index[v, i, j]
-        n = normal[v, i, j]
+        index = traced.shape_index[v, i, j]
+        n = traced.normal[v, i, j]
         reflectance = wp.vec3(0.0)
         start = wp.vec3(0.0)
         glow = wp.vec3(0.0)
-        if index != MISS and depth[v, i, j] < path:
-            path = depth[v, i, j]
+        if index != MISS and traced.depth[v, i, j] < path:
+            path = traced.depth[v, i, j]
             shape = int(index)
-            reflectance = surfaces[shape].colour
-            kind = surfaces[shape].texture
+            reflectance = scene.surfaces[shape].colour
+            kind = scene.surfaces[shape].texture
             if kind > 0:
                 local = (
-                    wp.transform_point(surfaces[shape].inverse, origin + path * ray) / surfaces[shape].size
+                    wp.transform_point(scene.surfaces[shape].inverse, origin + path * ray)
+                    / scene.surfaces[shape].size
                 )
-                contrast = surfaces[shape].contrast
+                contrast = scene.surfaces[shape].contrast
                 if kind == 4:
-                    reflectance = (1.0 + contrast * mottled(local, grain)) * reflectance
+                    reflectance = (1.0 + contrast * mottled(local, scene.grain)) * reflectance
                 elif kind == 5:
-                    face = wp.transform_vector(surfaces[shape].inverse, n)
-                    which = surfaces[shape].picture
-                    reflectance = painted(pictures, which, local, face, contrast, reflectance)
+                    face = wp.transform_vector(scene.surfaces[shape].inverse, n)
+                    which = scene.surfaces[shape].picture
+                    reflectance = painted(scene.pictures, which, local, face, contrast, reflectance)
                 else:
-                    reflectance = patterned(kind, local, reflectance, surfaces[shape].second, contrast)
+                    reflectance = patterned(kind, local, reflectance, scene.surfaces[shape].second, contrast)
             above = 0.5 * (1.0 + n[2])
             level = wp.max(wp.dot(n, sun), 0.0) + diffuse * above
             start = wp.cw_mul(reflectance, level * daylight + (1.0 - above) * veil)
-            glow = surfaces[shape].glow
+            glow = scene.surfaces[shape].glow
         elif ray[2] > 1.0e-6:
             start = below_surface(ray, veil, optics.sky[w])
         # Light that falls off with depth takes K u from the exponent; a beacon's own light does not.
@@ -546,44 +553,39 @@ def _take_picture(
         colour = wp.cw_mul(dim, through_water(start, net, wp.cw_mul(veil, wp.cw_div(c, net)), path))
         if glow[0] + glow[1] + glow[2] > 0.0:
             colour += through_water(glow, c, wp.vec3(0.0), path)
+        sight = WaterRay()
+        sight.origin = origin
+        sight.direction = ray
+        sight.length = path
         if lit:
-            colour += lamps_seen(origin, ray, path, n, reflectance, c, veil, lamps, pose)
+            colour += lamps_seen(sight, n, reflectance, c, veil, film.lamps, pose)
         if optics.snow > 0.0:
-            flakes = snow_seen(
-                origin,
-                ray,
-                path,
-                c,
-                wp.cw_mul(dim, daylight),
-                optics.snow,
-                optics.snow_size,
-                pixel,
-                lamps,
-                pose,
-            )
+            flakes = snow_seen(sight, c, wp.cw_mul(dim, daylight), optics, film, pose)
             colour = (1.0 - flakes[3]) * colour + rgb(flakes)
         if wp.length_sq(ray) < 0.5:
             colour = wp.vec3(0.0)  # the lens has no ray here
         if keep:
             if share < 1.0:
-                colour = linear[v, i, j] + share * colour
-            linear[v, i, j] = colour
+                colour = film.radiance[v, i, j] + share * colour
+            film.radiance[v, i, j] = colour
         if last == 0:
             continue
         bits = wp.uint32(0)
         if key >= 0:
             # Numbers of the normal distribution by their quantiles, 10 bits each, from one hash of the pixel.
-            bits = wp.rand_init(key, (v * depth.shape[1] + i) * depth.shape[2] + j)
+            bits = wp.rand_init(key, (v * traced.depth.shape[1] + i) * traced.depth.shape[2] + j)
         for k in range(3):
             charge = wp.max(gains[k] * colour[k], 0.0)
             if key >= 0:
                 # Shot noise, of variance `charge`, is normal instead of Poisson; above 20 electrons they hardly differ.
-                drawn = normal_quantiles[int(bits & wp.uint32(1023))]
+                drawn = film.quantiles[int(bits & wp.uint32(1023))]
                 bits = bits >> wp.uint32(11)
                 charge += drawn * wp.sqrt(charge + noise_floor)
-            last_digit = code.shape[0] - 1
+            last_digit = film.code.shape[0] - 1
             digit = int(wp.clamp(charge * digits, 0.0, float(last_digit)) + 0.5)
-            picture[v, i, j, k] = code[wp.clamp(digit, 0, last_digit)]  # of a charge that is no number too
+            film.picture[v, i, j, k] = film.code[
+                wp.clamp(digit, 0, last_digit)
+            ]  # of a charge that is no number too
 
 
 @wp.kernel(enable_backward=False)
@@ -699,9 +701,12 @@ class CameraBatch(RayBatch):
             self.radiance = wp.zeros(shape if keep else (0, 0, 0), dtype=wp.vec3)
             self._moved = wp.zeros(self.count, dtype=wp.transform)
             self.gain = wp.full(self.count, wp.vec3(camera.gain), dtype=wp.vec3)
-            self._normal = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
-            self._code = wp.array(np.uint8(code), dtype=wp.uint8)
-            self._lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
+            film = self._film = Film()
+            film.lamps = wp.array([_lamp(lamp) for lamp in lamps], dtype=Lamp)
+            film.quantiles = wp.array(np.float32(ndtri((np.arange(1024) + 0.5) / 1024)), dtype=float)
+            film.code = wp.array(np.uint8(code), dtype=wp.uint8)
+        film.pixel, film.full_well, film.read_noise = 1.0 / self.lens.fx, camera.full_well, camera.read_noise
+        film.gain, film.radiance, film.picture = self.gain, self.radiance, self.picture
 
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
@@ -744,21 +749,8 @@ class CameraBatch(RayBatch):
         if moments > 1 and k == 0:
             wp.launch(_clear, self.radiance.shape, [self.worlds, self.radiance], device=self.device)
         key = -1 if seed is None else noise_key(seed, time)
-        inputs = [self.rays, self.depth, self.shape_index, self.normal, self.views, poses, self.worlds]
-        inputs += [
-            self.dimming,
-            self.batch.optics,
-            self.batch.surfaces,
-            self.batch.grain,
-            self.batch.pictures,
-            self._lamps,
-            1.0 / self.lens.fx,
-            1.0 / moments,
-            int(k == moments - 1),
-            self.gain,
-        ]
-        inputs += [self.camera.full_well, self.camera.read_noise, self._code, self._normal, key]
-        inputs += [self._span(self.depth.shape[2]), self.radiance, self.picture]
+        inputs = [self.traced, poses, self.batch.scene, self._film, 1.0 / moments, int(k == moments - 1), key]
+        inputs.append(self._span(self.depth.shape[2]))
         wp.launch(_take_picture, self._blocks(self.depth), inputs, device=self.device)
 
 
@@ -772,23 +764,27 @@ def _lamp(light: Headlight) -> Lamp:
 # Imaging sonars.
 
 
+@wp.struct
+class Echoes:
+    """Echoes of the rays of many sonars, and what their receivers make of them."""
+
+    weight: wp.array(dtype=float)  # b² dW/pi, by elevation
+    absorption: float  # [dB/m]
+    steps: wp.vec2  # between rays along elevation and azimuth [rad]
+    bins_per_metre: float
+    noise: float  # power in a range cell before gain [-]
+    display: wp.vec2  # levels of 0 and 255 [dB]
+    taps: wp.array(dtype=float)  # pattern of a receiving beam
+    gain: wp.array(dtype=float)  # by range cell
+    quantiles: wp.array(dtype=float)  # of the exponential distribution
+    energy: wp.array3d(dtype=float)  # in one range cell, by view, elevation and azimuth
+    spread: wp.array3d(dtype=wp.vec2)  # first and last range cell
+    intensity: wp.array3d(dtype=float)  # power, by view, beam and range cell
+    picture: wp.array3d(dtype=wp.uint8)
+
+
 @wp.kernel(enable_backward=False)
-def _echo_rays(
-    worlds: wp.array(dtype=int),
-    rays: wp.array4d(dtype=wp.vec3),
-    depth: wp.array3d(dtype=float),
-    shape_index: wp.array3d(dtype=wp.uint32),
-    normal: wp.array3d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    surfaces: wp.array(dtype=Surface),
-    weight: wp.array(dtype=float),
-    absorption: float,
-    steps: wp.vec2,
-    bins_per_metre: float,
-    span: int,
-    energy: wp.array3d(dtype=float),
-    spread: wp.array3d(dtype=wp.vec2),
-):
+def _echo_rays(traced: Traced, scene: Scene, echoes: Echoes, span: int):
     """Echo of every ray and the ranges it comes from.
 
     A ray of solid angle dW that strikes a Lambertian surface of parameter mu at range r under cosine k returns
@@ -801,34 +797,35 @@ def _echo_rays(
     above the water is not heard.
     """
     v, i, block = wp.tid()
-    if worlds[v] == SKIPPED:
+    if traced.worlds[v] == SKIPPED:
         return
-    rotation = wp.transform_get_rotation(views[v])
-    decay = 0.2 * wp.log(10.0) * absorption
-    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
-        r = depth[v, i, j]
-        index = shape_index[v, i, j]
-        energy[v, i, j] = 0.0
-        if index != MISS and r > 0.0 and wp.transform_point(views[v], r * rays[i, j, 0, 1])[2] < 0.0:
-            d = rays[i, j, 0, 1]
-            n = wp.quat_rotate_inv(rotation, normal[v, i, j])
+    view = traced.views[v]
+    rotation = wp.transform_get_rotation(view)
+    decay = 0.2 * wp.log(10.0) * echoes.absorption
+    for j in range(block * span, wp.min(block * span + span, traced.depth.shape[2])):
+        r = traced.depth[v, i, j]
+        index = traced.shape_index[v, i, j]
+        d = traced.rays[i, j, 0, 1]
+        echoes.energy[v, i, j] = 0.0
+        if index != MISS and r > 0.0 and wp.transform_point(view, r * d)[2] < 0.0:
+            n = wp.quat_rotate_inv(rotation, traced.normal[v, i, j])
             k = wp.max(wp.abs(wp.dot(n, d)), 1.0e-3)
             flat = wp.max(d[0] * d[0] + d[1] * d[1], 1.0e-9)
             ahead = (n[0] * d[0] + n[1] * d[1]) / flat
             beside = (n[1] * d[0] - n[0] * d[1]) / k
             # Half the footprint along elevation and azimuth, by dr/dangle = r (n · e)/(n · d).
             flat = wp.sqrt(flat)
-            half = 0.5 * r * steps[0] * wp.min(wp.abs(n[2] - d[2] * ahead) * flat / k, 20.0)
-            across = 0.5 * r * steps[1] * wp.min(wp.abs(beside), 5.0)
+            half = 0.5 * r * echoes.steps[0] * wp.min(wp.abs(n[2] - d[2] * ahead) * flat / k, 20.0)
+            across = 0.5 * r * echoes.steps[1] * wp.min(wp.abs(beside), 5.0)
             low = r
             high = r
             count = int(0)
             for side in range(2):
                 other = i + 2 * side - 1
-                if other >= 0 and other < depth.shape[1]:
-                    if shape_index[v, other, j] == index:
+                if other >= 0 and other < traced.depth.shape[1]:
+                    if traced.shape_index[v, other, j] == index:
                         way = wp.clamp(
-                            0.5 * (depth[v, other, j] - r), -2.0 * half - 1.0e-3, 2.0 * half + 1.0e-3
+                            0.5 * (traced.depth[v, other, j] - r), -2.0 * half - 1.0e-3, 2.0 * half + 1.0e-3
                         )
                         low = wp.min(low, r + way)
                         high = wp.max(high, r + way)
@@ -837,169 +834,39 @@ def _echo_rays(
                 # At an edge: as far to the other side as the footprint lets it, but no farther than to this one.
                 low = wp.min(low, r - wp.min(half, wp.where(count == 0, half, high - r)))
                 high = wp.max(high, r + wp.min(half, wp.where(count == 0, half, r - low)))
-            first = (low - across) * bins_per_metre
-            last = wp.max((high + across) * bins_per_metre, first + 1.0e-3)
-            echo = weight[i] * surfaces[int(index)].backscatter * k * wp.exp(-decay * r) / (r * r)
-            spread[v, i, j] = wp.vec2(first, last)
-            energy[v, i, j] = echo / (last - first)
+            first = (low - across) * echoes.bins_per_metre
+            last = wp.max((high + across) * echoes.bins_per_metre, first + 1.0e-3)
+            echo = (
+                echoes.weight[i] * scene.surfaces[int(index)].backscatter * k * wp.exp(-decay * r) / (r * r)
+            )
+            echoes.spread[v, i, j] = wp.vec2(first, last)
+            echoes.energy[v, i, j] = echo / (last - first)
 
 
 @wp.kernel(enable_backward=False)
-def _mirror_views(
-    views: wp.array(dtype=wp.transform), worlds: wp.array(dtype=int), images: wp.array(dtype=wp.transform)
-):
-    """Poses of the sensors' images above the surface, whose bundle has left and right exchanged.
-
-    With M = diag(1, 1, -1), F = diag(1, -1, 1) and a sensor's attitude R, that of its image is M R F = (M R M) (M F).
-    """
-    v = wp.tid()
-    if worlds[v] != SKIPPED:
-        x = wp.transform_get_translation(views[v])
-        q = wp.transform_get_rotation(views[v])
-        turned = wp.quat(-q[0], -q[1], q[2], q[3]) * wp.quat(1.0, 0.0, 0.0, 0.0)
-        images[v] = wp.transform(wp.vec3(x[0], x[1], -x[2]), turned)
-
-
-@wp.kernel(enable_backward=False)
-def _cut_images(
-    worlds: wp.array(dtype=int),
-    rays: wp.array4d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    images: wp.array(dtype=wp.transform),
-    span: int,
-    depth: wp.array3d(dtype=float),
-    shape_index: wp.array3d(dtype=wp.uint32),
-    depth_image: wp.array3d(dtype=float),
-    index_image: wp.array3d(dtype=wp.uint32),
-):
-    """Give rays of images depth 0 where the sensor's own meets something before the surface, or they do above it."""
-    v, i, block = wp.tid()
-    if worlds[v] == SKIPPED:
-        return
-    for j in range(block * span, wp.min(block * span + span, depth.shape[2])):
-        ray = rays[i, j, 0, 1]
-        end = depth[v, i, j] * wp.vec3(ray[0], -ray[1], ray[2])
-        below = shape_index[v, i, j] != MISS and wp.transform_point(views[v], end)[2] < 0.0
-        point = wp.transform_point(images[v], depth_image[v, i, j] * ray)
-        above = index_image[v, i, j] != MISS and point[2] >= 0.0
-        if below or above:
-            depth_image[v, i, j] = 0.0
-            index_image[v, i, j] = wp.uint32(0)
-
-
-@wp.kernel(enable_backward=False)
-def _reflect_echoes(
-    worlds: wp.array(dtype=int),
-    rays: wp.array4d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    depth: wp.array3d(dtype=float),
-    shape_index: wp.array3d(dtype=wp.uint32),
-    normal: wp.array3d(dtype=wp.vec3),
-    energy: wp.array3d(dtype=float),
-    spread: wp.array3d(dtype=wp.vec2),
-    others: wp.array(dtype=wp.transform),
-    other_depth: wp.array3d(dtype=float),
-    other_index: wp.array3d(dtype=wp.uint32),
-    hand: float,
-    pattern: wp.array(dtype=float),
-    first: float,
-    steps: wp.vec2,
-    abeam: int,
-    loss: float,
-    absorption: float,
-    bins_per_metre: float,
-    span: int,
-    echoes: wp.array3d(dtype=float),
-    spreads: wp.array3d(dtype=wp.vec2),
-):
-    """Echoes that go out one way and come back the other: straight, and by the surface as from the sensor's image.
-
-    Lambert's law with another way there: k/r² of `_echo_rays` becomes that of the other way, b² the product of both,
-    and the range half of r + r'. The other way is open unless the ray of `others` that is nearest to it ends at another
-    shape before. `hand` is -1 where that view's bundle has left and right exchanged, `loss` what the reflection leaves.
-    """
-    v, i, block = wp.tid()
-    if worlds[v] == SKIPPED:
-        return
-    origin = wp.transform_get_translation(others[v])
-    attitude = wp.transform_get_rotation(others[v])
-    rows = depth.shape[1]
-    beams = depth.shape[2]
-    for j in range(block * span, wp.min(block * span + span, beams)):
-        echoes[v, i, j] = 0.0
-        if energy[v, i, j] <= 0.0:
-            continue
-        r = depth[v, i, j]
-        n = normal[v, i, j]
-        ray = wp.transform_vector(views[v], rays[i, j, 0, 1])
-        way = wp.transform_get_translation(views[v]) + r * ray - origin
-        other = wp.max(wp.length(way), 1.0e-3)
-        way = way / other
-        # Both ways must meet the same side of the surface.
-        k = wp.dot(n, way) * wp.sign(wp.dot(n, ray))
-        d = wp.quat_rotate_inv(attitude, way)
-        azimuth = wp.atan2(hand * d[1], d[0])
-        row = int(wp.floor((wp.asin(wp.clamp(d[2], -1.0, 1.0)) - first) / wp.max(steps[0], 1.0e-6) + 0.5))
-        beam = int(wp.floor(0.5 * float(beams) - azimuth / steps[1]))
-        if abeam == 1:
-            beam = wp.where(azimuth > 0.0, 0, 1)
-            if wp.abs(wp.abs(azimuth) - wp.static(0.5 * math.pi)) > 0.5 * steps[1]:
-                k = 0.0
-        if k <= 0.0 or row < 0 or row >= rows or beam < 0 or beam >= beams:
-            continue
-        end = other_depth[v, row, beam]
-        met = other_index[v, row, beam]
-        if met != MISS and (end <= 0.0 or (met != shape_index[v, i, j] and end < 0.95 * other - 0.05)):
-            continue
-        cosine = wp.max(wp.abs(wp.dot(n, ray)), 1.0e-3)
-        longer = 0.5 * (other - r)
-        share = loss * pattern[row] / pattern[i] * k / cosine * r * r / (other * other)
-        echoes[v, i, j] = share * wp.exp(-0.2 * wp.log(10.0) * absorption * longer) * energy[v, i, j]
-        shift = bins_per_metre * longer
-        spreads[v, i, j] = spread[v, i, j] + wp.vec2(shift, shift)
-
-
-@wp.kernel(enable_backward=False)
-def _gather_echoes(
-    worlds: wp.array(dtype=int),
-    energy: wp.array3d(dtype=float),
-    spread: wp.array3d(dtype=wp.vec2),
-    taps: wp.array(dtype=float),
-    intensity: wp.array3d(dtype=float),
-):
+def _gather_echoes(worlds: wp.array(dtype=int), echoes: Echoes):
     """Echo by beam and range cell: rays of the beam's own and the neighbouring directions, by its pattern."""
     v, b = wp.tid()
     if worlds[v] == SKIPPED:
         return
-    bins = intensity.shape[2]
-    reach = taps.shape[0] / 2
+    bins = echoes.intensity.shape[2]
+    reach = echoes.taps.shape[0] / 2
     for k in range(bins):
-        intensity[v, b, k] = 0.0
-    for j in range(wp.max(b - reach, 0), wp.min(b + reach + 1, energy.shape[2])):
-        tap = taps[j - b + reach]
-        for i in range(energy.shape[1]):
-            e = energy[v, i, j]
+        echoes.intensity[v, b, k] = 0.0
+    for j in range(wp.max(b - reach, 0), wp.min(b + reach + 1, echoes.energy.shape[2])):
+        tap = echoes.taps[j - b + reach]
+        for i in range(echoes.energy.shape[1]):
+            e = echoes.energy[v, i, j]
             if e > 0.0:
-                low = spread[v, i, j][0]
-                high = spread[v, i, j][1]
+                low = echoes.spread[v, i, j][0]
+                high = echoes.spread[v, i, j][1]
                 for k in range(wp.max(int(wp.floor(low)), 0), wp.min(int(wp.floor(high)) + 1, bins)):
                     overlap = wp.max(wp.min(high, float(k + 1)) - wp.max(low, float(k)), 0.0)
-                    intensity[v, b, k] = intensity[v, b, k] + tap * e * overlap
+                    echoes.intensity[v, b, k] += tap * e * overlap
 
 
 @wp.kernel(enable_backward=False)
-def _receive(
-    worlds: wp.array(dtype=int),
-    noise: float,
-    gain: wp.array(dtype=float),
-    floor_db: float,
-    span_db: float,
-    quantiles: wp.array(dtype=float),
-    key: int,
-    span: int,
-    intensity: wp.array3d(dtype=float),
-    picture: wp.array3d(dtype=wp.uint8),
-):
+def _receive(worlds: wp.array(dtype=int), echoes: Echoes, key: int, span: int):
     """Noise and speckle, gain, and 8 bits of the level; a thread takes `span` range cells of a beam.
 
     Echoes of many scatterers and noise add as complex normal numbers: power is (I + N) times a draw of the exponential
@@ -1008,16 +875,17 @@ def _receive(
     v, b, block = wp.tid()
     if worlds[v] == SKIPPED:
         return
-    bins = intensity.shape[2]
-    first = (v * intensity.shape[1] + b) * bins
-    scale = 255.0 / span_db
+    bins = echoes.intensity.shape[2]
+    first = (v * echoes.intensity.shape[1] + b) * bins
+    low = echoes.display[0]
+    scale = 255.0 / (echoes.display[1] - low)
     for k in range(block * span, wp.min(block * span + span, bins)):
-        power = (intensity[v, b, k] + noise) * gain[k]
+        power = (echoes.intensity[v, b, k] + echoes.noise) * echoes.gain[k]
         if key >= 0:
-            power = power * quantiles[int(wp.rand_init(key, first + k) & wp.uint32(4095))]
-        intensity[v, b, k] = power
-        level = scale * (4.3429448 * wp.log(wp.max(power, 1.0e-30)) - floor_db)
-        picture[v, b, k] = wp.uint8(wp.clamp(level, 0.0, 255.0) + 0.5)
+            power = power * echoes.quantiles[int(wp.rand_init(key, first + k) & wp.uint32(4095))]
+        echoes.intensity[v, b, k] = power
+        level = scale * (4.3429448 * wp.log(wp.max(power, 1.0e-30)) - low)
+        echoes.picture[v, b, k] = wp.uint8(wp.clamp(level, 0.0, 255.0) + 0.5)
 
 
 @wp.kernel(enable_backward=False)
@@ -1079,36 +947,28 @@ class SonarBatch(RayBatch):
         elevation, spacing = ray_elevations(sonar), sonar.sector / count
         if sonar.mode == "side_scan":
             spacing = sonar.beam_width / 0.8859  # the integral of its pattern sinc²
-        self._steps = wp.vec2(float(elevation[1] - elevation[0]) if len(elevation) > 1 else 0.0, spacing)
+        steps = wp.vec2(float(elevation[1] - elevation[0]) if len(elevation) > 1 else 0.0, spacing)
         two_way = np.exp(
             -8.0 * math.log(2.0) * ((elevation + sonar.depression) / sonar.vertical_beam_width) ** 2
         )
-        solid = max(self._steps[0], 1e-6) * spacing * np.cos(elevation) / math.pi
+        solid = max(steps[0], 1e-6) * spacing * np.cos(elevation) / math.pi
         ranges = (np.arange(self.bins) + 0.5) * self.bin_length
         loss = sonar.gain_spreading * np.log10(ranges) + 2.0 * self.absorption * ranges
         gain = np.where(ranges >= sonar.minimum_range, 10.0 ** (0.1 * loss), 0.0)
+        shape = (self.count, len(elevation), count)
+        echoes = self._echoes = Echoes()
+        echoes.absorption, echoes.steps, echoes.bins_per_metre = self.absorption, steps, 1.0 / self.bin_length
+        echoes.noise, echoes.display = 10.0 ** (0.1 * sonar.noise_level_db), wp.vec2(*sonar.display)
+        taps = np.ones(1) if sonar.mode == "side_scan" else beam_pattern(sonar.beam_width, spacing, count)
         with wp.ScopedDevice(self.device):
-            self._weight = wp.array(np.float32(two_way * solid), dtype=float)
-            taps = np.ones(1) if sonar.mode == "side_scan" else beam_pattern(sonar.beam_width, spacing, count)
-            self._taps = wp.array(np.float32(taps), dtype=float)
-            self._gain = wp.array(np.float32(gain), dtype=float)
-            self._exponential = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
-            # With the surface, echoes of four ways below each other: straight, and by it there, back, and both.
-            rows = (4 if sonar.surface_loss is not None else 1) * len(elevation)
-            self._energy = wp.zeros((self.count, rows, count), dtype=float)
-            self._spread = wp.zeros(self._energy.shape, dtype=wp.vec2)
+            echoes.weight = wp.array(np.float32(two_way * solid), dtype=float)
+            echoes.taps, echoes.gain = (wp.array(np.float32(x), dtype=float) for x in (taps, gain))
+            echoes.quantiles = wp.array(np.float32(-np.log1p(-(np.arange(4096) + 0.5) / 4096)), dtype=float)
+            echoes.energy, echoes.spread = wp.zeros(shape, dtype=float), wp.zeros(shape, dtype=wp.vec2)
             self.intensity = wp.zeros((self.count, count, self.bins), dtype=float)
             self.reading = self.picture = wp.zeros(self.intensity.shape, dtype=wp.uint8)
             self.ranges = wp.zeros(self.intensity.shape[:2], dtype=float)
-        self._image: RayBatch | None = None
-        if sonar.surface_loss is not None:
-            self._reflected = 10.0 ** (-0.1 * sonar.surface_loss)
-            self._first = float(elevation[0])
-            with wp.ScopedDevice(self.device):
-                self._pattern = wp.array(np.float32(np.sqrt(two_way)), dtype=float)
-                self._image_weight = wp.array(np.float32(self._reflected**2 * two_way * solid), dtype=float)
-                self._images = wp.zeros(self.count, dtype=wp.transform)
-            self._image = RayBatch(batch, rays * [1.0, -1.0, 1.0], DeviceMount(), vehicles)
+        echoes.intensity, echoes.picture = self.intensity, self.picture
 
     @property
     def bin_length(self) -> float:
@@ -1130,71 +990,17 @@ class SonarBatch(RayBatch):
             `picture`, which the next update overwrites.
         """
         self.cast(poses, mask)
-        sonar = self.sonar
-        self._echo(self, self._weight, 0)
-        if self._image is not None:
-            self._reflect(self._image, mask)
-        inputs = [self.worlds, self._energy, self._spread, self._taps, self.intensity]
-        wp.launch(_gather_echoes, self.intensity.shape[:2], inputs, device=self.device)
-        low, high = sonar.display
-        key = -1 if seed is None else noise_key(seed, time)
-        inputs = [
-            self.worlds,
-            10.0 ** (0.1 * sonar.noise_level_db),
-            self._gain,
-            low,
-            high - low,
-            self._exponential,
-            key,
-        ]
-        inputs += [self._span(self.bins), self.intensity, self.picture]
+        sonar, echoes, key = self.sonar, self._echoes, -1 if seed is None else noise_key(seed, time)
+        inputs = [self.traced, self.batch.scene, echoes, self._span(self.depth.shape[2])]
+        wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
+        wp.launch(_gather_echoes, self.intensity.shape[:2], [self.worlds, echoes], device=self.device)
+        inputs = [self.worlds, echoes, key, self._span(self.bins)]
         wp.launch(_receive, self._blocks(self.intensity), inputs, device=self.device)
         if sonar.mode == "profiling":
             threshold = 10.0 ** (0.1 * sonar.detection_db)
             inputs = [self.worlds, self.intensity, threshold, self.bin_length, self.ranges]
             wp.launch(_detect, self.ranges.shape, inputs, device=self.device)
         return self.picture
-
-    def _echo(self, view: RayBatch, weight: wp.array, part: int) -> None:
-        """Echoes along the rays of a view, into a part of the rows."""
-        inputs = [view.worlds, view.rays, view.depth, view.shape_index, view.normal, view.views]
-        inputs += [self.batch.surfaces, weight, self.absorption, self._steps, 1.0 / self.bin_length]
-        inputs += [self._span(self.depth.shape[2]), *self._part(part)]
-        wp.launch(_echo_rays, self._blocks(self.depth), inputs, device=self.device)
-
-    def _part(self, part: int) -> tuple[wp.array, wp.array]:
-        """Rows of energy and spread of one of the ways."""
-        rows = self.depth.shape[1]
-        return tuple(array[:, part * rows : (part + 1) * rows] for array in (self._energy, self._spread))
-
-    def _reflect(self, image: RayBatch, mask: wp.array | None) -> None:
-        """Echoes by the surface: both ways as from the sensor's image above it, and one way each."""
-        span, blocks = self._span(self.depth.shape[2]), self._blocks(self.depth)
-        inputs = [self.views, self.worlds, self._images]
-        wp.launch(_mirror_views, self.count, inputs, device=self.device)
-        image.cast(self._images, mask)
-        inputs = [self.worlds, image.rays, self.views, image.views, span, self.depth, self.shape_index]
-        inputs += [image.depth, image.shape_index]
-        wp.launch(_cut_images, blocks, inputs, device=self.device)
-        self._echo(image, self._image_weight, 1)
-        sides = int(self.sonar.mode == "side_scan")
-        # The image's own echoes have lost by two reflections already.
-        for part, outward, other, loss in (
-            (2, self, image, self._reflected),
-            (3, image, self, 1.0 / self._reflected),
-        ):
-            inputs = [
-                self.worlds,
-                outward.rays,
-                outward.views,
-                outward.depth,
-                outward.shape_index,
-                outward.normal,
-            ]
-            inputs += [*self._part(int(outward is image)), other.views, other.depth, other.shape_index]
-            inputs += [1.0 if other is self else -1.0, self._pattern, self._first, self._steps, sides, loss]
-            inputs += [self.absorption, 1.0 / self.bin_length, span, *self._part(part)]
-            wp.launch(_reflect_echoes, blocks, inputs, device=self.device)
 
 
 def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
@@ -1216,60 +1022,51 @@ def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
 
 @wp.kernel(enable_backward=False)
 def _take_ranges(
-    worlds: wp.array(dtype=int),
-    rays: wp.array4d(dtype=wp.vec3),
-    depth: wp.array3d(dtype=float),
-    shape_index: wp.array3d(dtype=wp.uint32),
-    normal: wp.array3d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    surfaces: wp.array(dtype=Surface),
-    weight: wp.array(dtype=float),
-    quantile: float,
-    shortest: float,
-    longest: float,
-    noise: float,
-    key: int,
-    ranges: wp.array2d(dtype=float),
-):
+    traced: Traced, scene: Scene, weight: wp.array(dtype=float), quantile: float, reach: wp.vec2, noise: float,
+    key: int, ranges: wp.array2d(dtype=float),
+):  # fmt: skip
     """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
     v, b = wp.tid()
-    if worlds[v] == SKIPPED:
+    if traced.worlds[v] == SKIPPED:
         return
-    rotation = wp.transform_get_rotation(views[v])
+    rotation = wp.transform_get_rotation(traced.views[v])
     total = float(0.0)
-    for j in range(depth.shape[2]):
-        total += _ray_echo(depth, shape_index, normal, surfaces, rays, rotation, weight, v, b, j)
+    for j in range(traced.depth.shape[2]):
+        total += _ray_echo(traced, scene, rotation, weight, v, b, j)
     best = float(wp.inf)
-    for j in range(depth.shape[2]):
-        r = depth[v, b, j]
-        if shape_index[v, b, j] != MISS and r < best:
+    for j in range(traced.depth.shape[2]):
+        r = traced.depth[v, b, j]
+        if traced.shape_index[v, b, j] != MISS and r < best:
             nearer = float(0.0)
-            for i in range(depth.shape[2]):
-                if depth[v, b, i] <= r:
-                    nearer += _ray_echo(depth, shape_index, normal, surfaces, rays, rotation, weight, v, b, i)
+            for i in range(traced.depth.shape[2]):
+                if traced.depth[v, b, i] <= r:
+                    nearer += _ray_echo(traced, scene, rotation, weight, v, b, i)
             if nearer >= quantile * total:
                 best = r
     if key >= 0:
-        state = wp.rand_init(key, v * depth.shape[1] + b)
+        state = wp.rand_init(key, v * traced.depth.shape[1] + b)
         best = best * (1.0 + noise * wp.randn(state))
-    if best < shortest or best > longest:
+    if best < reach[0] or best > reach[1]:
         best = float(wp.inf)
     ranges[v, b] = best
 
 
 @wp.func
 def _ray_echo(
-    depth: wp.array3d(dtype=float), shape_index: wp.array3d(dtype=wp.uint32), normal: wp.array3d(dtype=wp.vec3),
-    surfaces: wp.array(dtype=Surface), rays: wp.array4d(dtype=wp.vec3), rotation: wp.quat,
-    weight: wp.array(dtype=float), v: int, b: int, j: int,
-) -> float:  # fmt: skip
+    traced: Traced, scene: Scene, rotation: wp.quat, weight: wp.array(dtype=float), v: int, b: int, j: int
+) -> float:
     """Echo of one ray as `_echo_rays` has it, without absorption; 0 for a miss."""
-    index = shape_index[v, b, j]
-    r = depth[v, b, j]
+    index = traced.shape_index[v, b, j]
+    r = traced.depth[v, b, j]
     if index == MISS or r <= 0.0:
         return 0.0
-    ray = wp.quat_rotate(rotation, rays[b, j, 0, 1])
-    return weight[j] * surfaces[int(index)].backscatter * wp.abs(wp.dot(normal[v, b, j], ray)) / (r * r)
+    ray = wp.quat_rotate(rotation, traced.rays[b, j, 0, 1])
+    return (
+        weight[j]
+        * scene.surfaces[int(index)].backscatter
+        * wp.abs(wp.dot(traced.normal[v, b, j], ray))
+        / (r * r)
+    )
 
 
 class RangeBatch(RayBatch):
@@ -1307,40 +1104,25 @@ class RangeBatch(RayBatch):
         """
         self.cast(poses, mask)
         ranger, key = self.ranger, -1 if seed is None else noise_key(seed, time)
-        inputs = [
-            self.worlds,
-            self.rays,
-            self.depth,
-            self.shape_index,
-            self.normal,
-            self.views,
-            self.batch.surfaces,
-        ]
-        inputs += [self._weight, ranger.quantile, ranger.minimum_range, ranger.range, ranger.noise, key]
+        reach = wp.vec2(ranger.minimum_range, ranger.range)
+        inputs = [self.traced, self.batch.scene, self._weight, ranger.quantile, reach, ranger.noise, key]
         wp.launch(_take_ranges, self.ranges.shape, [*inputs, self.ranges], device=self.device)
         return self.ranges
 
 
 @wp.kernel(enable_backward=False)
 def _take_velocities(
-    worlds: wp.array(dtype=int),
-    rays: wp.array4d(dtype=wp.vec3),
-    views: wp.array(dtype=wp.transform),
-    twists: wp.array2d(dtype=vec6),
-    mount: wp.transform,
-    ranges: wp.array2d(dtype=float),
-    noise: float,
-    key: int,
-    speeds: wp.array2d(dtype=float),
-    velocity: wp.array2d(dtype=float),
-    lock: wp.array2d(dtype=int),
-):
+    traced: Traced, twists: wp.array2d(dtype=vec6), mount: wp.transform, noise: float, key: int,
+    reading: wp.array2d(dtype=float), lock: wp.array2d(dtype=int),
+):  # fmt: skip
     """Speed along each beam that finds the bottom, and the velocity that fits them best.
 
     s_b = d_b . v + noise;  v = (sum d d^T)^-1 sum d s  over the beams with an echo, of which there must be three
+
+    Ranges are read from the last columns of `reading`: velocity, speeds, ranges.
     """
     i = wp.tid()
-    if worlds[i] == SKIPPED:
+    if traced.worlds[i] == SKIPPED:
         return
     w = i // twists.shape[1]
     v = i % twists.shape[1]
@@ -1351,15 +1133,16 @@ def _take_velocities(
     normal = wp.mat33(0.0)
     right = wp.vec3(0.0)
     count = int(0)
-    for b in range(ranges.shape[1]):
-        d = rays[b, 0, 0, 1]
-        speeds[i, b] = float(wp.nan)
+    beams = traced.depth.shape[1]
+    for b in range(beams):
+        d = traced.rays[b, 0, 0, 1]
+        reading[i, 3 + b] = float(wp.nan)
         drawn = wp.randn(state)
-        if wp.isfinite(ranges[i, b]):
+        if wp.isfinite(reading[i, 3 + beams + b]):
             s = wp.dot(d, exact)
             if key >= 0:
                 s += noise * drawn
-            speeds[i, b] = s
+            reading[i, 3 + b] = s
             normal += wp.outer(d, d)
             right += s * d
             count += 1
@@ -1368,7 +1151,7 @@ def _take_velocities(
     if count >= 3:
         solution = wp.inverse(normal) * right
     for k in range(3):
-        velocity[i, k] = solution[k]
+        reading[i, k] = solution[k]
 
 
 class DopplerBatch(RangeBatch):
@@ -1422,8 +1205,15 @@ class DopplerBatch(RangeBatch):
         """
         super().update(poses, seed=seed, time=time, mask=mask)
         key = -1 if seed is None else noise_key(seed + 1, time)
-        inputs = [self.worlds, self.rays, self.views, self.twists, self._mount, self.ranges]
-        inputs += [self.ranger.velocity_noise, key, self.speeds, self.velocity, self.lock]
+        inputs = [
+            self.traced,
+            self.twists,
+            self._mount,
+            self.ranger.velocity_noise,
+            key,
+            self.reading,
+            self.lock,
+        ]
         wp.launch(_take_velocities, self.count, inputs, device=self.device)
         return self.reading
 
