@@ -37,12 +37,11 @@ class PingerArrays:
 
 @wp.func
 def measure_range(
-    truth: SampledState, p: PingerParameters, key: wp.uint32, root: float, restarting: bool,
-    pinger: PingerArrays, w: int, v: int, slot: int,
-) -> bool:  # fmt: skip
+    truth: SampledState, p: PingerParameters, pinger: PingerArrays, w: int, v: int, slot: int
+) -> bool:
     """Write one sample into its slot; return False where there is none."""
     point = truth.position + wp.quat_rotate(truth.quaternion, p.position)
-    pinger.ring[w, v, slot] = wp.length(point) + p.noise_std * normal(key, WHITE)
+    pinger.ring[w, v, slot] = wp.length(point) + p.noise_std * normal(truth.key, WHITE)
     return True
 
 

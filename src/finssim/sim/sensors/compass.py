@@ -42,13 +42,12 @@ def heading_of(q_wb: wp.quat) -> float:
 
 @wp.func
 def measure_heading(
-    truth: SampledState, p: CompassParameters, key: wp.uint32, root: float, restarting: bool,
-    compass: CompassArrays, w: int, v: int, slot: int,
-) -> bool:  # fmt: skip
+    truth: SampledState, p: CompassParameters, compass: CompassArrays, w: int, v: int, slot: int
+) -> bool:
     """One sample of a compass; arguments as `sampling_kernel` has them."""
-    if restarting:
-        compass.bias[w, v] = p.bias_initial * normal(key, TURN_ON)
-    heading = heading_of(truth.quaternion) + compass.bias[w, v] + p.noise_std * normal(key, WHITE)
+    if truth.restarting:
+        compass.bias[w, v] = p.bias_initial * normal(truth.key, TURN_ON)
+    heading = heading_of(truth.quaternion) + compass.bias[w, v] + p.noise_std * normal(truth.key, WHITE)
     compass.ring[w, v, slot] = digitised(heading, p.quantisation, wp.inf)
     return True
 

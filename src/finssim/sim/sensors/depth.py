@@ -53,16 +53,15 @@ def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
 
 @wp.func
 def measure_depth(
-    truth: SampledState, p: DepthParameters, key: wp.uint32, root: float, restarting: bool,
-    gauge: DepthArrays, w: int, v: int, slot: int,
-) -> bool:  # fmt: skip
+    truth: SampledState, p: DepthParameters, gauge: DepthArrays, w: int, v: int, slot: int
+) -> bool:
     """One sample of a gauge; arguments as `sampling_kernel` has them."""
-    if restarting:
-        gauge.bias[w, v] = p.bias_initial * normal(key, TURN_ON)
-    bias = gauge.bias[w, v] + p.bias_walk * root * normal(key, WALK)
+    if truth.restarting:
+        gauge.bias[w, v] = p.bias_initial * normal(truth.key, TURN_ON)
+    bias = gauge.bias[w, v] + p.bias_walk * truth.root * normal(truth.key, WALK)
     exact = depth_of_point(truth.position, truth.quaternion, p.position)
     gauge.ring[w, v, slot] = digitised(
-        exact + bias + p.noise_std * normal(key, WHITE), p.quantisation, wp.inf
+        exact + bias + p.noise_std * normal(truth.key, WHITE), p.quantisation, wp.inf
     )
     gauge.bias[w, v] = bias
     return True

@@ -74,16 +74,15 @@ def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
 
 @wp.func
 def measure_velocity(
-    truth: SampledState, p: DvlParameters, key: wp.uint32, root: float, restarting: bool,
-    dvl: DvlArrays, w: int, v: int, slot: int,
-) -> bool:  # fmt: skip
+    truth: SampledState, p: DvlParameters, dvl: DvlArrays, w: int, v: int, slot: int
+) -> bool:
     """One sample of a DVL; arguments as `sampling_kernel` has them."""
-    if restarting:
-        dvl.bias[w, v] = p.bias_initial * normal3(key, TURN_ON)
-        dvl.scale_error[w, v] = p.scale_error * normal(key, TURN_ON_2)
-    bias = dvl.bias[w, v] + p.bias_walk * root * normal3(key, WALK)
+    if truth.restarting:
+        dvl.bias[w, v] = p.bias_initial * normal3(truth.key, TURN_ON)
+        dvl.scale_error[w, v] = p.scale_error * normal(truth.key, TURN_ON_2)
+    bias = dvl.bias[w, v] + p.bias_walk * truth.root * normal3(truth.key, WALK)
     exact = sensed_velocity(truth.velocity, truth.quaternion, truth.water, p.position, p.orientation)
-    reading = (1.0 + dvl.scale_error[w, v]) * exact + bias + p.noise_std * normal3(key, WHITE)
+    reading = (1.0 + dvl.scale_error[w, v]) * exact + bias + p.noise_std * normal3(truth.key, WHITE)
     dvl.ring[w, v, slot] = digitised3(reading, p.quantisation, p.velocity_range)
     dvl.bias[w, v] = bias
     return truth.water_known or (dvl.lock[w, v] != 0 and has_echo(truth.position, truth.quaternion, p))

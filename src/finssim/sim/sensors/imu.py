@@ -74,21 +74,18 @@ def angular_rate(nu: vec6, q_bs: wp.quat) -> wp.vec3:
 
 
 @wp.func
-def measure_motion(
-    truth: SampledState, p: ImuParameters, key: wp.uint32, root: float, restarting: bool,
-    imu: ImuArrays, w: int, v: int, slot: int,
-) -> bool:  # fmt: skip
+def measure_motion(truth: SampledState, p: ImuParameters, imu: ImuArrays, w: int, v: int, slot: int) -> bool:
     """One sample of an IMU; arguments as `sampling_kernel` has them."""
-    if restarting:
-        imu.gyro_bias[w, v] = p.gyro_bias_initial * normal3(key, TURN_ON)
-        imu.accel_bias[w, v] = p.accel_bias_initial * normal3(key, TURN_ON_2)
-    gyro_bias = imu.gyro_bias[w, v] + p.gyro_bias_walk * root * normal3(key, WALK)
-    accel_bias = imu.accel_bias[w, v] + p.accel_bias_walk * root * normal3(key, WALK_2)
-    gyro = angular_rate(truth.velocity, p.orientation) + gyro_bias + p.gyro_noise * normal3(key, WHITE)
+    if truth.restarting:
+        imu.gyro_bias[w, v] = p.gyro_bias_initial * normal3(truth.key, TURN_ON)
+        imu.accel_bias[w, v] = p.accel_bias_initial * normal3(truth.key, TURN_ON_2)
+    gyro_bias = imu.gyro_bias[w, v] + p.gyro_bias_walk * truth.root * normal3(truth.key, WALK)
+    accel_bias = imu.accel_bias[w, v] + p.accel_bias_walk * truth.root * normal3(truth.key, WALK_2)
+    gyro = angular_rate(truth.velocity, p.orientation) + gyro_bias + p.gyro_noise * normal3(truth.key, WHITE)
     accel = specific_force(
         truth.velocity, truth.acceleration, truth.quaternion, p.position, p.orientation, p.gravity
     )
-    accel += accel_bias + p.accel_noise * normal3(key, WHITE_2)
+    accel += accel_bias + p.accel_noise * normal3(truth.key, WHITE_2)
     imu.gyro_ring[w, v, slot] = digitised3(gyro, p.gyro_quantisation, p.gyro_range)
     imu.accel_ring[w, v, slot] = digitised3(accel, p.accel_quantisation, p.accel_range)
     imu.gyro_bias[w, v] = gyro_bias

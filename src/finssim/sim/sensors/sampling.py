@@ -230,7 +230,7 @@ def new_sampling(
 
 @wp.struct
 class SampledState:
-    """True state of one vehicle at the end of a control step."""
+    """True state of one vehicle at the end of a control step, in which a sensor samples."""
 
     position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat  # attitude, body to world, xyzw
@@ -238,6 +238,9 @@ class SampledState:
     acceleration: vec6  # nu_dot, rate of the components of nu, body frame [m/s², rad/s²]
     water: wp.vec3  # velocity of the water, world frame [m/s]
     water_known: wp.bool  # whether that was given
+    key: wp.uint32  # of everything random in the sample
+    root: float  # square root of the time since the last sample [√s]
+    restarting: wp.bool  # whether the world was just reset
 
 
 def parameters_of(schema: type[Sensor], **derived: Any) -> Any:
@@ -262,9 +265,8 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
     Args:
         parameters: Warp struct of one sensor, from `parameters_of`.
         arrays: Warp struct of readings and memory.
-        measure: Warp function (truth, parameters, key, root of the time since the last sample [√s], whether worlds were
-            just reset, arrays, world, vehicle, slot) -> whether there is a sample; it puts the sample into the slot of
-            its rings, and at a reset draws what stays for an episode.
+        measure: Warp function (truth, parameters, arrays, world, vehicle, slot) -> whether there is a sample; it puts
+            the sample into the slot of its rings, and at a reset draws what stays for an episode.
         display: Warp function (parameters, arrays, world, vehicle, slot) that copies a sample that arrives from the
             slot to the readings.
     """
@@ -307,9 +309,11 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
             if water_velocity.shape[0] > 0:
                 truth.water = water_velocity[w, v]
                 truth.water_known = True
+            truth.key = key
+            truth.root = root_of_wait(sampling, w, v, step)
+            truth.restarting = restarting
             slot = slot_of(sampling, step)
-            root = root_of_wait(sampling, w, v, step)
-            measured = measure(truth, p, key, root, restarting, sensor, w, v, slot)
+            measured = measure(truth, p, sensor, w, v, slot)
             sampling.sent[w, v, slot] = measured and (restarting or not lost(key, p.dropout))
             sampling.last[w, v] = step
         arrived = arrival(sampling, w, v, step, restarting)
