@@ -8,7 +8,7 @@ pytest.importorskip("finssim.extensions.perception")
 
 from finssim.extensions.perception import WorldLayout, load_world
 from finssim.sim import RectangularPool, Simulator, SimulatorError
-from finssim.sim.step import physics_kernel
+from finssim.sim.step import Features, physics_kernel
 from reference.body import rotation
 from reference.cases import disturb, load, neutral, undamped
 
@@ -355,7 +355,7 @@ def test_the_step_with_solids_compiles_for_cuda(tmp_path):
         pytest.skip("this Warp has no CUDA compiler")
     from finssim.sim import solids
 
-    kernel = physics_kernel("calibrated", "midpoint", solids_present=True, funnel_present=True)
+    kernel = physics_kernel(Features("calibrated", solids=True, funnel=True))
     for module in (kernel.module, wp.get_module(solids.__name__)):
         wp.compile_aot_module(module, arch=75, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob("*.ptx"))) == 2

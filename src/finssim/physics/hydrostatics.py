@@ -17,6 +17,17 @@ class WaterWrench:
     wet_rate: float  # its rate [1/s]
 
 
+@wp.struct
+class Afloat:
+    """Pose and motion of a vehicle, as a hydrodynamic model takes them."""
+
+    position: wp.vec3  # body origin, world frame [m]
+    q: wp.quat  # attitude, body to world
+    up: wp.vec3  # world z axis in the body frame, unit
+    nu: vec6  # twist, body frame [m/s, rad/s]
+    nu_r: vec6  # the same relative to the water [m/s, rad/s]
+
+
 @wp.func
 def submerged_fraction(height: float, half_height: float) -> float:
     """Part of the displaced volume that is under water.

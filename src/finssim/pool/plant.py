@@ -13,12 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from finssim.physics.hydrostatics import submerged_fraction
 from finssim.physics.kinematics import up_in_body
 from finssim.physics.motors import thrust_of_speed
+from finssim.physics.plant import VehicleCommand
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays, profile_at
 from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
 from finssim.sim import Dock, RectangularPool, Simulator, TetherLine, Water, Wave
 from finssim.sim.plant_arrays import NO_LIMIT
+from finssim.sim.state import State
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
 
@@ -480,20 +482,23 @@ def buoyancy_change(hidden: Hidden, t: float) -> float:
     return total
 
 
+@wp.struct
+class Machinery:
+    """Everything of a plant that the engine does not have."""
+
+    motors: MotorBank
+    propellers: PropellerBank
+    hidden: Hidden
+    circulation: Gyre
+    line: Slack
+
+
 @wp.kernel(enable_backward=False)
 def drive(
-    position: wp.array2d(dtype=wp.vec3),
-    quaternion: wp.array2d(dtype=wp.quat),
-    velocity: wp.array2d(dtype=vec6),
-    steps: wp.array(dtype=int),
-    thrust: wp.array2d(dtype=vec8),
-    disturbance: wp.array2d(dtype=vec6),
+    state: State,
+    command: wp.array2d(dtype=VehicleCommand),
     surroundings: WaterArrays,
-    motors: MotorBank,
-    propellers: PropellerBank,
-    hidden: Hidden,
-    circulation: Gyre,
-    line: Slack,
+    machinery: Machinery,
     step: float,
     motor_steps: int,
     seed: int,
@@ -502,44 +507,38 @@ def drive(
     """Before a physics step: turn the motors through it, and write thrusts, wrench and current for the engine.
 
     Args:
-        position: Body origin, world frame [m], (worlds, vehicles); as the other arrays, it has one of each.
-        quaternion: Body to world, xyzw, (worlds, vehicles).
-        velocity: Twist, body frame [m/s, rad/s], (worlds, vehicles).
-        steps: Physics steps so far, (worlds,).
-        thrust: Written: along the thrusters' axes [N], and commands of other actuators, (worlds, vehicles).
-        disturbance: Written: wrench about the body origin, body frame [N, N m], (worlds, vehicles).
+        state: Of one world with one vehicle.
+        command: Written: thrusts along the thrusters' axes [N], commands of other actuators, and the wrench about the
+            body origin, body frame [N, N m], (worlds, vehicles).
         surroundings: Water of the engine; its current is written, to which the engine adds the profile.
-        motors: Motors and speed loops.
-        propellers: What makes thrust of their speeds.
-        hidden: What acts on the body besides.
-        circulation: Of the water.
-        line: The slack tether.
+        machinery: Motors, propellers and what else acts on the body.
         step: Physics step [s].
         motor_steps: Steps of the motors in it.
         seed: Of the speed measurements' noise.
         world_offset: First world of this launch; not used.
     """
-    count = steps[0]
+    hidden = machinery.hidden
+    count = state.steps[0]
     t = float(count) * step
     dt = step / float(motor_steps)
     for j in range(motor_steps):
         tick = count * motor_steps + j
-        turn_motors(motors, tick, dt, wp.rand_init(seed, tick))
-    x = position[0, 0]
-    q = quaternion[0, 0]
-    nu = velocity[0, 0]
-    water = circulation_at(circulation, x, t)
+        turn_motors(machinery.motors, tick, dt, wp.rand_init(seed, tick))
+    x = state.position[0, 0]
+    q = state.quaternion[0, 0]
+    nu = state.velocity[0, 0]
+    water = circulation_at(machinery.circulation, x, t)
     surroundings.current[0] = water
     if surroundings.profile_depth.shape[0] > 0:
         profile = profile_at(surroundings, 0, -wp.min(x[2], 0.0), t)
         water += profile.velocity
     nu_r = nu - join(wp.quat_rotate_inv(q, water), wp.vec3(0.0))
-    thrust[0, 0] = delivered_thrust(propellers, motors.speed, nu_r)
+    command[0, 0].thrust = delivered_thrust(machinery.propellers, machinery.motors.speed, nu_r)
     up = up_in_body(q)
     wet = submerged_fraction(x[2] + wp.dot(up, hidden.r_b), hidden.half_height)
     lift = wet * buoyancy_change(hidden, t) * up
     tau = wet * coupled_damping(hidden, nu_r) + join(lift, wp.cross(hidden.r_b, lift))
-    disturbance[0, 0] = tau + slack_pull(line, x, q)
+    command[0, 0].disturbance = tau + slack_pull(machinery.line, x, q)
 
 
 class Plant:
@@ -600,14 +599,19 @@ class Plant:
         s = self.simulator
         pipeline = s.pipeline()
         propellers = propeller_bank(vehicle, spec)
-        banks = [self.motors, propellers, _hidden(vehicle, spec)]
-        banks += [gyre(spec.circulation, spec.basin), slack_line(spec.tether)]
-        self._banks = banks  # a recorded launch does not keep the arrays inside structs alive
-        state = [s.state.position, s.state.quaternion, s.state.velocity, s.state.steps]
-        written = [s.command.thrust, s.command.disturbance, s.water]
+        machinery = self._machinery = (
+            Machinery()
+        )  # kept: a recorded launch does not keep arrays inside structs alive
+        machinery.motors, machinery.propellers, machinery.hidden = (
+            self.motors,
+            propellers,
+            _hidden(vehicle, spec),
+        )
+        machinery.circulation, machinery.line = gyre(spec.circulation, spec.basin), slack_line(spec.tether)
         # One slice of the generator's 32 bits per plant: seeds that differ by one must not share numbers.
         key = int(np.random.SeedSequence([seed, 71]).generate_state(1)[0] >> 1)
-        pipeline.add(drive, [*state, *written, *banks, self.step, motor_steps, key])
+        inputs = [s.state, s.command.array, s.water, machinery, self.step, motor_steps, key]
+        pipeline.add(drive, inputs)
         s.add_step(pipeline)
         self._step = captured(pipeline.run)
         self.steps = 0

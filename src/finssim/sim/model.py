@@ -14,13 +14,12 @@ from finssim.core.quiet import start_warp
 from finssim.core.rotations import quat_from_euler
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
-from finssim.physics.plant import VehicleParameters, refresh_plant
+from finssim.physics.plant import refresh_plant
 from finssim.physics.tether import Tether
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
-from finssim.physics.water import WaterArrays
 from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.simulator import checked_choice, find_device
-from finssim.sim.step import motion_function
+from finssim.sim.step import Instant, SimSurroundings, Vehicles, motion_function
 from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -116,9 +115,11 @@ def _model(vehicle: Vehicle, model: str) -> tuple[wp.Kernel, list[Any]]:
     wp.launch(refresh_plant, (1, 1), [plant.array, 1.0, everywhere, 0], device=device)
     fluid = vehicle.water
     water = Water().arrays(1, fluid.density, fluid.gravity, device, 0)
-    hull = hull_mesh([vehicle.hull_mesh()], device) if model == "mesh" else HullMesh()
-    tether = wp.zeros((1, 1), dtype=Tether, device=device)
-    return _acceleration_kernel(model, plant.terms), [plant.array, plant.extra, hull, water, tether]
+    vehicles, around = Vehicles(), SimSurroundings()
+    vehicles.plant, vehicles.extra = plant.array, plant.extra
+    around.hull = hull_mesh([vehicle.hull_mesh()], device) if model == "mesh" else HullMesh()
+    around.water, around.tether = water, wp.zeros((1, 1), dtype=Tether, device=device)
+    return _acceleration_kernel(model, plant.terms), [vehicles, around]
 
 
 @cache
@@ -133,19 +134,19 @@ def _acceleration_kernel(model: str, terms: tuple[Any, ...]) -> wp.Kernel:
         nu: wp.array(dtype=vec6),
         tau: wp.array(dtype=vec6),
         values: wp.array(dtype=vec8),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        tether: wp.array2d(dtype=Tether),
+        vehicles: Vehicles,
+        around: SimSurroundings,
         nu_dot: wp.array(dtype=vec6),
     ):
         i = wp.tid()
-        pushed = plant[0, 0].G * values[i]
-        motion = motion_at(
-            plant, extra, hull, water, tether, 0, 0, position[i], quaternion[i], nu[i], nu[i], values[i], pushed,
-            tau[i], 0.0, 0.0, 0.0,
-        )  # fmt: skip
-        nu_dot[i] = motion.nu_dot
+        moment = Instant()
+        moment.position = position[i]
+        moment.quaternion = quaternion[i]
+        moment.velocity = nu[i]
+        moment.before = nu[i]
+        moment.thrust = values[i]
+        moment.pushed = vehicles.plant[0, 0].G * values[i]
+        moment.other = tau[i]
+        nu_dot[i] = motion_at(vehicles, around.hull, around.water, around.tether, 0, 0, moment).nu_dot
 
     return evaluate

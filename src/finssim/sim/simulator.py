@@ -31,7 +31,7 @@ from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.site import Dock, RectangularPool, TetherLine
 from finssim.sim.solids import WorldSolids, layout_of, pool_of, refresh_clearing
 from finssim.sim.state import HISTORY, VehicleState, clear_actuators, new_state
-from finssim.sim.step import physics_kernel, tick
+from finssim.sim.step import Features, SimSurroundings, Vehicles, physics_kernel, tick
 from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import ReferenceWater as Fluid
@@ -199,35 +199,27 @@ class Simulator:
             pipeline.add(refresh_clearing, inputs, len(self.vehicles))
         # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
         general = self.device.is_cpu and not self.in_lanes
-        kernel = physics_kernel(
+        features = Features(
             self.hydrodynamics,
             self.integrator,
             water_moving=bool(self.water.moving),
-            walls_present=general or self.surroundings[1] is not None,
-            tether_present=general or self.surroundings[2] is not None,
+            walls=general or self.surroundings[1] is not None,
+            tether=general or self.surroundings[2] is not None,
             speed_lag=general or bool(self.plant.speed_lag.numpy().any()),
             terms=self.plant.terms,
-            funnel_present=self.dock is not None,
-            solids_present=self._solids is not None,
-            play_present=bool(self.plant.play.numpy().any()),
+            funnel=self.dock is not None,
+            solids=self._solids is not None,
+            play=bool(self.plant.play.numpy().any()),
             lanes=self.in_lanes,
         )
-        around = [self.hull, self.water, self.walls, self.tether.array, self.funnel, self.solids]
-        s = self.state
-        clocks = [s.commands, s.history, s.steps, s.broken, s.frozen]
-        inputs = [
-            s.vehicle,
-            self.command.array,
-            *clocks,
-            self.plant.array,
-            self.plant.extra,
-            *around,
-            self.control_step,
-            self.substeps,
-        ]
-        if self.in_lanes:
-            inputs.append(self._shared)
-        pipeline.add(kernel, inputs, len(self.vehicles), LANES if self.in_lanes else None)
+        machines, around = Vehicles(), SimSurroundings()
+        machines.command, machines.plant = self.command.array, self.plant.array
+        machines.extra, machines.shared = self.plant.extra, self._shared
+        around.hull, around.water, around.tether = self.hull, self.water, self.tether.array
+        for name in ("walls", "funnel", "solids"):
+            setattr(around.obstacles, name, getattr(self, name))
+        inputs = [self.state, machines, around, self.control_step, self.substeps]
+        pipeline.add(physics_kernel(features), inputs, len(self.vehicles), LANES if self.in_lanes else None)
         pipeline.add(tick, [self.state])
 
     @property

@@ -1,7 +1,9 @@
 """The physics kernel: one thread takes one vehicle through all substeps of a control step."""
 
 import math
+from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -11,6 +13,7 @@ from finssim.physics.damping import twist_at, wrench_from
 from finssim.physics.funnel import Funnel, funnel_within, funnel_wrench
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, drag_slope
+from finssim.physics.hydrostatics import Afloat
 from finssim.physics.inertia import (
     coriolis_wrench,
     rigid_body_momentum,
@@ -137,7 +140,7 @@ def slot_before(head: int, steps: int, slots: int) -> int:
 
 MODULE_OPTIONS = {
     "cpu_compiler_flags": "-march=native -ffp-contract=fast"
-    " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+    " -mllvm=-inline-threshold=20000 -mllvm=-inline-cold-callsite-threshold=9000"
 }
 """Warp's defaults, but with fused multiply-adds and no limit on the depth of SLP vectorisation: a quarter faster."""
 
@@ -163,12 +166,122 @@ class Course:
     struck: float  # greatest force of the world's solids so far [N]
 
 
+@wp.struct
+class Vehicles:
+    """Commands and parameters of all vehicles."""
+
+    command: wp.array2d(dtype=VehicleCommand)
+    plant: wp.array2d(dtype=VehicleParameters)
+    extra: wp.array3d(dtype=float)  # parameters of terms and actuators, each in its unit [-]
+    shared: wp.array(dtype=int)  # 1: all worlds have equal parameters
+
+
+@wp.struct
+class Obstacles:
+    """Everything that a vehicle can bump into."""
+
+    walls: PoolWalls
+    funnel: Funnel
+    solids: Solids
+
+
+@wp.struct
+class SimSurroundings:
+    """Everything around the vehicles."""
+
+    hull: HullMesh
+    water: WaterArrays
+    tether: wp.array2d(dtype=Tether)
+    obstacles: Obstacles
+
+
+@wp.struct
+class Instant:
+    """A state of a vehicle, and what acts on it, in which the equation of motion is evaluated."""
+
+    position: wp.vec3  # body origin, world frame [m]
+    quaternion: wp.quat  # body to world
+    velocity: vec6  # nu, body frame [m/s, rad/s]
+    before: vec6  # nu at the start of the substep [m/s, rad/s]
+    thrust: vec8  # of each thruster [N]; of other actuators their value
+    pushed: vec6  # acceleration by that thrust, submerged [m/s², rad/s²]
+    other: vec6  # wrench of everything else from outside, body frame [N, N m]
+    t: float  # time since the reset [s]
+    t_step: float  # time since the start of the control step [s]
+    h: float  # substep [s]
+
+
+@wp.struct
+class Rates:
+    """Rates of a state."""
+
+    x_dot: wp.vec3  # world frame [m/s]
+    q_dot: wp.quat
+    nu_dot: vec6  # body frame [m/s², rad/s²]
+
+
+@wp.struct
+class Beat:
+    """The control step that is being made."""
+
+    step: int  # number since the reset
+    head: int  # slot of its command in the delay line
+    control_step: float  # [s]
+    h: float  # substep [s]
+
+
+@wp.struct
+class Lagged:
+    """Actuators in a substep."""
+
+    after: vec8  # lagged force [N] or propeller speed [rad/s] at its end
+    thrust: vec8  # mean of each thruster [N]; of other actuators their value
+    pushed: vec6  # acceleration by that thrust, submerged [m/s², rad/s²]
+
+
+@dataclass(frozen=True)
+class Features:
+    """Parts of a simulation for which its kernel is compiled: code for what is not there is left out."""
+
+    model: str
+    """A key of `HYDRODYNAMICS`."""
+    integrator: str = "midpoint"
+    """`midpoint` (see `finssim.sim.midpoint`) or `rk4`."""
+    water_moving: bool = True
+    """True with currents or waves."""
+    walls: bool = True
+    """True with a pool to bump into."""
+    tether: bool = True
+    speed_lag: bool = True
+    """True if some vehicle's motors lag in speed rather than in force."""
+    terms: tuple[Item, ...] = ()
+    """Terms and actuators that some vehicle has, in the order of the rows of their parameters."""
+    funnel: bool = False
+    """True with a dock to enter."""
+    solids: bool = False
+    """True with a world with solids to bump into."""
+    play: bool = False
+    """True if some actuator has play."""
+    lanes: bool = False
+    """True if worlds go in blocks of `LANES`, on a processor; see `finssim.physics.lanes`."""
+
+    @property
+    def runge_kutta(self) -> bool:
+        """Return whether the integrator is `rk4`."""
+        return self.integrator == "rk4"
+
+    @property
+    def contacts(self) -> bool:
+        """Return whether there is anything to bump into."""
+        return self.walls or self.funnel or self.solids
+
+
 @cache
 def motion_function(
     model: str,
     runge_kutta: bool,
     water_moving: bool = False,
-    tether_present: bool = False,
+    tethered: bool = False,
     terms: tuple[Item, ...] = (),
 ) -> Any:
     """Return the Warp function of the equation of motion, without the terms that a simulation does not need.
@@ -177,7 +290,7 @@ def motion_function(
         model: A key of `HYDRODYNAMICS`.
         runge_kutta: Whether the integrator is `rk4`, which needs no relaxation.
         water_moving: Whether there are currents or waves.
-        tether_present: Whether there is a tether.
+        tethered: Whether there is a tether.
         terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
     """
     hydrodynamic_wrench = HYDRODYNAMICS[model]
@@ -188,24 +301,9 @@ def motion_function(
 
     @wp.func
     def motion_at(
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        tether: wp.array2d(dtype=Tether),
-        w: int,
-        v: int,
-        position: wp.vec3,
-        q: wp.quat,
-        nu: vec6,
-        nu_start: vec6,
-        thrust: vec8,
-        pushed: vec6,
-        tau_other: vec6,
-        t: float,
-        t_step: float,
-        h: float,
-    ) -> StateDerivative:
+        vehicles: Vehicles, hull: HullMesh, water: WaterArrays, tether: wp.array2d(dtype=Tether), w: int, v: int,
+        moment: Instant,
+    ) -> StateDerivative:  # fmt: skip
         """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
 
         (M_RB + s M_A) nu_dot = tau_model + s tau_thrust + tau_other - C_RB(nu) nu - s C_A(nu_r) nu_r
@@ -219,10 +317,16 @@ def motion_function(
         That term is taken at the middle of a substep h that starts with nu_start, implicitly: M_A sets no limit to h.
         """
         out = StateDerivative()
+        plant = vehicles.plant
+        extra = vehicles.extra
+        position = moment.position
+        q = moment.quaternion
+        nu = moment.velocity
+        thrust = moment.thrust
         up = up_in_body(q)
         r_g = plant[w, v].r_g
         inertia = plant[w, v].inertia
-        tau = tau_other
+        tau = moment.other
         if wp.static(mass_shift is not None):
             shift = mass_shift(extra, w, v, nu, up, -position[2], water.density, thrust)
             first = wp.vec3(shift[0], shift[1], shift[2])
@@ -234,13 +338,19 @@ def motion_function(
         nu_r = nu
         water_b = wp.vec3(0.0)
         if wp.static(water_moving):
-            flow = flow_at(water, w, position, t, t_step)
+            flow = flow_at(water, w, position, moment.t, moment.t_step)
             water_b = wp.quat_rotate_inv(q, flow.velocity)
             if wp.static(added_mass):
                 nu_r = nu - join(water_b, wp.vec3(0.0))
         else:
             flow.normal = wp.vec3(0.0, 0.0, 1.0)
-        wet = hydrodynamic_wrench(plant, hull, water, w, v, position, q, up, nu, nu_r, flow)
+        body = Afloat()
+        body.position = position
+        body.q = q
+        body.up = up
+        body.nu = nu
+        body.nu_r = nu_r
+        wet = hydrodynamic_wrench(plant, hull, water, w, v, body, flow)
         tau = tau + wet.tau
         if wp.static(added_mass):
             momentum_A = wet.wet * symmetric_times(plant[w, v].M_A, nu_r)
@@ -260,7 +370,7 @@ def motion_function(
             tau += wet.wet * wrench_from(tau_h, r_h)
         if wp.static(actuator_wrench is not None):
             tau += wet.wet * actuator_wrench(extra, w, v, nu_r, up, -position[2], water.density, thrust)
-        if wp.static(tether_present):
+        if wp.static(tethered):
             tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         tau -= coriolis_wrench(momentum, nu)
         # The drag of the wet faces of a mesh is all there before much of its volume is wet.
@@ -270,23 +380,28 @@ def motion_function(
         share = vec6(damped, damped, damped, damped, damped, damped)
         if wp.static(added_mass or mass_shift is not None):
             if wp.static(mass_shift is None) and wet.wet == 1.0 and wet.wet_rate <= 0.0:
-                out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + pushed
+                out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + moment.pushed
             else:
                 s_dot = wp.max(wet.wet_rate, 0.0)
                 tau += wet.wet * (plant[w, v].B * thrust)
-                tau -= s_dot * symmetric_times(plant[w, v].M_A, nu_start - join(water_b, wp.vec3(0.0)))
-                s = wet.wet + 0.5 * h * s_dot
+                tau -= s_dot * symmetric_times(plant[w, v].M_A, moment.before - join(water_b, wp.vec3(0.0)))
+                s = wet.wet + 0.5 * moment.h * s_dot
                 M = mass_matrix(plant[w, v].mass, r_g, inertia, s * plant[w, v].M_A)
                 out.nu_dot = solve_spd(M, tau)
                 dry = wp.cw_div(wp.get_diag(plant[w, v].M_A), wp.get_diag(M))
                 share = damped * (vec6(1.0, 1.0, 1.0, 1.0, 1.0, 1.0) + (1.0 - s) * dry)
         else:
-            out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + wet.wet * pushed
+            out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + wet.wet * moment.pushed
         out.wet = wet.wet
         if wp.static(not runge_kutta):
             if wp.static(model == "mesh"):
                 slope = drag_slope(
-                    hull, plant[w, v].hull, nu_r, water.density, plant[w, v].form_drag, plant[w, v].skin_drag
+                    hull,
+                    plant[w, v].hull,
+                    nu_r,
+                    water.density,
+                    plant[w, v].form_drag,
+                    plant[w, v].skin_drag,
                 )
                 out.relaxation = wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, slope))
             else:
@@ -304,42 +419,8 @@ def motion_function(
 
 
 @cache
-def physics_kernel(
-    model: str,
-    integrator: str,
-    water_moving: bool = True,
-    walls_present: bool = True,
-    tether_present: bool = True,
-    speed_lag: bool = True,
-    terms: tuple[Item, ...] = (),
-    funnel_present: bool = False,
-    solids_present: bool = False,
-    play_present: bool = False,
-    lanes: bool = False,
-) -> wp.Kernel:
-    """The kernel for one hydrodynamic model and one integrator, without the code that a simulation does not need.
-
-    Args:
-        model: A key of `HYDRODYNAMICS`.
-        integrator: `midpoint` (see `finssim.sim.midpoint`) or `rk4`.
-        water_moving: Whether there are currents or waves.
-        walls_present: Whether there is a pool to bump into.
-        tether_present: Whether there is a tether.
-        speed_lag: Whether some vehicle's motors lag in speed rather than in force.
-        terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
-        funnel_present: Whether there is a dock to enter.
-        solids_present: Whether there is a world with solids to bump into.
-        play_present: Whether some actuator has play.
-        lanes: Whether worlds go in blocks of `LANES`, on a processor; see `finssim.physics.lanes`.
-
-    Returns:
-        A kernel over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), which takes the
-        number of the slice's worlds before its offset.
-    """
-    runge_kutta = integrator == "rk4"
-    motion_at = motion_function(model, runge_kutta, water_moving, tether_present, terms)
-    contacts = walls_present or funnel_present or solids_present
-    contact_step = DOCK_STEP if funnel_present else WALL_STEP
+def thrust_function(speed_lag: bool) -> Any:
+    """Return the Warp function of the thrusts of lagged actuators, without speeds where no motor lags in speed."""
 
     @wp.func
     def thrust_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
@@ -347,450 +428,426 @@ def physics_kernel(
             return delivered_thrust(plant, w, v, actuator)
         return wp.cw_mul(plant[w, v].gain, actuator)
 
+    return thrust_of
+
+
+@cache
+def contact_function(walls: bool, funnel: bool, solids: bool) -> Any:
+    """Return the Warp function of the wrench of what a vehicle can bump into."""
+
     @wp.func
     def contact_at(
-        plant: wp.array2d(dtype=VehicleParameters),
-        walls: PoolWalls,
-        funnel: Funnel,
-        solids: Solids,
-        clearing: wp.vec4,
-        w: int,
-        v: int,
-        position: wp.vec3,
-        q: wp.quat,
-        nu: vec6,
-    ) -> Touch:
+        plant: wp.array2d(dtype=VehicleParameters), obstacles: Obstacles, clearing: wp.vec4, w: int, v: int,
+        position: wp.vec3, q: wp.quat, nu: vec6,
+    ) -> Touch:  # fmt: skip
         """Wrench of walls, dock and solids, and the sizes of the forces of the latter two."""
         out = Touch()
-        if wp.static(walls_present):
-            out.tau = contact_wrench(walls, position, q, nu, plant[w, v].half_size)
-        if wp.static(funnel_present):
-            tau = funnel_wrench(funnel, w, position, q, nu, plant[w, v].half_size)
+        if wp.static(walls):
+            out.tau = contact_wrench(obstacles.walls, position, q, nu, plant[w, v].half_size)
+        if wp.static(funnel):
+            tau = funnel_wrench(obstacles.funnel, w, position, q, nu, plant[w, v].half_size)
             out.push = wp.length(linear(tau))
             out.tau += tau
-        if wp.static(solids_present):
-            tau = solids_wrench(solids, clearing, w, v, position, q, nu, plant[w, v].half_size)
+        if wp.static(solids):
+            tau = solids_wrench(obstacles.solids, clearing, w, v, position, q, nu, plant[w, v].half_size)
             out.strike = wp.length(linear(tau))
             out.tau += tau
         return out
 
+    return contact_at
+
+
+@cache
+def lag_function(speed_lag: bool, play: bool) -> Any:
+    """Return the Warp function of the actuators' lag."""
+    thrust_of = thrust_function(speed_lag)
+
     @wp.func
-    def set_out(
-        state: wp.array2d(dtype=VehicleState),
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        plant: wp.array2d(dtype=VehicleParameters),
-        w: int,
-        v: int,
-        head: int,
-    ) -> Course:
-        """Start the course of a control step, with the newest command in the delay line."""
-        out = Course()
-        newest = admissible(
-            command[w, v].thrust,
-            plant[w, v].force_min,
-            plant[w, v].force_max,
-            plant[w, v].dead_minus,
-            plant[w, v].dead_plus,
-        )
-        if wp.static(speed_lag):
-            newest = lag_target(plant, w, v, newest)
-        commands[w, v, head] = newest
-        out.start = state[w, v].position
-        out.quaternion = state[w, v].quaternion
-        out.velocity = state[w, v].velocity
-        out.actuator = state[w, v].actuator
-        out.coasting = state[w, v].coasting
-        out.pressed = state[w, v].pressed
-        out.x_dot = position_rate(out.quaternion, out.velocity)
-        if wp.static(solids_present):
-            out.clearing = state[w, v].clearing
+    def lag_at(
+        commands: wp.array3d(dtype=vec8), plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, beat: Beat,
+        k: int, actuator: vec8,
+    ) -> Lagged:  # fmt: skip
+        """Actuators in substep k: their values after it, and the thrusts of their mean."""
+        out = Lagged()
+        max_change = beat.h * plant[w, v].slew
+        elapsed = float(wp.max(k, 0)) * beat.h
+        rate = 1.0 / beat.control_step
+        target = delayed_command(commands, w, v, beat.head, elapsed, plant[w, v].delay, beat.h, rate)
+        if wp.static(play):
+            target = beyond_play(target, actuator, plant[w, v].play)
+        mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
+        out.after = first_order(actuator, target, plant[w, v].alpha, max_change)
+        out.thrust = thrust_of(plant, w, v, mean)
+        out.pushed = plant[w, v].G * out.thrust
+        return out
+
+    return lag_at
+
+
+@cache
+def runge_kutta_function(features: Features) -> Any:
+    """Return the Warp function of one substep by the rule of Runge and Kutta."""
+    motion_at = motion_function(features.model, True, features.water_moving, features.tether, features.terms)
+    contact_at = contact_function(features.walls, features.funnel, features.solids)
+    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
+
+    @wp.func
+    def rates_at(
+        vehicles: Vehicles, around: SimSurroundings, clearing: wp.vec4, w: int, v: int, start: Instant, h: float,
+        rates: Rates,
+    ) -> Rates:  # fmt: skip
+        """Rates of the state that is a time h [s] on from another, at given rates."""
+        out = Rates()
+        on = Instant()
+        on.position = start.position + h * rates.x_dot
+        on.quaternion = wp.normalize(start.quaternion + h * rates.q_dot)
+        on.velocity = start.velocity + h * rates.nu_dot
+        on.before = on.velocity
+        on.thrust = start.thrust
+        on.pushed = start.pushed
+        on.other = start.other
+        on.t = start.t + h
+        on.t_step = start.t_step + h
+        if wp.static(contacts):
+            touch = contact_at(
+                vehicles.plant, around.obstacles, clearing, w, v, on.position, on.quaternion, on.velocity
+            )
+            on.other += touch.tau
+        out.x_dot = position_rate(on.quaternion, on.velocity)
+        out.q_dot = quaternion_rate(on.quaternion, angular(on.velocity))
+        out.nu_dot = motion_at(vehicles, around.hull, around.water, around.tether, w, v, on).nu_dot
         return out
 
     @wp.func
     def substep(
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        walls: PoolWalls,
-        tether: wp.array2d(dtype=Tether),
-        funnel: Funnel,
-        solids: Solids,
+        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
+        k: int, course: Course,
+    ) -> Course:  # fmt: skip
+        """The course after substep k."""
+        out = Course()
+        h = beat.h
+        q = course.quaternion
+        clearing = course.clearing
+        lagged = lag_at(commands, vehicles.plant, w, v, beat, k, course.actuator)
+        start = Instant()
+        start.position = course.start + course.moved
+        start.quaternion = q
+        start.velocity = course.velocity
+        start.thrust = lagged.thrust
+        start.pushed = lagged.pushed
+        start.other = vehicles.command[w, v].disturbance
+        start.t_step = float(k) * h
+        start.t = float(beat.step) * beat.control_step + start.t_step
+        out.greatest = course.greatest
+        out.impulse = course.impulse
+        out.struck = course.struck
+        if wp.static(contacts):
+            touch = contact_at(
+                vehicles.plant, around.obstacles, clearing, w, v, start.position, q, start.velocity
+            )
+            out.greatest = wp.max(course.greatest, touch.push)
+            out.impulse = course.impulse + h * touch.push
+            out.struck = wp.max(course.struck, touch.strike)
+        k1 = rates_at(vehicles, around, clearing, w, v, start, 0.0, Rates())
+        k2 = rates_at(vehicles, around, clearing, w, v, start, 0.5 * h, k1)
+        k3 = rates_at(vehicles, around, clearing, w, v, start, 0.5 * h, k2)
+        k4 = rates_at(vehicles, around, clearing, w, v, start, h, k3)
+        out.start = course.start
+        out.moved = course.moved + (h / 6.0) * (k1.x_dot + 2.0 * k2.x_dot + 2.0 * k3.x_dot + k4.x_dot)
+        out.quaternion = wp.normalize(q + (h / 6.0) * (k1.q_dot + 2.0 * k2.q_dot + 2.0 * k3.q_dot + k4.q_dot))
+        out.velocity = course.velocity + (h / 6.0) * (
+            k1.nu_dot + 2.0 * k2.nu_dot + 2.0 * k3.nu_dot + k4.nu_dot
+        )
+        out.actuator = lagged.after
+        out.coasting = k4.nu_dot - lagged.pushed
+        out.x_dot = position_rate(out.quaternion, out.velocity)
+        out.jerk = course.jerk
+        out.pressed = course.pressed
+        out.clearing = clearing
+        return out
+
+    return substep
+
+
+@cache
+def midpoint_function(features: Features) -> Any:
+    """Return the Warp function of one substep by the midpoint rule; see `finssim.sim.midpoint`."""
+    motion_at = motion_function(features.model, False, features.water_moving, features.tether, features.terms)
+    contact_at = contact_function(features.walls, features.funnel, features.solids)
+    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
+    walls, funnel, solids = features.walls, features.funnel, features.solids
+    contact_step = DOCK_STEP if funnel else WALL_STEP
+
+    @wp.func
+    def bump(
+        vehicles: Vehicles,
+        obstacles: Obstacles,
         w: int,
         v: int,
-        head: int,
-        step: int,
-        k: int,
         h: float,
-        control_step: float,
+        wet: float,
+        nu_dot: vec6,
         course: Course,
     ) -> Course:
-        """The course after substep k; -1 only looks ahead."""
+        """The course after a substep [s] of a vehicle that may touch something, in shorter steps."""
         out = Course()
+        out.start = course.start
+        out.clearing = course.clearing
+        out.actuator = course.actuator
+        out.coasting = course.coasting
+        out.jerk = course.jerk
         moved = course.moved
-        position = course.start + moved
         q = course.quaternion
         nu = course.velocity
-        actuator = course.actuator
-        coasting = course.coasting
         x_dot = course.x_dot
-        jerk = course.jerk
-        pressed = course.pressed
+        pressed = vec6()
         greatest = course.greatest
         impulse = course.impulse
         struck = course.struck
-        other = command[w, v].disturbance
-        max_change = h * plant[w, v].slew
-        rate = 1.0 / control_step
-        committed = wp.where(k < 0, 0.0, 1.0)
-        step_h = committed * h
-        elapsed = float(wp.max(k, 0)) * h
-        t = float(step) * control_step + elapsed
-        target = delayed_command(commands, w, v, head, elapsed, plant[w, v].delay, h, rate)
-        if wp.static(play_present):
-            target = beyond_play(target, actuator, plant[w, v].play)
-        mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
-        after = first_order(actuator, target, plant[w, v].alpha, max_change)
-        thrust = thrust_of(plant, w, v, mean)
-        pushed = plant[w, v].G * thrust
-        if wp.static(runge_kutta):
-            outer = other
-            actuator = after
-            if wp.static(contacts):
-                touch = contact_at(plant, walls, funnel, solids, course.clearing, w, v, position, q, nu)
-                greatest = wp.max(greatest, touch.push)
-                impulse += h * touch.push
-                struck = wp.max(struck, touch.strike)
-                outer = other + touch.tau
-            q1 = quaternion_rate(q, angular(nu))
-            n1 = motion_at(
-                plant,
-                extra,
-                hull,
-                water,
-                tether,
-                w,
-                v,
-                position,
-                q,
-                nu,
-                nu,
-                thrust,
-                pushed,
-                outer,
-                t,
-                elapsed,
-                0.0,
-            ).nu_dot
-            nu2 = nu + 0.5 * h * n1
-            qm = wp.normalize(q + 0.5 * h * q1)
-            xm = position + 0.5 * h * x_dot
-            x2 = position_rate(qm, nu2)
-            q2 = quaternion_rate(qm, angular(nu2))
-            if wp.static(contacts):
-                outer = (
-                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xm, qm, nu2).tau
-                )
-            n2 = motion_at(
-                plant, extra, hull, water, tether, w, v, xm, qm, nu2, nu2, thrust, pushed, outer, t + 0.5 * h,
-                elapsed + 0.5 * h, 0.0,
-            ).nu_dot  # fmt: skip
-            nu3 = nu + 0.5 * h * n2
-            qn = wp.normalize(q + 0.5 * h * q2)
-            xn = position + 0.5 * h * x2
-            x3 = position_rate(qn, nu3)
-            q3 = quaternion_rate(qn, angular(nu3))
-            if wp.static(contacts):
-                outer = (
-                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xn, qn, nu3).tau
-                )
-            n3 = motion_at(
-                plant, extra, hull, water, tether, w, v, xn, qn, nu3, nu3, thrust, pushed, outer, t + 0.5 * h,
-                elapsed + 0.5 * h, 0.0,
-            ).nu_dot  # fmt: skip
-            nu4 = nu + h * n3
-            qe = wp.normalize(q + h * q3)
-            xe = position + h * x3
-            x4 = position_rate(qe, nu4)
-            q4 = quaternion_rate(qe, angular(nu4))
-            if wp.static(contacts):
-                outer = (
-                    other + contact_at(plant, walls, funnel, solids, course.clearing, w, v, xe, qe, nu4).tau
-                )
-            n4 = motion_at(
-                plant,
-                extra,
-                hull,
-                water,
-                tether,
-                w,
-                v,
-                xe,
-                qe,
-                nu4,
-                nu4,
-                thrust,
-                pushed,
-                outer,
-                t + h,
-                elapsed + h,
-                0.0,
-            ).nu_dot
-            moved = moved + (h / 6.0) * (x_dot + 2.0 * x2 + 2.0 * x3 + x4)
-            q = wp.normalize(q + (h / 6.0) * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
-            nu = nu + (h / 6.0) * (n1 + 2.0 * n2 + 2.0 * n3 + n4)
+        parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
+        if wp.static(solids):
+            parts = wp.max(parts, int(wp.ceil(h / obstacles.solids.step - 1.0e-4)))
+        d = h / float(parts)
+        for _ in range(parts):
+            moved = moved + 0.5 * d * x_dot
+            q = rotate_by(q, angular(nu), 0.5 * d)
+            touch = contact_at(vehicles.plant, obstacles, course.clearing, w, v, course.start + moved, q, nu)
+            greatest = wp.max(greatest, touch.push)
+            impulse += d * touch.push
+            struck = wp.max(struck, touch.strike)
+            push = yielding(vehicles.plant, w, v, wet, touch.tau)
+            pressed += push / float(parts)
+            nu = nu + d * (nu_dot + push)
+            q = rotate_by(q, angular(nu), 0.5 * d)
             x_dot = position_rate(q, nu)
-            coasting = n4 - pushed
-        else:
-            guess = coasting + pushed
-            near = bool(False)
-            if wp.static(contacts):
-                half_size = plant[w, v].half_size
-                turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
-                slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
-                if wp.static(walls_present):
-                    near = walls_within(walls, position, q, half_size, h * slack)
-                if wp.static(funnel_present):
-                    near = near or funnel_within(funnel, w, position, half_size, h * slack)
-                if wp.static(solids_present):
-                    near = near or solids_within(course.clearing, position, half_size, h * slack)
-            # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
-            # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
-            lead = h * lead_of(nu, h)
-            nu_middle = nu + lead * guess
-            push_ahead = lead * pressed
-            if wp.static(not funnel_present):
-                push_ahead = wp.min(
-                    wp.max(push_ahead, wp.min(-nu_middle, vec6())), wp.max(-nu_middle, vec6())
-                )
-            nu_middle = nu_middle + push_ahead
-            x_middle = position + 0.5 * h * x_dot
-            q_middle = q + 0.5 * h * quaternion_rate(q, angular(nu))
-            motion = motion_at(
-                plant, extra, hull, water, tether, w, v, x_middle, q_middle, nu_middle, nu, thrust, pushed, other,
-                t + 0.5 * h, elapsed + 0.5 * h, h,
-            )  # fmt: skip
-            nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, plant[w, v].r_m)
-            jerk = nu_dot - guess
-            coasting = nu_dot - pushed
-            if k >= 0:
-                actuator = after
-                pressed = vec6()
-            if k < 0 or not near:
-                nu_new = nu + step_h * nu_dot
-                q = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
-                nu = nu_new
-                moved = moved + 0.5 * step_h * x_dot
-                x_dot = position_rate(q, nu)
-                moved = moved + 0.5 * step_h * x_dot
-            else:
-                if wp.static(contacts):
-                    parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
-                    if wp.static(solids_present):
-                        parts = wp.max(parts, int(wp.ceil(h / solids.step - 1.0e-4)))
-                    d = h / float(parts)
-                    for _ in range(parts):
-                        moved = moved + 0.5 * d * x_dot
-                        position = course.start + moved
-                        q = rotate_by(q, angular(nu), 0.5 * d)
-                        touch = contact_at(
-                            plant, walls, funnel, solids, course.clearing, w, v, position, q, nu
-                        )
-                        greatest = wp.max(greatest, touch.push)
-                        impulse += d * touch.push
-                        struck = wp.max(struck, touch.strike)
-                        push = yielding(plant, w, v, motion.wet, touch.tau)
-                        pressed += push / float(parts)
-                        nu = nu + d * (nu_dot + push)
-                        q = rotate_by(q, angular(nu), 0.5 * d)
-                        x_dot = position_rate(q, nu)
-                        moved = moved + 0.5 * d * x_dot
-        out.start = course.start
+            moved = moved + 0.5 * d * x_dot
         out.moved = moved
         out.quaternion = q
         out.velocity = nu
-        out.actuator = actuator
-        out.coasting = coasting
         out.x_dot = x_dot
-        out.jerk = jerk
         out.pressed = pressed
         out.greatest = greatest
         out.impulse = impulse
-        out.clearing = course.clearing
         out.struck = struck
         return out
 
     @wp.func
+    def substep(
+        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
+        k: int, course: Course,
+    ) -> Course:  # fmt: skip
+        """The course after substep k; -1 only looks ahead."""
+        out = Course()
+        h = beat.h
+        q = course.quaternion
+        nu = course.velocity
+        position = course.start + course.moved
+        step_h = wp.where(k < 0, 0.0, 1.0) * h
+        lagged = lag_at(commands, vehicles.plant, w, v, beat, k, course.actuator)
+        guess = course.coasting + lagged.pushed
+        near = bool(False)
+        if wp.static(contacts):
+            half_size = vehicles.plant[w, v].half_size
+            turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
+            slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
+            if wp.static(walls):
+                near = walls_within(around.obstacles.walls, position, q, half_size, h * slack)
+            if wp.static(funnel):
+                near = near or funnel_within(around.obstacles.funnel, w, position, half_size, h * slack)
+            if wp.static(solids):
+                near = near or solids_within(course.clearing, position, half_size, h * slack)
+        # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
+        # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
+        lead = h * lead_of(nu, h)
+        nu_middle = nu + lead * guess
+        push_ahead = lead * course.pressed
+        if wp.static(not funnel):
+            push_ahead = wp.min(wp.max(push_ahead, wp.min(-nu_middle, vec6())), wp.max(-nu_middle, vec6()))
+        middle = Instant()
+        middle.position = position + 0.5 * h * course.x_dot
+        middle.quaternion = q + 0.5 * h * quaternion_rate(q, angular(nu))
+        middle.velocity = nu_middle + push_ahead
+        middle.before = nu
+        middle.thrust = lagged.thrust
+        middle.pushed = lagged.pushed
+        middle.other = vehicles.command[w, v].disturbance
+        middle.t_step = float(wp.max(k, 0)) * h + 0.5 * h
+        middle.t = float(beat.step) * beat.control_step + middle.t_step
+        middle.h = h
+        motion = motion_at(vehicles, around.hull, around.water, around.tether, w, v, middle)
+        nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, vehicles.plant[w, v].r_m)
+        out.start = course.start
+        out.clearing = course.clearing
+        out.moved = course.moved
+        out.quaternion = q
+        out.velocity = nu
+        out.x_dot = course.x_dot
+        out.greatest = course.greatest
+        out.impulse = course.impulse
+        out.struck = course.struck
+        out.actuator = course.actuator
+        out.pressed = course.pressed
+        out.jerk = nu_dot - guess
+        out.coasting = nu_dot - lagged.pushed
+        if k >= 0:
+            out.actuator = lagged.after
+            out.pressed = vec6()
+        if k < 0 or not near:
+            nu_new = nu + step_h * nu_dot
+            out.quaternion = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
+            out.velocity = nu_new
+            out.x_dot = position_rate(out.quaternion, nu_new)
+            out.moved = course.moved + 0.5 * step_h * course.x_dot + 0.5 * step_h * out.x_dot
+        else:
+            if wp.static(contacts):
+                out = bump(vehicles, around.obstacles, w, v, h, motion.wet, nu_dot, out)
+        return out
+
+    return substep
+
+
+@cache
+def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
+    """Return the Warp functions that start the course of a control step and that write down where it ended."""
+    thrust_of = thrust_function(speed_lag)
+
+    @wp.func
+    def set_out(state: State, vehicles: Vehicles, w: int, v: int, head: int) -> Course:
+        """Start the course of a control step, with the newest command in the delay line."""
+        out = Course()
+        plant = vehicles.plant
+        newest = admissible(
+            vehicles.command[w, v].thrust, plant[w, v].force_min, plant[w, v].force_max, plant[w, v].dead_minus,
+            plant[w, v].dead_plus,
+        )  # fmt: skip
+        if wp.static(speed_lag):
+            newest = lag_target(plant, w, v, newest)
+        state.commands[w, v, head] = newest
+        now = state.vehicle
+        out.start = now[w, v].position
+        out.quaternion = now[w, v].quaternion
+        out.velocity = now[w, v].velocity
+        out.actuator = now[w, v].actuator
+        out.coasting = now[w, v].coasting
+        out.pressed = now[w, v].pressed
+        out.x_dot = position_rate(out.quaternion, out.velocity)
+        if wp.static(solids):
+            out.clearing = now[w, v].clearing
+        return out
+
+    @wp.func
     def arrive(
-        state: wp.array2d(dtype=VehicleState),
-        history: wp.array3d(dtype=vec13),
-        broken: wp.array(dtype=int),
-        plant: wp.array2d(dtype=VehicleParameters),
-        funnel: Funnel,
-        w: int,
-        v: int,
-        slot: int,
-        course: Course,
+        state: State, vehicles: Vehicles, around: SimSurroundings, w: int, v: int, slot: int, course: Course
     ):
         """Write down where the vehicle has come to, unless a number stopped being finite."""
         position = course.start + course.moved
         q = wp.normalize(course.quaternion)
-        history[slot, w, v] = snapshot(position, q, course.velocity)
+        state.history[slot, w, v] = snapshot(position, q, course.velocity)
         if not is_finite(position, q, course.velocity):
-            broken[w] = 1
+            state.broken[w] = 1
             return
-        state[w, v].position = position
-        state[w, v].quaternion = q
-        state[w, v].velocity = course.velocity
-        delivered = thrust_of(plant, w, v, course.actuator)
-        state[w, v].acceleration = (
-            course.coasting + 0.5 * course.jerk + course.pressed + plant[w, v].G * delivered
+        now = state.vehicle
+        now[w, v].position = position
+        now[w, v].quaternion = q
+        now[w, v].velocity = course.velocity
+        delivered = thrust_of(vehicles.plant, w, v, course.actuator)
+        now[w, v].acceleration = (
+            course.coasting + 0.5 * course.jerk + course.pressed + vehicles.plant[w, v].G * delivered
         )
-        state[w, v].coasting = course.coasting
-        state[w, v].pressed = course.pressed
-        state[w, v].actuator = course.actuator
-        state[w, v].thrust = delivered
-        if wp.static(funnel_present):
-            funnel.force[w, v] = course.greatest
-            funnel.impulse[w, v] = course.impulse
+        now[w, v].coasting = course.coasting
+        now[w, v].pressed = course.pressed
+        now[w, v].actuator = course.actuator
+        now[w, v].thrust = delivered
+        if wp.static(funnel):
+            around.obstacles.funnel.force[w, v] = course.greatest
+            around.obstacles.funnel.impulse[w, v] = course.impulse
+
+    return set_out, arrive
+
+
+@cache
+def physics_kernel(features: Features) -> wp.Kernel:
+    """Return the kernel of one control step.
+
+    It is over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), and takes the number of
+    the slice's worlds before its offset.
+
+    Args:
+        features: Parts of the simulation.
+    """
+    runge_kutta, solids = features.runge_kutta, features.solids
+    substep = (runge_kutta_function if runge_kutta else midpoint_function)(features)
+    set_out, arrive = ends_of(features.speed_lag, features.funnel, solids)
 
     @wp.func
     def step_vehicle(
-        state: wp.array2d(dtype=VehicleState),
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        history: wp.array3d(dtype=vec13),
-        steps: wp.array(dtype=int),
-        broken: wp.array(dtype=int),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        walls: PoolWalls,
-        tether: wp.array2d(dtype=Tether),
-        funnel: Funnel,
-        solids: Solids,
+        state: State,
+        vehicles: Vehicles,
+        around: SimSurroundings,
         control_step: float,
         substeps: int,
         w: int,
         v: int,
     ):
         """One control step of one vehicle."""
-        step = steps[w]
-        h = control_step / float(substeps)
-        if not is_finite(wp.vec3(0.0), wp.quat_identity(), command[w, v].disturbance) or not wp.isfinite(
-            wp.dot(command[w, v].thrust, command[w, v].thrust)
+        beat = Beat()
+        beat.step = state.steps[w]
+        beat.control_step = control_step
+        beat.h = control_step / float(substeps)
+        slot = beat.step % wp.static(HISTORY)
+        thrust = vehicles.command[w, v].thrust
+        disturbance = vehicles.command[w, v].disturbance
+        if not is_finite(wp.vec3(0.0), wp.quat_identity(), disturbance) or not wp.isfinite(
+            wp.dot(thrust, thrust)
         ):
-            history[step % wp.static(HISTORY), w, v] = snapshot(
-                state[w, v].position, state[w, v].quaternion, state[w, v].velocity
-            )
-            broken[w] = 1
+            now = state.vehicle
+            state.history[slot, w, v] = snapshot(now[w, v].position, now[w, v].quaternion, now[w, v].velocity)
+            state.broken[w] = 1
             return
-        head = step % commands.shape[2]
-        course = set_out(state, command, commands, plant, w, v, head)
+        beat.head = beat.step % state.commands.shape[2]
+        course = set_out(state, vehicles, w, v, beat.head)
         first = int(0)
         if wp.static(not runge_kutta):
             # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
-            first = wp.where(step == 0, -1, 0)
+            first = wp.where(beat.step == 0, -1, 0)
         for k in range(first, substeps):
-            course = substep(
-                command,
-                commands,
-                plant,
-                extra,
-                hull,
-                water,
-                walls,
-                tether,
-                funnel,
-                solids,
-                w,
-                v,
-                head,
-                step,
-                k,
-                h,
-                control_step,
-                course,
-            )
-        arrive(state, history, broken, plant, funnel, w, v, step % wp.static(HISTORY), course)
-        if wp.static(solids_present):
-            solids.force[w, v] = course.struck
+            course = substep(state.commands, vehicles, around, w, v, beat, k, course)
+        arrive(state, vehicles, around, w, v, slot, course)
+        if wp.static(solids):
+            around.obstacles.solids.force[w, v] = course.struck
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_step(
-        state: wp.array2d(dtype=VehicleState),
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        history: wp.array3d(dtype=vec13),
-        steps: wp.array(dtype=int),
-        broken: wp.array(dtype=int),
-        frozen: wp.array(dtype=int),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        walls: PoolWalls,
-        tether: wp.array2d(dtype=Tether),
-        funnel: Funnel,
-        solids: Solids,
+        state: State,
+        vehicles: Vehicles,
+        around: SimSurroundings,
         control_step: float,
         substeps: int,
         world_offset: int,
     ):
         i, v = wp.tid()
         w = world_offset + i
-        if frozen[w] != 0:
+        if state.frozen[w] != 0:
             return
-        step_vehicle(
-            state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
-            solids, control_step, substeps, w, v,
-        )  # fmt: skip
+        step_vehicle(state, vehicles, around, control_step, substeps, w, v)
 
-    if not lanes:
+    if not features.lanes:
         return physics_step
 
-    block = lane_block(set_out, substep, arrive, row_length(terms))
+    block = lane_block(set_out, substep, arrive, row_length(features.terms))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_blocks(
-        state: wp.array2d(dtype=VehicleState),
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        history: wp.array3d(dtype=vec13),
-        steps: wp.array(dtype=int),
-        broken: wp.array(dtype=int),
-        frozen: wp.array(dtype=int),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        hull: HullMesh,
-        water: WaterArrays,
-        walls: PoolWalls,
-        tether: wp.array2d(dtype=Tether),
-        funnel: Funnel,
-        solids: Solids,
-        control_step: float,
-        substeps: int,
-        shared: wp.array(dtype=int),
-        worlds: int,
+        state: State, vehicles: Vehicles, around: SimSurroundings, control_step: float, substeps: int, worlds: int,
         world_offset: int,
-    ):
+    ):  # fmt: skip
         i, v = wp.tid()
         w = world_offset + wp.static(LANES) * i
         count = wp.min(wp.static(LANES), worlds - wp.static(LANES) * i)
-        done = block(
-            state, command, commands, history, steps, frozen, plant, extra, shared, water, walls, tether, control_step,
-            substeps, w, v, count,
-        )  # fmt: skip
+        done = block(state, vehicles, around, control_step, substeps, w, v, count)
         for k in range(count):
-            if ((done >> k) & 1) == 0 and frozen[w + k] == 0:
-                step_vehicle(
-                    state, command, commands, history, steps, broken, plant, extra, hull, water, walls, tether, funnel,
-                    solids, control_step, substeps, w + k, v,
-                )  # fmt: skip
+            if ((done >> k) & 1) == 0 and state.frozen[w + k] == 0:
+                step_vehicle(state, vehicles, around, control_step, substeps, w + k, v)
 
     return physics_blocks
 
@@ -812,70 +869,56 @@ def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> An
     under water in still water, or that are near a wall.
     """
     trace = Trace()
-    state = StructArray(trace, "state", VehicleState, SUBMERGED)
-    command = StructArray(trace, "command", VehicleCommand, {})
-    plant = StructArray(trace, "plant", VehicleParameters, {})
-    extra = NumberArray(trace, "extra", term_numbers)
-    tether = StructArray(trace, "tether", Tether, {})
+    row, command = (
+        StructArray(trace, "state", VehicleState, SUBMERGED),
+        StructArray(trace, "command", VehicleCommand, {}),
+    )
     commands, history = VectorArray(trace, "commands", vec8, 2), VectorArray(trace, "history", vec13, 0)
     commands.shape = (0, 0, trace.symbol("I", "slots", 4))
-    water, walls = (
-        UniformStruct(trace, "water", WaterArrays, {}),
-        UniformStruct(trace, "walls", PoolWalls, WIDE),
+    state = SimpleNamespace(vehicle=row, commands=commands, history=history)
+    plant, extra = (
+        StructArray(trace, "plant", VehicleParameters, {}),
+        NumberArray(trace, "extra", term_numbers),
+    )
+    vehicles = SimpleNamespace(command=command, plant=plant, extra=extra)
+    around = SimpleNamespace(
+        hull=None,
+        water=UniformStruct(trace, "around.water", WaterArrays, {}),
+        obstacles=SimpleNamespace(walls=UniformStruct(trace, "around.obstacles.walls", PoolWalls, WIDE)),
+        tether=StructArray(trace, "tether", Tether, {}),
     )
     step, head, slot = (trace.symbol("I", name, 2) for name in ("step", "head", "place"))
     h, control_step = (trace.symbol("F", name, 0.1) for name in ("h", "control"))
-    numbers = command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers
-    for number in numbers:
+    for number in command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers:
         trace.require(trace.apply("M", "finite({})", math.isfinite, number))
-    loop = LaneLoop(trace, "course", lane_function(set_out)(state, command, commands, plant, 0, 0, head))
+    loop = LaneLoop(trace, "course", lane_function(set_out)(state, vehicles, 0, 0, head))
     trace.level = 1
     trace.sections[1].append("const I k = all_i(pass);")
     k = trace.symbol("I", "k", 1)
-    loop.carry(
-        lane_function(substep)(
-            command,
-            commands,
-            plant,
-            extra,
-            None,
-            water,
-            walls,
-            tether,
-            None,
-            None,
-            0,
-            0,
-            head,
-            step,
-            k,
-            h,
-            control_step,
-            loop.value(),
-        )
-    )
+    beat = SimpleNamespace(step=step, head=head, control_step=control_step, h=h)
+    loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, beat, k, loop.value()))
     trace.level = 2
-    lane_function(arrive)(state, history, None, plant, None, 0, 0, slot, loop.value())
+    lane_function(arrive)(state, vehicles, around, 0, 0, slot, loop.value())
     source = block_source(
         trace,
-        [state, commands, history],
+        [row, commands, history],
         f"""
-const long row = shared.data[0] ? 0 : plant.strides[0];
-const At state_at = {{(char*)state.data + w * state.strides[0] + v * state.strides[1], state.strides[0], 0}};
-const At command_at = {{(char*)command.data + w * command.strides[0] + v * command.strides[1], command.strides[0], 0}};
-const At plant_at = {{(char*)plant.data + w * row + v * plant.strides[1], row, 0}};
-const long term_row = shared.data[0] ? 0 : extra.strides[0];
-const At extra_at = {{(char*)extra.data + w * term_row + v * extra.strides[1], term_row, 0}};
-const At tether_at = {{(char*)tether.data + w * tether.strides[0] + v * tether.strides[1], tether.strides[0], 0}};
-const At commands_at = {{
-    (char*)commands.data + w * commands.strides[0] + v * commands.strides[1], commands.strides[0], commands.strides[2]
+const long row = vehicles.shared.data[0] ? 0 : vehicles.plant.strides[0];
+const long term_row = vehicles.shared.data[0] ? 0 : vehicles.extra.strides[0];
+const auto at = [&](const auto& a, long world) {{
+    return At{{(char*)a.data + w * world + v * a.strides[1], world, 0}};
 }};
-const At history_at = {{
-    (char*)history.data + w * history.strides[1] + v * history.strides[2], history.strides[1], history.strides[0]
-}};
-I step; for (int l = 0; l < {LANES}; ++l) step[l] = l < count && frozen.data[w + l] == 0 ? steps.data[w + l] : 0;
+const At state_at = at(state.vehicle, state.vehicle.strides[0]), plant_at = at(vehicles.plant, row);
+const At command_at = at(vehicles.command, vehicles.command.strides[0]), extra_at = at(vehicles.extra, term_row);
+const At tether_at = at(around.tether, around.tether.strides[0]);
+const auto& c = state.commands;
+const At commands_at = {{(char*)c.data + w * c.strides[0] + v * c.strides[1], c.strides[0], c.strides[2]}};
+const auto& y = state.history;
+const At history_at = {{(char*)y.data + w * y.strides[1] + v * y.strides[2], y.strides[1], y.strides[0]}};
+I step; for (int l = 0; l < {LANES}; ++l)
+    step[l] = l < count && state.frozen.data[w + l] == 0 ? state.steps.data[w + l] : 0;
 ok &= step != 0;
-const I slots = all_i(commands.shape[2]), head = step % slots, place = step % all_i({HISTORY});
+const I slots = all_i(c.shape[2]), head = step % slots, place = step % all_i({HISTORY});
 const F control = all(control_step), h = all(control_step / (float)substeps);
 """,
         "for (int pass = 0; pass < substeps; ++pass)",
@@ -883,24 +926,9 @@ const F control = all(control_step), h = all(control_step / (float)substeps);
 
     @wp.func_native(source)
     def block(
-        state: wp.array2d(dtype=VehicleState),
-        command: wp.array2d(dtype=VehicleCommand),
-        commands: wp.array3d(dtype=vec8),
-        history: wp.array3d(dtype=vec13),
-        steps: wp.array(dtype=int),
-        frozen: wp.array(dtype=int),
-        plant: wp.array2d(dtype=VehicleParameters),
-        extra: wp.array3d(dtype=float),
-        shared: wp.array(dtype=int),
-        water: WaterArrays,
-        walls: PoolWalls,
-        tether: wp.array2d(dtype=Tether),
-        control_step: float,
-        substeps: int,
-        w: int,
-        v: int,
+        state: State, vehicles: Vehicles, around: SimSurroundings, control_step: float, substeps: int, w: int, v: int,
         count: int,
-    ) -> int: ...
+    ) -> int: ...  # fmt: skip
 
     return block
 

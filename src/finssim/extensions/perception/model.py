@@ -110,7 +110,7 @@ class Optics:
 
 
 @wp.struct
-class Scene:
+class RayScene:
     """Everything that light and sound meet in all worlds."""
 
     optics: Optics
@@ -156,7 +156,7 @@ class WorldBatch(WorldLayout):
                 render_order=SensorCamera.RenderOrder.VIEW_PRIORITY,
             ),
         )
-        self.scene = Scene()
+        self.scene = RayScene()
         self.scene.optics = self.optics = self._optics()
         self.scene.grain = wp.array(_grain(), dtype=float, device=self.device)
         self._pictures: list[np.ndarray] = []

@@ -22,7 +22,7 @@ import warp as wp
 from scipy.special import ndtri
 
 from finssim.extensions.perception.description import WorldError
-from finssim.extensions.perception.model import Optics, Scene, WorldBatch
+from finssim.extensions.perception.model import Optics, RayScene, WorldBatch
 from finssim.extensions.perception.rays import WATER_INDEX, camera_rays, cones, fan, ray_elevations
 from finssim.physics.types import angular, linear, vec6
 from finssim.sim.overhead_camera.photometry import fresnel, noise_key, refracted, through_water
@@ -200,7 +200,7 @@ class Film:
     read_noise: float  # [electrons]
     gain: wp.array(dtype=wp.vec3)  # by view: share of the full scale of radiance 1
     code: wp.array(dtype=wp.uint8)  # numbers by level of the converter
-    quantiles: wp.array(dtype=float)  # of the normal distribution
+    quantiles: wp.array(dtype=float)  # of the normal distribution [-]
     radiance: wp.array3d(dtype=wp.vec3)  # [-], or empty
     picture: wp.array4d(dtype=wp.uint8)
 
@@ -474,7 +474,7 @@ def snow_seen(
 
 @wp.kernel(enable_backward=False)
 def _take_picture(
-    traced: Traced, poses: wp.array(dtype=wp.transform), scene: Scene, film: Film, share: float, last: int, key: int,
+    traced: Traced, poses: wp.array(dtype=wp.transform), scene: RayScene, film: Film, share: float, last: int, key: int,
     span: int,
 ):  # fmt: skip
     """Radiance of every pixel, and its 8-bit numbers.
@@ -768,23 +768,23 @@ def _lamp(light: Headlight) -> Lamp:
 class Echoes:
     """Echoes of the rays of many sonars, and what their receivers make of them."""
 
-    weight: wp.array(dtype=float)  # b² dW/pi, by elevation
+    weight: wp.array(dtype=float)  # b² dW/pi, by elevation [-]
     absorption: float  # [dB/m]
     steps: wp.vec2  # between rays along elevation and azimuth [rad]
-    bins_per_metre: float
+    bins_per_metre: float  # range cells [1/m]
     noise: float  # power in a range cell before gain [-]
     display: wp.vec2  # levels of 0 and 255 [dB]
-    taps: wp.array(dtype=float)  # pattern of a receiving beam
-    gain: wp.array(dtype=float)  # by range cell
-    quantiles: wp.array(dtype=float)  # of the exponential distribution
-    energy: wp.array3d(dtype=float)  # in one range cell, by view, elevation and azimuth
-    spread: wp.array3d(dtype=wp.vec2)  # first and last range cell
-    intensity: wp.array3d(dtype=float)  # power, by view, beam and range cell
+    taps: wp.array(dtype=float)  # pattern of a receiving beam [-]
+    gain: wp.array(dtype=float)  # by range cell [-]
+    quantiles: wp.array(dtype=float)  # of the exponential distribution [-]
+    energy: wp.array3d(dtype=float)  # in one range cell, by view, elevation and azimuth [-]
+    spread: wp.array3d(dtype=wp.vec2)  # first and last range cell [-]
+    intensity: wp.array3d(dtype=float)  # power, by view, beam and range cell [-]
     picture: wp.array3d(dtype=wp.uint8)
 
 
 @wp.kernel(enable_backward=False)
-def _echo_rays(traced: Traced, scene: Scene, echoes: Echoes, span: int):
+def _echo_rays(traced: Traced, scene: RayScene, echoes: Echoes, span: int):
     """Echo of every ray and the ranges it comes from.
 
     A ray of solid angle dW that strikes a Lambertian surface of parameter mu at range r under cosine k returns
@@ -1022,7 +1022,7 @@ def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
 
 @wp.kernel(enable_backward=False)
 def _take_ranges(
-    traced: Traced, scene: Scene, weight: wp.array(dtype=float), quantile: float, reach: wp.vec2, noise: float,
+    traced: Traced, scene: RayScene, weight: wp.array(dtype=float), quantile: float, reach: wp.vec2, noise: float,
     key: int, ranges: wp.array2d(dtype=float),
 ):  # fmt: skip
     """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
@@ -1053,7 +1053,7 @@ def _take_ranges(
 
 @wp.func
 def _ray_echo(
-    traced: Traced, scene: Scene, rotation: wp.quat, weight: wp.array(dtype=float), v: int, b: int, j: int
+    traced: Traced, scene: RayScene, rotation: wp.quat, weight: wp.array(dtype=float), v: int, b: int, j: int
 ) -> float:
     """Echo of one ray as `_echo_rays` has it, without absorption; 0 for a miss."""
     index = traced.shape_index[v, b, j]

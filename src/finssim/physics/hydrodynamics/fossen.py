@@ -6,10 +6,15 @@ import warp as wp
 
 from finssim.physics.damping import damping_wrench, twist_at, wrench_from
 from finssim.physics.hydrodynamics.mesh import HullMesh
-from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench, submerged_fraction, submersion_rate
+from finssim.physics.hydrostatics import (
+    Afloat,
+    WaterWrench,
+    hydrostatic_wrench,
+    submerged_fraction,
+    submersion_rate,
+)
 from finssim.physics.kinematics import point_velocity
 from finssim.physics.plant import VehicleParameters
-from finssim.physics.types import vec6
 from finssim.physics.water import Flow, WaterArrays
 
 
@@ -20,11 +25,7 @@ def fossen_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    position: wp.vec3,
-    q: wp.quat,
-    up: wp.vec3,
-    nu: vec6,
-    nu_r: vec6,
+    body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
     """Hydrostatic and damping wrench of a submerged or emerging vehicle.
@@ -40,28 +41,24 @@ def fossen_wrench(
         water: Density and gravity.
         w: World.
         v: Vehicle.
-        position: Body origin, world frame [m].
-        q: Attitude, body to world.
-        up: World z axis in the body frame, a unit vector.
-        nu: Twist, body frame [m/s, rad/s].
-        nu_r: The same relative to the water, body frame [m/s, rad/s].
+        body: Pose and motion.
         flow: Water at the body origin.
 
     Returns:
         Wrench about the body origin, the mass of water displaced and the part under water.
     """
     r_b = plant[w, v].r_b
-    height = position[2] + wp.dot(up, r_b) - flow.elevation
+    height = body.position[2] + wp.dot(body.up, r_b) - flow.elevation
     wet = submerged_fraction(height, plant[w, v].surface_half_height)
     out = WaterWrench()
     out.wet = wet
     if wp.abs(height) < plant[w, v].surface_half_height:
-        climb = wp.dot(up, point_velocity(nu, r_b)) - flow.velocity[2]
+        climb = wp.dot(body.up, point_velocity(body.nu, r_b)) - flow.velocity[2]
         out.wet_rate = submersion_rate(height, plant[w, v].surface_half_height, climb)
     out.displaced = water.density * plant[w, v].volume * wet
     r_h = plant[w, v].r_h
-    tau_D = damping_wrench(twist_at(nu_r, r_h), plant[w, v].D1, plant[w, v].D2)
+    tau_D = damping_wrench(twist_at(body.nu_r, r_h), plant[w, v].D1, plant[w, v].D2)
     weight = plant[w, v].mass * water.gravity
-    tau_H = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, r_b, up)
+    tau_H = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, r_b, body.up)
     out.tau = tau_H + wet * wrench_from(tau_D, r_h)
     return out

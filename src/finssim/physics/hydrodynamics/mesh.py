@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
-from finssim.physics.hydrostatics import WaterWrench, hydrostatic_wrench
+from finssim.physics.hydrostatics import Afloat, WaterWrench, hydrostatic_wrench
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 from finssim.physics.water import Flow, WaterArrays
@@ -349,11 +349,7 @@ def mesh_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    position: wp.vec3,
-    q: wp.quat,
-    up: wp.vec3,
-    nu: vec6,
-    nu_r: vec6,
+    body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
     """Wrench of the part of a hull mesh below the instantaneous surface: buoyancy, form drag and skin drag.
@@ -368,35 +364,33 @@ def mesh_wrench(
         water: Density and gravity.
         w: World.
         v: Vehicle.
-        position: Body origin, world frame [m].
-        q: Attitude, body to world.
-        up: World z axis in the body frame, a unit vector.
-        nu: Twist, body frame [m/s, rad/s].
-        nu_r: The same relative to the water, body frame [m/s, rad/s].
+        body: Pose and motion.
         flow: Water at the body origin.
 
     Returns:
         Wrench about the body origin, the mass of water displaced and the part under water.
     """
     kind = plant[w, v].hull
-    normal = up
+    normal = body.up
     G = wp.mat33(0.0)
     if water.moving != 0:
-        normal = wp.quat_rotate_inv(q, flow.normal)
-        R = wp.quat_to_matrix(q)
+        normal = wp.quat_rotate_inv(body.q, flow.normal)
+        R = wp.quat_to_matrix(body.q)
         G = wp.transpose(R) * flow.gradient * R
-    height = flow.normal[2] * (position[2] - flow.elevation)
+    height = flow.normal[2] * (body.position[2] - flow.elevation)
     wet = mesh_displacement(hull, kind, normal, height)
     out = WaterWrench()
     out.wet = wet[0] / hull.volume[kind]
-    water_b = linear(nu) - linear(nu_r)
+    water_b = linear(body.nu) - linear(body.nu_r)
     if out.wet > 0.0 and out.wet < 1.0:
-        out.wet_rate = mesh_inflow(hull, kind, nu_r, normal, height) / hull.volume[kind]
+        out.wet_rate = mesh_inflow(hull, kind, body.nu_r, normal, height) / hull.volume[kind]
     out.displaced = water.density * plant[w, v].volume * out.wet
     center = wp.vec3(wet[1], wet[2], wet[3]) + plant[w, v].r_b - hull.centroid[kind]
     weight = plant[w, v].mass * water.gravity
-    tau = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, center, up)
+    tau = hydrostatic_wrench(weight, out.displaced * water.gravity, plant[w, v].r_g, center, body.up)
     form = plant[w, v].form_drag
-    tau += mesh_drag(hull, kind, nu, water_b, G, water.density, form, plant[w, v].skin_drag, normal, height)
+    tau += mesh_drag(
+        hull, kind, body.nu, water_b, G, water.density, form, plant[w, v].skin_drag, normal, height
+    )
     out.tau = tau
     return out

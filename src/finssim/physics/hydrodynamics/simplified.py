@@ -6,9 +6,8 @@ import warp as wp
 
 from finssim.physics.hydrodynamics.fossen import fossen_wrench
 from finssim.physics.hydrodynamics.mesh import HullMesh
-from finssim.physics.hydrostatics import WaterWrench
+from finssim.physics.hydrostatics import Afloat, WaterWrench
 from finssim.physics.plant import VehicleParameters
-from finssim.physics.types import vec6
 from finssim.physics.water import Flow, WaterArrays
 
 
@@ -19,11 +18,7 @@ def simplified_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    position: wp.vec3,
-    q: wp.quat,
-    up: wp.vec3,
-    nu: vec6,
-    nu_r: vec6,
+    body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
     """Hydrostatic and damping wrench: tau_H + tau_D(nu)                               (paper, eq. 5)
@@ -37,16 +32,18 @@ def simplified_wrench(
         water: Density and gravity.
         w: World.
         v: Vehicle.
-        position: Body origin, world frame [m].
-        q: Attitude, body to world.
-        up: World z axis in the body frame, a unit vector.
-        nu: Twist, body frame [m/s, rad/s].
-        nu_r: The same relative to the water, body frame [m/s, rad/s]; not used here.
+        body: Pose and motion; its twist relative to the water is not used.
         flow: Water at the body origin; of its velocity only the vertical part counts here.
 
     Returns:
         As of `fossen_wrench`, with no water displaced.
     """
-    out = fossen_wrench(plant, hull, water, w, v, position, q, up, nu, nu, flow)
+    own = Afloat()
+    own.position = body.position
+    own.q = body.q
+    own.up = body.up
+    own.nu = body.nu
+    own.nu_r = body.nu
+    out = fossen_wrench(plant, hull, water, w, v, own, flow)
     out.displaced = 0.0
     return out
