@@ -14,6 +14,7 @@ from typer.main import get_command
 from finssim import __version__
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from reference.commands import finssim, refusal
 
 COMMANDS = [
     "demo",
@@ -65,19 +66,6 @@ COMMANDS = [
     "worlds",
     "worlds show",
 ]
-
-
-def finssim(*words):
-    """Run a command here and now; returns its exit status."""
-    return boundary.run(app, [str(word) for word in words])
-
-
-def refusal(capsys, *words):
-    """The one sentence with which a command refuses its input."""
-    assert finssim(*words) == 2
-    (line,) = filter(None, capsys.readouterr().err.splitlines())
-    assert line.startswith("finssim: ")
-    return line.removeprefix("finssim: ")
 
 
 def test_commands_are_those_of_the_contract():

@@ -5,30 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from finssim.cli import boundary
-from finssim.cli.commands import app
 from finssim.sim.ranges_file import load_ranges
 from finssim.trials.trial_files import load_trials, write_trial
 from finssim.vehicles import load_vehicle
+from reference.commands import finssim, refusal
 
 PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
 KEYS = {
     "kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials", "out", "provenance",
 }  # fmt: skip
-
-
-def finssim(*words):
-    """Run a command here and now; returns its exit status."""
-    return boundary.run(app, [str(word) for word in words])
-
-
-def refusal(capsys, *words):
-    """The one sentence with which a command refuses its input."""
-    capsys.readouterr()
-    assert finssim(*words) == 2
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("finssim: ")
-    return line.removeprefix("finssim: ")
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +82,9 @@ def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
     for folder in (tmp_path / "t").iterdir():
         text = (folder / "trial.yaml").read_text("utf-8").replace("role: fit", "role: held-out")
         (folder / "trial.yaml").write_text(text, "utf-8")
-    assert "every trial is marked held-out" in refusal(capsys, *words, "--out", tmp_path / "w.yaml")
+    assert "every trial is marked held-out" in refusal(
+        capsys, *words, "--out", tmp_path / "w.yaml", notes=True
+    )
 
 
 def vars_of(trial):
@@ -169,7 +156,7 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypa
     """Before the work, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     given = [trials / "fit" if word == "TRIALS" else word for word in words]
-    assert sentence in refusal(capsys, *given)
+    assert sentence in refusal(capsys, *given, notes=True)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.cli import boundary
-from finssim.cli.commands import app
 from finssim.core.optics import project
 from finssim.core.rotations import (
     matrix_to_quat,
@@ -28,6 +26,7 @@ from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.sim.overhead_camera import ImageSensor, ObjectPose, OverheadCamera, Scene, TagInScene, TiledBasin
 from finssim.vehicles import load_vehicle
 from localization.fusion.known_streams import SITE, attitude, position, streams
+from reference.commands import finssim, refusal
 
 FINSROV = load_vehicle("finsrov")
 POOL = """
@@ -40,21 +39,6 @@ interface: {height: 1.0}
 """
 LATENCY, SECONDS = 0.04, 3.0
 TIMES = np.arange(0.2, 2.8, 0.2)
-
-
-def finssim(*words):
-    """Run a command here and now; returns its exit status."""
-    return boundary.run(app, [str(word) for word in words])
-
-
-def refusal(capsys, *words):
-    """The one sentence with which a command refuses its input."""
-    capsys.readouterr()
-    assert finssim(*words) == 2
-    out, err = capsys.readouterr()
-    (line,) = filter(None, err.splitlines())
-    assert line.startswith("finssim: ") and out == ""
-    return line.removeprefix("finssim: ")
 
 
 def table(path):

@@ -4,24 +4,9 @@ import json
 
 import pytest
 
-from finssim.cli import boundary
-from finssim.cli.commands import app
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import load_vehicle
-
-
-def finssim(*words):
-    """Run a command here and now; returns its exit status."""
-    return boundary.run(app, [str(word) for word in words])
-
-
-def refusal(capsys, *words):
-    """The one sentence with which a command refuses its input."""
-    capsys.readouterr()
-    assert finssim(*words) == 2
-    (line,) = filter(None, capsys.readouterr().err.splitlines())
-    assert line.startswith("finssim: ")
-    return line.removeprefix("finssim: ")
+from reference.commands import finssim, refusal
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from finssim.studies.localization import (
     CampaignPicture,
     localization_experiment,
 )
+from reference.commands import finssim
 
 pytestmark = pytest.mark.slow
 
@@ -191,11 +192,6 @@ def test_somebodys_folder_is_refused_before_the_work(tmp_path):
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(OutputError, match="already holds files"):
         localization_experiment(out=tmp_path, progress=interrupting("seed 1, published conditions"))
-
-
-def finssim(*words):
-    """Run a command here and now; returns its exit status."""
-    return boundary.run(app, [str(word) for word in words])
 
 
 @pytest.fixture

@@ -1,7 +1,24 @@
-"""Every command, those of the extensions included."""
+"""Every command, those of the extensions included, and how tests type them."""
 
-from finssim.cli.commands import COMMANDS
+from finssim.cli import boundary
+from finssim.cli.commands import COMMANDS, app
 from finssim.core.registry import COMMANDS as FAMILY
 
 EVERY = COMMANDS | {words: FAMILY.reference(words) for words in FAMILY.of_packages()}
 """Words of every command -> its function."""
+
+
+def finssim(*words):
+    """Run a command here and now; returns its exit status."""
+    return boundary.run(app, [str(word) for word in words])
+
+
+def refusal(capsys, *words, notes=False):
+    """The one sentence with which a command refuses its input; notes on what it left out may stand before it."""
+    capsys.readouterr()
+    assert finssim(*words) == 2
+    out, err = capsys.readouterr()
+    lines = list(filter(None, err.splitlines()))
+    assert sum(line.startswith("finssim: ") for line in lines) == 1 and "Traceback" not in err and out == ""
+    assert notes or len(lines) == 1
+    return lines[-1].removeprefix("finssim: ")
