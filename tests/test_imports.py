@@ -92,7 +92,6 @@ HOMES = {
     "onnx": {"learning/export.py"},
     "onnxruntime": {"control/policy.py"},
     "mujoco": {"extensions/perception/parts.py"},
-    "pxr": {"extensions/perception/parts.py"},
     "pandas": {"sim/recorder.py"},
     "pyarrow": {"trials/trial_files.py", "sim/recorder.py"},
     "matplotlib": {

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from finssim.survey.camera import Board, common_board, parse_size, see_board
+from finssim.survey.camera import Board, parse_size, see_board
 from finssim.trials.findings import CalibrationError
 
 CHESSBOARD = Board(columns=9, rows=6, square=0.025)
@@ -91,18 +91,10 @@ def test_a_hidden_part_of_a_charuco_board_is_left_out():
     assert slope == pytest.approx(60 / 0.04, rel=2e-3)
 
 
-@pytest.mark.slow
-def test_the_size_of_a_common_board_is_found():
-    found = common_board([("a.png", drawn(H))], 0.025)
-    assert (found.columns, found.rows) in ((9, 6), (6, 9))
-
-
 def test_a_picture_without_a_board_shows_none():
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (240, 320)).astype(np.uint8)
     assert see_board(noise, CHESSBOARD) is None
-    with pytest.raises(CalibrationError, match="give --board COLUMNSxROWS"):
-        common_board([("noise.png", noise)], 0.025)
 
 
 @pytest.mark.parametrize(

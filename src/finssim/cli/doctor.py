@@ -68,7 +68,6 @@ EXTRAS = {
         "show vehicles and runs live in the browser",
     ),
     "mujoco": Extra({"mujoco": "mujoco"}, "place MJCF and URDF models in described worlds"),
-    "usd": Extra({"usd-core": "pxr"}, "place USD models in described worlds"),
     "xacro": Extra({"xacro": "xacro"}, "import vehicles from xacro"),
     "mpc": Extra({"casadi": "casadi"}, "control by nonlinear model prediction (nmpc)"),
     "perception": Extra(

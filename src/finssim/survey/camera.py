@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,16 +52,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "Board", "BoardView", "MODELS", "adjust", "common_board", "calibrate_camera", "evidence",
+    "Board", "BoardView", "MODELS", "adjust", "calibrate_camera", "evidence",
     "lens_names", "lens_vector", "parse_size", "run", "see_board",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 # Boards of known corners, and where a picture shows those corners.
-
-COMMON_SIZES = ((9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (10, 7), (11, 8), (6, 4), (6, 5), (11, 7), (9, 7))
-"""Inner corners that are tried if the board's size is not given."""
 
 REFINE_SHARE = 0.35
 """Half width of the window that refines a corner, in distances to its nearest neighbour: no other corner is in it."""
@@ -163,29 +160,6 @@ def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | N
         return None
     pixels, index = detection
     return pixels, board.corners[index]
-
-
-def common_board(images: Iterable[tuple[str, NDArray[np.uint8]]], square: float) -> Board:
-    """The common chessboard that most of some pictures show.
-
-    Args:
-        images: Names and gray pictures; those after the first five are not looked at.
-        square: Edge of a square [m].
-
-    Raises:
-        CalibrationError: None is seen.
-    """
-    some = [image for _, image in zip(range(5), (picture for _, picture in images), strict=False)]
-    counts = {size: sum(_chessboard(image, *size) is not None for image in some) for size in COMMON_SIZES}
-    # A board shows smaller ones too: of those seen as often the largest is meant.
-    best = max(counts, key=lambda size: (counts[size], size[0] * size[1]))
-    if not counts[best]:
-        candidates = ", ".join(f"{c}x{r}" for c, r in COMMON_SIZES)
-        raise CalibrationError(
-            f"no chessboard found in the first {len(some)} pictures (inner corners tried: {candidates}): "
-            "give --board COLUMNSxROWS, or --charuco for a ChArUco board"
-        )
-    return Board(columns=best[0], rows=best[1], square=square)
 
 
 def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Array, NDArray[np.int64]] | None:
@@ -873,7 +847,7 @@ def run(
     Args:
         images (IMAGE): Images of a board, folders of them, or videos.
         out (FILE): Camera file to write (.yaml).
-        board (NxM): Inner corners of a chessboard, such as 9x6; common sizes are tried if not given.
+        board (NxM): Inner corners of a chessboard, such as 9x6.
         square: Edge of a square [m].
         charuco (NxM): Squares of a ChArUco board instead of a chessboard, such as 7x5.
         marker: Edge of its markers [m]; three quarters of a square if not given.
@@ -894,9 +868,6 @@ def run(
     refuse_places(out, report, "camera")
     screen = Console(stderr=True)
     chosen = _board(board, square, charuco, marker, dictionary)
-    if chosen is None:
-        chosen = common_board(((name, image) for _, name, image in pictures(images)), square)
-        screen.print(f"found a {chosen.words}; --board says otherwise", highlight=False, markup=False)
     views, without = _board_views(images, chosen, screen)
     for name in without:
         screen.print(str(finding("board_unseen", name)), highlight=False, markup=False)
@@ -921,18 +892,17 @@ def run(
 
 def _board(
     board: str | None, square: float, charuco: str | None, marker: float | None, dictionary: str
-) -> Board | None:
-    if board is not None and charuco is not None:
+) -> Board:
+    if (board is None) == (charuco is None):
+        given = "neither --board nor --charuco is" if board is None else "--board and --charuco are both"
         raise CalibrationError(
-            "--board and --charuco are both given: name the one board that the pictures show"
+            f"{given} given: name the one board that the pictures show, --board COLUMNSxROWS by its inner corners"
         )
     if charuco is not None:
         columns, rows = parse_size(charuco, "--charuco")
         edge = 0.75 * square if marker is None else marker
         return Board(columns=columns, rows=rows, square=square, marker=edge, dictionary=dictionary)
-    if board is None:
-        return None
-    columns, rows = parse_size(board, "--board")
+    columns, rows = parse_size(str(board), "--board")
     return Board(columns=columns, rows=rows, square=square)
 
 

@@ -19,40 +19,6 @@ URDF = """<robot name="buoy"><link name="base">
 <collision><origin xyz="0 0 0.4" rpy="1.5708 0 0"/>
 <geometry><cylinder radius="0.2" length="1.0"/></geometry></collision>
 </link></robot>"""
-USD = """#usda 1.0
-(
-    metersPerUnit = 0.01
-    upAxis = "Y"
-)
-
-def Xform "rack"
-{
-    double3 xformOp:translate = (100, 50, 0)
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-
-    def Cube "block"
-    {
-        double size = 20
-        color3f[] primvars:displayColor = [(0.2, 0.4, 0.6)]
-        float3 xformOp:scale = (1, 2, 3)
-        uniform token[] xformOpOrder = ["xformOp:scale"]
-    }
-
-    def Cylinder "post"
-    {
-        double radius = 5
-        double height = 80
-        uniform token axis = "Y"
-    }
-
-    def Mesh "tile"
-    {
-        point3f[] points = [(0, 0, 0), (10, 0, 0), (10, 0, 10), (0, 0, 10)]
-        int[] faceVertexCounts = [4]
-        int[] faceVertexIndices = [0, 1, 2, 3]
-    }
-}
-"""
 
 
 def write(folder, name, text):
@@ -87,23 +53,6 @@ def test_a_urdf_is_its_collision_shapes(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_usd_stage_becomes_metres_with_z_up(tmp_path):
-    """Centimetres with y up: what is up there is up here, and what comes towards the viewer goes along -y."""
-    pytest.importorskip("pxr", reason="usd-core is not installed")
-    block, post, tile = parts_of(write(tmp_path, "rack.usda", USD))
-    np.testing.assert_allclose(block.position, [1.0, 0.0, 0.5], atol=1e-6)
-    np.testing.assert_allclose(
-        np.abs(quat_to_matrix(block.quaternion) @ block.size), [0.1, 0.3, 0.2], atol=1e-6
-    )
-    np.testing.assert_allclose(block.colour, [0.2, 0.4, 0.6], atol=1e-6)
-    assert post.size[:2] == pytest.approx((0.05, 0.4))
-    np.testing.assert_allclose(np.abs(quat_to_matrix(post.quaternion)[:, 2]), [0, 0, 1], atol=1e-6)
-    corners = tile.position + tile.vertices @ quat_to_matrix(tile.quaternion).T
-    np.testing.assert_allclose(corners[2], [1.1, -0.1, 0.5], atol=1e-6)
-    assert tile.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-
-
-@pytest.mark.slow
 def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
     """Twice as large, moved and turned as its object; a colour of the world file comes before the model's."""
     pytest.importorskip("mujoco")
@@ -126,17 +75,12 @@ def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
 
 
 def test_files_outside_the_folder_are_refused_however_they_are_named(tmp_path):
-    """By a file that the model includes, or as a layer of a USD stage."""
+    """By a file that the model includes."""
     pytest.importorskip("mujoco")
     (tmp_path / "own").mkdir()
-    write(tmp_path, "other.usda", USD)
     write(tmp_path / "own", "more.xml", "<mujoco><asset><mesh file='../secret.stl'/></asset></mujoco>")
     with pytest.raises(PartsError, match="names the file '../secret.stl'"):
         parts_of(write(tmp_path / "own", "rack.xml", "<mujoco><include file='more.xml'/></mujoco>"))
-    pytest.importorskip("pxr", reason="usd-core is not installed")
-    layered = "#usda 1.0\n(\n    subLayers = [@../other.usda@]\n)\n"
-    with pytest.raises(PartsError, match="names the file .*other.usda"):
-        parts_of(write(tmp_path / "own", "rack.usda", layered))
 
 
 SHAPE = "<worldbody><geom type='sphere' size='0.1'/></worldbody>"

@@ -171,7 +171,7 @@ class Object(Finish):
     length: Positive | None = None
     """Length of the cylinder, or of the straight part of a capsule [m]."""
     file: str | None = None
-    """Beside the world file: STL of a mesh [m]; of a model MJCF (.xml), URDF (.urdf) or USD (.usd, .usda, .usdc)."""
+    """Beside the world file: STL of a mesh [m]; of a model MJCF (.xml) or URDF (.urdf)."""
     scale: Positive | None = None
     """Factor on the file's coordinates."""
     vary: Variation | None = None

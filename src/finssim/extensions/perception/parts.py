@@ -1,13 +1,12 @@
-"""Rigid models of other programs as parts of a world: MJCF and URDF, read by MuJoCo, and USD, read by OpenUSD."""
+"""Rigid models of other programs as parts of a world: MJCF and URDF, read by MuJoCo."""
 # mypy: ignore-errors
 
 from __future__ import annotations
 
-import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +14,9 @@ import numpy as np
 
 from finssim.core.budget import DEPTH, FILE, NODES, in_child, read_bytes
 from finssim.core.mesh import FARTHEST
-from finssim.core.rotations import matrix_to_quat, quat_multiply, quat_rotate
+from finssim.core.rotations import matrix_to_quat
 
-SUFFIXES = (".xml", ".mjcf", ".urdf", ".usd", ".usda", ".usdc", ".usdz")
-Y_UP = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
-"""Rotation from axes with y up to axes with z up, xyzw."""
-
-
-USD_KINDS = {"Cube": "box", "Sphere": "sphere", "Capsule": "capsule", "Cylinder": "cylinder", "Mesh": "mesh"}
-FROM_Z = {
-    "X": [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)],
-    "Y": [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
-    "Z": [0.0, 0.0, 0.0, 1.0],
-}
-"""Turns the z axis to another, xyzw."""
+SUFFIXES = (".xml", ".mjcf", ".urdf")
 
 
 class PartsError(ValueError):
@@ -59,8 +47,8 @@ def parts_of(path: Path) -> list[ModelPart]:
     """The shapes of a model file at rest, all joints at zero.
 
     Args:
-        path: MJCF (`.xml`, `.mjcf`) or URDF (`.urdf`), which need `finssim[mujoco]`, or USD (`.usd`, `.usda`, `.usdc`,
-            `.usdz`), which needs `usd-core`. Files that it names must be in its folder or below.
+        path: MJCF (`.xml`, `.mjcf`) or URDF (`.urdf`), which need `finssim[mujoco]`. Files that it names must be in
+            its folder or below.
 
     Raises:
         PartsError: It cannot be read, or has a shape that worlds do not have.
@@ -68,8 +56,7 @@ def parts_of(path: Path) -> list[ModelPart]:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise PartsError(f"ends in '{path.suffix}', expected one of {', '.join(SUFFIXES)}")
-    model = str(path.resolve()) if suffix.startswith(".usd") else (path.name, _files_of(path))
-    parts = [ModelPart(**part) for part in in_child(_shapes, model, PartsError)]
+    parts = [ModelPart(**part) for part in in_child(_shapes, (path.name, _files_of(path)), PartsError)]
     if not parts:
         raise PartsError("has no shapes")
     for part in parts:
@@ -83,10 +70,9 @@ def parts_of(path: Path) -> list[ModelPart]:
     return parts
 
 
-def _shapes(model: str | tuple[str, dict[str, bytes]]) -> list[dict[str, Any]]:
-    """The shapes of a model as plain data, in the child process: a USD file's path, or a name and MuJoCo's files."""
-    parts = _usd(Path(model)) if isinstance(model, str) else _mujoco(*model)
-    return [dict(vars(part)) for part in parts]
+def _shapes(model: tuple[str, dict[str, bytes]]) -> list[dict[str, Any]]:
+    """The shapes of a model as plain data, in the child process: its name, and MuJoCo's files."""
+    return [dict(vars(part)) for part in _mujoco(*model)]
 
 
 def _mujoco(name: str, files: dict[str, bytes]) -> Iterator[ModelPart]:
@@ -185,93 +171,3 @@ def _files_of(path: Path) -> dict[str, bytes]:
 def _is_model(data: bytes) -> bool:
     """Return whether a file may be XML: meshes and pictures are not."""
     return data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-
-
-def _usd(path: Path) -> Iterator[ModelPart]:
-    try:
-        from pxr import Tf, Usd, UsdGeom
-    except ImportError:
-        raise PartsError("needs OpenUSD: pip install usd-core") from None
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise PartsError(f"is not a USD stage: {' '.join(str(error).split())[:160]}") from None
-    folder = path.resolve().parent
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
-            raise PartsError(f"names the file '{layer.realPath}': put it into the model's folder or below")
-    unit = UsdGeom.GetStageMetersPerUnit(stage)
-    upright = Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.array([0.0, 0.0, 0.0, 1.0])
-    poses = UsdGeom.XformCache()
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if not prim.IsA(UsdGeom.Gprim) or (
-            UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible
-        ):
-            continue
-        part = _usd_part(prim, unit, np.array(poses.GetLocalToWorldTransform(prim)).T)
-        turned = quat_multiply(upright, part.quaternion)
-        yield replace(part, position=quat_rotate(upright, part.position), quaternion=turned)
-
-
-def _usd_part(prim: Any, unit: float, matrix: np.ndarray) -> ModelPart:
-    """One geometric prim in the stage's own axes; `matrix` is prim to stage, (4, 4), `unit` the stage's in metres."""
-    from pxr import UsdGeom
-
-    name, kind = prim.GetPath(), USD_KINDS.get(prim.GetTypeName())
-    if kind is None:
-        raise PartsError(
-            f"{name} is a {prim.GetTypeName()}, expected one of {', '.join(USD_KINDS)}: replace it"
-        )
-    shape = getattr(UsdGeom, prim.GetTypeName())(prim)
-    colours = shape.GetDisplayColorAttr().Get()
-    colour, position = np.array(colours[0], float) if colours else None, unit * matrix[:3, 3]
-    if kind == "mesh":
-        points, counts, corners = (
-            attribute.Get()
-            for attribute in (
-                shape.GetPointsAttr(),
-                shape.GetFaceVertexCountsAttr(),
-                shape.GetFaceVertexIndicesAttr(),
-            )
-        )
-        if not points or not counts or not corners:
-            raise PartsError(f"{name} has no faces: remove it")
-        vertices, faces = (
-            unit * np.array(points, float) @ matrix[:3, :3].T,
-            _triangles(np.array(counts), np.array(corners)),
-        )
-        upright = np.array([0.0, 0.0, 0.0, 1.0])
-        return ModelPart(
-            kind=kind, position=position, quaternion=upright, vertices=vertices, faces=faces, colour=colour
-        )
-    scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    rotation = matrix[:3, :3] / np.maximum(scale, 1e-12)
-    if np.linalg.det(rotation) < 0.0 or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
-        raise PartsError(f"{name} is mirrored, sheared or flat: give it as a mesh")
-    if kind != "box" and np.ptp(scale) > 1e-4 * scale.max():
-        raise PartsError(f"{name} is scaled by {scale.tolist()}, expected equal factors: give it as a mesh")
-    q = matrix_to_quat(rotation)
-    if kind == "box":
-        size = tuple(float(0.5 * unit * s * shape.GetSizeAttr().Get()) for s in scale)
-    else:
-        length = 0.0 if kind == "sphere" else shape.GetHeightAttr().Get()
-        size = (
-            float(unit * scale[0] * shape.GetRadiusAttr().Get()),
-            float(0.5 * unit * scale[0] * length),
-            0.0,
-        )
-        if kind != "sphere":
-            q = quat_multiply(q, np.array(FROM_Z[shape.GetAxisAttr().Get()]))
-    return ModelPart(kind=kind, position=position, quaternion=q, size=size, colour=colour)
-
-
-def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Polygons as fans of triangles, (m, 3)."""
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return np.array(
-        [
-            (corners[a], corners[a + k], corners[a + k + 1])
-            for a, n in zip(first, counts, strict=True)
-            for k in range(1, n - 1)
-        ]
-    ).reshape(-1, 3)
