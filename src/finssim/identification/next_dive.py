@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LEVELS = (0.15, 0.35, 0.7)
+LEVELS = (0.15, 0.4, 0.9)
 """Levels that are compared, as parts of the vehicle's wrench limit."""
 
-HOLDS = (1.5, 4.0)
+HOLDS = (3.0, 8.0)
 """Lengths of the first step that are compared [s]."""
 
 UPRIGHT = 0.8

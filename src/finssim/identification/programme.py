@@ -209,8 +209,8 @@ class Leg:
         return 1.0 + self.hold * (2.0 * sum(SHRINK) + 1.0)
 
 
-SHRINK = (1.0, 0.5, 0.25)
-"""Lengths of the pairs of steps of a `Leg`, relative to the first."""
+SHRINK = (1.0, 0.5)
+"""Lengths of the pairs of steps of a `Leg`, relative to the first: shorter ones are lost between samples of a log."""
 
 
 def alternating(leg: Leg, number: int = 1) -> Programme:
