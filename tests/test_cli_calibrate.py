@@ -45,8 +45,8 @@ def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
     assert d1[0, 0] == pytest.approx(truth.hydrodynamic_set("calibrated").linear_damping[0, 0], rel=0.05)
     assert d1[1, 1] == truth.hydrodynamic_set("calibrated").linear_damping[1, 1]
     assert all(vehicle.fitted_on(trial.sha256) for trial in load_trials([fitted.parent / "fit"]))
-    assert {"report.html", "report.md", "fit.json"} <= {f.name for f in (fitted / "report").iterdir()}
-    assert "finssim calibrate hydrodynamics" in (fitted / "report" / "report.md").read_text("utf-8")
+    assert {"report.html", "fit.json"} <= {f.name for f in (fitted / "report").iterdir()}
+    assert "finssim calibrate hydrodynamics" in (fitted / "report" / "report.html").read_text("utf-8")
     low, high = load_ranges(fitted / "r.yaml").linear_damping.axes["surge"]
     assert 0.8 < low < 1.0 < high < 1.2
 
@@ -75,7 +75,7 @@ def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
     assert finssim(*words, "--out", tmp_path / "v.yaml") == 0
     told = capsys.readouterr().err
     assert "surge_plus_12: left out: it is marked as held out" in told
-    assert "calibrate hydrodynamics: preparing" in told
+    assert "calibrate hydrodynamics: reading the trials" in told
     vehicle = load_vehicle(tmp_path / "v.yaml")
     assert len(vehicle.calibrations[0].trials) == 5
     assert not any(vehicle.fitted_on(t.sha256) for t in every if t.name == "surge_plus_12")

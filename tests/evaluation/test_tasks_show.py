@@ -16,7 +16,7 @@ from finssim.tasks.station_keeping import StationKeeping
 NUMERIC = numeric_tasks()
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own/task/keep_depth.py"
-WARP_EXAMPLE = EXAMPLE.with_name("own_task.py")
+WARP_EXAMPLE = EXAMPLE.parents[2] / "own_task.py"
 
 
 def finssim(*words):

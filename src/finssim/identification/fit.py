@@ -123,20 +123,20 @@ class Curve:
     """Half width of the 95 % band around the fitted values in the unit of the label, (n,)."""
 
     @classmethod
-    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, Array, Array, Array]]) -> Curve:
-        """Stretches of time [s], measured and fitted values and bands, (k,) each, one after the other with a second
-        between."""
+    def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, ...]]) -> Curve:
+        """Stretches of time [s], measured and fitted values, and bands if there are any, (k,) each, one after the other
+        with a second between."""
         x, start = [], 0.0
         for t, *_ in parts:
             x += [t - t[0] + start, [np.nan]]
             start = float(x[-2][-1]) + 1.0
-        measured, fitted, band = (
-            np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in (1, 2, 3)
+        measured, fitted, *band = (
+            np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in range(1, len(parts[0]))
         )
         label = "time, one after the other [s]"
         return cls(
             title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted,
-            band=band,
+            band=band[0] if band else None,
         )  # fmt: skip
 
 
