@@ -1,5 +1,6 @@
 """`finssim new`: what it writes runs, passes its tests, and is found by every command once it is installed."""
 
+import json
 import re
 import subprocess
 import sys
@@ -89,6 +90,11 @@ def test_what_cannot_be_made_is_refused(words, sentence, capsys, tmp_path, monke
     assert boundary.run(app, ["new", *words]) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())
+
+
+def test_json_is_one_object(tmp_path, capsys):
+    assert boundary.run(app, ["new", "term", "keel", "--out", str(tmp_path / "k"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["written"] == str(tmp_path / "k")
 
 
 def test_what_is_there_is_kept(written, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import keyword
 import re
 from collections.abc import Mapping
@@ -50,7 +51,7 @@ class TemplateError(ValueError):
     """A template that cannot be made; the message is one sentence."""
 
 
-def new(kind: str, name: str, *, out: Path | None = None) -> Path:
+def new(kind: str, name: str, *, out: Path | None = None, as_json: bool = False) -> Path:
     """Write a vehicle, task, term, sensor, actuator, agent or study of your own, which runs and passes its tests.
 
     The directory holds the file to change, tests of the laws that it must obey, and, where every command can use it
@@ -64,6 +65,7 @@ def new(kind: str, name: str, *, out: Path | None = None) -> Path:
         kind: vehicle, task, term, sensor, actuator, agent or study.
         name: Of the new thing: small letters, digits and underscores.
         out (DIR): Directory to write; NAME if not given.
+        as_json: Print one JSON object instead of text.
 
     Returns:
         The directory.
@@ -91,9 +93,10 @@ def new(kind: str, name: str, *, out: Path | None = None) -> Path:
             text = PROJECT.format(group=group, point=entry, **after)
             (temporary / "pyproject.toml").write_text(text, encoding="utf-8")
     shown = command.format(**after).replace(f"{name}/", f"{folder}/")
-    print(f"written: {folder}\ntry it: {shown}\ntest it: python -m pytest {folder}")
+    told = {"written": str(folder), "try it": shown, "test it": f"python -m pytest {folder}"}
     if point:
-        print(f"use it in every command: pip install -e {folder}")
+        told["use it in every command"] = f"pip install -e {folder}"
+    print(json.dumps(told) if as_json else "\n".join(f"{key}: {text}" for key, text in told.items()))
     return folder
 
 
