@@ -39,7 +39,7 @@ def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path)
     assert study("faults", *words) == 0
     assert "control" in capsys.readouterr().out
     assert next((tmp_path / "trials").glob("*.json")).stat().st_mtime_ns == written
-    assert "fails, as it must" in (tmp_path / "faults.md").read_text()
+    assert "fails, as it must" in (tmp_path / "faults.html").read_text()
 
 
 def test_an_unknown_scenario_is_refused(capsys, tmp_path):
