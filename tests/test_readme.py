@@ -13,6 +13,7 @@ import pytest
 from finssim import __version__
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from finssim.vehicles import load_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -89,6 +90,25 @@ def test_finssim_lines_run_in_order(tmp_path, monkeypatch, capfd):
         printed = "".join(capfd.readouterr())
         assert status == 0 and printed.strip(), f"{shlex.join(words)}\n{printed}"
     assert (tmp_path / "run.csv").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_the_recipes_that_need_no_file_of_the_reader_run_in_order(tmp_path, monkeypatch, capfd):
+    """Trainings and evaluations of the page of recipes, cut short, with its files and a controller of one's own."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "reference" / "recipes.md").read_text(encoding="utf-8")
+    water, camera = re.findall(r"^```yaml\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    Path("water.yaml").write_text(water, encoding="utf-8")
+    Path("camera.yaml").write_text(camera, encoding="utf-8")
+    assert "front_camera" in load_vehicle("camera.yaml").perception
+    own = (ROOT / "examples" / "own" / "agent" / "homing.py").read_text(encoding="utf-8")
+    Path("mine.py").write_text(own.replace("Homing", "Mine"), encoding="utf-8")
+    lines = re.findall(r"^finssim (?:train|evaluate|worlds)\b.*$", page, flags=re.MULTILINE)
+    assert len(lines) > 8
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        status = boundary.run(app, [*words[1:], *SMALL.get(words[1], [])])
+        assert status == 0, f"{line}\n{''.join(capfd.readouterr())}"
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ import finssim as fs
 SEEDS, PLANTS = (1, 2, 3), ("nominal", "current")
 
 
-def study(out: Path, trials: int = 8) -> dict[str, dict[str, list[float]]]:
+def study(out: Path, trials: int = 8) -> dict[str, dict[str, Any]]:
     """Evaluate, keep every seed's result as it is made, and continue where an earlier call stopped.
 
     Args:
