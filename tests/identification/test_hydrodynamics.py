@@ -112,14 +112,13 @@ def test_a_heading_that_decays(tmp_path):
     options = {"held_out": trials[:1]}  # for what replays worse there is a test below
     fit = fit_hydrodynamics(trials, vehicle, **options)
     ratio = fit.estimates["yaw.d2/m_eff"]
-    # A tether that may pull a little at each spin cannot be told from a little linear drag.
-    assert ratio.estimate == pytest.approx(0.775, rel=0.03) and ratio.ci95[0] < 0.775 < ratio.ci95[1]
+    assert ratio.estimate == pytest.approx(0.775, rel=0.01) and ratio.ci95[0] < 0.775 < ratio.ci95[1]
     assert ratio.identifiable
-    assert ratio.ci95[1] - ratio.ci95[0] < 0.1 * ratio.estimate
+    assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
     assert scores(calibrated(fit), trials)["yaw"] < 0.02
     linear = fit_hydrodynamics(trials, vehicle, damping="linear", **options)
     assert linear.estimates["yaw.d1/m_eff"].estimate > 0.1 and "yaw.d2/m_eff" not in linear.estimates
-    assert fit.quality["yaw"]["rmse"] < 0.4 * linear.quality["yaw"]["rmse"]
+    assert fit.quality["yaw"]["rmse"] < 0.2 * linear.quality["yaw"]["rmse"]
     known = fit_hydrodynamics(trials, vehicle, known={"yaw": 0.5}, **options)
     assert known.estimates["yaw.d2"].estimate == pytest.approx(0.5 * ratio.estimate, rel=0.01)
     assert calibrated(known).mass_matrix()[5, 5] == pytest.approx(0.5, rel=1e-6)

@@ -508,6 +508,7 @@ class Shooting:
         *,
         lagged: NDArray[np.bool_] | None = None,
         swinging: NDArray[np.bool_] | None = None,
+        pulled: bool = True,
         few: bool = False,
         correlated: bool = True,
     ) -> None:
@@ -519,6 +520,7 @@ class Shooting:
             channels: Measured columns to compare.
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
             swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
+            pulled: Whether something may pull at a vehicle that coasts, where the trials are coasts alone.
             few: Whether some axis is excited by too few trials to show how trials differ.
             correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
         """
@@ -536,7 +538,11 @@ class Shooting:
         seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
         unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
         states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
-        if swinging is not None and swinging.any():  # unknowns 12 to 17 are pulls
+        self.released = bool(swinging is not None and swinging.all())
+        self.coasts = self.released and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
+        if (
+            swinging is not None and swinging.any() and (pulled or not self.coasts)
+        ):  # unknowns 12 to 17 are pulls
             body, coasting = parameters.vehicle.body, set(parameters.axes).difference(parameters.biases)
             pulled = [i for i in COASTING if AXES[i] in coasting]
             pull = (
@@ -592,11 +598,9 @@ class Shooting:
         rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
         self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
         self._known = np.concatenate([known, 0.0 * far + LATE_STD**-1.0])
-        free = self.released = bool(swinging is not None and swinging.all())
-        self.coasts = free and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
         forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
-        self._relative_step = np.where(np.array(forces) & free, FORCE_STEP, RELATIVE_STEP)
-        if "thrust_delay" in parameters.names or free:
+        self._relative_step = np.where(np.array(forces) & self.released, FORCE_STEP, RELATIVE_STEP)
+        if "thrust_delay" in parameters.names or self.released:
             # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
             self._known[len(parameters.names)] = EXACT_CLOCK**-1.0
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)

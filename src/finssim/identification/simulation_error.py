@@ -59,6 +59,7 @@ from finssim.identification.rollout import (
 from finssim.identification.shooting import FitSolution, Point, Shooting, solve
 from finssim.identification.uncertainty import (
     degeneracy,
+    releases_disagree,
 )
 from finssim.identification.weak_form import weak_form
 from finssim.trials.findings import CalibrationError, Finding, finding
@@ -137,6 +138,7 @@ class Stages:
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
+        self.pulled = False
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
         self.extras = set(estimate)
@@ -399,6 +401,7 @@ class Stages:
             sorted({c for s in self.segments for c in s.measured}),
             lagged=None if other else self.lagged,
             swinging=swinging,
+            pulled=self.pulled,
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
@@ -646,6 +649,9 @@ def fit_by_simulation(
     stage = fit.rough(kinds, [{}, fit.weak_start])
     start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
     if not stage.solution.interrupted:
+        stage = fit.first(kinds, start)
+    if stage.problem.coasts and not stage.solution.interrupted and releases_disagree(stage.found.evidence):
+        fit.pulled = True
         stage = fit.first(kinds, start)
     shapes = fit.shapes(stage) if damping == "auto" and not stage.solution.interrupted else {}
     end = averaged(stage, shapes)

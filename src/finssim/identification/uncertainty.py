@@ -26,6 +26,7 @@ __all__ = [
     "degeneracy",
     "intervals",
     "pooled_covariance",
+    "releases_disagree",
     "trial_covariance",
 ]
 
@@ -185,14 +186,8 @@ def pooled_covariance(evidence: Evidence) -> Covariance:
     T, unknown = _whitener(evidence.information)
     local = T @ T.T
     local[unknown, unknown] = np.inf
-    q = dof = 0.0
-    share = np.zeros(len(T))
-    for normal, score in zip(evidence.normal, evidence.score, strict=True):
-        values, axes = np.linalg.eigh(T.T @ normal @ T)
-        shown = values > FAINT / len(evidence.normal)
-        q += float(np.sum((axes.T @ (T.T @ score))[shown] ** 2 / values[shown]))
-        dof += float(np.sum(1.0 - values[shown]))
-        share = np.maximum(share, np.einsum("pk,kl,pl->p", T, T.T @ normal @ T, T))
+    q, dof = _scatter(evidence, T)
+    share = np.max([np.einsum("pk,kl,pl->p", T, T.T @ N @ T, T) for N in evidence.normal], axis=0)
     factor, P = max(1.0, q / max(dof, 1e-9)), len(T)
     alone = share > ALONE * np.maximum(np.diagonal(T @ T.T), 1e-300)
     return Covariance(
@@ -202,6 +197,28 @@ def pooled_covariance(evidence: Evidence) -> Covariance:
         dof=np.where(alone, np.inf, np.full(P, max(dof, 1.0))),
         alone=alone | unknown,
     )
+
+
+def _scatter(evidence: Evidence, T: Array) -> tuple[float, float]:
+    """Return Q of `pooled_covariance` and its expectation ν for independent errors, under a whitener, (P, n)."""
+    q = dof = 0.0
+    for normal, score in zip(evidence.normal, evidence.score, strict=True):
+        values, axes = np.linalg.eigh(T.T @ normal @ T)
+        shown = values > FAINT / len(evidence.normal)
+        q += float(np.sum((axes.T @ (T.T @ score))[shown] ** 2 / values[shown]))
+        dof += float(np.sum(1.0 - values[shown]))
+    return q, dof
+
+
+def releases_disagree(evidence: Evidence) -> bool:
+    """Return whether releases differ by more than their noise: Q of `pooled_covariance` beyond 95 % of χ²(ν).
+
+    Blocks of too few trials cannot show that they agree.
+    """
+    from scipy.stats import chi2
+
+    q, dof = _scatter(evidence, _whitener(evidence.information)[0])
+    return evidence.unit != "trials" or q > float(chi2.ppf(0.95, max(dof, 1.0)))
 
 
 def intervals(theta: Array, covariance: Covariance) -> Array:
