@@ -129,23 +129,25 @@ def record(
     told = np.zeros((n, worlds, k), dtype=np.float32)
     shapes = {"position": 3, "quaternion": 4, "velocity": 6, "acceleration": 6, "actuator": k}
     states = {name: np.empty((n, worlds, size), dtype=np.float32) for name, size in shapes.items()}
+    thrust = simulator.command.thrust.numpy()[:, 0]
+    views = [(out, simulator.numpy(name)[:, 0, : shapes[name]]) for name, out in states.items()]
     for i in range(n):
         if i > 0:
-            simulator.command.thrust.numpy()[:, 0, :thrusters] = command[i - 1]
+            thrust[:, :thrusters] = command[i - 1]
             if each_step is not None:
                 each_step(simulator)
-            told[i - 1] = simulator.command.thrust.numpy()[:, 0, :k]
+            told[i - 1] = thrust[:, :k]
             simulator.step()
-        for name, out in states.items():
-            out[i] = simulator.numpy(name)[:, 0, : shapes[name]]
+        for out, view in views:
+            out[i] = view
     if len(simulator.frozen_worlds()):
         first = programmes[int(simulator.frozen_worlds()[0])].name
         raise CalibrationError(f"{first}: the motion did not stay finite; give lower levels")
     # There is no acceleration before the first step; the one right after it is that of the start.
     states["acceleration"][0] = states["acceleration"][1]
-    thrust = _nominal_thrust(states.pop("actuator"), vehicle, bool(simulator.plant.speed_lag.numpy().any()))
+    nominal = _nominal_thrust(states.pop("actuator"), vehicle, bool(simulator.plant.speed_lag.numpy().any()))
     told[-1] = told[-2]
-    return Recording(step=STEP, thrust=thrust, command=told, **states)
+    return Recording(step=STEP, thrust=nominal, command=told, **states)
 
 
 def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> float:
@@ -261,7 +263,8 @@ settings that FinsROV's software was published with, which are larger than any n
 class _Recorded:
     """Arrays that a `SensorSuite` reads, filled from a recording."""
 
-    def __init__(self, worlds: int) -> None:
+    def __init__(self, recording: Recording) -> None:
+        worlds = recording.velocity.shape[1]
         shape = (worlds, 1)
         self.position = wp.zeros(shape, dtype=wp.vec3, device="cpu")
         self.quaternion = wp.zeros(shape, dtype=wp.quat, device="cpu")
@@ -269,12 +272,15 @@ class _Recorded:
         self.acceleration = wp.zeros(shape, dtype=vec6, device="cpu")
         self.steps = wp.zeros(worlds, dtype=wp.int32, device="cpu")
         self.episode = wp.ones(worlds, dtype=wp.int32, device="cpu")
+        fields = ("position", "quaternion", "velocity", "acceleration")
+        self._views = [(getattr(self, name).numpy()[:, 0], getattr(recording, name)) for name in fields]
+        self._clock = self.steps.numpy()
 
-    def show(self, step: int, recording: Recording) -> None:
+    def show(self, step: int) -> None:
         """Put the state of one step there."""
-        for name in ("position", "quaternion", "velocity", "acceleration"):
-            getattr(self, name).numpy()[:, 0] = getattr(recording, name)[step]
-        self.steps.fill_(step)
+        for view, values in self._views:
+            view[...] = values[step]
+        self._clock[...] = step
 
 
 def measure(
@@ -337,22 +343,32 @@ def _sensor_channels(
     if not noise.own_sensors:
         return None, None, None
     steps, worlds = recording.velocity.shape[:2]
-    state = _Recorded(worlds)
+    state = _Recorded(recording)
     suite = SensorSuite(vehicle, worlds=worlds, control_step=recording.step, seed=seed)
     rows = len(range(0, steps, every))
     gyro, accel = np.full((rows, worlds, 3), np.nan), np.full((rows, worlds, 3), np.nan)
     depth = np.full((rows, worlds), np.nan)
+    readings: list[tuple[Array, Array, Array]] = []
+    """Which worlds have a new sample, the samples, and the rows that take them."""
+    if (imu := suite.imu) is not None:
+        readings += [
+            (imu.fresh.numpy(), imu.gyro.numpy(), gyro),
+            (imu.fresh.numpy(), imu.accel.numpy(), accel),
+        ]
+    if suite.depth is not None:
+        readings.append((suite.depth.fresh.numpy(), suite.depth.depth.numpy(), depth))
+    update = suite.launches(state)
     for step in range((rows - 1) * every + 1):
-        state.show(step, recording)
-        (suite.reset if step == 0 else suite.update)(state)
+        state.show(step)
+        if step == 0:
+            suite.reset(state)
+        else:
+            for launch in update:
+                launch.launch()
         row = -(-step // every)
-        if suite.imu is not None:
-            fresh = suite.imu.fresh.numpy()[:, 0]
-            gyro[row, fresh] = suite.imu.gyro.numpy()[fresh, 0]
-            accel[row, fresh] = suite.imu.accel.numpy()[fresh, 0]
-        if suite.depth is not None:
-            fresh = suite.depth.fresh.numpy()[:, 0]
-            depth[row, fresh] = suite.depth.depth.numpy()[fresh, 0]
+        for fresh, samples, out in readings:
+            now = fresh[:, 0]
+            out[row, now] = samples[now, 0]
     measured_depth = None if suite.depth is None else depth
     if vehicle.sensors.imu is None:
         return None, None, measured_depth
