@@ -1,6 +1,7 @@
 """Changes of a vehicle while it is driven: payload, weak thruster and drag, in simulated driving with known truth."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -45,12 +46,13 @@ def fouled():
     return {name: 1.3 * np.array(NOMINAL[name], float) for name in ("D1", "D2")}
 
 
-def driven(plant=None, seed=1, duration=28.0):
-    """A trial of all axes with the noise of the vehicle's sensors."""
-    programme = multisine(PLAY, VEHICLE, seed=seed, duration=duration, band=(0.1, 1.0))
+@cache
+def driven(plant=dict, seed=1):
+    """A trial of all axes with the noise of the vehicle's sensors; `plant` gives where the vehicle differs."""
+    programme = multisine(PLAY, VEHICLE, seed=seed, duration=28.0, band=(0.1, 1.0))
     columns = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
     options = {"inputs": ("command",), "columns": columns, "noise": "sensors"}
-    return simulate_programme([programme], VEHICLE, seed=seed, plant=plant, **options)[0]
+    return simulate_programme([programme], VEHICLE, seed=seed, plant=plant(), **options)[0]
 
 
 def followed(*trials):
@@ -78,7 +80,7 @@ CASES = {
 def test_what_changed_is_found_and_nothing_else(case):
     """Within 30 s of driving: the interval holds the truth and not the file's number; no other estimate differs."""
     plant, truth = CASES[case]
-    adaptation = followed(driven(plant()))
+    adaptation = followed(driven(plant))
     assert differing(adaptation) == set(truth)
     for name, value in truth.items():
         low, high = adaptation.estimates[name].ci95
@@ -90,7 +92,7 @@ def test_a_sudden_change_is_followed_at_once():
     """After 60 s as the file says, the first window with a payload renews the estimate, and holds the new weight."""
     adaptation = followed(driven(), driven(seed=2))
     assert differing(adaptation) == set() and adaptation.renewed == []
-    adaptation.update(next(windows_of(driven(payload(), seed=3), VEHICLE)))
+    adaptation.update(next(windows_of(driven(payload, seed=3), VEHICLE)))
     assert adaptation.renewed == [adaptation.windows]
     low, high = adaptation.estimates["weight"].ci95
     assert low <= 6.0 <= high and low > 3.0
@@ -99,12 +101,12 @@ def test_a_sudden_change_is_followed_at_once():
 @pytest.mark.slow
 def test_the_adapted_vehicle_moves_as_the_changed_one():
     """Its forces are those of the changed plant: volume and centre, thrust, drag; everything else keeps its number."""
-    adapted = followed(driven(payload()), driven(payload(), seed=2)).adapted
+    adapted = followed(driven(payload), driven(payload, seed=2)).adapted
     weight = (VEHICLE.body.displaced_volume - adapted.body.displaced_volume) * GRAVITY
     assert weight == pytest.approx(6.0, abs=0.6)
     assert adapted.body.mass == VEHICLE.body.mass and adapted.thrusters == VEHICLE.thrusters
     assert adapted.origin_of("body.displaced_volume").origin == "measured"
-    weak = followed(driven(weak_thruster())).adapted.thrusters["H_LB"]
+    weak = followed(driven(weak_thruster)).adapted.thrusters["H_LB"]
     assert weak.c_plus / VEHICLE.thrusters["H_LB"].c_plus == pytest.approx(0.7, abs=0.06)
     assert weak.force_max / VEHICLE.thrusters["H_LB"].force_max == pytest.approx(0.7, abs=0.06)
 
@@ -112,7 +114,7 @@ def test_the_adapted_vehicle_moves_as_the_changed_one():
 @pytest.mark.slow
 def test_a_follower_of_live_states_finds_what_the_log_shows():
     """The same states one by one, of which a gap begins a new window; windows are fitted in order."""
-    trial = driven(weak_thruster())
+    trial = driven(weak_thruster)
     follower = Follower(VEHICLE)
     channels = trial.channels
     nu = np.column_stack([channels[c] for c in ("u", "v", "w", "p", "q", "r")])
@@ -130,7 +132,7 @@ def test_a_follower_of_live_states_finds_what_the_log_shows():
 @pytest.mark.slow
 def test_the_command_writes_the_vehicle_as_it_is_now(tmp_path, capsys):
     """`calibrate changes`: JSON with the estimates, and a file that loads."""
-    write_trial(driven(fouled()), tmp_path / "dive")
+    write_trial(driven(fouled), tmp_path / "dive")
     out = tmp_path / "now.yaml"
     calibrate_changes([tmp_path / "dive"], vehicle="finsrov", out=out, as_json=True)
     said = json.loads(capsys.readouterr().out)

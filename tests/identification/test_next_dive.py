@@ -21,7 +21,7 @@ def dived(plan, seed, name=""):
 @pytest.mark.slow
 def test_a_designed_second_dive_halves_what_a_repeated_one_leaves():
     """Median width of the intervals, as long a dive: 0.6 of that of the first dive once more, or less."""
-    plan = programmes("surge,yaw", VEHICLE, levels={"surge": (9.0, 18.0), "yaw": (2.5, 5.0)})
+    plan = programmes("surge,yaw", VEHICLE, levels={"surge": (18.0,), "yaw": (5.0,)})
     first = dived(plan, 1)
     fit = fit_hydrodynamics(first, VEHICLE, design=True)
     dive = fit.next_dive

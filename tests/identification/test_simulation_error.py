@@ -270,7 +270,7 @@ def test_all_axes_moving_at_once():
 def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
     """Only rates and attitude are logged: yaw and roll are fitted, and surge is named as unmeasured."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge", "roll", "yaw")
-    fit = fit_by_simulation(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
+    fit = fit_by_simulation(without(some[::3], "u", "v", "w", "x", "y", "z", "depth"), vehicle)
     assert {n.partition(".")[0] for n in fit.estimates if "." in n} == {"roll", "yaw"}
     assert ("axis_untold", "surge") in {(one.code, one.subject) for one in fit.findings}
 
