@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from finssim.sim import Simulator
+from finssim.sim import Simulator, SimulatorError
 
 
 def simulator(threads: int) -> Simulator:
@@ -37,6 +37,21 @@ def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
             made.step()
             assert (made.numpy("steps") == made.numpy("steps")[0]).all()
     np.testing.assert_array_equal(threaded.numpy("velocity"), alone.numpy("velocity"))
+
+
+def test_the_environment_limits_the_threads_of_who_names_none(monkeypatch) -> None:
+    """One slice a thread; a number in the call comes first, and nonsense is refused."""
+
+    def slices(**options: int) -> int:
+        return len(Simulator("finsrov", worlds=4096, **options).pipeline().slices)
+
+    for given, expected in (("1", 1), ("3", 3)):
+        monkeypatch.setenv("FINSSIM_THREADS", given)
+        assert slices() == expected and slices(threads=2) == 2
+    for given in ("0", "-1", "many"):
+        monkeypatch.setenv("FINSSIM_THREADS", given)
+        with pytest.raises(SimulatorError, match=f"FINSSIM_THREADS is '{given}', expected a whole number"):
+            slices()
 
 
 @pytest.mark.slow

@@ -35,6 +35,8 @@ from finssim.core.yaml_file import json_value, read_json
 from finssim.evaluation.tables import Table, print_tables, write_page
 from finssim.vehicles import load_vehicle
 
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "FINSSIM_THREADS": "1"}
+"""Environment of a worker: there are as many of them as processors."""
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
 SETTINGS = 4
@@ -303,7 +305,7 @@ def _on_cluster(
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     _knock(address)
     try:
-        environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+        environment = {"env_vars": ONE_THREAD}
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
@@ -354,7 +356,7 @@ def _knock(address: str) -> None:
 def _prepare(parent: int) -> None:
     """Prepare a worker: one thread, since there are as many workers as processors, and an end with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.update(ONE_THREAD)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import warp as wp
 
+from finssim.sim.plant_arrays import SimulatorError
+
 MIN_SLICE = 64
 """Number of worlds below which a slice is not given to another thread."""
 
@@ -65,7 +67,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def default_threads() -> int:
-    """Processors this process may use."""
+    """Number of threads of a simulator that names none: FINSSIM_THREADS, else the processors this process may use."""
+    if given := os.environ.get("FINSSIM_THREADS"):
+        if not given.isdecimal() or int(given) < 1:
+            raise SimulatorError(f"FINSSIM_THREADS is '{given}', expected a whole number from 1 on")
+        return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
