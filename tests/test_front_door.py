@@ -218,5 +218,9 @@ def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
 def test_a_task_without_a_figure_and_one_that_is_not_for_the_pool_are_refused():
     with pytest.raises(EvaluationError, match="run_in_pool plays t1, t2, but the task is 'docking'"):
         fs.run_in_pool("pid", "docking")
+    with pytest.raises(EvaluationError, match="unknown firmware 'px4'; available: mcu, ardusub"):
+        fs.run_in_pool("pid", vehicle="bluerov2_heavy", firmware="px4")
+    with pytest.raises(EvaluationError, match="unknown site 'lake'"):
+        fs.run_in_pool("pid", site="lake")
     with pytest.raises(ValueError, match="P99"):
         fs.run_in_pool("pid", targets=["P99"])

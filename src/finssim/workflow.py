@@ -191,6 +191,8 @@ def run_in_pool(
     targets: Sequence[str] | None = None,
     severity: str = "realistic",
     camera: str = "corners",
+    site: str = "pool",
+    firmware: Literal["mcu", "ardusub"] = "mcu",
     duration: float = 60.0,
     seed: int = 1,
     progress: bool = False,
@@ -208,6 +210,9 @@ def run_in_pool(
         targets: Names of setpoints (t1) or of trajectories (t2); all of the paper's if None.
         severity: How far the drawn vehicle is from the vehicle file: nominal, realistic or hard.
         camera: What the overhead camera gives: corners of the tags with noise, or pictures that are drawn and searched.
+        site: Where the vehicle is: pool, tank or open-water.
+        firmware: mcu (a motor controller), or ardusub: the emulated autopilot, with a Doppler log and a compass instead
+            of the camera.
         duration: Length of a trial of t1 [s].
         seed: Seed of all noise.
         progress: Whether progress is shown on standard error.
@@ -216,21 +221,26 @@ def run_in_pool(
         The result by the true motion: `table`, `metrics`, `plot()`.
 
     Raises:
-        EvaluationError: Another task.
+        EvaluationError: Another task, or unknown firmware or site.
         PolicyError, ControlError, PlantSpecError, VehicleError: As they say.
     """
     from finssim.control.policy import Policy
     from finssim.evaluation.evaluate import FORMS, EvaluationError, Evaluations, evaluation
     from finssim.evaluation.robot_trials import RobotJob, play_trial
     from finssim.robot.pilots import make_pilot
+    from finssim.vehicles.defaults import SITES
 
     if task not in FORMS:
         raise EvaluationError(f"run_in_pool plays {', '.join(FORMS)}, but the task is '{task}'")
+    for kind, value, known in (("firmware", firmware, ("mcu", "ardusub")), ("site", site, tuple(SITES))):
+        if value not in known:
+            raise EvaluationError(f"unknown {kind} '{value}'; available: {', '.join(known)}")
     if vehicle is None:
         vehicle = _vehicle_of(controller) if isinstance(controller, Policy) else "finsrov"
     body = load_vehicle(vehicle)
     name = str(controller.folder if isinstance(controller, Policy) else controller)
     about = make_pilot(name, body, task=task).describe()
+    eyes = f"seen by {camera}" if firmware == "mcu" else firmware
     names = FORMS[task].targets if targets is None else targets
     measures, trials = [], []
     with silent(not progress), progress_bar(f"virtual pool, plant {plant}") as show:
@@ -238,12 +248,12 @@ def run_in_pool(
             show(k / len(names), target)
             job = RobotJob(
                 row=name, target=target, plant=plant, seed=seed, controller=name, vehicle=body, pool_vehicle=body,
-                severity=severity, camera=camera, duration=duration,
+                severity=severity, camera=camera, site=site, firmware=firmware, duration=duration,
             )  # fmt: skip
             result, trial = play_trial(job)
             measures.append(result)
             trials.append(trial)
-    where = {"name": f"pool {plant}", "title": f"virtual pool, plant {plant}, {severity}, seen by {camera}"}
+    where = {"name": f"pool {plant}", "title": f"virtual pool, plant {plant}, {severity}, {eyes}"}
     return Evaluations((evaluation(about, task, body, where, measures, trials, seed=seed),))
 
 

@@ -26,6 +26,7 @@ import numpy.typing as npt
 import warp as wp
 
 from finssim.control import ControlError
+from finssim.core.quiet import start_warp
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
 # The tables that wrench allocation looks up, computed once per vehicle in float64.
@@ -302,6 +303,7 @@ def allocation_data(
             f"allocation has {len(B)} matrices, {len(lower)} lower and {len(upper)} upper limits, "
             f"{len(weights)} weights: give one of each per vehicle type"
         )
+    start_warp()  # without its banner
     types = [tables(*arguments, regularisation) for arguments in zip(B, lower, upper, weights, strict=True)]
     data = AllocationData()
     for name in Tables._fields:
