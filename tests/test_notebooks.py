@@ -1,5 +1,6 @@
 """The notebooks run from their first cell to their last."""
 
+import base64
 import json
 import os
 import subprocess
@@ -8,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples" / "notebooks").glob("*.ipynb"))
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
+COURSE = sorted((EXAMPLES / "course").glob("*.ipynb"))
 
 
 def cells(path: Path) -> list[dict]:
@@ -30,8 +33,18 @@ def test_a_notebook_is_committed_without_outputs(path):
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells(path))
 
 
+@pytest.mark.parametrize("path", COURSE, ids=lambda path: path.stem)
+def test_the_course_is_committed_as_it_ran(path):
+    """Learners read it before they install anything: every cell ran once, in order, without a warning on its way."""
+    assert [cell["execution_count"] for cell in cells(path)] == list(range(1, len(cells(path)) + 1))
+    outputs = [output for cell in cells(path) for output in cell["outputs"]]
+    assert all(o["output_type"] != "error" and o.get("name") != "stderr" for o in outputs)
+    pictures = [o["data"]["image/png"] for o in outputs if "image/png" in o.get("data", {})]
+    assert pictures and max(len(base64.b64decode(picture)) for picture in pictures) < 100_000
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*NOTEBOOKS, *COURSE], ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path):
     """In a process and a folder of its own."""
     (tmp_path / "notebook.py").write_text(code(path), encoding="utf-8")
