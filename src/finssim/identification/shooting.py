@@ -508,7 +508,7 @@ class Shooting:
         *,
         lagged: NDArray[np.bool_] | None = None,
         swinging: NDArray[np.bool_] | None = None,
-        pulled: bool = True,
+        twisted: bool = True,
         few: bool = False,
         correlated: bool = True,
     ) -> None:
@@ -520,7 +520,8 @@ class Shooting:
             channels: Measured columns to compare.
             lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
             swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
-            pulled: Whether something may pull at a vehicle that coasts, where the trials are coasts alone.
+            twisted: Whether a constant moment may act on a vehicle that coasts, where the trials are coasts alone;
+                a force may in any case.
             few: Whether some axis is excited by too few trials to show how trials differ.
             correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
         """
@@ -540,11 +541,9 @@ class Shooting:
         states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
         self.released = bool(swinging is not None and swinging.all())
         self.coasts = self.released and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
-        if (
-            swinging is not None and swinging.any() and (pulled or not self.coasts)
-        ):  # unknowns 12 to 17 are pulls
+        if swinging is not None and swinging.any():  # unknowns 12 to 17 are pulls
             body, coasting = parameters.vehicle.body, set(parameters.axes).difference(parameters.biases)
-            pulled = [i for i in COASTING if AXES[i] in coasting]
+            pulled = [i for i in COASTING if AXES[i] in coasting and (i < 3 or twisted or not self.coasts)]
             pull = (
                 PULL
                 * parameters.vehicle.weight

@@ -138,7 +138,7 @@ class Stages:
         apart = [float(np.median(np.diff(s.drive.t))) for s in prepared if not s.drive.held]
         self.own_error = OWN_ERROR + BETWEEN * max([0.0, *(dt - STEP for dt in apart)])
         self.shorter: dict[str, float] = {}
-        self.pulled = False
+        self.twisted = False
         self.used: list[Streams] = []
         self.segments: list[Segment] = []
         self.extras = set(estimate)
@@ -401,7 +401,7 @@ class Stages:
             sorted({c for s in self.segments for c in s.measured}),
             lagged=None if other else self.lagged,
             swinging=swinging,
-            pulled=self.pulled,
+            twisted=self.twisted,
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
         )
 
@@ -650,8 +650,9 @@ def fit_by_simulation(
     start = dict(zip(stage.problem.parameters.names, stage.x.tolist(), strict=True))
     if not stage.solution.interrupted:
         stage = fit.first(kinds, start)
-    if stage.problem.coasts and not stage.solution.interrupted and releases_disagree(stage.found.evidence):
-        fit.pulled = True
+    spun = stage.problem.coasts and "yaw" in fit.axes and not stage.solution.interrupted
+    if spun and releases_disagree(stage.found.evidence):
+        fit.twisted = True
         stage = fit.first(kinds, start)
     shapes = fit.shapes(stage) if damping == "auto" and not stage.solution.interrupted else {}
     end = averaged(stage, shapes)
