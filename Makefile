@@ -61,7 +61,8 @@ clean:  ## remove what was built, the environment included
 	rm -rf $(VENV) build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find src tests examples studies benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
-PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Python compiles a module when it is first imported, which most never are.
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
 # An environment of the right Python; installed into by each of the two targets below.
 $(BIN)/python:

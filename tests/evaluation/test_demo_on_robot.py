@@ -27,7 +27,7 @@ QUIET = Console(quiet=True)
 
 
 def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(tmp_path, capsys):
-    """q after the first of four programmes; then the rest, a training, three controllers, and what they did."""
+    """q after the first of four programmes; then the rest, a training, two controllers, and what they did."""
     out, file = tmp_path / "demo", tmp_path / "pool.yaml"
     options = {"steps": 8192, "scope": SMALL, "console": QUIET}
     with lockstep_pool(FINSROV, file) as wiring, pytest.raises(KeyboardInterrupt):
@@ -43,7 +43,7 @@ def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(tmp_path
     assert Policy.load(out / "policy", vehicle=vehicle).description.training["steps"] == 8192
     result = json.loads((out / "t1" / "t1.json").read_text())
     assert result["robot"] and {name: row["trials"] for name, row in result["rows"].items()} == dict.fromkeys(
-        ("calibrated-pool", "pid", "pid-paper"), 1
+        ("calibrated-pool", "pid"), 1
     )
     page = report.read_text()
     assert "integrating, hardware" in page and "setpoints on hardware" in page and "trials of a robot" in page

@@ -15,9 +15,9 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -271,19 +271,41 @@ def spread(
         return
     if not items:
         return
+    with _workers(min(processes, len(items))) as executor:
+        futures = {executor.submit(work, item): item for item in items}
+        for future in as_completed(futures):
+            yield futures[future], future
+
+
+@contextmanager
+def running(work: Callable[..., Any], *arguments: Any) -> Iterator[None]:
+    """Run a function in a process of its own beside a block, whose end waits for it.
+
+    It only prepares: what it returns or raises is not read.
+
+    Args:
+        work: A function of a module.
+        arguments: Its arguments.
+    """
+    with _workers(1) as executor:
+        future = executor.submit(work, *arguments)
+        yield
+        future.exception()
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Start processes, which an error or Ctrl-C ends without waiting for results that are not read."""
     # A fork would copy the threads of Warp and torch half-alive.
     executor = ProcessPoolExecutor(
-        min(processes, len(items)),
+        count,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_prepare,
         initargs=(os.getpid(),),
     )
     try:
-        futures = {executor.submit(work, item): item for item in items}
-        for future in as_completed(futures):
-            yield futures[future], future
+        yield executor
     except BaseException:
-        # End without waiting for results that are not read.
         workers = list((executor._processes or {}).values())
         executor.shutdown(wait=False, cancel_futures=True)
         for worker in workers:

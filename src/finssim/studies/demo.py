@@ -6,10 +6,11 @@ import json
 import math
 import shutil
 import sys
+import tempfile
 import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -24,7 +25,7 @@ from rich.console import Console
 from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
 from finssim.core.quiet import start_warp
-from finssim.evaluation.campaign import Progress
+from finssim.evaluation.campaign import Progress, running
 from finssim.evaluation.evaluate import T1_COLUMNS
 from finssim.evaluation.excitation import record_programmes
 from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
@@ -40,7 +41,6 @@ from finssim.evaluation.robot_trials import (
     take_folder,
 )
 from finssim.evaluation.tables import Table, cells, print_tables, write_page
-from finssim.evaluation.trials import GoalTrial
 from finssim.identification.fit import Fit
 from finssim.identification.prediction import Replay, replay
 from finssim.identification.programme import RATE, STEADY, Programme, programmes, which_axes
@@ -48,12 +48,14 @@ from finssim.identification.replay_report import draw_response_envelopes
 from finssim.identification.report import interval_text, number_text, state_text, write_report
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.identification.vehicle_file import all_findings, calibrated, number_in, write_vehicle
+from finssim.learning.train import TrainingSettings, train
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
 from finssim.sim import RectangularPool
 from finssim.studies.demo_course import demo_course
 from finssim.studies.transfer import T1, Spec, transfer_experiment
 from finssim.trials.findings import Finding, sentences
+from finssim.trials.trial import Trial
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import AXES, Provenance, Vehicle, load_vehicle
 from finssim.vehicles.capability import level_speed
@@ -166,8 +168,8 @@ SET = "hydrodynamics.calibrated"
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
 """Levels that no trial of the fit has [N, N m]."""
 
-Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Path]]]
-"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> folders of the trials by role."""
+Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Trial]]]
+"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> the trials by role."""
 
 
 @dataclass(frozen=True)
@@ -231,8 +233,9 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
     name = truth.name
     start_file, vehicle_file = (file.format(name) for file in VEHICLE_FILES)
     write_vehicle(rough_vehicle(truth), folder / start_file)
-    folders = record({role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file))
-    recorded = {role: load_trials(paths) for role, paths in folders.items()}
+    recorded = record(
+        {role: folder / TRIALS / role for role in ("fit", "held-out")}, str(folder / start_file)
+    )
     fit = fit_by_simulation(recorded["fit"], load_vehicle(folder / start_file))
     identified = calibrated(fit)
     findings = tuple(all_findings(fit, identified))
@@ -285,31 +288,39 @@ POOL_VEHICLE = (
 )
 
 
-def _paths(trials: Sequence[GoalTrial], site: str) -> Any:
-    """The paths of all trials from above and from the side, in the water; start and goals with their headings."""
+def _paths(
+    motions: Sequence[NDArray[np.float64]], site: str, goals: NDArray[np.float64] | None = None
+) -> Any:
+    """Draw paths from above and from the side, in the water.
+
+    Args:
+        motions: Positions of each trial in the world [m], (n, 3).
+        site: A name of `SITES`.
+        goals: Position [m] and yaw [rad] that each trial was to hold, (trials, 4); None: it had none.
+    """
     size = SITES[site]
     pool = (
         RectangularPool() if size is None else RectangularPool(length=size[0], width=size[1], depth=size[2])
     )
     figure = new_figure(7.2, 6.0, layout="compressed")
-    panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
+    above, side = panels = figure.subplots(2, 1, sharex=True, height_ratios=(pool.width, pool.depth))
     spans = ((1, -pool.width / 2, pool.width), (2, -pool.depth, pool.depth))
-    goals = np.array([trial.goal for trial in trials])
     for axes, (vertical, low, height) in zip(panels, spans, strict=True):
         axes.fill_between([-pool.length / 2, pool.length / 2], low, low + height, color="#eaf3f8")
-        for trial in trials:
-            axes.plot(*trial.motion.position[:, [0, vertical]].T, color=BLUE, linewidth=1.2)
-        axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
-        axes.plot(*trials[0].motion.position[0, [0, vertical]], "s", color="0.2", ms=5, label="start")
+        for positions in motions:
+            axes.plot(*positions[:, [0, vertical]].T, color=BLUE, linewidth=1.2)
+        starts = np.array([positions[0] for positions in motions] if goals is None else motions[0][:1])
+        if goals is not None:
+            axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
+        axes.plot(*starts[:, [0, vertical]].T, "s", color="0.2", ms=5, label="start")
         axes.set(aspect="equal", ylim=(low - 0.05, low + height + 0.05))
         axes.spines[["top", "right"]].set_visible(False)
-    above, side = panels
-    for x, y, _, yaw in goals:
+    for x, y, _, yaw in () if goals is None else goals:
         tip = (x + ARROW * np.cos(yaw), y + ARROW * np.sin(yaw))
         above.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": ORANGE})
     above.set_ylabel("y, left [m]")
     side.set(ylabel="z, up [m]", xlabel="x, forward [m]")
-    legend_below(figure, above, 2)
+    legend_below(figure, above, 1 if goals is None else 2)
     return figure
 
 
@@ -477,8 +488,8 @@ def demo(
 
     Trials are recorded and controllers deployed through the robot's complete software: camera, localization,
     fusion,
-    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid` (tuned from the
-    identified vehicle) and `pid-paper` run the same setpoints in the same pool.
+    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid`, tuned from the
+    identified vehicle, runs the same setpoints in the same pool.
 
     A vehicle that must move to steer, such as remus100, is identified from manoeuvres of its autopilot, and follows
     paths in open water.
@@ -556,6 +567,13 @@ def _shown(tables: list[Table], report: Path, as_json: bool) -> Path:
     return report
 
 
+def _compile_training(vehicle: str, action: str | None) -> None:
+    """Train for one rollout, so that the kernels of the training are compiled."""
+    settings = TrainingSettings(vehicle=vehicle, action=action, randomize=RANGES, steps=1)
+    with tempfile.TemporaryDirectory() as folder:
+        train(T1.name, settings, out=Path(folder) / "policy", console=Console(stderr=True, quiet=True))
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Demonstration:
     """A demonstration: its steps, with their arguments and places."""
@@ -578,7 +596,7 @@ class _Demonstration:
     def run(self) -> list[Table]:
         """Identify, train, deploy and report; returns the tables of what was held."""
         identification, spec = self._identified(), self._spec()
-        title, held = f"Station keeping of {self.standing.name}", self.out / "t1"
+        title, held = self._title, self.out / "t1"
         found, known = _identification(identification, self.robot is not None), _known(identification)
         write_page(
             self.out / REPORT_FILE, title, found, lead=[known, "Training and trials are still to come."]
@@ -600,7 +618,8 @@ class _Demonstration:
         learnt = {"training.png": "Success [1] and return [1] over the control steps of the training"}
         drawn = [Table(title="Training", pictures=learnt), _setpoints(result, spec)]
         if trials:
-            save_figure(_paths(trials, self.site), self.out / "paths.png")
+            goals = np.array([trial.goal for trial in trials])
+            save_figure(_paths([t.motion.position for t in trials], self.site, goals), self.out / "paths.png")
             paths = {"paths.png": "Paths of the trials from above and from the side [m]"}
             drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
         files = dict(Policy.load(policy).description.files)
@@ -620,8 +639,8 @@ class _Demonstration:
         return tables
 
     def _spec(self) -> Spec:
-        """Station keeping by the policy and two PIDs; one setpoint with pictures, which takes longest, first."""
-        names = (POLICY, "pid", "pid-paper")
+        """Station keeping by the policy and a PID; one setpoint with pictures, which takes longest, first."""
+        names = (POLICY, "pid")
         rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
         if self.robot is None and self.firmware == "mcu" and not find_spec("cv2"):
             self.report(
@@ -630,9 +649,17 @@ class _Demonstration:
             )
         elif self.robot is None and self.firmware == "mcu":
             title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
-            with_pictures = replace(rows[POLICY], title=title, changes=changes, targets=self.scope.pictures)
+            with_pictures = replace(
+                rows[POLICY], title=title, changes=changes, targets=self.scope.pictures,
+                training={"name": POLICY, **(rows[POLICY].training or {})},
+            )  # fmt: skip
             rows = {WITH_PICTURES: with_pictures, **rows}
         return replace(T1, rows=rows, targets=self.scope.setpoints, bases=(POLICY,))
+
+    @property
+    def _title(self) -> str:
+        """Return the title of the report."""
+        return f"Station keeping of {self.standing.name}"
 
     @property
     def site(self) -> str:
@@ -677,13 +704,17 @@ class _Demonstration:
                 ),
             )  # fmt: skip
 
-            def recorded(*args: Any) -> Any:
-                folders = record(*args)
+            def recorded(folders: Mapping[str, Path], rough: str) -> Mapping[str, Sequence[Trial]]:
+                trials = {role: load_trials(paths) for role, paths in record(folders, rough).items()}
+                self._show_recorded([trial for of_role in trials.values() for trial in of_role])
+                if not (self.out / "t1" / "policies").exists():
+                    beside.enter_context(running(_compile_training, rough, FIRMWARES[self.firmware].action))
                 self.report("identifying the vehicle from these trials")
                 progress(1.0, "identifying the vehicle from them")
-                return folders
+                return trials
 
-            result = identify(self.out, self.name, seed=self.seed, record=recorded)
+            with ExitStack() as beside:
+                result = identify(self.out, self.name, seed=self.seed, record=recorded)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.report(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
@@ -691,6 +722,27 @@ class _Demonstration:
             f"{result.replay.aggregate('calibrated').value:.3f}"
         )
         return result
+
+    def _show_recorded(self, trials: Sequence[Trial]) -> None:
+        """Begin the report with the paths of the recorded trials."""
+        paths = [
+            np.column_stack([t.channels[c] for c in ("x", "y", "z")]) for t in trials if t.has("x", "y", "z")
+        ]
+        if not paths:
+            return
+        save_figure(
+            _paths([p[np.isfinite(p).all(axis=1)] for p in paths], self.site), self.out / "trials.png"
+        )
+        write_page(
+            self.out / REPORT_FILE,
+            self._title,
+            [],
+            lead=[
+                f"{len(trials)} trials are recorded. Identification, training and trials of it are still to come."
+            ],
+            first={"trials.png": "Paths of the recorded trials from above and from the side [m]"},
+        )
+        self.report(f"report so far: {self.out / REPORT_FILE}")
 
     def _show(self, job: RobotJob, result: Mapping[str, Any]) -> None:
         held = "held" if result["success"] else result["fault"] or "not held"
