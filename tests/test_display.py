@@ -6,9 +6,12 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
+from finssim import make
 from finssim.evaluation.evaluate import evaluation
+from finssim.identification import programmes, replay, simulate_programme
 from finssim.identification.fit import Estimate, Fit
-from finssim.sim import Simulator
+from finssim.sim import Randomization, Simulator, Water
+from finssim.sim.ranges_file import Ranges
 from finssim.trials.trial import Trial
 from finssim.vehicles import catalogue, load_vehicle
 
@@ -68,6 +71,10 @@ def test_every_object_is_one_line():
     simulator = Simulator("finsrov", worlds=3)
     assert repr(simulator) == "<Simulator: 3 worlds of finsrov (calibrated), 0.1 s in 4 substeps, cpu>"
     assert repr(trial()) == "<Trial surge_050: 2.0 s, 21 rows, u depth>"
+    (first, *_) = programmes("yaw", FINSROV)
+    assert repr(first) == f"<Programme {first.name}: 14.0 s at 50 Hz, yaw>"
+    assert repr(Randomization("cruise")).startswith("<Randomization cruise: draws ")
+    assert repr(make("t1", worlds=2)) == "<Environment of t1: 2 worlds of finsrov, cpu>"
     assert repr(fit()) == "<Fit hydrodynamics (simulation) of finsrov: 1 estimates, 0 changes, 0 findings>"
 
 
@@ -88,6 +95,39 @@ def test_notebooks_show_tables():
     ]
     assert "10.5 to 13.5" in cells(fit()._repr_html_())
     assert "<script>" not in FINSROV.replace({"title": "<script>"})._repr_html_()
+    water = FINSROV.water
+    assert cells(water._repr_html_()) == ["density", str(water.density), "gravity", str(water.gravity)]
+
+
+def test_notebooks_show_what_is_simulated_and_drawn():
+    """A simulator with its surroundings and state, a task with what it observes, ranges with their ends."""
+    simulator = Simulator("finsrov", worlds=3, water=Water(current=(0.1, 0.0, 0.0)))
+    simulator.place(position=(1.0, 2.0, -0.5))
+    simulator.step()
+    shown = cells(simulator._repr_html_())
+    assert {"0.1 0 0 m/s", "open water", "0.1 to 0.1 s"} <= set(shown)
+    assert shown[-1].startswith("at 1.00")
+    assert {"goal offset, body frame", "m"} <= set(cells(make("t1")._repr_html_()))
+    drawn = Randomization(
+        Ranges(name="mine", mass=(0.9, 1.1), current={"normal": (0.1, 0.02), "probability": 0.5})
+    )
+    rows = cells(drawn._repr_html_())
+    assert rows[3:9] == [
+        "mass",
+        "uniform 0.9, 1.1",
+        "1",
+        "current",
+        "normal 0.1, 0.02, in 50% of the episodes",
+        "m/s",
+    ]
+
+
+def test_a_replay_shows_its_scores():
+    """The tables that `finssim replay` prints."""
+    trials = simulate_programme(programmes("yaw", FINSROV, levels=[2.0]), FINSROV, seed=1)
+    result = replay(trials[:1], FINSROV)
+    assert repr(result) == "<Replay of finsrov (calibrated): 1 trials>"
+    assert {"yaw", "aggregate", trials[0].name} <= set(cells(result._repr_html_()))
 
 
 def test_an_evaluation_shows_its_table():

@@ -31,7 +31,13 @@ from finssim.identification.replay_metrics import (
     response_span,
     score,
 )
-from finssim.identification.replay_report import REPLAY_FILE, print_replay, replay_json, write_replay
+from finssim.identification.replay_report import (
+    REPLAY_FILE,
+    print_replay,
+    replay_html,
+    replay_json,
+    write_replay,
+)
 from finssim.identification.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.trials.findings import CalibrationError, Finding, finding
@@ -395,6 +401,12 @@ class Replay:
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` prints."""
         return replay_json(self)
+
+    def __repr__(self) -> str:
+        return f"<Replay of {self.vehicle.name} ({' '.join(self.models)}): {len(self.pairs)} trials>"
+
+    def _repr_html_(self) -> str:
+        return replay_html(self)
 
 
 def replay(

@@ -176,6 +176,9 @@ class Programme:
     ascent_time: float = 2.0
     """[s]"""
 
+    def __repr__(self) -> str:
+        return f"<Programme {self.name}: {self.duration:.1f} s at {self.rate:g} Hz, {' '.join(self.axes)}>"
+
     @property
     def t(self) -> Array:
         """Times of the rows from 0 [s], (n,)."""

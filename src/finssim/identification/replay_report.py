@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from finssim.core.files import atomic_directory
+from finssim.core.page import notebook_html
 from finssim.core.provenance import provenance
 from finssim.identification.replay_metrics import (
     RESAMPLES,
@@ -411,6 +412,13 @@ def replay_markdown(replay: Replay) -> str:
     parts += ["\n".join(f"- {sentence}" for sentence in _remarks(replay)), DEFINITION]
     parts.append(f"Vehicle {replay.vehicle.sha256}.")
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def replay_html(replay: Replay) -> str:
+    """Return the tables as a notebook displays them."""
+    (_, *first), *others = _tables(replay)
+    tables = [(_headline(replay), *first), *others]
+    return "".join(notebook_html(title, heads, rows) for title, heads, rows in tables)
 
 
 def _tables(replay: Replay) -> list[tuple[str, list[str], Rows]]:

@@ -7,6 +7,7 @@ from finssim.core.lazy import exports
 if TYPE_CHECKING:
     from finssim.sim.free_motion import linear_model
     from finssim.sim.plant_arrays import SimulatorError
+    from finssim.sim.randomize import Randomization
     from finssim.sim.recorder import StateRecorder, read_run
     from finssim.sim.sensors.batch import SensorBatch
     from finssim.sim.sensors.sampling import WHITE, SampledState, normal, parameters_of, sampling_kernel
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CurrentProfile",
     "Dock",
+    "Randomization",
     "RectangularPool",
     "SeaState",
     "StateRecorder",

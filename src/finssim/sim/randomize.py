@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from finssim.core.page import notebook_html
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.terms.composed import layout
 from finssim.physics.tether import Tether
@@ -540,6 +541,22 @@ class Randomization:
         self.ranges = ranges if isinstance(ranges, Ranges) else load_ranges(ranges)
         self.drawn = drawn_entries(self.ranges)
         """Entry of the table -> its distribution, of those that vary."""
+
+    def __repr__(self) -> str:
+        return f"<Randomization {self.ranges.name}: draws {len(self.drawn)} numbers>"
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for name, distribution in self.drawn.items():
+            ((kind, numbers),) = distribution.model_dump(include=set(KINDS), exclude_none=True).items()
+            share = (
+                f", in {distribution.probability:.0%} of the episodes"
+                if distribution.probability < 1.0
+                else ""
+            )
+            unit = ENTRIES[INDEX[name]].unit
+            rows.append((name, f"{kind} {', '.join(f'{x:.4g}' for x in numbers)}{share}", unit))
+        return notebook_html(f"Ranges {self.ranges.name}", ("entry", "drawn", "unit; 1: a factor"), rows)
 
     def at_full_width(self) -> "Randomization":
         """Return the same ranges without a schedule, at their full width, for an evaluation."""

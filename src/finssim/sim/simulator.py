@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control.allocation import Allocator
 from finssim.core.files import atomic_write
+from finssim.core.page import notebook_html
 from finssim.core.quiet import start_warp
 from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
@@ -250,6 +251,27 @@ class Simulator:
             f"<Simulator: {self.worlds} worlds of {names} ({self.hydrodynamics}), {self.control_step:g} s in "
             f"{self.substeps} substeps, {self.device}>"
         )
+
+    def _repr_html_(self) -> str:
+        water, pool, _ = self.surroundings
+        steps = self.state.steps.numpy()
+        rows = [
+            ("hydrodynamics", f"{self.hydrodynamics}, {self.integrator}"),
+            ("step", f"{self.control_step:g} s in {self.substeps} substeps, on {self.device}"),
+            ("current", " ".join(f"{speed:g}" for speed in water.current) + " m/s"),
+            (
+                "basin",
+                f"{pool.length:g} by {pool.width:g} m, {pool.depth:g} m deep" if pool else "open water",
+            ),
+            ("time", f"{steps.min() * self.control_step:g} to {steps.max() * self.control_step:g} s"),
+        ]
+        for vehicle, position, nu in zip(
+            self.vehicles, self.numpy("position")[0], self.numpy("velocity")[0], strict=True
+        ):
+            where = " ".join(f"{x:.3f}" for x in position)
+            speed = float(np.linalg.norm(nu[:3]))
+            rows.append((f"{vehicle.name} of world 0", f"at {where} m, {speed:.3f} m/s"))
+        return notebook_html(f"{self.worlds} worlds", ("", ""), rows)
 
     def step(self) -> None:
         """Advance every world by one control step under `command`."""

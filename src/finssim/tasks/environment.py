@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -321,6 +322,13 @@ class Environment:
         self.task.add_spawn(pipeline, self._batch, mask)
         self._add_measure(pipeline, mask)
         self.task.add_observe(pipeline, self._batch, mask)
+
+    def __repr__(self) -> str:
+        names = ", ".join(vehicle.name for vehicle in self.nominal)
+        return f"<Environment of {self.task.name}: {self.worlds} worlds of {names}, {self.simulator.device}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.task._repr_html_()}"
 
     def reset(self, mask: ArrayLike | None = None, seed: int | None = None) -> Any:
         """Start new episodes.

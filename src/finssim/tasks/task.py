@@ -16,6 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from finssim.control.policy import ObservationEntry, ObservationSchema
+from finssim.core.page import notebook_html
 from finssim.sim import Dock, RectangularPool
 from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
@@ -87,6 +88,11 @@ class Task:
     """Length of an episode in training [s]."""
     training_noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     """Errors of what the controller observes in training."""
+
+    def _repr_html_(self) -> str:
+        rows = [(part.name, str(part.size), part.unit, f"{part.scale:g}") for part in self.observation]
+        title = f"Task {self.name}: {self.action}, every {self.control_step:g} s for {self.time_limit:g} s"
+        return notebook_html(title, ("observation", "numbers", "unit", "scale"), rows)
 
     def terms(self) -> Terms:
         """Return the terms of the task."""

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 from pydantic_core import PydanticCustomError
 
+from finssim.core.page import notebook_html
+
 UNIT_TOLERANCE = 1e-3
 SYMMETRY_TOLERANCE = 1e-3
 """Asymmetry accepted as rounding of printed digits, relative to the largest entry."""
@@ -51,6 +53,10 @@ class Part(BaseModel):
                         f"unknown key '{key}'{did_you_mean(str(key), allowed)} known keys: {', '.join(allowed)}"
                     )
         return data
+
+    def _repr_html_(self) -> str:
+        rows = [(name, f"{getattr(self, name)}") for name in type(self).model_fields]
+        return notebook_html(type(self).__name__, ("", ""), rows)
 
     def values(self) -> dict[str, Any]:
         """Plain nested dict of what was given (lists for arrays), ready to be read again."""
