@@ -153,6 +153,15 @@ def test_pages_build_without_a_warning(tmp_path):
     assert run.returncode == 0, run.stderr
 
 
+def test_a_page_about_a_package_begins_with_what_to_call_first():
+    """Then comes a few lines that do it, which run with the other Python of the pages."""
+    pages = {page: page.read_text(encoding="utf-8") for page in PAGES}
+    of_packages = {page: text.partition("\n::: ")[0] for page, text in pages.items() if "\n::: " in text}
+    assert len(of_packages) > 15
+    assert [page.name for page, head in of_packages.items() if "**Call first:** " not in head] == []
+    assert [page.name for page, head in of_packages.items() if "```python" not in head] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_files_that_a_page_names_exist(page):
     """Tests and sources that a page names by their path are there."""
