@@ -13,7 +13,7 @@ from finssim.learning.learners import LearningError, learner_named
 from finssim.sim import site
 from finssim.tasks import EnvironmentSetupError, StationKeeping, task_named
 from finssim.vehicles import VehicleError, catalogue, load_vehicle
-from reference.commands import EVERY
+from reference.commands import EVERY, finssim
 from reference.installed import install
 
 PACKAGE = '''
@@ -160,19 +160,19 @@ def test_commands_of_packages(outside):
 
 
 @pytest.mark.slow
-def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken):
-    """By family and package; each broken member with a sentence."""
-    both = os.pathsep.join(map(str, (outside, broken)))
-    report = json.loads(command("doctor", "--json", path=both).stdout)
+def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken, capsys):
+    """By family and package; each broken member with a sentence, and a process that has it begins all the same."""
+    assert finssim("doctor", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
     assert report["registered"]["tasks"]["outside 1.0"] == ["hover"]
     assert "t1" in report["registered"]["tasks"]["finssim"]
     assert sum("package broken 1.0" in sentence for sentence in report["failures"]) == len(FAMILIES)
     assert not any("outside" in sentence for sentence in report["failures"])
-    text = command("doctor", path=both)
-    assert text.returncode == 0 and "package broken 1.0 cannot be used" in " ".join(text.stdout.split())
-    lost = command("lost", path=both)
+    assert finssim("doctor") == 0 and finssim("vehicles") == 0
+    assert "package broken 1.0 cannot be used" in " ".join(capsys.readouterr().out.split())
+    lost = command("lost", path=broken)
     assert lost.returncode == 2 and "package broken 1.0" in lost.stderr and "Traceback" not in lost.stderr
-    assert command("vehicles", path=both).returncode == 0 and "lost" in command("--help", path=both).stdout
+    assert "lost" in command("--help", path=broken).stdout
 
 
 def test_a_described_world_is_refused_where_no_extension_reads_it(monkeypatch):
