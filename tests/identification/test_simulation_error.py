@@ -48,8 +48,9 @@ def without(some, *columns):
     return [replace(t, channels={n: c for n, c in t.channels.items() if n not in columns}) for t in some]
 
 
-def trials_of(vehicle, axes, *, count=None, **options):
-    return simulate_programme(programmes(axes, vehicle)[:count], vehicle, **{"seed": 3, **options})
+def trials_of(vehicle, axes, *, count=3, **options):
+    """Return trials of every second step of a programme: three levels in turns ahead and astern."""
+    return simulate_programme(programmes(axes, vehicle)[::2][:count], vehicle, **{"seed": 3, **options})
 
 
 def check(fit, vehicle, axes, within):
@@ -73,7 +74,7 @@ CASES = {
         0.10,
     ),
     "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
-    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("surge", "heave", "pitch"), {}, 0.05),
+    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("heave", "pitch"), {}, 0.05),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
         ("roll",),
@@ -232,12 +233,12 @@ def test_one_trial_says_what_its_intervals_rest_on():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """Over 8 noise draws of six trials, 95 % intervals of mass and damping hold the truth in at least 6."""
+    """Over 8 noise draws of three trials, 95 % intervals of mass and damping hold the truth in at least 6."""
     names = ("surge.m_eff", "surge.d1", "surge.d2")
     hits = np.zeros(3)
     for seed in range(8):
         vehicle, some = known_trials.trials("bluerov2_heavy", "surge", seed=seed)
-        found, expected = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
+        found, expected = fit_by_simulation(some[::2], vehicle).estimates, known_trials.truth(vehicle)
         hits += [found[n].ci95[0] <= expected[n] <= found[n].ci95[1] for n in names]
     assert (hits >= 6).all()  # 7.6 expected; 1 in 170 has fewer
 
@@ -247,7 +248,7 @@ def test_a_velocity_later_than_the_gyro_costs_no_mass():
     """u is logged 120 ms late and the gyro is not: the lag of the one stream is found, the mass is within 5 %."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge")
     late = []
-    for t in some:
+    for t in some[::2]:
         shifted = {n: np.interp(t.t - 0.12, t.t, c) if n in "uvw" else c for n, c in t.channels.items()}
         late.append(replace(t, channels=shifted))
     fit = fit_by_simulation(without(late, "x", "y", "z", "depth", "ax", "ay", "az"), vehicle)
@@ -279,7 +280,7 @@ def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
 def test_roll_without_attitude_rests_on_its_swing():
     """Without any angle the gyro alone shows how fast roll swings back: stiffness and mass are in their intervals."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "roll")
-    found = fit_by_simulation(without(some, "qx", "qy", "qz", "qw"), vehicle).estimates
+    found = fit_by_simulation(without(some[::2], "qx", "qy", "qz", "qw"), vehicle).estimates
     for name in ("roll.m_eff", "roll.k"):
         low, high = found[name].ci95
         assert low <= known_trials.truth(vehicle)[name] <= high and high - low < 0.3 * found[name].estimate
@@ -303,7 +304,7 @@ def test_axes_that_hardly_move_do_not_shake_the_others():
     vehicle, some = known_trials.trials("finsrov", "roll", "pitch")
     centre = {"body.center_of_gravity": vehicle.body.center_of_gravity.tolist()}
     file = wrong(vehicle).replace(centre, Provenance("measured", "weighed"))
-    fit, expected = fit_by_simulation(some, file), known_trials.truth(vehicle)
+    fit, expected = fit_by_simulation(some[::2], file), known_trials.truth(vehicle)
     for name in ("roll.m_eff", "roll.k", "pitch.m_eff", "pitch.d1"):
         assert fit.estimates[name].estimate == pytest.approx(expected[name], rel=0.05), name
         low, high = fit.estimates[name].ci95
@@ -327,7 +328,8 @@ def test_dive_and_coast_gives_the_buoyancy():
 def test_a_file_that_is_too_heavy_is_reported():
     """An effective mass below the file's rigid mass: no negative added mass is written."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge", inputs=("wrench",))
-    fit = fit_by_simulation(some, vehicle.replace({"body.mass": 25.0, "body.displaced_volume": 0.0249}))
+    heavy = vehicle.replace({"body.mass": 25.0, "body.displaced_volume": 0.0249})
+    fit = fit_by_simulation(some[::2], heavy)
     assert not fit.estimates["surge.added_mass"].identifiable
     assert not any("added_mass.0" in path for path in fit.changes)
     (said,) = (one for one in fit.findings if one.code == "inertia_too_small")
@@ -384,7 +386,7 @@ def test_an_interrupt_returns_the_best_until_then():
 def test_equal_seeds_give_equal_fits():
     """Nothing depends on threads, time or chance."""
     vehicle = load_vehicle("finsrov")
-    trials = trials_of(vehicle, "yaw", count=2)
+    trials = trials_of(vehicle, "yaw", count=1)
     a, b = (fit_by_simulation(trials, wrong(vehicle)) for _ in range(2))
     assert a.estimates == b.estimates
 
