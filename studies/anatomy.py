@@ -11,11 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 
 from finssim.cli.command_line import run_script
+from finssim.core.palette import COLORS
 from finssim.core.progress import Progress
 from finssim.core.provenance import provenance
 from finssim.evaluation.campaign import check_choices, run_jobs, write_json
 from finssim.evaluation.evaluate import ControllerTrials, play
-from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.plants import PlantChanges, load_plant
 from finssim.evaluation.statistics import with_interval
 from finssim.evaluation.tables import Columns, Table, cells

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.files import atomic_write
+from finssim.core.palette import COLORS
 from finssim.evaluation.metrics import (
     EVALUATION_WINDOW,
     POSITION_TOLERANCE,
@@ -27,8 +28,6 @@ QUARTILES = (0.25, 0.5, 0.75)
 
 LONGEST_OF_THREE = 28
 """Letters of a label; where one is longer, the legend has two columns."""
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette, which the colour-blind can distinguish too."""
 DPI = 130
 
 

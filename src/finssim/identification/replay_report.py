@@ -16,6 +16,7 @@ from rich.text import Text
 
 from finssim.core.files import atomic_directory
 from finssim.core.page import notebook_html
+from finssim.core.palette import BLUE, GREEN, ORANGE, PINK, SKY, VERMILION
 from finssim.core.provenance import provenance
 from finssim.identification.replay_metrics import (
     RESAMPLES,
@@ -39,9 +40,8 @@ if TYPE_CHECKING:
     from finssim.identification.prediction import Replay
 
 MODEL_LABELS = {"calibrated": "Calibrated Fossen", "mesh": "Physics-mesh", "simplified": "Simplified Fossen"}
-COLORS = {"calibrated": "#0072B2", "mesh": "#009E73", "simplified": "#D55E00"}
-OTHERS = ("#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's palette, which the colour-blind can distinguish too."""
+COLORS = {"calibrated": BLUE, "mesh": GREEN, "simplified": VERMILION}
+OTHERS = (PINK, SKY, ORANGE)
 BLACK = "#1a1a1a"
 STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
 """Line styles, for a print without colours."""

@@ -22,6 +22,7 @@ from rich.text import Text
 
 from finssim.core.files import atomic_directory, atomic_write, refuse_unwritable
 from finssim.core.page import RECORD_FILE, Page, Pictures
+from finssim.core.palette import BLUE, VERMILION
 from finssim.core.provenance import provenance
 from finssim.identification.fit import Correlation, Curve, Estimate, Fit
 from finssim.identification.vehicle_file import (
@@ -81,7 +82,7 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
     return shlex.join(tokens)
 
 
-BLUE, ORANGE, GRAY = "#0072B2", "#D55E00", "0.6"
+GRAY = "0.6"
 PER_FIGURE = 6
 MAX_CURVES = 48
 """Greatest number of drawn curves; the report states how many are not drawn."""
@@ -163,8 +164,10 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
         below.plot(x, measured - fitted, color=BLUE, linewidth=0.8)
     if curve.band is not None:
         band = curve.band[order]
-        above.fill_between(x, fitted - band, fitted + band, color=ORANGE, alpha=0.25, linewidth=0.0)
-    above.plot(x, fitted, color=ORANGE, linewidth=1.2, label="fitted" if curve.band is None else "fit, 95 %")
+        above.fill_between(x, fitted - band, fitted + band, color=VERMILION, alpha=0.25, linewidth=0.0)
+    above.plot(
+        x, fitted, color=VERMILION, linewidth=1.2, label="fitted" if curve.band is None else "fit, 95 %"
+    )
     below.axhline(0.0, color=GRAY, linewidth=0.6)
     above.set_title(curve.title, fontsize=9)
     above.set_ylabel(curve.y_label, fontsize=8)
@@ -213,7 +216,7 @@ def draw_arrows(
     arrows = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0022}
     axes.quiver(*at[good].T, *vectors[good].T, color=BLUE, label=label, **arrows)
     if not good.all():
-        axes.plot(*at[~good].T, "x", color=ORANGE, markersize=6, label="left out")
+        axes.plot(*at[~good].T, "x", color=VERMILION, markersize=6, label="left out")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, frameon=False)
     axes.grid(True, color="0.93", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)

@@ -24,11 +24,12 @@ from rich.console import Console
 
 from finssim.control.axis_model import axis_model
 from finssim.control.policy import Policy
+from finssim.core.palette import BLUE, VERMILION
 from finssim.core.quiet import start_warp
 from finssim.evaluation.campaign import Progress, running
 from finssim.evaluation.evaluate import T1_COLUMNS
 from finssim.evaluation.excitation import record_programmes
-from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import (
     FIRMWARES,
@@ -272,7 +273,6 @@ def commands(folder: Path, name: str) -> list[str]:
     ]
 
 
-BLUE, ORANGE = COLORS[:2]
 ARROW = 0.18
 """Length of an arrow that shows a heading [m]."""
 
@@ -311,13 +311,13 @@ def _paths(
             axes.plot(*positions[:, [0, vertical]].T, color=BLUE, linewidth=1.2)
         starts = np.array([positions[0] for positions in motions] if goals is None else motions[0][:1])
         if goals is not None:
-            axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=ORANGE, ms=9, label="goal")
+            axes.plot(*goals[:, [0, vertical]].T, "o", mfc="none", mec=VERMILION, ms=9, label="goal")
         axes.plot(*starts[:, [0, vertical]].T, "s", color="0.2", ms=5, label="start")
         axes.set(aspect="equal", ylim=(low - 0.05, low + height + 0.05))
         axes.spines[["top", "right"]].set_visible(False)
     for x, y, _, yaw in () if goals is None else goals:
         tip = (x + ARROW * np.cos(yaw), y + ARROW * np.sin(yaw))
-        above.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": ORANGE})
+        above.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": VERMILION})
     above.set_ylabel("y, left [m]")
     side.set(ylabel="z, up [m]", xlabel="x, forward [m]")
     legend_below(figure, above, 1 if goals is None else 2)

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from finssim.core.palette import COLORS
 from finssim.evaluation.campaign import keep_result, load_result
-from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.tables import Table, write_page
 from finssim.identification.fit import Fit
 from finssim.identification.hydrodynamics import fit_hydrodynamics

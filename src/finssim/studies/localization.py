@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from finssim.core.files import atomic_directory, refuse_unwritable
 from finssim.core.optics import Camera, Interface, Lens, Status, project
+from finssim.core.palette import COLORS
 from finssim.core.provenance import provenance
 from finssim.core.rotations import matrix_to_quat, quat_from_euler, quat_to_matrix
 from finssim.core.text_table import write_csv
 from finssim.core.yaml_file import yaml_text
 from finssim.evaluation.campaign import Progress, check_choices, write_json
-from finssim.evaluation.figures import COLORS, clean, legend_below, new_figure, save_figure
+from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.metrics import PAPER
 from finssim.evaluation.statistics import bootstrap
 from finssim.evaluation.tables import Columns, Table, cells, figure_text

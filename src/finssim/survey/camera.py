@@ -14,14 +14,13 @@ from rich.console import Console
 
 from finssim.core.least_squares import block_of, rms
 from finssim.core.optics import COEFFICIENTS, Lens
+from finssim.core.palette import BLUE, VERMILION
 from finssim.core.provenance import provenance
 from finssim.core.rotations import quat_from_rotvec, quat_to_matrix, skew
 from finssim.identification.fit import Correlation, Estimate
 from finssim.identification.report import (
-    BLUE,
     GRAY,
     HEADS,
-    ORANGE,
     ExtraTable,
     Report,
     command_line,
@@ -801,7 +800,7 @@ def _coverage(fit: CameraFit) -> Figure:
         alpha=0.75,
     )
     for view in fit.views:
-        mark = {"color": ORANGE, "marker": "x"} if view.left_out else {"color": "black", "marker": "."}
+        mark = {"color": VERMILION, "marker": "x"} if view.left_out else {"color": "black", "marker": "."}
         axes.plot(*view.pixels.T, linestyle="", markersize=2.5, **mark)
     picture_axes(axes, fit.lens)
     axes.set_title("corners (crosses: left out) and 95 % uncertainty of a pixel [px]", fontsize=9)
