@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from finssim.extensions.viewer.app import LONGEST_TURN, Playback
+from finssim.extensions.viewer.app import LONGEST_TURN, Playback, event_marks
 
 
 def test_a_recording_stops_at_its_end_and_starts_again_from_there():
@@ -32,3 +32,9 @@ def test_a_live_source_knows_no_other_time():
     clock = Playback(math.inf)
     clock.seek(5.0)
     assert clock.live and clock.advance(60.0) == LONGEST_TURN
+
+
+def test_events_are_marked_on_the_slider_and_named_where_there_is_room():
+    """Every event has a mark within the slider; a word that would lie on the one before is left out."""
+    events = [(-0.1, "armed: by pid"), (1.0, "vision: lost"), (6.0, "vision: lost"), (10.2, "fault: leak")]
+    assert event_marks(events, 10.0) == ((0.0, "armed"), 1.0, (6.0, "lost"), (10.0, "fault"))

@@ -1,13 +1,15 @@
 """Frames of a record are what was recorded, at any time and in any order."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from finssim.evaluation.clocks import ClockError, clock_offset
 from finssim.extensions.viewer.series import PoseSeries
-from finssim.extensions.viewer.sources import RecordSource
+from finssim.extensions.viewer.sources import RecordSource, _vision, known_covariance
 from finssim.pool.virtual_pool import TruthError, read_truth
-from finssim.robot.record_messages import RecordError
+from finssim.robot.record_messages import UNKNOWN, RecordError
 from finssim.robot.record_reader import open_record
 from finssim.vehicles import VehicleError
 
@@ -54,6 +56,23 @@ def test_the_truth_lies_under_the_estimate(source, trial):
         "heading error [deg]",
         "to the goal",
     ) in labels
+
+
+def test_the_covariance_is_that_of_the_estimator(source):
+    """Its greatest standard deviation is the one in the panel; a position with an unknown axis has none."""
+    frame = source.frame(5.0)
+    std = 100.0 * np.sqrt(np.diag(frame.covariance)).max()
+    assert frame.status["position std"] == f"{std:.1f} cm" and std > 0.0
+    assert known_covariance(np.diag([0.1, 0.1, UNKNOWN])) is None
+
+
+def test_events_of_the_whole_record_are_known_at_its_beginning(source):
+    """In order, with their times in the record; loss of vision is one, coasting between two pictures is none."""
+    times, texts = zip(*source.stage.events, strict=True)
+    assert list(times) == sorted(times) and times[-1] <= source.duration + 0.1
+    assert any(text.startswith("armed:") for text in texts) and texts[-1].startswith("disarmed:")
+    modes = [SimpleNamespace(mode=mode) for mode in ("fresh", "coast", "fresh", "lost", "lost", "fresh")]
+    assert _vision(range(6), modes) == [(3, "vision: lost"), (5, "vision: fresh")]
 
 
 def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):

@@ -13,8 +13,8 @@ from finssim.extensions.viewer.shapes import (
     force_arrows,
     hull_of,
     line_of,
+    propeller_poses,
     tag_plates,
-    wall_mesh,
 )
 from finssim.robot.messages import TagCorners
 from finssim.vehicles import load_vehicle
@@ -43,21 +43,28 @@ def test_arrows_push_where_thrusters_push():
     )
 
 
-def test_a_vehicle_without_a_hull_is_a_box_of_its_size():
-    """The box is closed and faces outwards: its volume is that of the size."""
-    bare = FINSROV.model_copy(update={"hull": None})
-    assert volume(hull_of(bare)) == pytest.approx(float(np.prod(FINSROV.body.size)))
-    assert len(hull_of(FINSROV).faces) > 12
+def test_a_vehicle_without_a_hull_is_a_body_of_its_size_and_volume():
+    """It is closed and faces outwards; of a volume that exceeds the size there is the box."""
+    bare = load_vehicle("remus100")
+    assert bare.hull is None
+    hull = hull_of(bare)
+    assert volume(hull) == pytest.approx(bare.body.displaced_volume, rel=1e-6)
+    assert np.ptp(hull.vertices, axis=0) == pytest.approx(np.array(bare.body.size))
+    size = float(np.prod(bare.body.size))
+    heavy = bare.body.model_copy(update={"displaced_volume": 1.5 * size})
+    assert volume(hull_of(bare.model_copy(update={"body": heavy}))) == pytest.approx(size)
 
 
-@pytest.mark.parametrize("top", [0.0, -0.1])
-def test_walls_face_the_water(top):
-    """Floor and four walls, seen from inside, whatever the height of the lid that is left out."""
-    walls = wall_mesh(np.array([-2.0, -1.0, -1.0]), np.array([2.0, 1.0, top]))
-    a, b, c = (walls.vertices[walls.faces[:, i]] for i in range(3))
-    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3.0
-    assert len(walls.faces) == 10
-    assert (np.einsum("ij,ij->i", normal, np.array([0.0, 0.0, -0.5]) - middle) > 0.0).all()
+def test_propellers_turn_about_the_axes_of_their_thrusters():
+    """z lies along the thrust's axis at every angle; a quarter turn carries a blade to where the next axis was."""
+    n = len(FINSROV.thrusters)
+    begin, places, radii = propeller_poses(FINSROV, np.zeros(n))
+    turned, *_ = propeller_poses(FINSROV, np.full(n, 0.5 * np.pi))
+    for k, thruster in enumerate(FINSROV.thrusters.values()):
+        before, after = (quat_to_matrix(np.roll(q[k], -1)) for q in (begin, turned))
+        assert before[:, 2] == pytest.approx(thruster.axis) and after[:, 2] == pytest.approx(thruster.axis)
+        assert after[:, 0] == pytest.approx(before[:, 1])
+        assert places[k] == pytest.approx(thruster.position) and radii[k] > 0.0
 
 
 def test_plates_lie_on_the_mounts():

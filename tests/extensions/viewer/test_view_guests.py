@@ -68,3 +68,12 @@ def test_the_page_is_served_under_names_of_this_machine_alone(port):
         except urllib.error.HTTPError as refusal:
             found = refusal.code
         assert found == status
+
+
+@pytest.mark.slow
+def test_the_page_has_its_own_title_and_icon(port):
+    """viser's do not remain in it."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=30.0) as answer:
+        head = answer.read(4000).decode()
+    assert "<title>FinsSim view</title>" in head and "fill='%230072B2'" in head
+    assert "Viser</title>" not in head and "f9e20b" not in head

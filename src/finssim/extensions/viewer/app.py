@@ -13,13 +13,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import viser
 import websockets.asyncio.server
 
+from finssim.core.palette import BLUE, GREEN, ORANGE, PINK, SKY, VERMILION, rgb
+from finssim.extensions.viewer import water
 from finssim.extensions.viewer.frame import (
     BodyPose,
     LatestPicture,
@@ -30,17 +32,22 @@ from finssim.extensions.viewer.frame import (
     ViewStage,
 )
 from finssim.extensions.viewer.shapes import (
+    Mesh,
     box_edges,
+    duct_mesh,
     fin_attitude,
     fin_plates,
     force_arrows,
     hull_of,
     line_of,
+    propeller_mesh,
+    propeller_poses,
     tag_plates,
-    wall_mesh,
     wxyz,
 )
-from finssim.localization.overhead_camera import Pool
+
+if TYPE_CHECKING:
+    from finssim.localization.overhead_camera import Pool
 
 __all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_own", "draw_picture", "legend_of", "plots_of"]
 
@@ -49,18 +56,24 @@ __all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_own", "draw_pictur
 Colour = tuple[int, int, int]
 
 COLOURS: dict[str, Colour] = {
-    "truth": (240, 140, 20),
-    "estimate": (40, 110, 235),
-    "goal": (20, 160, 80),
-    "force": (215, 30, 60),
-    "trail": (200, 110, 10),
-    "wall": (214, 228, 236),
-    "water": (70, 150, 205),
+    "truth": rgb(ORANGE),
+    "estimate": rgb(BLUE),
+    "goal": rgb(GREEN),
+    "force": rgb(VERMILION),
+    "trail": rgb(VERMILION),
     "box": (90, 110, 125),
+    "part": (52, 58, 66),
+    "propeller": (196, 204, 212),
 }
 """Object -> its colour."""
 PICTURE_HEIGHT = 0.16
 """Size of the camera's frustum [m]."""
+SPIN = 4.0 * math.pi
+"""Drawn speed of a propeller at the largest thrust [rad/s]: its own would be a blur."""
+LANDSCAPE = 0.8
+"""Least width over height of a picture that shows the water whole from the first viewpoint."""
+REGION = 2.796
+"""Semi-axes of the ellipsoid that contains a normally distributed position with 95 %, in standard deviations."""
 
 
 class StageScene:
@@ -74,9 +87,12 @@ class StageScene:
         """
         self._scene, self.stage = server.scene, stage
         self._scene.set_up_direction("+z")
-        self._scene.configure_default_lights(True, cast_shadow=False)
+        self._floors, self._images = list[Any](), iter(list[Any]())
+        self._light()
         self._water()
         self._fins: list[tuple[int, Any]] = []
+        self._propellers = list[Any]()
+        self._angles, self._time = np.zeros(len(stage.vehicle.thrusters)), math.nan
         self._bodies = {name: self._vehicle(name) for name in ("truth", "estimate")}
         size = float(np.max(stage.vehicle.body.size))
         self._goal = self._scene.add_frame(
@@ -90,25 +106,34 @@ class StageScene:
         self._arrows = self._scene.add_arrows(
             "/forces",
             np.zeros((1, 2, 3)),
-            COLOURS["force"],
+            _unlit(COLOURS["force"]),
             shaft_radius=0.02 * size,
             head_radius=0.05 * size,
             head_length=0.1 * size,
             visible=False,
         )
-        self._trail = self._line("/trail", np.zeros((1, 2, 3)), "trail", 2.5)
+        self._trail = self._line("/trail", np.zeros((1, 2, 3)), "trail", 3.0)
         self._trail.visible = False
+        self._region = self._scene.add_icosphere(
+            "/region", 1.0, COLOURS["estimate"], opacity=0.3, cast_shadow=False, visible=False
+        )
+        self._notice = self._scene.add_label("/notice", "", visible=False)
         path = line_of(stage.path)
         if len(path):
             self._line("/path", path, "goal", 2.0)
         if stage.site is not None:
             self._camera(stage.site)
         for thing in stage.bodies:
+            if thing.name == "seabed":
+                self._ground(Mesh(thing.vertices, thing.faces), thing.colour, "sand")
+                continue
             self._scene.add_mesh_simple(
                 f"/world/{thing.name}", thing.vertices, thing.faces, color=thing.colour, flat_shading=True,
-                side="double", cast_shadow=False,
+                side="double",
             )  # fmt: skip
-        self._look(server)
+        server.initial_camera.up = (0.0, 0.0, 1.0)
+        if not server.get_clients():  # pages that are open are moved one by one
+            self.look(server.initial_camera)
 
     def draw(self, frame: ViewFrame) -> None:
         """Move everything to where it is in a frame."""
@@ -118,10 +143,52 @@ class StageScene:
         fins = list(self.stage.vehicle.actuators.values())
         for k, plate in self._fins if len(frame.values) else ():
             plate.wxyz = wxyz(fin_attitude(fins[k], float(frame.values[k])))
+        self._turn(frame)
+        self._shimmer(frame.time)
+        self._doubt(frame)
+        self._notice.visible = bool(frame.notice)
         pose = frame.truth or frame.estimate
+        if frame.notice and pose is not None:
+            self._notice.text, self._notice.position = frame.notice, tuple(pose.position)
         arrows = force_arrows(self.stage.vehicle, frame.force, pose) if pose else np.zeros((0, 2, 3))
         _set_points(self._arrows, arrows)
-        _set_points(self._trail, line_of(frame.trail))
+        trail = line_of(frame.trail)
+        if len(trail):  # it fades into the water with its age
+            age = np.linspace(0.85, 0.0, len(trail) + 1)[:, None]
+            colour = (1.0 - age) * COLOURS["trail"] + age * np.array(self._fog)
+            self._trail.colors = _unlit(line_of(colour))
+        _set_points(self._trail, trail)
+
+    def _turn(self, frame: ViewFrame) -> None:
+        """Turn the propellers by the time since the frame before: their speed grows with the root of the force."""
+        elapsed = frame.time - self._time
+        self._time = frame.time
+        if len(frame.force) != len(self._angles) or not abs(elapsed) < 1.0 or not self._propellers:
+            return
+        part = np.nan_to_num(np.asarray(frame.force, float) / np.max(np.abs(self.stage.vehicle.force_limits)))
+        self._angles += SPIN * elapsed * np.sign(part) * np.sqrt(np.abs(part))
+        for node in self._propellers:
+            node.batched_wxyzs = propeller_poses(self.stage.vehicle, self._angles)[0].astype(np.float32)
+
+    def _shimmer(self, time: float) -> None:
+        """Show the caustics of a time [s], as far as their pictures have been made."""
+        image = next(self._images, None)
+        if image is not None:
+            self._add_floor(image)
+        now = int(time * water.FRAMES / water.PERIOD) % max(len(self._floors), 1)
+        for k, floor in enumerate(self._floors):
+            if floor.visible != (k == now):
+                floor.visible = k == now
+
+    def _doubt(self, frame: ViewFrame) -> None:
+        """Draw the ellipsoid in which the position lies with 95 % probability, where the source has a covariance."""
+        self._region.visible = frame.estimate is not None and frame.covariance is not None
+        if frame.estimate is not None and frame.covariance is not None:
+            variance, axes = np.linalg.eigh(frame.covariance)
+            axes[:, 0] *= np.sign(np.linalg.det(axes))
+            self._region.position = tuple(frame.estimate.position)
+            self._region.wxyz = viser.transforms.SO3.from_matrix(axes).wxyz
+            self._region.scale = tuple((REGION * np.sqrt(np.maximum(variance, 1e-8))).tolist())
 
     def _place(self, name: str, pose: BodyPose | None, *, ghost: bool) -> None:
         """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
@@ -144,6 +211,8 @@ class StageScene:
         hull = self._scene.add_mesh_simple(
             f"/{name}/hull", mesh.vertices, mesh.faces, color=COLOURS[name], flat_shading=True, side="double"
         )
+        if name == "truth":
+            self._thrusters(name)
         plates = tag_plates(vehicle)
         for part, plate, colour in zip(
             ("plates", "tags"), plates or (), ((250,) * 3, (25,) * 3), strict=False
@@ -162,31 +231,62 @@ class StageScene:
         self._line(f"/{name}/nose", nose, name, 3.0)
         return body, hull
 
+    def _thrusters(self, name: str) -> None:
+        """Ducts and propellers of a body."""
+        vehicle, ducts, blades = self.stage.vehicle, duct_mesh(self.stage.vehicle), propeller_mesh()
+        if ducts is not None:
+            self._scene.add_mesh_simple(
+                f"/{name}/ducts", ducts.vertices, ducts.faces, color=COLOURS["part"], side="double"
+            )
+        if vehicle.thrusters:
+            attitudes, positions, radii = propeller_poses(vehicle, self._angles)
+            self._propellers.append(
+                self._scene.add_batched_meshes_simple(
+                    f"/{name}/propellers", blades.vertices, blades.faces, attitudes, positions, batched_scales=radii,
+                    batched_colors=COLOURS["propeller"], flat_shading=True, side="double",
+                )
+            )  # fmt: skip
+
+    def _light(self) -> None:
+        """Daylight from above through water that is thick far away, and blue where it is deep."""
+        lower, upper = self.stage.lower, self.stage.upper
+        depth, reach = float(-lower[2]), float(np.linalg.norm(upper - lower))
+        self._fog = water.water_colour(depth)
+        self._scene.set_background_image(water.backdrop(depth))
+        self._scene.configure_fog(0.7 * reach, 3.0 * reach, color=self._fog)
+        self._scene.configure_default_lights(False)
+        self._scene.configure_environment_map(None)
+        self._scene.add_light_hemisphere(
+            "/light/sky", sky_color=(232, 246, 255), ground_color=(150, 190, 205), intensity=1.7
+        )
+        self._scene.add_light_directional(
+            "/light/sun",
+            color=(255, 250, 235),
+            intensity=2.0,
+            cast_shadow=True,
+            position=(-0.3, -0.2, 1.0),
+        )
+
     def _water(self) -> None:
-        """Walls and floor, or the edges of a box, and the surface."""
+        """The pool's walls and floor, or the edges of a box, and the surface."""
         lower, upper = self.stage.lower, self.stage.upper
         if self.stage.walls:
-            walls = wall_mesh(lower, upper)
-            self._scene.add_mesh_simple(
-                "/pool/walls", walls.vertices, walls.faces, color=COLOURS["wall"], flat_shading=True
-            )
-            width, length = float(upper[0] - lower[0]), float(upper[1] - lower[1])
-            middle = (*(0.5 * (lower + upper)[:2]).tolist(), float(lower[2]) + 0.003)
-            self._scene.add_grid(
-                "/pool/floor", width, length, cell_size=0.25, section_size=1.0, position=middle
-            )
+            self._ground(water.floor(lower, upper), water.TILES, "tiles")
+            self._scene.add_mesh_trimesh("/pool/walls", water.walls(lower, upper), cast_shadow=False)
         self._line("/pool/edges", box_edges(lower, upper), "box", 1.5)
-        x0, y0, x1, y1 = *lower[:2], *upper[:2]
-        surface = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-        self._scene.add_mesh_simple(
-            "/pool/surface",
-            surface,
-            np.array([[0, 1, 2], [0, 2, 3]]),
-            color=COLOURS["water"],
-            opacity=0.16,
-            side="double",
-            cast_shadow=False,
-        )
+        top = np.array([*upper[:2], 0.0])
+        self._scene.add_mesh_trimesh("/pool/surface", water.surface(lower, top), cast_shadow=False)
+
+    def _ground(self, mesh: Mesh, colour: Colour, pattern: Literal["tiles", "sand"]) -> None:
+        """Add the floor under caustics: one picture now, and the others while frames are drawn."""
+        self._floor = mesh
+        self._images = water.floor_images(colour, pattern, float(-mesh.vertices[:, 2].mean()))
+        self._add_floor(next(self._images))
+
+    def _add_floor(self, image: Image) -> None:
+        mesh = water.draped(self._floor.vertices, self._floor.faces, image)
+        name, first = f"/floor/{len(self._floors)}", not self._floors
+        self._floors.append(self._scene.add_mesh_trimesh(name, mesh, cast_shadow=False, visible=first))
 
     def _camera(self, site: Pool) -> None:
         """The overhead camera where its calibration has it."""
@@ -208,17 +308,23 @@ class StageScene:
         )
 
     def _line(self, name: str, points: Array, colour: str, width: float) -> Any:
-        return self._scene.add_line_segments(
-            name, points, COLOURS[colour], thickness=width, thickness_units="screen"
-        )
+        colours = np.broadcast_to(_unlit(COLOURS[colour]), points.shape)
+        return self._scene.add_line_segments(name, points, colours, thickness=width, thickness_units="screen")
 
-    def _look(self, server: viser.ViserServer) -> None:
-        """Place the first viewpoint beside and above the water."""
+    def look(self, camera: Any, aspect: float = LANDSCAPE) -> None:
+        """Place a camera beside and above the water; on a phone farther away, with the water above the panel."""
         lower, upper = self.stage.lower, self.stage.upper
         middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
-        server.initial_camera.look_at = tuple(middle)
-        server.initial_camera.position = tuple(middle + reach * np.array([-0.31, -0.56, 0.52]))
-        server.initial_camera.up = (0.0, 0.0, 1.0)
+        if aspect < LANDSCAPE:
+            reach *= LANDSCAPE / max(aspect, 0.1)
+            middle[2] -= 0.12 * reach
+        camera.position = tuple(middle + reach * np.array([-0.31, -0.56, 0.52]))
+        camera.look_at = tuple(middle)
+
+
+def _unlit(colour: npt.ArrayLike) -> Image:
+    """Return colours for lines and arrows, 0 to 255, (..., 3): viser shows those without the decoding of sRGB."""
+    return np.asarray(255.0 * (np.asarray(colour) / 255.0) ** 2.2).astype(np.uint8)
 
 
 def _set_points(node: Any, points: Array) -> None:
@@ -229,7 +335,7 @@ def _set_points(node: Any, points: Array) -> None:
 
 # Curves as the browser's plots take them.
 
-LINES = ("#d9480f", "#1c6ef2", "#2b8a3e", "#862e9c")
+LINES = (VERMILION, BLUE, GREEN, PINK)
 """Colours, in the order of the curves."""
 
 
@@ -406,6 +512,8 @@ def _outline(image: Image, corners: Array, reach: int) -> None:
 
 SLIDER_STEP = 0.02
 """Step of the time slider [s]."""
+LABEL = 0.25
+"""Room of an event's word, part of the slider."""
 
 
 class Panel:
@@ -427,7 +535,7 @@ class Panel:
         self._button: Any = None
         self._speed: Any = None
         self._shown = 0.0
-        self._controls(playback)
+        self._controls(playback, stage.events)
         self._status = self._gui.add_markdown("")
         self._image: Any = None
         if stage.site is not None:
@@ -504,19 +612,33 @@ class Panel:
             else:
                 self._plots[key].data = plot.data(now)
 
-    def _controls(self, playback: Playback) -> None:
+    def _controls(self, playback: Playback, events: Sequence[tuple[float, str]]) -> None:
         gui = self._gui
         if playback.live:
             self._clock = gui.add_markdown("0.0 s")
         else:
             steps = max(1, math.floor(playback.duration / SLIDER_STEP))
-            self._slider = gui.add_slider("time [s]", 0.0, round(steps * SLIDER_STEP, 2), SLIDER_STEP, 0.0)
+            end = round(steps * SLIDER_STEP, 2)
+            marks = event_marks(events, end)
+            self._slider = gui.add_slider("time [s]", 0.0, end, SLIDER_STEP, 0.0, marks=marks or None)
         self._button = gui.add_button("pause" if playback.playing else "play")
         speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
         first = f"{playback.speed:g}x"
         options = speeds if first in speeds else (first, *speeds)
         self._speed = gui.add_dropdown("speed", options, initial_value=first)
         self._button.on_click(lambda _: playback.play(not playback.playing))
+
+
+def event_marks(events: Sequence[tuple[float, str]], end: float) -> tuple[float | tuple[float, str], ...]:
+    """Return marks of a slider from 0 to `end` [s]: each event's time, and its kind where there is room for a word."""
+    marks: list[float | tuple[float, str]] = []
+    free = 0.0
+    for moment, text in events:
+        at = min(max(round(moment, 2), 0.0), end)
+        kind = text.removeprefix("vision: ").partition(":")[0]
+        marks.append((at, kind) if at >= free else at)
+        free = at + LABEL * end if at >= free else free
+    return tuple(marks)
 
 
 def _legend() -> str:
@@ -531,6 +653,19 @@ def _plain(text: str) -> str:
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|" else c for c in text)
 
 
+TITLE = "FinsSim view"
+ICON = (
+    "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'>"
+    f"<rect width='32' height='32' rx='7' fill='{BLUE}'/><path fill='#fff' d='M7 20C13 18 16 12 17 4c4 5 7 10 8 16z'/>"
+    f"<path fill='none' stroke='{SKY}' stroke-width='3' d='M3 26q4.3-4 8.6 0t8.7 0t8.7 0'/></svg>"
+)
+"""Name of the page, and a fin above water, in the browser's tab."""
+PHONE = (
+    "<style>@media (max-width: 36em) {"
+    ".mantine-Paper-root[style*='fixed'] { width: 100% !important; max-height: 45% !important; }"
+    ".mantine-Paper-root[style*='fixed'] [style*='20em'] { width: 100% !important; } }</style>"
+)
+"""On a phone, viser's panel is a sheet at the bottom: as wide as the page, and not so high that it hides the scene."""
 RATE = 20.0
 """Frames a second [Hz]."""
 PLOT_PERIOD = 0.5
@@ -579,15 +714,31 @@ def _is_address(name: str) -> bool:
     return True
 
 
+def _titled(page: Any) -> Any:
+    """Give the page, in the answer to its request, its own title and icon."""
+    if page is not None and page.headers.get("Content-Type", "").startswith("text/html"):
+        page.body = page.body.replace(b"<title>Viser</title>", f"<title>{TITLE}</title>{PHONE}".encode(), 1)
+        page.body = re.sub(
+            rb"data:image/svg\+xml,[^\"]*", ICON.replace("#", "%23").encode(), page.body, count=1
+        )
+        del page.headers["Content-Length"]
+        page.headers["Content-Length"] = str(len(page.body))
+    return page
+
+
 @contextmanager
 def _only_own_pages(bind: str) -> Iterator[None]:
-    """Have the server that viser starts meanwhile check who connects: viser has no setting for it."""
+    """Have the server that viser starts meanwhile check who connects, and name its page, which viser does not offer."""
     serve, check = websockets.asyncio.server.serve, _own_guests(bind)
 
     def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             refusal = check(connection, request)
-            return process_request(connection, request) if refusal is None and process_request else refusal
+            if refusal is not None or process_request is None:
+                return refusal
+            if "Accept-Encoding" in request.headers:
+                del request.headers["Accept-Encoding"]  # so the page comes as text
+            return _titled(process_request(connection, request))
 
         return serve(*arguments, process_request=answer, **options)
 
@@ -607,7 +758,7 @@ class View:
 
     def __init__(
         self,
-        source: Source,
+        source: Source | None = None,
         *,
         bind: str = "127.0.0.1",
         port: int = 8080,
@@ -617,28 +768,50 @@ class View:
         """Serve the page.
 
         Args:
-            source: What is shown; it belongs to the view from now on.
+            source: What is shown, which belongs to the view from now on; nothing before `show` if None.
             bind: Address to serve at; this machine alone by default.
             port: To serve at, or the next one that is free.
             speed: Factor on the speed of time.
             playing: Whether it runs from the start.
         """
-        self.source, self.playback = source, Playback(source.duration, speed=speed, playing=playing)
         _check_address(bind)
         with (
             redirect_stdout(StringIO()),
             _only_own_pages(bind),
         ):  # viser prints messages at start and end even if verbosity is off
             self.server = viser.ViserServer(host=bind, port=port, label="FinsSim", verbose=False)
-        self.scene = StageScene(self.server, source.stage)
-        self.panel = Panel(self.server, source.stage, self.playback)
-        self._drawn, self._plotted, self._since_plot = math.nan, math.nan, math.inf
+        self.server.on_client_connect(self._opened)
+        self._speed, self._playing = speed, playing
+        self.source: Source | None = None
+        if source is not None:
+            self.show(source)
         host = "localhost" if bind in ("0.0.0.0", "::") else bind
         self.url = f"http://{host}:{self.server.get_port()}"
         """Of the page."""
 
+    def show(self, source: Source) -> None:
+        """Show a source from its beginning, instead of the one before, which is closed."""
+        if self.source is not None:
+            self.source.close()
+        with self.server.atomic():
+            self.server.scene.reset()
+            self.server.gui.reset()
+            self.playback = Playback(source.duration, speed=self._speed, playing=self._playing)
+            self.scene = StageScene(self.server, source.stage)
+            self.panel = Panel(self.server, source.stage, self.playback)
+            self.source = source
+        self._drawn, self._plotted, self._since_plot = math.nan, math.nan, math.inf
+        for page in self.server.get_clients().values():
+            self.scene.look(page.camera, page.camera.aspect)
+
+    def _opened(self, page: viser.ClientHandle) -> None:
+        if self.source is not None:
+            self.scene.look(page.camera, page.camera.aspect)
+
     def turn(self, elapsed: float) -> None:
         """Let so much real time go by [s], and draw what that changes."""
+        if self.source is None:
+            return
         self.panel.read()
         now = self.playback.advance(elapsed)
         self._since_plot += elapsed
@@ -665,4 +838,5 @@ class View:
         """Take the page down."""
         with redirect_stdout(StringIO()):
             self.server.stop()
-        self.source.close()
+        if self.source is not None:
+            self.source.close()

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.extensions.perception import World
-from finssim.localization.overhead_camera import Pool
-from finssim.robot.messages import TagCorners
-from finssim.vehicles import Vehicle
+if TYPE_CHECKING:  # the first picture of a view does not wait for them
+    from finssim.extensions.perception import World
+    from finssim.localization.overhead_camera import Pool
+    from finssim.robot.messages import TagCorners
+    from finssim.vehicles import Vehicle
 
 Array = npt.NDArray[np.float64]
 
@@ -65,6 +67,8 @@ class ViewStage:
     """Trajectory to follow, world frame [m], (k, 3)."""
     bodies: Sequence[FixedBody] = ()
     """Bodies of the world around the vehicle."""
+    events: Sequence[tuple[float, str]] = ()
+    """Time since the source's beginning [s] and text of everything that happens in a recorded one, in order."""
     eyes: Sequence[str] = ()
     """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
 
@@ -88,6 +92,8 @@ class ViewFrame:
     """Since the source's beginning [s]."""
     truth: BodyPose | None = None
     estimate: BodyPose | None = None
+    covariance: Array | None = None
+    """Covariance of the estimated position, world frame [m²], (3, 3); None if the source has none."""
     goal: BodyPose | None = None
     force: Array = field(default_factory=lambda: np.zeros(0))
     """Forces of the thrusters, canonical order [N], (n,), or none."""
@@ -103,6 +109,8 @@ class ViewFrame:
     """Name -> a few words or a number with its unit."""
     events: Sequence[str] = ()
     """The latest, newest last."""
+    notice: str = ""
+    """A few words beside the vehicle."""
 
 
 class PlotLine(NamedTuple):
@@ -132,6 +140,38 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Let go of what it holds."""
+
+
+class Placeholder:
+    """A vehicle at rest, shown until the source of a view has been made."""
+
+    duration = math.inf
+
+    def __init__(self, vehicle: Vehicle, title: str, notice: str, *, placed: bool = True) -> None:
+        """
+        Args:
+            vehicle: Any one.
+            title: Of the view.
+            notice: What is being waited for, in a few words.
+            placed: False leaves the vehicle out, where it is not known yet.
+        """
+        deep = max(0.5, float(vehicle.body.size[2]))
+        room = max(4.0, 3.0 * float(vehicle.body.size[0]))
+        lower, upper = box_of(vehicle, (room, 0.5 * room, 2.0 * deep), nowhere())
+        self.stage = ViewStage(vehicle=vehicle, title=title, lower=lower, upper=upper)
+        pose = BodyPose(np.array([0.0, 0.0, -deep]), np.array([0.0, 0.0, 0.0, 1.0]))
+        self._pose, self._notice = pose if placed else None, notice
+
+    def frame(self, time: float) -> ViewFrame:
+        """Return the vehicle, which does not move, at a time since the beginning [s]."""
+        return ViewFrame(time=time, truth=self._pose, status={"state": self._notice}, notice=self._notice)
+
+    def curves(self) -> Sequence[PlotLine]:
+        """No errors."""
+        return ()
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 # The box of water that is drawn.

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 import webbrowser
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from finssim.extensions.perception import load_world
-from finssim.extensions.viewer.frame import Source, ViewError
-from finssim.extensions.viewer.sources import guide_for
-from finssim.robot.interrupt import interruptible
+from finssim.extensions.viewer.frame import Placeholder, Source, ViewError
+from finssim.robot.interrupt import interruptible, interrupting
 from finssim.vehicles import load_vehicle
-from finssim.vehicles.defaults import vehicle_at
 
 _DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
 HEEDED = {
@@ -75,23 +72,18 @@ def open_source(choice: SourceChoice) -> Source:
         ViewError: There is none of that name.
         ValueError: What it is made of is refused, in one sentence.
     """
-    _refuse_strangers(choice)
-    if choice.source == "pool":
+    kind, path = _check(choice), Path(choice.source)
+    if kind == "pool":
         return _pool(choice)
-    if choice.source == "sim":
+    if kind == "sim":
         return _simulator(choice)
-    path = Path(choice.source)
-    if path.is_dir():
+    if kind == "folder":
         from finssim.extensions.viewer.sources import RunSource
 
         if choice.world is not None and not choice.world.isdecimal():
             raise ViewError(f"--world {choice.world}: expected the number of a world of the folder's run")
         number = None if choice.world is None else int(choice.world)
         return RunSource(path, world=number, vehicle=choice.vehicle)
-    if not path.is_file():
-        raise ViewError(
-            f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
-        )
     from finssim.extensions.viewer.sources import RecordSource
 
     return RecordSource(
@@ -130,32 +122,65 @@ def run(
     """
     from finssim.extensions.viewer.app import View
 
-    view = View(open_source(choice), bind=bind, port=port, speed=speed)
-    print(f"{view.source.stage.title}\nview: {view.url}   (Ctrl-C ends)")
-    sys.stdout.flush()
+    placeholder = _placeholder(choice, _check(choice))
+    view = View(bind=bind, port=port, speed=speed)
+    print(f"view: {view.url}   (Ctrl-C ends)", flush=True)
     if not no_browser:
         webbrowser.open(view.url)
-    end = time.monotonic() + (math.inf if duration is None else duration)
+    source: Source | None = None
     try:
         with interruptible() as interrupted:
+            view.show(placeholder)
+            view.turn(0.0)
+            with (
+                interrupting(),
+                suppress(KeyboardInterrupt),
+            ):  # the page is served meanwhile, by a thread of its own
+                source = open_source(choice)
+                source.frame(FIRST)
+            if source is None:
+                return
+            view.show(source)
+            print(source.stage.title, flush=True)
+            end = time.monotonic() + (math.inf if duration is None else duration)
             view.run(lambda: interrupted() or time.monotonic() >= end)
     finally:
         view.close()
 
 
-def _refuse_strangers(choice: SourceChoice) -> None:
-    """Refuse options that the source would not use."""
+FIRST = 0.2
+"""A live source runs to this time before it is shown [s]: so its kernels are compiled behind the placeholder."""
+
+
+def _placeholder(choice: SourceChoice, kind: str) -> Source:
+    """Return the first picture of a view: the vehicle, if it is known before a record has been read."""
+    name = choice.vehicle or "finsrov"
+    if kind in ("pool", "sim"):
+        return Placeholder(load_vehicle(name), f"{kind}: {name}", "compiling kernels …")
+    named = choice.vehicle is not None
+    return Placeholder(load_vehicle(name), Path(choice.source).name, f"reading the {kind} …", placed=named)
+
+
+def _check(choice: SourceChoice) -> str:
+    """Return the kind of the source; refuse one that does not exist and options that it would not use."""
     path = Path(choice.source)
-    kind = choice.source if choice.source in HEEDED else "folder" if path.is_dir() else "record"
+    kind = choice.source if choice.source in ("pool", "sim") else "folder" if path.is_dir() else "record"
+    if kind == "record" and not path.is_file():
+        raise ViewError(
+            f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
+        )
     usual = SourceChoice()
     for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
         if getattr(choice, name) != getattr(usual, name):
             takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
             raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
+    return kind
 
 
 def _pool(choice: SourceChoice) -> Source:
-    from finssim.extensions.viewer.sources import PoolSource
+    from finssim.extensions.perception import load_world
+    from finssim.extensions.viewer.sources import PoolSource, guide_for
+    from finssim.vehicles.defaults import vehicle_at
 
     name = choice.vehicle or "finsrov"
     goal = choice.goal
@@ -178,7 +203,7 @@ def _pool(choice: SourceChoice) -> Source:
 
 
 def _simulator(choice: SourceChoice) -> Source:
-    from finssim.extensions.viewer.sources import SimulatorSource
+    from finssim.extensions.viewer.sources import SimulatorSource, guide_for
 
     vehicle = load_vehicle(choice.vehicle or "finsrov")
     return SimulatorSource(

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from finssim.core.rotations import quat_to_matrix
-from finssim.core.sonar_fan import fan_picture
-from finssim.extensions.perception.layout import Shape, WorldLayout
+from finssim.core import mesh as hulls
+from finssim.core.rotations import quat_from_rotvec, quat_multiply, quat_to_matrix
 from finssim.extensions.viewer.frame import BodyPose, FixedBody
-from finssim.physics.actuators.fin import Fin
-from finssim.robot.messages import Picture
-from finssim.robot.record_messages import FAN_ROWS
 from finssim.vehicles import Vehicle, VehicleError
-from finssim.vehicles.device_files import SonarDevice, device_of
+
+if TYPE_CHECKING:  # the first picture of a view does not wait for them
+    from finssim.extensions.perception.layout import Shape, WorldLayout
+    from finssim.physics.actuators.fin import Fin
+    from finssim.robot.messages import Picture
 
 Array = npt.NDArray[np.float64]
 
@@ -43,12 +43,15 @@ def wxyz(quaternion: npt.ArrayLike) -> tuple[float, float, float, float]:
 
 
 def hull_of(vehicle: Vehicle) -> Mesh:
-    """The hull in the body frame; a box of the vehicle's size where its file gives none."""
+    """The hull in the body frame; where the vehicle's file gives none, a body of its size and volume, or its box."""
+    body = vehicle.body
     try:
+        if vehicle.hull is None:
+            return Mesh(*hulls.parametric_hull(body.size, body.displaced_volume, body.center_of_buoyancy))
         return Mesh(*vehicle.hull_mesh())
-    except VehicleError:
-        half = 0.5 * np.asarray(vehicle.body.size, float)
-        return _box(vehicle.body.center_of_buoyancy - half, vehicle.body.center_of_buoyancy + half)
+    except (VehicleError, hulls.MeshError):
+        half = 0.5 * np.asarray(body.size, float)
+        return _box(body.center_of_buoyancy - half, body.center_of_buoyancy + half)
 
 
 def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
@@ -71,7 +74,11 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 def fin_plates(vehicle: Vehicle) -> dict[int, Mesh]:
     """Return the plate of each fin about its position at deflection 0, in body axes, by its index among the actuators
     besides thrusters."""
-    plates = {}
+    plates: dict[int, Mesh] = {}
+    if not vehicle.actuators:
+        return plates
+    from finssim.physics.actuators.fin import Fin
+
     for k, fin in enumerate(vehicle.actuators.values()):
         if isinstance(fin, Fin):
             half = 0.5 * np.array([*fin.sides, 0.1 * fin.sides[0]])
@@ -86,14 +93,59 @@ def fin_attitude(fin: Fin, deflection: float) -> Array:
     return np.array([*(np.sin(0.5 * deflection) * fin.span), np.cos(0.5 * deflection)])
 
 
-def wall_mesh(lower: Array, upper: Array) -> Mesh:
-    """Floor and four walls of a box, seen from inside alone: those between the eye and the water vanish.
+def duct_mesh(vehicle: Vehicle) -> Mesh | None:
+    """Return the ducts of the thrusters, body frame; None of a vehicle with a single, open propeller."""
+    import trimesh
 
-    Corners are in [m].
-    """
-    vertices, faces = _box(lower, upper)
-    lid = (vertices[faces][..., 2] > 0.5 * (lower[2] + upper[2])).all(axis=1)
-    return Mesh(vertices, faces[~lid][:, ::-1])
+    if len(vehicle.thrusters) < 2:
+        return None
+    rings = []
+    for radius, (position, attitude) in zip(_radii(vehicle), _shafts(vehicle), strict=True):
+        ring = trimesh.creation.annulus(1.06 * radius, 1.2 * radius, 0.9 * radius, sections=24)
+        rings.append(Mesh(ring.vertices @ quat_to_matrix(attitude).T + position, np.asarray(ring.faces)))
+    return _joined(rings)
+
+
+def propeller_mesh() -> Mesh:
+    """Return a hub and three twisted blades of unit radius about z."""
+    import trimesh
+
+    hub = trimesh.creation.cylinder(0.24, 0.8, sections=12)
+    parts = [Mesh(np.asarray(hub.vertices), np.asarray(hub.faces))]
+    for turn in 2.0 * np.pi / 3.0 * np.arange(3):
+        edges = []
+        for r, half, pitch in ((0.2, 0.22, 0.9), (0.6, 0.36, 0.6), (1.0, 0.28, 0.4)):
+            across = half * np.array([0.0, np.cos(pitch), np.sin(pitch)])
+            edges += [[r, 0.0, 0.0] - across, [r, 0.0, 0.0] + across]
+        blade = np.array(edges) @ quat_to_matrix(quat_from_rotvec([0.0, 0.0, turn])).T
+        parts.append(Mesh(blade, np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]])))
+    return _joined(parts)
+
+
+def propeller_poses(vehicle: Vehicle, angles: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Return attitudes wxyz (n, 4), positions (n, 3) and radii (n,) [m] of propellers turned by angles [rad], (n,)."""
+    turned = [
+        wxyz(quat_multiply(attitude, quat_from_rotvec([0.0, 0.0, angle])))
+        for (_, attitude), angle in zip(_shafts(vehicle), np.asarray(angles, float), strict=True)
+    ]
+    return np.array(turned), np.array([position for position, _ in _shafts(vehicle)]), _radii(vehicle)
+
+
+def _radii(vehicle: Vehicle) -> Array:
+    """Return the radii of the propellers [m], as the file gives them or in proportion to the hull, (n,)."""
+    usual = 0.17 * float(np.min(vehicle.body.size))
+    return np.array([usual if t.diameter is None else 0.5 * t.diameter for t in vehicle.thrusters.values()])
+
+
+def _shafts(vehicle: Vehicle) -> list[tuple[Array, Array]]:
+    """Return position [m] and attitude of each propeller, which turns z to the thrust's axis; body frame, xyzw."""
+    shafts = []
+    for thruster in vehicle.thrusters.values():
+        x, y, z = thruster.axis
+        sine = float(np.hypot(x, y))
+        turn = np.array([-y, x, 0.0]) / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
+        shafts.append((np.array(thruster.position, float), quat_from_rotvec(turn * np.arctan2(sine, z))))
+    return shafts
 
 
 def force_arrows(vehicle: Vehicle, force: Array, pose: BodyPose) -> Array:
@@ -130,6 +182,10 @@ def box_edges(lower: Array, upper: Array) -> Array:
 
 def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
     """Return a displayable reading of the vehicle's own sensors: a picture, a sonar's fan, or ranges as text."""
+    from finssim.core.sonar_fan import fan_picture
+    from finssim.robot.record_messages import FAN_ROWS
+    from finssim.vehicles.device_files import SonarDevice, device_of
+
     if picture.image is None:
         ranges = [] if picture.ranges is None else picture.ranges.tolist()
         return ", ".join(f"{x:.2f} m" if np.isfinite(x) else "nothing in reach" for x in ranges)
@@ -153,14 +209,14 @@ def world_bodies(layout: WorldLayout) -> list[FixedBody]:
             turned = Mesh(scale * mesh.vertices @ quat_to_matrix(pose[3:]).T + pose[:3], mesh.faces)
             parts.setdefault(shape.owner, []).append(turned)
             colours[shape.owner] = tuple((255.0 * shape.finish.colour ** (1.0 / GAMMA)).astype(int).tolist())
-    bodies = []
-    for name, meshes in parts.items():
-        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        faces = np.concatenate([mesh.faces + i for mesh, i in zip(meshes, first, strict=False)])
-        bodies.append(
-            FixedBody(name, np.concatenate([mesh.vertices for mesh in meshes]), faces, colours[name])
-        )
-    return bodies
+    return [FixedBody(name, *_joined(meshes), colours[name]) for name, meshes in parts.items()]
+
+
+def _joined(meshes: list[Mesh]) -> Mesh:
+    """Return several meshes as one."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + i for mesh, i in zip(meshes, first, strict=False)])
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), faces)
 
 
 def _mesh_of(shape: Shape) -> Mesh:

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,7 +52,7 @@ from finssim.robot.pictures import picture_of
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.robot.record_files import pool_of, vehicle_of
-from finssim.robot.record_messages import STATES
+from finssim.robot.record_messages import STATES, UNKNOWN
 from finssim.robot.record_reader import Record, open_record
 from finssim.robot.runtime import Runtime
 from finssim.sim import RectangularPool as Walls
@@ -149,6 +150,7 @@ class PoolSource:
             time=self._steps / RATE,
             truth=self._truth(),
             estimate=self._estimate(),
+            covariance=self._covariance(),
             goal=self._goal(),
             force=np.array(plant.thrust, float),
             values=np.array(plant.values, float),
@@ -196,6 +198,10 @@ class PoolSource:
         if reading is None or not np.isfinite(reading.position).all():
             return None
         return BodyPose(reading.position, reading.quaternion)
+
+    def _covariance(self) -> Array | None:
+        reading = self._runtime.reading
+        return None if reading is None else known_covariance(np.diag(np.square(reading.std[:3])))
 
     def _goal(self) -> BodyPose:
         t = self._runtime.t
@@ -402,6 +408,7 @@ class RecordSource:
             walls=basin is not None,
             site=site,
             path=_thinned(self._goal.position),
+            events=[(t - self.begin, text) for t, text in self._happened],
             eyes=list(self._eyes),
             **around,
         )
@@ -422,6 +429,7 @@ class RecordSource:
             time=time,
             truth=None if self._truth is None else self._truth.at(at),
             estimate=self._odom.at(at),
+            covariance=self._covariance(at),
             goal=self._goal.at(at),
             force=force,
             values=np.zeros(0) if values is None else np.asarray(values.position, float),
@@ -429,11 +437,7 @@ class RecordSource:
             picture=self._picture(at),
             pictures={name: image for name in self._eyes if (image := self._own(name, at)) is not None},
             status=self._status(at, thrusters),
-            events=[
-                f"{t - self.begin:.1f} s  {text}"
-                for t, text in zip(self._events.time, self._events.values, strict=True)
-                if t <= at
-            ][-EVENTS:],
+            events=[f"{t - self.begin:.1f} s  {text}" for t, text in self._happened if t <= at][-EVENTS:],
         )
 
     def curves(self) -> Sequence[PlotLine]:
@@ -461,6 +465,7 @@ class RecordSource:
         self.begin = min(t[0] for t in times.values())
         self.duration = max(t[-1] for t in times.values()) - self.begin
         self._odom = _poses(times["odom"], [m.pose.pose for m in by_name["odom"]])
+        self._covariances = TimeSeries(times["odom"], [m.pose.covariance for m in by_name["odom"]])
         self._goal = _poses(times["goal"], [m.pose for m in by_name["goal"]])
         self._health = TimeSeries(times["estimator_status"], by_name["estimator_status"])
         self._thrusters = TimeSeries(times["thruster_state"], by_name["thruster_state"])
@@ -476,7 +481,17 @@ class RecordSource:
             }
             for kind in ("/image/compressed", "/range")
         )
-        self._events = TimeSeries(times["events"], [_event(m.data) for m in by_name["events"]])
+        self._happened = sorted(
+            [
+                *zip(times["events"], (_event(m.data) for m in by_name["events"]), strict=True),
+                *_vision(times["estimator_status"], by_name["estimator_status"]),
+            ]
+        )
+
+    def _covariance(self, at: float) -> Array | None:
+        """That of the estimate's position; None where the estimator gives none."""
+        covariance = self._covariances.at(at)
+        return None if covariance is None else known_covariance(np.reshape(covariance, (6, 6))[:3, :3])
 
     def _add_truth(self, truth: Truth, offset: float | None) -> None:
         if offset is None:
@@ -549,6 +564,19 @@ class RecordSource:
             curves += [PlotLine(POSITION, label, time - self.begin, distance)]
             curves += [PlotLine(HEADING, label, time - self.begin, turn)]
         return [curve for curve in curves if np.isfinite(curve.value).any()]
+
+
+def known_covariance(covariance: npt.ArrayLike) -> Array | None:
+    """Return a covariance of a position [m²], (3, 3), or None where an axis is not known."""
+    known = np.asarray(covariance, float)
+    variance = np.diag(known)
+    return known if (variance > 0.0).all() and (variance < UNKNOWN).all() else None
+
+
+def _vision(times: Sequence[float], statuses: Sequence[Any]) -> list[tuple[float, str]]:
+    """Return when vision held, lost and found the vehicle; coasting between two pictures is no event."""
+    modes = [(t, status.mode) for t, status in zip(times, statuses, strict=True) if status.mode != "coast"]
+    return [(t, f"vision: {mode}") for (_, last), (t, mode) in pairwise(modes) if mode != last]
 
 
 def _age(series: TimeSeries, at: float) -> float:

@@ -1,0 +1,130 @@
+"""The scene that is sent to the page: what moves with a frame, and by how much."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from finssim.core.rotations import quat_from_yaw, quat_to_matrix
+from finssim.extensions.viewer.app import LANDSCAPE, REGION, View
+from finssim.extensions.viewer.frame import BodyPose, Placeholder, ViewFrame
+from finssim.vehicles import load_vehicle
+
+FINSROV = load_vehicle("finsrov")
+AT = np.array([0.4, -0.2, -0.6])
+
+
+@pytest.fixture
+def view():
+    """A page with a vehicle at rest."""
+    view = View(Placeholder(FINSROV, "a vehicle", "compiling kernels …"), port=8280)
+    yield view
+    view.close()
+
+
+def node(view, name):
+    """A handle of the scene."""
+    handle = view.server.scene.get_handle_by_name(name)
+    assert handle is not None, name
+    return handle
+
+
+def frame_at(time, **values):
+    """A frame with a true pose and an estimate."""
+    pose = BodyPose(AT, quat_from_yaw(0.3))
+    return ViewFrame(time=time, truth=pose, estimate=pose, **values)
+
+
+@pytest.mark.slow
+def test_the_placeholder_shows_the_vehicle_in_its_pool(view):
+    """Hull, propellers, walls and floor are there, with a notice at the vehicle."""
+    view.turn(0.0)
+    for name in (
+        "/truth/hull",
+        "/truth/ducts",
+        "/truth/propellers",
+        "/pool/walls",
+        "/pool/surface",
+        "/floor/0",
+    ):
+        node(view, name)
+    assert node(view, "/truth").visible and not node(view, "/estimate").visible
+    notice = node(view, "/notice")
+    assert notice.visible and notice.text == "compiling kernels …"
+    assert notice.position == pytest.approx(node(view, "/truth").position)
+
+
+@pytest.mark.slow
+def test_the_ellipsoid_contains_the_position_with_95_percent(view):
+    """Its axes are those of the covariance, as long as a chi-square of three degrees says; none without one."""
+    axes = quat_to_matrix(quat_from_yaw(0.7))
+    std = np.array([0.03, 0.05, 0.08])
+    view.scene.draw(frame_at(0.0, covariance=axes @ np.diag(std**2) @ axes.T))
+    region = node(view, "/region")
+    assert chi2.cdf(REGION**2, 3) == pytest.approx(0.95, abs=1e-4)
+    assert region.visible and region.scale == pytest.approx(REGION * std)
+    turned = quat_to_matrix(np.roll(region.wxyz, -1))
+    assert np.abs(turned.T @ axes) == pytest.approx(np.eye(3), abs=1e-9)
+    view.scene.draw(frame_at(0.1))
+    assert not region.visible
+
+
+@pytest.mark.slow
+def test_propellers_turn_with_their_thrusts(view):
+    """Forward for a positive thrust, backward for a negative one, not at all without; a pause stops them."""
+    force = np.zeros(len(FINSROV.thrusters))
+    force[0], force[1] = 0.5 * np.array([1.0, -1.0]) * np.max(np.abs(FINSROV.force_limits))
+    view.scene.draw(frame_at(1.0, force=force))
+    view.scene.draw(frame_at(1.05, force=force))
+    ahead, astern, *others = view.scene._angles
+    assert ahead == pytest.approx(-astern) and 0.1 < ahead < 2.0 * np.pi / 6.0 and not np.any(others)
+    sent = node(view, "/truth/propellers").batched_wxyzs.copy()
+    view.scene.draw(frame_at(1.05, force=force))
+    assert np.array_equal(node(view, "/truth/propellers").batched_wxyzs, sent)
+
+
+@pytest.mark.slow
+def test_caustics_move_with_time(view):
+    """Of all pictures of the floor exactly one is visible, another one a while later."""
+    seen = []
+    for k in range(20):
+        view.scene.draw(frame_at(0.2 * k))
+        seen.append([k for k, floor in enumerate(view.scene._floors) if floor.visible])
+    assert all(len(visible) == 1 for visible in seen) and len({visible[0] for visible in seen}) > 8
+
+
+@pytest.mark.slow
+def test_the_trail_fades_with_its_age(view):
+    """Its newest end has its full colour, its oldest nearly that of the water."""
+    view.scene.draw(frame_at(0.0, trail=np.linspace(AT - 1.0, AT, 12)))
+    colours = node(view, "/trail").colors.astype(int)
+    assert colours.shape == (11, 2, 3)
+    assert np.abs(np.diff(colours[:, 0, 2])).max() > 0 and colours[0, 0, 2] > colours[-1, 1, 2] + 60
+
+
+@pytest.mark.slow
+def test_a_source_replaces_the_placeholder(view):
+    """The page shows the new stage alone, from its beginning."""
+    other = Placeholder(load_vehicle("torpedo"), "another", "")
+    other.stage = replace(other.stage, walls=False)
+    view.turn(0.05)
+    view.show(other)
+    view.turn(0.0)
+    assert view.playback.time == 0.0 and node(view, "/truth/propellers").batched_wxyzs.shape == (1, 4)
+    assert view.server.scene.get_handle_by_name("/pool/walls") is None
+
+
+@pytest.mark.slow
+def test_a_phone_sees_the_water_from_farther_away(view):
+    """A narrow picture is taken from a greater distance, a wide one from the usual."""
+
+    def distance(aspect):
+        camera = SimpleNamespace()
+        view.scene.look(camera, aspect)
+        return np.linalg.norm(
+            np.subtract(camera.position, 0.5 * (view.scene.stage.lower + view.scene.stage.upper))
+        )
+
+    assert distance(390.0 / 844.0) > 1.4 * distance(LANDSCAPE) and distance(2.0) == distance(1.0)
