@@ -312,7 +312,12 @@ class StageScene:
         return self._scene.add_line_segments(name, points, colours, thickness=width, thickness_units="screen")
 
     def look(self, camera: Any, aspect: float = LANDSCAPE) -> None:
-        """Place a camera beside and above the water; on a phone farther away, with the water above the panel."""
+        """Place a camera beside and above the water; on a phone farther away, with the water above the panel.
+
+        Args:
+            camera: Of a page, or the initial one.
+            aspect: Width over height of the picture [-].
+        """
         lower, upper = self.stage.lower, self.stage.upper
         middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
         if aspect < LANDSCAPE:
