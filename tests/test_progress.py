@@ -1,9 +1,12 @@
 """Long work shows how far it is, by a bar or by lines; a silent command says within two seconds that it starts."""
 
+import io
 import sys
-import threading
+import time
 
-from finssim.core import progress
+import pytest
+
+from finssim.core import progress, system
 from finssim.core.progress import progress_bar
 from finssim.core.system import announce
 
@@ -30,14 +33,37 @@ def test_progress_that_nobody_wants_is_not_shown(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_command_that_is_silent_says_that_it_starts(capsys, monkeypatch):
-    """Once its time is over; not after it has printed something."""
-    for printed in (False, True):
-        monkeypatch.setattr(sys, "stdout", sys.stdout)
-        timer = announce("finssim view: starting", after=0.05 if not printed else 30.0)
-        if printed:
-            print("a table")
-        timer.join(20.0) if not printed else timer.join(2.0)
-        assert not timer.is_alive() and threading.current_thread() is not timer
-        captured = capsys.readouterr()
-        assert captured.err == ("" if printed else "finssim view: starting\n")
+class Terminal(io.StringIO):
+    """Standard error, on a terminal or not."""
+
+    def __init__(self, terminal):
+        super().__init__()
+        self.isatty = lambda: terminal
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_silent_command_counts_until_it_prints(monkeypatch, terminal):
+    """On a terminal the count is one line, erased before the output; elsewhere each is a line."""
+    monkeypatch.setattr(system, "COUNT", (0.01, 0.01))
+    out, error = io.StringIO(), Terminal(terminal)
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", error)
+    announce("finssim view: starting", after=0.01)
+    deadline = time.monotonic() + 20.0
+    while error.getvalue().count("starting") < 3 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    print("a table")
+    said = error.getvalue()
+    time.sleep(0.1)
+    assert error.getvalue() == said and out.getvalue() == "a table\n"
+    words = "finssim view: starting"
+    first = f"\r{words}\r{words}, 0 s" if terminal else f"{words}\n{words}, 0 s\n"
+    assert said.startswith(first) and said.endswith("\r\x1b[K" if terminal else " s\n")
+
+
+def test_a_command_that_prints_says_nothing_else(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    announce("finssim view: starting", after=0.2)
+    print("a table")
+    time.sleep(0.5)
+    assert capsys.readouterr().err == ""

@@ -110,8 +110,10 @@ def main() -> None:
     """
     replace_unwritable(sys.stdout, sys.stderr)
     words = itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:3])
-    announce(f"finssim {' '.join(words)}: starting")
-    sys.exit(boundary.run(app, sys.argv[1:]))
+    started = announce(f"finssim {' '.join(words)}: starting")
+    status = boundary.run(app, sys.argv[1:])
+    started()
+    sys.exit(status)
 
 
 def _version(requested: bool) -> None:

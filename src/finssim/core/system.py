@@ -14,12 +14,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
 PARENT = "FINSSIM_PARENT"
 """Environment variable: the process without which this one ends too."""
+COUNT = 1.0, 10.0
+"""Time between two signs of life of a silent command, on a terminal and elsewhere [s]."""
 ORPHANED = 0.5
 """Time between two checks whether the parent is running [s]."""
 SEPARATE: dict[str, Any] = (
@@ -113,27 +115,50 @@ def peak_memory() -> float:
     )
 
 
-def announce(text: str, after: float = 1.5) -> threading.Timer:
-    """Print a line on standard error unless something else is printed before.
+def announce(text: str, after: float = 1.0) -> Callable[[], None]:
+    """Print a line with the seconds that have passed on standard error until something else is printed.
+
+    On a terminal it counts every second and is then erased; elsewhere it is printed again every 10 s.
 
     Args:
         text: The line.
-        after: From now [s].
+        after: Time of the first one, from now [s].
 
     Returns:
-        The timer that prints it, already started.
+        A function that ends it.
     """
-    timer = threading.Timer(after, lambda: print(text, file=sys.stderr, flush=True))
-    timer.daemon = True
-    for stream in (sys.stdout, sys.stderr):
+    error, lock, printed, began = sys.stderr, threading.Lock(), threading.Event(), time.monotonic()
+    own, terminal, shown = error.write, error.isatty(), False
+
+    def end() -> None:
+        with lock:
+            if not printed.is_set() and terminal and shown:
+                own("\r\x1b[K")
+                error.flush()
+            printed.set()
+
+    def count() -> None:
+        nonlocal shown
+        wait = after
+        while not printed.wait(wait):
+            with lock:
+                if printed.is_set():
+                    return
+                line = f"{text}, {time.monotonic() - began:.0f} s" if shown else text
+                own(f"\r{line}" if terminal else f"{line}\n")
+                error.flush()
+                shown, wait = True, COUNT[0 if terminal else 1]
+
+    for stream in (sys.stdout, error):
 
         def write(characters: str, write: Any = stream.write) -> Any:
-            timer.cancel()
+            if not printed.is_set():
+                end()
             return write(characters)
 
         stream.write = write  # type: ignore[method-assign]
-    timer.start()
-    return timer
+    threading.Thread(target=count, name="announce", daemon=True).start()
+    return end
 
 
 def replace_unwritable(*streams: TextIO) -> None:
