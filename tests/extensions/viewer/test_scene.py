@@ -43,8 +43,8 @@ def test_the_placeholder_shows_the_vehicle_in_its_pool(view):
     view.turn(0.0)
     for name in (
         "/truth/hull",
-        "/truth/ducts",
-        "/truth/propellers",
+        "/truth/thrusters/ducts",
+        "/truth/thrusters/propellers",
         "/pool/walls",
         "/pool/surface",
         "/floor/0",
@@ -54,6 +54,16 @@ def test_the_placeholder_shows_the_vehicle_in_its_pool(view):
     notice = node(view, "/notice")
     assert notice.visible and notice.text == "compiling kernels …"
     assert notice.position == pytest.approx(node(view, "/truth").position)
+
+
+@pytest.mark.slow
+def test_beside_the_truth_the_estimate_is_a_net_without_thrusters(view):
+    """So that it hides nothing; alone it is the whole vehicle."""
+    view.scene.draw(frame_at(0.0))
+    hull, thrusters = (node(view, f"/estimate/{part}") for part in ("hull", "thrusters"))
+    assert hull.wireframe and not thrusters.visible and node(view, "/truth/thrusters").visible
+    view.scene.draw(replace(frame_at(0.1), truth=None))
+    assert not hull.wireframe and thrusters.visible and not node(view, "/truth").visible
 
 
 @pytest.mark.slow
@@ -80,9 +90,9 @@ def test_propellers_turn_with_their_thrusts(view):
     view.scene.draw(frame_at(1.05, force=force))
     ahead, astern, *others = view.scene._angles
     assert ahead == pytest.approx(-astern) and 0.1 < ahead < 2.0 * np.pi / 6.0 and not np.any(others)
-    sent = node(view, "/truth/propellers").batched_wxyzs.copy()
+    sent = node(view, "/truth/thrusters/propellers").batched_wxyzs.copy()
     view.scene.draw(frame_at(1.05, force=force))
-    assert np.array_equal(node(view, "/truth/propellers").batched_wxyzs, sent)
+    assert np.array_equal(node(view, "/truth/thrusters/propellers").batched_wxyzs, sent)
 
 
 @pytest.mark.slow
@@ -112,7 +122,10 @@ def test_a_source_replaces_the_placeholder(view):
     view.turn(0.05)
     view.show(other)
     view.turn(0.0)
-    assert view.playback.time == 0.0 and node(view, "/truth/propellers").batched_wxyzs.shape == (1, 4)
+    assert view.playback.time == 0.0 and node(view, "/truth/thrusters/propellers").batched_wxyzs.shape == (
+        1,
+        4,
+    )
     assert view.server.scene.get_handle_by_name("/pool/walls") is None
 
 

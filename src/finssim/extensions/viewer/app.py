@@ -192,10 +192,10 @@ class StageScene:
 
     def _place(self, name: str, pose: BodyPose | None, *, ghost: bool) -> None:
         """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
-        body, hull = self._bodies[name]
+        body, hull, thrusters = self._bodies[name]
         self._show(body, pose)
         if hull.wireframe != ghost:
-            hull.wireframe = ghost
+            hull.wireframe, thrusters.visible = ghost, not ghost
 
     def _show(self, node: Any, pose: BodyPose | None) -> None:
         visible = pose is not None and bool(np.isfinite(pose.position).all())
@@ -203,16 +203,15 @@ class StageScene:
             node.position, node.wxyz = tuple(pose.position), wxyz(pose.quaternion)
         node.visible = visible
 
-    def _vehicle(self, name: str) -> tuple[Any, Any]:
-        """The body's node and its hull."""
+    def _vehicle(self, name: str) -> tuple[Any, Any, Any]:
+        """The body's node, its hull and its thrusters."""
         vehicle = self.stage.vehicle
         body = self._scene.add_frame(f"/{name}", show_axes=False, visible=False)
         mesh = hull_of(vehicle)
         hull = self._scene.add_mesh_simple(
             f"/{name}/hull", mesh.vertices, mesh.faces, color=COLOURS[name], flat_shading=True, side="double"
         )
-        if name == "truth":
-            self._thrusters(name)
+        thrusters = self._thrusters(f"/{name}/thrusters")
         plates = tag_plates(vehicle)
         for part, plate, colour in zip(
             ("plates", "tags"), plates or (), ((250,) * 3, (25,) * 3), strict=False
@@ -229,23 +228,25 @@ class StageScene:
             self._fins.append((k, node))
         nose = np.array([[[0.0, 0.0, 0.0], [0.75 * float(vehicle.body.size[0]), 0.0, 0.0]]])
         self._line(f"/{name}/nose", nose, name, 3.0)
-        return body, hull
+        return body, hull, thrusters
 
-    def _thrusters(self, name: str) -> None:
+    def _thrusters(self, name: str) -> Any:
         """Ducts and propellers of a body."""
+        node = self._scene.add_frame(name, show_axes=False)
         vehicle, ducts, blades = self.stage.vehicle, duct_mesh(self.stage.vehicle), propeller_mesh()
         if ducts is not None:
             self._scene.add_mesh_simple(
-                f"/{name}/ducts", ducts.vertices, ducts.faces, color=COLOURS["part"], side="double"
+                f"{name}/ducts", ducts.vertices, ducts.faces, color=COLOURS["part"], side="double"
             )
         if vehicle.thrusters:
             attitudes, positions, radii = propeller_poses(vehicle, self._angles)
             self._propellers.append(
                 self._scene.add_batched_meshes_simple(
-                    f"/{name}/propellers", blades.vertices, blades.faces, attitudes, positions, batched_scales=radii,
+                    f"{name}/propellers", blades.vertices, blades.faces, attitudes, positions, batched_scales=radii,
                     batched_colors=COLOURS["propeller"], flat_shading=True, side="double",
                 )
             )  # fmt: skip
+        return node
 
     def _light(self) -> None:
         """Daylight from above through water that is thick far away, and blue where it is deep."""

@@ -170,7 +170,7 @@ def surface(lower: Array, upper: Array, *, seed: int = 1) -> trimesh.Trimesh:
     corner = (np.arange(48)[:, None] * 49 + np.arange(48)).ravel()
     faces = np.concatenate([corner[:, None] + [0, 1, 50], corner[:, None] + [0, 50, 49]])
     material = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=[70, 150, 195, 60], alphaMode="BLEND", roughnessFactor=0.4, metallicFactor=0.0, doubleSided=True
+        baseColorFactor=[40, 125, 175, 60], alphaMode="BLEND", roughnessFactor=0.8, metallicFactor=0.0, doubleSided=True
     )  # fmt: skip
     return trimesh.Trimesh(
         points, faces, visual=trimesh.visual.TextureVisuals(material=material), process=False
