@@ -95,13 +95,14 @@ def tables(
     gain = np.zeros((6, MAX_THRUSTERS))
     gain[:, :n] = np.linalg.solve(H, WB.T * W).T
 
+    # One system of n equations for every set of clamped thrusters C: H_FF X = -H_FC for the free, X = 0 for the others.
+    C = (np.arange(1 << n)[:, None] >> np.arange(n)) & 1 == 1
+    F, I = ~C, np.eye(n)
+    right = np.where(F[:, :, None] & C[:, None, :], -H, 0.0)
+    response = np.linalg.solve(np.where(F[:, :, None] & F[:, None, :], H, I), right)
     clamped = np.zeros((1 << MAX_THRUSTERS, MAX_THRUSTERS, MAX_THRUSTERS))
-    for mask in range(1, 1 << n):
-        at_limit = (mask >> np.arange(n)) & 1 == 1
-        C, F = np.flatnonzero(at_limit), np.flatnonzero(~at_limit)
-        response = -np.linalg.solve(H[np.ix_(F, F)], H[np.ix_(F, C)])
-        clamped[mask][np.ix_(C, F)] = response.T
-        clamped[mask][np.ix_(C, C)] = (H[np.ix_(C, C)] + H[np.ix_(C, F)] @ response) / h
+    inside = np.where(C[:, :, None] & C[:, None, :], (H + H @ response) / h, 0.0)
+    clamped[: 1 << n, :n, :n] = response.swapaxes(1, 2) + inside
     return Tables(gain.astype(np.float32), clamped.astype(np.float32), _toward_zero(low), _toward_zero(high))
 
 
