@@ -186,6 +186,7 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
 
 
 CORE_ALONE = """
+import os
 import sys
 from importlib.machinery import PathFinder
 
@@ -199,8 +200,9 @@ class CoreFinder(PathFinder):
 
 
 sys.meta_path[sys.meta_path.index(PathFinder)] = CoreFinder
+os.cpu_count = lambda: 1
 """
-"""Hides the packages of every extra from a process and those that it starts."""
+"""Hides the packages of every extra from a process, and all processors but one: see `one_processor` of conftest.py."""
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -26,17 +27,22 @@ from finssim.vehicles import Vehicle
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had.
-
-    Python does not keep the sentences under a dataclass' fields, their source does.
-    """
+    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had."""
     docs: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        with suppress(OSError, TypeError, SyntaxError):
-            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-            for line, below in pairwise(getattr(tree, "body", ())):
-                if isinstance(line, ast.AnnAssign) and isinstance(below, ast.Expr):
-                    docs[ast.unparse(line.target)] = " ".join(str(ast.literal_eval(below.value)).split())
+        docs |= _own_docs(base)
+    return docs
+
+
+@cache
+def _own_docs(kind: type) -> dict[str, str]:
+    """Read the strings of a class's own fields from its source, where alone they are: tasks share their bases."""
+    docs: dict[str, str] = {}
+    with suppress(OSError, TypeError, SyntaxError):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+        for line, below in pairwise(getattr(tree, "body", ())):
+            if isinstance(line, ast.AnnAssign) and isinstance(below, ast.Expr):
+                docs[ast.unparse(line.target)] = " ".join(str(ast.literal_eval(below.value)).split())
     return docs
 
 
