@@ -41,7 +41,8 @@ def test_the_page_is_served_until_control_c(trial):
 
 @pytest.mark.slow
 def test_the_vehicle_is_shown_before_kernels_are_compiled(tmp_path):
-    """With an empty cache the page gets the vehicle, the pool and a notice while no kernel has been compiled."""
+    """With an empty cache the page gets the vehicle, the pool and a notice while no kernel has been compiled; Ctrl-C
+    then ends the command before all are."""
     run, url = start("pool", "--port", "8242", WARP_CACHE_PATH=str(tmp_path))
     try:
         options = {"subprotocols": [f"viser-v{viser.__version__}"], "additional_headers": {"Origin": url}}
@@ -55,9 +56,11 @@ def test_the_vehicle_is_shown_before_kernels_are_compiled(tmp_path):
                 if not missing:
                     break
         assert not missing and not list(tmp_path.rglob("*.o"))
+        run.send_signal(signal.SIGINT)
+        out, _ = run.communicate(timeout=60.0)
+        assert run.returncode == 0 and out == "" and len(list(tmp_path.rglob("*.o"))) < 3
     finally:
         run.kill()
-        run.communicate()
 
 
 @pytest.mark.slow

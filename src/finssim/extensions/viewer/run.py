@@ -127,17 +127,11 @@ def run(
     print(f"view: {view.url}   (Ctrl-C ends)", flush=True)
     if not no_browser:
         webbrowser.open(view.url)
-    source: Source | None = None
     try:
         with interruptible() as interrupted:
             view.show(placeholder)
             view.turn(0.0)
-            with (
-                interrupting(),
-                suppress(KeyboardInterrupt),
-            ):  # the page is served meanwhile, by a thread of its own
-                source = open_source(choice)
-                source.frame(FIRST)
+            source = None if interrupted() else _ready(choice)
             if source is None:
                 return
             view.show(source)
@@ -150,6 +144,15 @@ def run(
 
 FIRST = 0.2
 """A live source runs to this time before it is shown [s]: so its kernels are compiled behind the placeholder."""
+
+
+def _ready(choice: SourceChoice) -> Source | None:
+    """Return the source once its kernels are compiled, while the page is served by its own thread; None if stopped."""
+    with interrupting(), suppress(KeyboardInterrupt):
+        source = open_source(choice)
+        source.frame(FIRST)
+        return source
+    return None
 
 
 def _placeholder(choice: SourceChoice, kind: str) -> Source:
