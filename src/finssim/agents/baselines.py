@@ -17,6 +17,7 @@ from finssim.core.rotations import (
     quat_conjugate,
     quat_from_euler,
     quat_from_yaw,
+    quat_multiply,
     quat_rotate,
 )
 from finssim.tasks.moving_target import DISTANCE_SCALE as TARGET_DISTANCE_SCALE
@@ -24,6 +25,7 @@ from finssim.tasks.moving_target import TARGET_SCALE
 from finssim.tasks.station_keeping import DISTANCE_SCALE as STATION_SCALE
 from finssim.tasks.trajectory_tracking import DISTANCE_SCALE as TRACKING_SCALE
 from finssim.tasks.trajectory_tracking import LOOK_AHEAD
+from finssim.tasks.velocity import VELOCITY_SCALE
 from finssim.vehicles import Vehicle
 from finssim.vehicles.capability import coefficients_of
 
@@ -166,6 +168,20 @@ class TargetPid(TrackingPid):
         )
         action, pid = self.command(memory.pid, Track(np.zeros((len(o), 3)), q, nu), goal)
         return action, TrackingMemory(memory.heading + self.period * nu[..., 5], pid)
+
+
+class VelocityPid(TrackingPid):
+    """PID of `velocity6`: no way to go, the commanded velocity is that of the goal. Axes as for `TrackingPid`."""
+
+    def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
+        """Actions for observations of `velocity6`."""
+        o = np.asarray(observation, float)
+        up, nu = o[..., 15:18], o[..., 9:15]
+        q = attitude_from(up, memory.heading)
+        wanted = quat_rotate(q, VELOCITY_SCALE * o[..., :3] + nu[..., :3])
+        goal = Goal(np.zeros_like(up), quat_multiply(q, quat_conjugate(turned_from(o))), wanted)
+        action, pid = self.command(memory.pid, Track(np.zeros_like(up), q, nu), goal)
+        return action, TrackingMemory(memory.heading + self.period * heading_rate(up, nu), pid)
 
 
 def attitude_from(up: Array, heading: Array) -> Array:

@@ -222,6 +222,7 @@ TASKS = Family(
         "t1": "finssim.tasks.station_keeping:StationKeeping",
         "t2": "finssim.tasks.trajectory_tracking:TrajectoryTracking",
         "t3": "finssim.tasks.moving_target:MovingTarget",
+        "velocity6": "finssim.tasks.velocity:VelocityControl",
         "docking": "finssim.tasks.docking:Docking",
         "path": "finssim.tasks.path:PathFollowing",
         "waypoints": "finssim.tasks.path:WaypointTour",

@@ -130,9 +130,9 @@ def train(
     Example: finssim train t2 --learner rsl-rl --randomize hold_for_position --set epochs=8 --out runs/track
 
     Args:
-        task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), docking, path,
-            waypoints, terrain, homing, pursuit, team-pursuit, formation; with a camera camera-docking, pipeline or
-            gate, with a sonar net; or your own, FILE.py:CLASS.
+        task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), velocity6
+            (velocity and attitude), docking, path, waypoints, terrain, homing, pursuit, team-pursuit, formation; with
+            a camera camera-docking, pipeline or gate, with a sonar net; or your own, FILE.py:CLASS.
         settings: What it is trained with.
         out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
         resume: Resume a killed training from its last checkpoint.

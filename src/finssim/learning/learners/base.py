@@ -46,6 +46,7 @@ SETTINGS: Table = {
     },
     # So is a target that moves, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
+    "velocity6": {"on-policy": {"discount": 0.95}},
     "docking": {"ppo": {"steps": 900_000}},
     # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
     "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SIGHT},
@@ -88,6 +89,7 @@ RANDOMIZED: Table = {
         "on-policy": {"steps": 2_000_000},
     },
     "t3": {"ppo": {"steps": 1_500_000}},
+    "velocity6": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
     "docking": {"ppo": {"steps": 2_000_000}},
     # In `open_water` its student succeeds in all episodes after half of these steps.
     "camera-docking": {"distill": {"teacher_steps": 1_500_000, "steps": 60_000}},
