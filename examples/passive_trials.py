@@ -47,7 +47,7 @@ def draw(curves: list[Curve], path: Path) -> None:
     figure = Figure(figsize=(9.0, 2.4 * len(curves)), layout="constrained")
     for axes, curve in zip(np.atleast_1d(figure.subplots(len(curves), 1)), curves, strict=True):
         axes.plot(curve.x, curve.measured, ".", color="0.6", markersize=3, label="measured")
-        axes.plot(curve.x, curve.fitted, color="C0", label="fitted")
+        axes.plot(curve.x, curve.fitted, color="C0", label="simulated")
         axes.set_title(curve.title, fontsize=10)
         axes.set_ylabel(curve.y_label)
         axes.grid(alpha=0.3)
