@@ -193,7 +193,7 @@ Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
 def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: float = 1.0) -> str:
     """A figure as text, with its interval in brackets where it has one; – where there is none.
 
-    One plant and one seed have an interval of no width, which is left out.
+    An interval whose ends are equal, such as that of one plant and one seed, is left out.
 
     `factor` takes the unit of the figure to that of the text.
     """
