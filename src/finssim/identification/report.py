@@ -251,8 +251,7 @@ QUALITY = {
     "trials": "trials",
     "samples": "samples",
     "rejected": "rejected",
-    "speed_low": "speeds from",
-    "speed_high": "to",
+    "speed_low": "speeds",
 }
 """Figures of a fit that the table on the terminal shows, in this order; the report has all."""
 
@@ -346,7 +345,11 @@ def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
     """
     keys = [key for key in QUALITY if key in figures]
     keys += [key for key in figures if key not in QUALITY] if every or not keys else []
-    return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {number_text(figures[key])}" for key in keys)
+    texts = {key: number_text(figures[key]) for key in keys}
+    if {"speed_low", "speed_high"} <= figures.keys():
+        texts["speed_low"] = f"{number_text(figures['speed_low'])} to {number_text(figures['speed_high'])}"
+        texts.pop("speed_high", None)
+    return ", ".join(f"{QUALITY.get(key, key.replace('_', ' '))} {text}" for key, text in texts.items())
 
 
 AS_STATED = "as given"

@@ -193,7 +193,7 @@ def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequ
     for report in reports:
         _print_trial(report, console, brief=len(reports) > MANY)
     if len(reports) > 1:
-        table = _table(("axis", *PARAMETERS), ("axis",), "trials that tell")
+        table = _table(("axis", *PARAMETERS), ("axis",), "trials that determine a parameter")
         for axis in AXES:
             counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
             table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
