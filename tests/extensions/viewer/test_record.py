@@ -33,7 +33,7 @@ def test_frames_are_the_recorded_messages(source, trial):
         assert frame.estimate.position.tolist() == [p.x, p.y, p.z]
         assert frame.force.tolist() == [f for t, f in states if t <= at][-1].tolist()
         assert frame.goal.position == pytest.approx(GOAL)
-        assert frame.status["bridge"] == "armed"
+        assert frame.status["bridge"] == "armed" and frame.status["shafts"].endswith(" rpm")
 
 
 def test_pictures_come_with_the_tags_in_them(source):

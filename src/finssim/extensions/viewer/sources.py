@@ -219,8 +219,15 @@ class PoolSource:
         status["estimate error"] = self._errors.of_estimate
         status["battery"] = f"{float(plant.electric[0]):.2f} V"
         rpm = np.asarray(plant.shaft_speed) * 60.0 / (2.0 * math.pi)
-        status["shafts [rpm]"] = " ".join(f"{r:.0f}" for r in rpm)
+        status["shafts"] = listed(rpm, "rpm")
         return status
+
+
+def listed(values: npt.ArrayLike, unit: str, digits: int = 0) -> str:
+    """Return numbers, (n,), of a unit as a text, in the order of the vehicle's thrusters, with so many decimals."""
+    return (
+        ", ".join(f"{x:.{digits}f}" for x in np.asarray(values)).replace("-", "\N{MINUS SIGN}") + f" {unit}"
+    )
 
 
 # Frames of the simulator with a controller that knows the state exactly.
@@ -297,7 +304,7 @@ class SimulatorSource:
                 "controller": self._pilot.name,
                 "to the goal": self._errors.to_goal,
                 "progress": f"{100.0 * float(self._guide.at(now).progress):.0f} %",
-                "thrust [N]": " ".join(f"{f:.1f}" for f in self._channels()[: self._n]),
+                "thrusts": listed(self._channels()[: self._n], "N", 1),
             },
         )
 
@@ -544,7 +551,7 @@ class RecordSource:
             status["position std"] = f"{100.0 * float(np.max(health.position_std)):.1f} cm"
         if shafts is not None:
             rpm = np.asarray(shafts.velocity) * 60.0 / (2.0 * math.pi)
-            status["shafts [rpm]"] = " ".join(f"{r:.0f}" for r in rpm)
+            status["shafts"] = listed(rpm, "rpm")
         for name, series in self._ranges.items():
             if _age(series, at) < FRESH:
                 status[name] = f"{series.at(at).range:.2f} m"
@@ -671,7 +678,7 @@ class RunSource:
         channels = self._channels.at(time)
         channels = np.zeros(0) if channels is None else channels
         force = channels[: self._n]
-        status = {"thrust [N]": " ".join(f"{f:.1f}" for f in force)} if len(force) else {}
+        status = {"thrusts": listed(force, "N", 1)} if len(force) else {}
         return ViewFrame(
             time=time,
             truth=self._poses.at(time),
