@@ -141,3 +141,15 @@ def test_a_phone_sees_the_water_from_farther_away(view):
         )
 
     assert distance(390.0 / 844.0) > 1.4 * distance(LANDSCAPE) and distance(2.0) == distance(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, thrusters, fins", [("slocum", 0, 1), ("eca_a9", 1, 4), ("rexrov", 8, 0)])
+def test_vehicles_of_every_build_are_drawn(view, name, thrusters, fins):
+    """A glider without propeller, a torpedo with fins and one propeller, a vehicle with a mesh of its own."""
+    view.show(Placeholder(load_vehicle(name), name, ""))
+    view.turn(0.05)
+    propellers = view.server.scene.get_handle_by_name("/truth/thrusters/propellers")
+    assert thrusters == (0 if propellers is None else len(propellers.batched_wxyzs))
+    assert len(view.scene._fins) == 2 * fins and node(view, "/truth/hull").vertices.shape[0] > 20
+    assert (view.server.scene.get_handle_by_name("/truth/thrusters/ducts") is not None) == (thrusters > 1)
