@@ -115,3 +115,18 @@ def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
     # The camera's picture in the panel follows, too.
     panel = np.s_[200:, int(0.7 * after.shape[1]) :]
     assert (np.abs(after[panel].astype(int) - before[panel]) > 40).sum() > 500
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_on_a_phone_the_panel_lies_below_the_scene(page):
+    """It is as wide as the page and at most half as high; a tap on its head leaves the head alone."""
+    page.set_viewport_size({"width": 390, "height": 844})
+    panel = page.locator(".mantine-Paper-root[style*='fixed']")
+    panel.wait_for()
+    wait(lambda: panel.bounding_box()["height"] > 0.2 * 844)
+    box = panel.bounding_box()
+    assert box["x"] == 0 and box["width"] == 390 and box["height"] <= 0.5 * 844
+    assert box["y"] + box["height"] == pytest.approx(844, abs=1)
+    page.get_by_text("FinsSim", exact=True).first.click()
+    wait(lambda: panel.bounding_box()["height"] < 0.1 * 844)
