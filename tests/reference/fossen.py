@@ -29,7 +29,8 @@ class Fossen(Origin):
     def __init__(self, m, inertia, rg, rb, B, added, linear, quadratic, g=9.81):
         self.M_RB = np.block([[m * np.eye(3), -m * S(rg)], [m * S(rg), np.diag(inertia) - m * S(rg) @ S(rg)]])
         self.M_A, self.D, self.Dn = (np.diag(np.abs(x)) for x in (added, linear, quadratic))
-        self.W, self.B, self.rg, self.rb = m * g, B, np.array(rg), np.array(rb)
+        self.W, self.B = m * g, B
+        self.arm = self.W * S(rg) - B * S(rb)
 
     def added_coriolis(self, nu):
         return coriolis(self.M_A, nu)
@@ -39,14 +40,12 @@ class Fossen(Origin):
 
     def rate(self, R, nu, tau):
         """Acceleration of many states, x forward, y left, z up: rotation (n, 3, 3), velocity and wrench (n, 6)."""
-        out = []
+        out, inverse = [], np.linalg.inv(self.M_RB + self.M_A)
         for turn, v, push in zip(R, nu * F, tau * F, strict=True):
             down = np.array([-turn[2, 0], turn[2, 1], turn[2, 2]])  # the world's, in body axes with z down
-            force = (self.W - self.B) * down
-            moment = np.cross(self.rg, self.W * down) - np.cross(self.rb, self.B * down)
-            total = push + np.concatenate([force, moment]) - self.drag(v)
+            total = push + np.concatenate([(self.W - self.B) * down, self.arm @ down]) - self.drag(v)
             total -= (coriolis(self.M_RB, v) + self.added_coriolis(v)) @ v
-            out.append(np.linalg.solve(self.M_RB + self.M_A, total) * F)
+            out.append(inverse @ total * F)
         return np.array(out)
 
 

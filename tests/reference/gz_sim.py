@@ -220,8 +220,9 @@ class Origin:
             + momentum_wrench(nu @ (self.rigid + self.implicit).T)
             + momentum_wrench(nu * np.diag(self.Ma))
         )
-        for force, r in [(-w, r) for w, r in self.weights] + self.lifts:
-            wrench += np.hstack([force * up, np.cross(r, force * up)])
+        forces = [(-w, r) for w, r in self.weights] + self.lifts
+        arm = np.sum([force * r for force, r in forces], axis=0)
+        wrench += np.hstack([sum(force for force, _ in forces) * up, np.cross(arm, up)])
         D = self.linear + np.einsum("ijk,nk->nij", self.absolute, np.abs(nu))
         wrench += np.einsum("nij,nj->ni", D, nu)
         return wrench @ np.linalg.inv(self.rigid + self.implicit - self.Ma).T
