@@ -54,15 +54,15 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FI
     guide_end = 0.0 if isinstance(guide, Station) else guide.duration
     with Recorder(record, vehicle, about, pictures="none", epoch=1e9) as recorder:
         runtime = Runtime(vehicle, known_site, pilot, guide, arm=True, recorder=recorder)
-        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(24.0, guide_end) + 0.5)
+        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(20.0, guide_end) + 0.5)
     pool.close()
     return record, truth, runtime.started
 
 
 @pytest.fixture(scope="module")
 def held(brief_t1, tmp_path_factory):
-    """P03, held for 24 s."""
-    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 34.0)
+    """P03, held for 20 s."""
+    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 30.0)
 
 
 def captured(path, truth, late):
