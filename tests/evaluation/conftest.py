@@ -19,8 +19,8 @@ def one_processor():
 
 @pytest.fixture(scope="module")
 def brief_t1():
-    """Trials of T1 last 20 s in place of 60, with the late errors from the last eight: where only what is made of a trial
-    is tested."""
+    """Trials of T1 last 20 s in place of 60, with the late errors from the last eight: where only what is made of a
+    trial is tested."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics, "EVALUATION_WINDOW", (12.0, 20.0))
         for function in (RobotJob.__init__, read_record):
