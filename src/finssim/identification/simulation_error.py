@@ -430,35 +430,8 @@ class Stages:
             scores, error = held_out(stage, file, self.axes, several)
             for axis, (after, before) in scores.items():
                 figures[axis] |= {"held_out": after, "file": before}
-        found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
         others, held = other_estimates(p, numbers)
-        for axis in self.axes:
-            own = speeds([s.motion for s in self.used], axis)
-            # A coast shows drag at all speeds, and those in the middle best.
-            speed = float(np.sqrt(own[0] * own[1])) if stage.problem.coasts else own[1]
-            known = is_drag_known(p, x, stage.found, axis, speed, shapes.get(axis))
-            result = axis_result(
-                p, x, numbers, axis, speeds=own, drag_known=known, given=self.known.get(axis)
-            )
-            reason = ""
-            worst, r2 = unexplained(stage.problem, stage.solution, axis, self.used)
-            if figures.get(axis, {}).get("r2", 1.0) < EXPLAINED:
-                reason = f"the model explains nothing of this axis' motion: R² {figures[axis]['r2']:.2f}"
-            elif r2 < EXPLAINED:
-                reason = (
-                    f"the model explains nothing of how {worst} moves, R² {r2:.2f}: fit its releases apart"
-                )
-            if reason:
-                result.believe_nothing(reason)
-            if axis == "heave":
-                others["buoyancy_excess"], said = self.buoyancy(others["buoyancy_excess"], reason)
-                result.findings += said
-            found |= result.estimates
-            if axis in self.free:
-                found |= result.estimates if reason else self.free_estimates(stage, result)
-            axes |= result.changes
-            bounds += result.findings
-        found |= others
+        found, axes, bounds = self.axis_results(stage, shapes, numbers, figures, others)
         sources = {s.drive.source for s in self.used}
         unmeasured = [axis for axis in p.unseen if axis not in observable(self.prepared)]
         new = changes(p, x, found, axes, unmeasured=unmeasured, scaled=sources <= {"rpm", "pwm"})
@@ -479,19 +452,6 @@ class Stages:
             *held,
             *traded,
         ]
-        settings: dict[str, Any] = {
-            "axes": list(self.axes),
-            "damping": damping,
-            "drag": dict(kinds) | {axis: shape.weights for axis, shape in shapes.items()},
-            "estimate": sorted(self.extras),
-            "fix": {f"{axis}.m": m for axis, m in self.known.items()},
-            "published": self.published,
-            "speeds": {axis: round(figures[axis]["speed_high"], 4) for axis in self.axes if axis in figures},
-            "horizon": round(self.length, 3),
-            "step": STEP,
-            "segments": len(self.segments),
-            "iterations": stage.solution.iterations,
-        }
         self.say("done")
         return Fit(
             kind="hydrodynamics",
@@ -504,9 +464,70 @@ class Stages:
             findings=tuple(dict.fromkeys(remarks)),
             curves=pictures(stage, self.axes, error),
             trials={one.trial.name: one.trial.sha256 for one in self.used},
-            settings=settings,
+            settings={
+                "axes": list(self.axes),
+                "damping": damping,
+                "drag": dict(kinds) | {axis: shape.weights for axis, shape in shapes.items()},
+                "estimate": sorted(self.extras),
+                "fix": {f"{axis}.m": m for axis, m in self.known.items()},
+                "published": self.published,
+                "speeds": {a: round(figures[a]["speed_high"], 4) for a in self.axes if a in figures},
+                "horizon": round(self.length, 3),
+                "step": STEP,
+                "segments": len(self.segments),
+                "iterations": stage.solution.iterations,
+            },
             interrupted=stage.solution.interrupted,
         )
+
+    def axis_results(
+        self,
+        stage: Stage,
+        shapes: Mapping[str, DragShape],
+        numbers: Mapping[str, Number],
+        figures: Mapping[str, Mapping[str, float]],
+        others: Mapping[str, Estimate],
+    ) -> tuple[dict[str, Estimate], dict[str, Any], list[Finding]]:
+        """Return all estimates, the changes of the vehicle by axis, and what has to be said of them.
+
+        Args:
+            stage: The finished fit.
+            shapes: Drag of each axis whose shape was averaged.
+            numbers: Parameter -> value and interval.
+            figures: Axis -> quality of the fit, in the units of `Fit.quality`.
+            others: Estimates that belong to no axis.
+        """
+        p, x, others = stage.problem.parameters, stage.x, dict(others)
+        found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
+        for axis in self.axes:
+            own = speeds([s.motion for s in self.used], axis)
+            # A coast shows drag at all speeds, and those in the middle best.
+            speed = float(np.sqrt(own[0] * own[1])) if stage.problem.coasts else own[1]
+            known = is_drag_known(p, x, stage.found, axis, speed, shapes.get(axis))
+            result = axis_result(
+                p, x, numbers, axis, speeds=own, drag_known=known, given=self.known.get(axis)
+            )
+            reason = self.unbelievable(stage, axis, figures.get(axis, {}).get("r2", 1.0))
+            if reason:
+                result.believe_nothing(reason)
+            if axis == "heave":
+                others["buoyancy_excess"], said = self.buoyancy(others["buoyancy_excess"], reason)
+                result.findings += said
+            found |= result.estimates
+            if axis in self.free:
+                found |= result.estimates if reason else self.free_estimates(stage, result)
+            axes |= result.changes
+            bounds += result.findings
+        return found | others, axes, bounds
+
+    def unbelievable(self, stage: Stage, axis: str, r2: float) -> str:
+        """Return why nothing that was fitted to an axis can be believed, or an empty text; `r2` is the axis' R²."""
+        if r2 < EXPLAINED:
+            return f"the model explains nothing of this axis' motion: R² {r2:.2f}"
+        worst, least = unexplained(stage.problem, stage.solution, axis, self.used)
+        if least < EXPLAINED:
+            return f"the model explains nothing of how {worst} moves, R² {least:.2f}: fit its releases apart"
+        return ""
 
     def buoyancy(self, excess: Estimate, reason: str) -> tuple[Estimate, list[Finding]]:
         """Return the excess of buoyancy, not identifiable where it rests on an assumed mass, and what contradicts it.
