@@ -521,7 +521,13 @@ class Stages:
         return found | others, axes, bounds
 
     def unbelievable(self, stage: Stage, axis: str, r2: float) -> str:
-        """Return why nothing that was fitted to an axis can be believed, or an empty text; `r2` is the axis' R²."""
+        """Return why nothing that was fitted to an axis can be believed, or an empty text.
+
+        Args:
+            stage: The finished fit.
+            axis: The axis.
+            r2: R² of the whole axis [-].
+        """
         if r2 < EXPLAINED:
             return f"the model explains nothing of this axis' motion: R² {r2:.2f}"
         worst, least = unexplained(stage.problem, stage.solution, axis, self.used)
