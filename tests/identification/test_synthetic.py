@@ -92,6 +92,23 @@ def test_the_vehicles_own_sensors_measure():
     assert abs(halves[0]) < 5 * 5e-3
 
 
+def test_a_row_has_the_newest_sample_and_the_commands_from_then_on():
+    """A gyro without errors reads the true rate of the row, and the thrusts add up to the wrench that was asked for."""
+    names = ("gyro_noise_density", "gyro_bias_walk", "gyro_bias_initial", "gyro_quantisation", "latency")
+    vehicle = FINSROV.replace({f"sensors.imu.{name}": 0.0 for name in names})
+    plan = programmes("yaw", vehicle, levels=[1.0])[:1]
+    recording = record(plan, vehicle)
+    noise = NoiseProfile(own_sensors=True)
+    (trial,) = trials_of(recording, plan, vehicle, noise=noise, inputs=("command",))
+    every = round(0.02 / recording.step)
+    true = recording.velocity[::every, 0, 5][: len(trial.t)]
+    np.testing.assert_allclose(trial.channels["r"], true, atol=1e-5)
+    thrusts = np.stack([trial.channels[f"command_{name}"] for name in vehicle.thruster_names], axis=-1)
+    asked = np.repeat(plan[0].tau_desired[:, 5], round(50.0 / plan[0].rate))
+    given = thrusts @ vehicle.thruster_matrix()[5]
+    np.testing.assert_allclose(given[: len(asked)], asked, atol=0.02)
+
+
 def test_published_noise_takes_velocity_from_noisy_positions():
     """A local parabola of 1 s over 5 cm of noise at 50 Hz leaves std² = 12 σ² / (N T²) of velocity error."""
     recording = record(SURGE, FINSROV, seed=1)
