@@ -1,6 +1,7 @@
 """The record: what was put in comes out, in any reader; what is written stays readable when the process dies."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +33,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
 
-from finssim.robot.record_messages import Messages
+from finssim.robot.record_files import vehicle_of
+from finssim.robot.record_messages import Messages, RecordError
 from finssim.robot.record_reader import describe_record, open_record
 from finssim.robot.recorder import Recorder
 
@@ -199,6 +201,37 @@ def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
     assert json.loads(about["configuration"]) == {"rate": 60} and about["seed"] == "3"
     assert "finssim" in json.loads(about["provenance"])
     assert kept.data == VEHICLE.path.read_bytes()
+
+
+def test_a_record_keeps_the_files_that_its_vehicle_extends(tmp_path):
+    """Without the folder in which they were, with a parent beside the file and one in the catalogue."""
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "otter.yaml").write_text(
+        "extends: finsrov\nbody: {mass: 12.4}\norigin: guessed\nsource: me\n"
+    )
+    child = tmp_path / "own" / "otter_heavy.yaml"
+    child.write_text("extends: otter\nbody: {mass: 12.9}\norigin: guessed\nsource: me\n")
+    vehicle = load_vehicle(child)
+    with Recorder(tmp_path / "run.mcap", vehicle):
+        pass
+    shutil.rmtree(tmp_path / "own")
+    with open_record(tmp_path / "run.mcap") as record:
+        assert set(record.files) == {"otter.yaml", "otter_heavy.yaml"}
+        assert vehicle_of(record).sha256 == vehicle.sha256
+
+
+def test_a_parent_that_a_record_keeps_may_not_name_a_path(tmp_path):
+    (tmp_path / "otter.yaml").write_text(
+        "extends: finsrov\nbody: {mass: 12.4}\norigin: guessed\nsource: me\n"
+    )
+    child = tmp_path / "heavy.yaml"
+    child.write_text("extends: otter.yaml\norigin: guessed\nsource: me\n")
+    with Recorder(tmp_path / "run.mcap", load_vehicle(child)):
+        pass
+    with open_record(tmp_path / "run.mcap") as record:
+        record.files["otter.yaml"] = "extends: /etc/otter.yaml\n"
+        with pytest.raises(RecordError, match="otter.yaml: extends"):
+            vehicle_of(record)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,9 @@ from finssim.robot.record_messages import RecordError
 from finssim.robot.record_reader import Record
 from finssim.vehicles import Vehicle, VehicleError, catalogue_vehicle, load_vehicle
 
+POOL = "pool.yaml"
+"""Name of the pool's file in a record."""
+
 
 def vehicle_of(record: Record) -> Vehicle:
     """Return the vehicle that a record names, from the file that it keeps where the catalogue has another one now.
@@ -45,30 +48,38 @@ def pool_of(record: Record) -> Pool | None:
         RecordError: The pool's file names another file by a path.
         LocalizationError: The pool's file is wrong.
     """
-    if "pool.yaml" not in record.files:
+    if POOL not in record.files:
         return None
-    with _kept_file(record, "pool.yaml", ("camera", "lens")) as file:
+    with _kept_file(record, POOL, ("camera", "lens")) as file:
         return load_pool(file)
 
 
 @contextmanager
 def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
-    """Yield a file that the record keeps, in a separate folder; `references` are its keys that may name other files.
+    """Yield a file that the record keeps, in a folder of its own, beside those that it extends.
 
-    So may the devices of a vehicle's `perception`.
+    `references` are the keys that may name other files. So may the devices of a vehicle's `perception`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / name
-        file.write_text(record.files[name], encoding="utf-8")
-        tree: Any = read_mapping(file, RecordError, such_as="name: value")
-        for keys in references:
-            value = tree
-            for key in keys:
-                value = value.get(key) if isinstance(value, dict) else None
-            if isinstance(value, str):
-                plain_name(value, f"{record.path}: {name}: {': '.join(keys)}", RecordError)
-        entries = tree.get("perception")
-        for entry in entries.values() if isinstance(entries, dict) else ():
-            if isinstance(entry, dict) and isinstance(entry.get("device"), str):
-                plain_name(entry["device"], f"{record.path}: {name}: perception: device", RecordError)
-        yield file
+        names = [name]
+        for one in names:  # which grows
+            file = Path(folder) / one
+            file.write_text(record.files[one], encoding="utf-8")
+            tree: Any = read_mapping(file, RecordError, such_as="name: value")
+            entries = tree.get("perception")
+            devices = entries.values() if isinstance(entries, dict) else ()
+            named = [(": ".join(keys), _value_at(tree, keys)) for keys in references]
+            named += [("perception: device", _value_at(entry, ("device",))) for entry in devices]
+            for keys, value in named:
+                if isinstance(value, str):
+                    plain_name(value, f"{record.path}: {one}: {keys}", RecordError)
+            parents = (f"{tree.get('extends')}{suffix}" for suffix in ("", ".yaml"))
+            names += [p for p in parents if p in record.files and p not in names][:1]
+        yield Path(folder) / name
+
+
+def _value_at(tree: Any, keys: tuple[str, ...]) -> Any:
+    """Return the value below some keys of nested mappings; None where there is none."""
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return tree

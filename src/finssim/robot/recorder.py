@@ -23,6 +23,7 @@ from finssim.core import realtime
 from finssim.core.files import OutputError, atomic_write, refuse_unwritable
 from finssim.core.mcap_files import END
 from finssim.core.provenance import provenance
+from finssim.core.yaml_file import read_mapping
 from finssim.robot.messages import CommandEcho, NavigationAid, Picture, Telemetry
 from finssim.robot.pictures import jpeg
 from finssim.robot.reading import Reading
@@ -247,7 +248,7 @@ class Recorder:
             OSError: One of `files` cannot be read.
         """
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
-        texts |= _vehicle_file(vehicle)
+        texts |= _vehicle_files(vehicle)
         self._name, self._vehicle, self._messages = vehicle.name, vehicle, Messages(vehicle)
         self._topics = TOPICS | own_topics(vehicle)
         self._schemas: dict[str, int] = {}
@@ -469,9 +470,15 @@ def recording(
         yield recorder
 
 
-def _vehicle_file(vehicle: Vehicle) -> dict[str, bytes]:
-    """The vehicle's file; its values where a program changed them after reading."""
+def _vehicle_files(vehicle: Vehicle) -> dict[str, bytes]:
+    """The vehicle's file and those of its folder that it extends; its values where a program changed them."""
     path = vehicle.path
-    if path is not None and path.suffix in (".yaml", ".yml") and load_vehicle(path).sha256 == vehicle.sha256:
-        return {f"{vehicle.name}.yaml": path.read_bytes()}
-    return {f"{vehicle.name}.json": json.dumps(vehicle.values(), default=str).encode()}
+    if path is None or path.suffix not in (".yaml", ".yml") or load_vehicle(path).sha256 != vehicle.sha256:
+        return {f"{vehicle.name}.json": json.dumps(vehicle.values(), default=str).encode()}
+    texts = {f"{vehicle.name}.yaml": path.read_bytes()}
+    while True:
+        parent = str(read_mapping(path, OutputError, such_as="name: value").get("extends") or "")
+        path = path.parent / (parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml")
+        if Path(parent).name != parent or path.name in texts or not path.is_file():
+            return texts
+        texts[path.name] = path.read_bytes()
