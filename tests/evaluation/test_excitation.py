@@ -9,9 +9,10 @@ from typer.testing import CliRunner
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.evaluation.excitation import PoolRun, play_programme, record_programmes
+from finssim.evaluation.excitation import PoolRun, play_programme, record_programmes, trimmed
 from finssim.identification.programme import Programme, programmes
 from finssim.identification.simulation_error import fit_by_simulation
+from finssim.identification.vehicle_file import write_vehicle
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import load_vehicle
@@ -81,26 +82,42 @@ def test_equal_runs_have_equal_keys_and_every_setting_counts():
         assert other.key() != first.key()
 
 
-def test_a_programme_that_the_bridge_stops_is_refused(tmp_path):
-    """Rolled hard and left so: the tilt watchdog ends it."""
+def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
+    """Rolled hard and left so: the tilt watchdog ends it. What was finished beside it is kept; alone it is refused."""
     n = 300
     tau = np.zeros((n, 6))
     tau[50:, 3] = FINSROV.wrench_limits[3]
     phase = np.array(["baseline"] * 50 + ["excitation"] * (n - 50))
     hard = Programme(name="roll_hard", axes=("roll",), rate=50.0, tau_desired=tau, phase=phase)
-    light = FINSROV.replace({"safety.max_tilt": 0.05})
-    from finssim.identification.vehicle_file import write_vehicle
+    still = Programme(name="still", axes=("roll",), rate=50.0, tau_desired=np.zeros((n, 6)), phase=phase)
+    write_vehicle(FINSROV.replace({"safety.max_tilt": 0.05}), tmp_path / "light.yaml")
+    faults = {}
 
-    write_vehicle(light, tmp_path / "light.yaml")
-    with pytest.raises(CalibrationError, match="roll_hard in the virtual pool: .*tilt"):
-        record_programmes(
-            {"fit": [hard]},
-            {"fit": tmp_path / "out"},
+    def recorded(plan, out):
+        return record_programmes(
+            {"fit": plan},
+            {"fit": tmp_path / out},
             str(tmp_path / "light.yaml"),
             pool_vehicle="finsrov",
             severity="nominal",
             processes=1,
+            show=lambda run, result: faults.update({run.target: result["fault"]}),
         )
+
+    assert recorded([hard, still], "both") == {"fit": [tmp_path / "both" / "still"]}
+    assert "tilt" in faults["roll_hard"] and not faults["still"]
+    with pytest.raises(CalibrationError, match="stopped every fit trial in the virtual pool: .*tilt"):
+        recorded([hard], "alone")
+
+
+def test_thrusters_carry_what_a_vehicle_is_too_light():
+    """All the time, and nothing where it is ballasted or not controlled in heave."""
+    programme = step(6.0)
+    light = FINSROV.replace({"body.displaced_volume": FINSROV.body.displaced_volume + 2e-4})
+    carried = trimmed(programme, light).tau_desired - programme.tau_desired
+    np.testing.assert_allclose(carried[:, 2], light.weight - light.buoyancy)
+    assert carried[0, 2] < -1.5 and not np.delete(carried, 2, axis=1).any()
+    assert trimmed(programme, FINSROV) is programme
 
 
 def test_excite_in_a_pool_by_command(tmp_path):

@@ -47,6 +47,14 @@ def known_in(environment: Environment) -> Known:
     )
 
 
+def goals_in(environment: Environment) -> Goal:
+    """Return the goals that the task has set to the worlds, one each; none for a team."""
+    if environment.agents > 1:
+        return NOWHERE
+    arrays = environment.arrays
+    return Goal(*(np.asarray(a.numpy(), float) for a in (arrays.goal_position, arrays.goal_quaternion)))
+
+
 class Agent(Protocol):
     """An agent without internal state: it sees measurements and a goal; its memory is an argument and a result."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from finssim.agents.agent import NOWHERE, agent_for, rollout
+from finssim.agents.agent import agent_for, goals_in, rollout
 from finssim.control.policy import read_description
 from finssim.core.files import atomic_write
 from finssim.core.progress import progress_bar
@@ -82,7 +82,7 @@ def play(
     with atomic_write(video) as temporary, progress_bar("episode") as show:
         steps = round(the_task.time_limit / the_task.control_step)
         onlooker, pictures = described_world("pool").onlooker(environment), []
-        for k, step in rollout(agent, environment, steps, lambda t: NOWHERE):
+        for k, step in rollout(agent, environment, steps, lambda t: goals_in(environment)):
             pictures.append(_with_observed(onlooker.picture(), environment))
             show(k / steps)
             if step is not None and (step.terminated[0] or step.truncated[0]):

@@ -61,9 +61,13 @@ class Known:
     """Readings as plain arrays; fields that are not needed may be left out."""
 
     observation: Any
+    """Observation of the task, in the order and the units of its parts, (..., n)."""
     position: Any = None
+    """Position of the body origin, world frame [m], (..., 3)."""
     quaternion: Any = None
+    """Attitude, body to world, xyzw, (..., 4)."""
     nu: Any = None
+    """Linear [m/s] and angular [rad/s] velocity, body frame, (..., 6)."""
     pictures: Any = None
     """Pictures by name: uint8 (n, height, width, 3)."""
 

@@ -449,22 +449,41 @@ def fastest_text(programme: Programme, outcome: TrialOutcome) -> str:
     return f"up to {pilot.fastest:.2f} {unit} in {0.0 if math.isnan(t) else t:.0f} s"
 
 
+BALLASTED = 0.25
+"""Weight minus buoyancy that the thrusters need not carry [N]."""
+
+
+def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
+    """The programme with the vehicle's weight less its buoyancy carried by the thrusters, where it is not ballasted.
+
+    A BlueROV2 that rises with 2 N is out of a shallow pool before its first step; the fit takes what acted.
+
+    Args:
+        programme: On any axis.
+        vehicle: Whose weight and displaced volume are known.
+    """
+    net = vehicle.weight - vehicle.buoyancy
+    if abs(net) < BALLASTED or "heave" not in vehicle.controlled_axes:
+        return programme
+    tau = programme.tau_desired.copy()
+    tau[:, 2] += net
+    return replace(programme, tau_desired=tau)
+
+
 def _in_pool(
     plans: Plans,
     folders: Mapping[str, Path],
     vehicle: str,
     *,
-    leave_out: bool = False,
     processes: int | None = None,
     progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
     **settings: Any,
 ) -> None:
-    """Make trials of programmes in a pool.
+    """Make trials of programmes in a pool; those that the bridge stopped are left out, and `show` is given their fault.
 
     Args:
         plans, folders, vehicle: As of `record_programmes`.
-        leave_out: Leave out the trials that the bridge stopped, instead of refusing all; `show` is given their fault.
         processes: As many as there are processors if None.
         progress: Told the share that is done and what is left.
         show: Given each run and its result, of `play_programme`, as soon as there is one.
@@ -484,12 +503,8 @@ def _in_pool(
             runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
         )
         for run, result in zip(runs, results, strict=True):
-            if result["fault"] and leave_out:
-                continue
             if result["fault"]:
-                raise CalibrationError(
-                    f"{run.target} in the virtual pool: {result['fault']}: give lower levels, or fewer axes"
-                )
+                continue
             source, folder = Path(scratch) / result["key"], folders[run.row]
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
             shutil.move(source / run.target, folder / run.target)
@@ -581,6 +596,8 @@ def excite(
         print_folders(folders, as_json)
         return folders
     played = programmes(axes, body, seed=seed, **plan)
+    if pool is not None:
+        played = [trimmed(programme, body) for programme in played]
     with atomic_directory(out, replaces=PLAN_FILE) as folder:
         if pool is not None:
             about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
@@ -588,7 +605,7 @@ def excite(
             with progress_bar("playing programmes") as progress:
                 record_programmes(
                     {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool,
-                    severity=severity, seed=seed, progress=progress,
+                    severity=severity, seed=seed, progress=progress, show=_show_left_out,
                 )  # fmt: skip
         else:
             take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"simulated": simulate}))
@@ -596,9 +613,16 @@ def excite(
                 write_trial(trial, folder / trial.name)
             for programme in () if simulate else played:
                 write_programme(programme, body, folder / programme.name)
-    folders = [Path(out) / programme.name for programme in played]
+    folders = [path for programme in played if (path := Path(out) / programme.name).is_dir()]
     print_folders(folders, as_json)
     return folders
+
+
+def _show_left_out(run: PoolRun, result: Mapping[str, Any]) -> None:
+    """Say on standard error which trial is left out, and why."""
+    if result["fault"]:
+        text = f"{run.target}: left out: {result['fault']}"
+        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 MANOEUVRES = "manoeuvres"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.agents.agent import NOWHERE, Agent, rollout
+from finssim.agents.agent import Agent, goals_in, rollout
 from finssim.control.guidance import Goal, Guide, Station, Track, acceleration_at
 from finssim.control.trajectories import load_trajectory
 from finssim.core.files import atomic_write
@@ -344,7 +344,7 @@ def run_episodes(
     running = np.ones(trials, dtype=np.bool_)
     metrics = {name: np.full(trials, np.nan) for name in task.metrics(environment.arrays)}
     longest = round(task.time_limit / task.control_step) + 1
-    for k, step in rollout(agent, environment, longest, lambda t: NOWHERE, record=record):
+    for k, step in rollout(agent, environment, longest, lambda t: goals_in(environment), record=record):
         if step is None:
             continue
         ended = running & (step.terminated | step.truncated)

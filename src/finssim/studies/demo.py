@@ -28,7 +28,7 @@ from finssim.core.palette import BLUE, VERMILION
 from finssim.core.quiet import start_warp
 from finssim.evaluation.campaign import Progress, running
 from finssim.evaluation.evaluate import T1_COLUMNS
-from finssim.evaluation.excitation import record_programmes
+from finssim.evaluation.excitation import record_programmes, trimmed
 from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import (
@@ -66,8 +66,6 @@ __all__ = ["demo"]
 
 SHARE = 0.9
 """Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
-BALLASTED = 0.25
-"""Weight minus buoyancy of a vehicle that floats well enough [N]."""
 
 
 def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:
@@ -106,23 +104,6 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
         limit = SHARE * float(vehicle.wrench_limits[i])
         scaled[axis] = list(dict.fromkeys(float(f"{min(x, limit):.3g}") for x in level))
     return scaled
-
-
-def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
-    """The programme with the vehicle's weight less its buoyancy carried by the thrusters, where it is not ballasted.
-
-    A BlueROV2 that rises with 2 N is out of a shallow pool before its first step; the fit takes what acted.
-
-    Args:
-        programme: On any axis.
-        vehicle: Whose weight and displaced volume are known.
-    """
-    net = vehicle.weight - vehicle.buoyancy
-    if abs(net) < BALLASTED:
-        return programme
-    tau = programme.tau_desired.copy()
-    tau[:, 2] += net
-    return replace(programme, tau_desired=tau)
 
 
 PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
@@ -697,7 +678,7 @@ class _Demonstration:
         with self._working("recording trials") as progress:
             record = partial(
                 record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
-                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware, leave_out=True,
+                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware,
                 processes=self.processes, progress=progress,
                 show=lambda run, result: self.report(
                     f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
