@@ -21,8 +21,9 @@ from std_msgs.msg import Header
 
 class OwnController(Node):
     def __init__(self, vehicle="bluerov2_heavy", goal=(0.5, 0.3, -0.7)):
-        super().__init__("own_controller", namespace=vehicle)
-        thrusters = load_vehicle(vehicle).thrusters
+        body = load_vehicle(vehicle)  # a name or a file; its name is the namespace of its topics
+        super().__init__("own_controller", namespace=body.name)
+        thrusters = body.thrusters
         columns = [(*t.axis, *np.cross(t.position, t.axis)) for t in thrusters.values()]
         self.names, self.allocation = list(thrusters), np.linalg.pinv(np.array(columns).T)
         self.goal, self.armed = np.array(goal), False
@@ -52,4 +53,7 @@ class OwnController(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(OwnController())
+    try:
+        rclpy.spin(OwnController())
+    except KeyboardInterrupt:
+        pass

@@ -511,9 +511,8 @@ def _lead(fit: Fit) -> list[str]:
             part = 0.5 * (e.ci95[1] - e.ci95[0]) / max(abs(e.estimate), 1e-12)
             size = f"±{100.0 * part:.0f} %" if part < 1.0 else "hardly"
             (known if e.identifiable else unknown).append(f"{name} ({size})")
-    count = sum(e.identifiable for e in fit.estimates.values())
     told = f": {', '.join(known)}" if known else ""
-    out = [f"{count} of {len(fit.estimates)} parameters are determined by the data{told}."]
+    out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{told}."]
     out += [f"Not determined: {', '.join(unknown)}."] if unknown else []
     out += [f"R{str(fit.next_dive)[1:]}."] if fit.next_dive is not None else []
     return [*out, *(["The fit was interrupted before it converged."] if fit.interrupted else [])]

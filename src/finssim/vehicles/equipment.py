@@ -177,7 +177,8 @@ def _additional(name: str, value: Any) -> Sensor:
             )
         raise refuse_section(
             f"unknown key '{name}'{did_you_mean(name, known)} known keys: {', '.join(known)}; a sensor of another "
-            f"name gives its kind, such as '{name}: {{kind: depth, ...}}'"
+            f"name gives its kind, such as '{name}: {{kind: depth, ...}}', and a kind of your own is known once its "
+            "package is installed: pip install -e FOLDER"
         )
     if not re.fullmatch(SENSOR_NAME, name) or name in OTHER_NAMES:
         raise refuse_section(

@@ -20,6 +20,7 @@ import rclpy
 from nav_msgs.msg import Odometry
 
 EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "own_controller.py"
+TOPICS = EXAMPLE.with_name("topics.py")
 PATIENCE = 120.0  # [s] for processes to start on a machine that does much else
 
 
@@ -55,6 +56,24 @@ def test_a_controller_of_ones_own_holds_its_place(graph):
     assert node.armed and np.linalg.norm(node.error) < 0.1
     taken = np.diff([stamp for stamp in stamps if stamp > 1.0])
     assert len(taken) > 60 and np.abs(taken - 1.0 / 60.0).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_topics_are_listed_without_an_installed_ros(graph):
+    """By the example, with their types."""
+    words = [sys.executable, str(TOPICS), "list"]
+    listed = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE)
+    assert "/bluerov2_heavy/arm std_msgs/msg/Bool" in listed.stdout.splitlines(), listed.stderr
+
+
+def test_a_message_is_filled_from_nested_values():
+    """Whole numbers become the fields' own types; an unknown field is refused."""
+    example = runpy.run_path(str(TOPICS))
+    pose = example["type_of"]("geometry_msgs/msg/PoseStamped")()
+    example["fill"](pose, {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1, "z": -0.6}}})
+    assert pose.header.frame_id == "map" and pose.pose.position.x == 1.0 and pose.pose.position.z == -0.6
+    with pytest.raises(AttributeError):
+        example["fill"](pose, {"place": {"x": 1.0}})
 
 
 @pytest.mark.slow
