@@ -43,7 +43,7 @@ def test_a_reader_finds_what_they_need(folder):
     vehicle = calibrated(made_fit())
     for words in (
         "37.9 to 40.2",
-        "5 of 7 parameters",
+        "4 of 6 parameters",
         "yaw.d2 0.4776",
         "rests on its bound",
         "11" * 32,
@@ -62,7 +62,7 @@ def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
     text = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     order = (
         '<img alt="Measured and fitted',
-        "5 of 7 parameters",
+        "4 of 6 parameters",
         "Not determined: yaw.d2 (hardly)",
         "Record next: yaw at ±2 N m",
     )
