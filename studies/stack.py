@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from finssim.cli.command_line import run_script
+from finssim.control import ControlError
 from finssim.control.guidance import Guide
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.evaluation.campaign import keep_result, load_result
@@ -25,6 +26,7 @@ from finssim.pool.task_site import TaskSite
 from finssim.robot.pilots import make_pilot
 from finssim.tasks import Task
 from finssim.tasks.observer import fitted_task
+from finssim.tasks.velocity import VelocityControl
 from finssim.vehicles import Vehicle, load_vehicle
 
 BATCH = 256
@@ -62,6 +64,11 @@ def site_of(
         PolicyError, ControlError, BaselineError: Controller, vehicles and task do not fit.
     """
     fitted = fitted_task(task, vehicles)
+    if isinstance(fitted, VelocityControl):
+        raise ControlError(
+            f"task '{fitted.name}' draws velocities and attitudes in training alone: on a robot the velocity and the "
+            "heading of a trajectory are its command, so that an episode of it cannot be played here"
+        )
     pool = fitted.arena() is not None and fitted.dock() is None
     vehicle = vehicles[0]
     site, state_sources, settings = camera_of(vehicle, plant, severity)

@@ -33,8 +33,8 @@ SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [name for name in TASKS if name != "terrain"]
-)  # its seabed is in training alone
+    "name", [name for name in TASKS if name not in ("terrain", "velocity6")]
+)  # the seabed and the commands of these are in training alone
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
     (who, *_), task = baselines_of(name), task_named(name)
@@ -49,6 +49,12 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     for runtime in site.runtimes.values():
         assert not runtime.bridge.reason and runtime.counters.missed == 0
         assert runtime.counters.decisions >= measured["length"] - 1
+
+
+def test_a_task_whose_commands_are_drawn_is_refused():
+    """Before anything starts, with what commands it on a robot."""
+    with pytest.raises(ControlError, match="the velocity and the heading of a trajectory"):
+        site_of("velocity6", "pid", [FINSROV])
 
 
 @pytest.mark.slow
