@@ -36,7 +36,7 @@ from finssim.evaluation.tables import Table, print_tables, write_page
 from finssim.vehicles import load_vehicle
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "FINSSIM_THREADS": "1"}
-"""Environment of a worker: there are as many of them as processors."""
+"""Environment of a worker: one thread each, for there are as many workers as processors."""
 WATCH = 1.0
 """Time between two looks of a worker at its parent [s]."""
 SETTINGS = 4

@@ -392,7 +392,7 @@ def record_programmes(
     Raises:
         RobotError: It may not be armed, or stopped with nobody there to help.
         KeyboardInterrupt: Ctrl-C; of a robot the same call goes on.
-        CalibrationError: A programme that the water has no room for, or that the pool's bridge stopped.
+        CalibrationError: A programme that the water has no room for, or a role all of whose trials the bridge stopped.
         GoalError, LinkError, VehicleError, OutputError: As they say.
     """
     if robot is None:
