@@ -74,7 +74,7 @@ CASES = {
         0.10,
     ),
     "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
-    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("heave", "pitch"), {}, 0.05),
+    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("surge", "heave", "pitch"), {}, 0.05),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
         ("roll",),
