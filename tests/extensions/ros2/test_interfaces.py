@@ -118,7 +118,7 @@ def test_nodes_depend_on_every_package_whose_types_they_use():
             )
             used |= {name.partition(".")[0] for name in named if name}
     used -= {*sys.stdlib_module_names, "finssim", "finssim_ros"}
-    keys = {"python3-numpy" if name == "numpy" else name for name in used}
+    keys = {{"numpy": "python3-numpy", "yaml": "python3-yaml"}.get(name, name) for name in used}
     assert keys | {"python3-venv"} == {e.text for e in root.findall("exec_depend")}
 
 
