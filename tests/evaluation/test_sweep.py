@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import threading
 import time
 from html import escape
 from pathlib import Path
@@ -12,10 +13,11 @@ import yaml
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.policy import Policy
-from finssim.evaluation.campaign import ClusterError
+from finssim.evaluation import campaign
+from finssim.evaluation.campaign import Checkpoints, ClusterError
+from finssim.learning.train import TrainingSettings, train
 from finssim.studies import sweep as command
 from finssim.studies import transfer
-from finssim.studies.sweep import load_sweep
 from studies.anatomy import anatomy
 from studies.faults import faults_experiment
 
@@ -165,23 +167,52 @@ def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
 
 
 @pytest.mark.slow
-def test_a_machine_that_is_lost_half_way_is_made_up_for(tmp_path, sweep_file, two_machines, monkeypatch):
-    """One of two nodes is killed while both work. Every job still has its row and its policy."""
-    changed(sweep_file, seeds=2)
+def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
+    tmp_path, sweep_file, two_machines, monkeypatch
+):
+    """One of two nodes is killed when both have sent a checkpoint: every training ends, one resumed."""
+    changed(sweep_file, train={"steps": 8 * 4096, "worlds": 16})
     cluster, second = two_machines
-    ended, train_policies = [], command.train_policies
+    ended = threading.Event()
 
-    def watched(*words):
-        for policy, error in train_policies(*words):
-            ended.append(policy.name)
-            if (
-                len(ended) == 1
-            ):  # both nodes work now: one on its second training, the other on its first or second
-                cluster.remove_node(second, allow_graceful=False)
-            yield policy, error
+    class WatchedCheckpoints(Checkpoints):  # a class of this function is sent to Ray with its code
+        def store(self, number, files):
+            super().store(number, files)
+            (tmp_path / str(number)).touch()
 
-    monkeypatch.setattr(command, "train_policies", watched)
-    result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
-    assert result["ok"] and sorted(ended) == sorted(t.run for t in load_sweep(sweep_file).trainings())
-    assert len(list(tmp_path.glob("out/runs/*/policy.onnx"))) == 4
-    assert all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])
+    monkeypatch.setattr(campaign, "Checkpoints", WatchedCheckpoints)
+
+    def kill_when_both_have_begun():
+        while len(list(tmp_path.glob("[01]"))) < 2 and not ended.wait(0.05):
+            pass
+        cluster.remove_node(second, allow_graceful=False)
+
+    killer = threading.Thread(target=kill_when_both_have_begun)
+    killer.start()
+    try:
+        result = command.sweep(sweep_file, out=tmp_path / "out", address=cluster.address)
+    finally:
+        ended.set()
+        killer.join()
+    assert result["ok"] and all(row["plants"]["current"]["trials"] == 1 for row in result["rows"])
+    policies = [Policy.load(tmp_path / "out" / "runs" / row["run"]) for row in result["rows"]]
+    resumed = [policy.description.training.get("resumed_after", []) for policy in policies]
+    assert sorted(map(len, resumed)) == [0, 1]
+    (steps,) = max(resumed, key=len)
+    assert 0 < steps < 8 * 4096 and steps % (2 * 4096) == 0
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_resumes_from_its_checkpoint(tmp_path):
+    """On this machine: its checkpoints are beside the policy, and are gone with the end."""
+    policy, settings = tmp_path / "run", TrainingSettings(worlds=16, steps=4 * 4096)
+
+    def interrupt(checkpoint):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train("t1", settings, out=policy, saved=interrupt)
+    assert not transfer.finished(policy)
+    assert list(transfer.train_policies({policy: ("t1", settings)})) == [(policy, None)]
+    assert transfer.finished(policy) and [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert Policy.load(policy).description.training["resumed_after"] == [4096]

@@ -214,6 +214,11 @@ def _runs(pid: int) -> bool:
         return True
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file directly in a folder, by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
 def plain_name(name: str, subject: str, error: type[Exception]) -> str:
     """Return a name from data that becomes part of a path, if it names one file or folder in one place.
 

@@ -27,7 +27,7 @@ from rich.console import Console
 
 from finssim.agents.controllers import CONTROLLERS
 from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
-from finssim.core.files import atomic_write, plain_name
+from finssim.core.files import atomic_write, contents, plain_name
 from finssim.core.progress import Progress, progress_bar
 from finssim.core.quiet import start_warp
 from finssim.core.system import parent_runs
@@ -236,8 +236,52 @@ def run_jobs(
     return [load_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
 
 
+class Checkpoints:
+    """The newest checkpoint of each piece of work on a cluster, in the memory of an actor on the machine that asked
+    for it: work whose own machine is lost resumes from it elsewhere.
+    """
+
+    def __init__(self) -> None:
+        self._files: dict[int, dict[str, bytes]] = {}
+
+    def store(self, number: int, files: dict[str, bytes]) -> None:
+        """Replace the checkpoint of one piece of work: its files by name."""
+        self._files[number] = files
+
+    def load(self, number: int) -> dict[str, bytes]:
+        """Return the files of the newest checkpoint, by name; none if there is no checkpoint."""
+        return self._files.get(number, {})
+
+
+@dataclass(frozen=True)
+class OwnCheckpoint:
+    """Checkpoint of one piece of work on a cluster."""
+
+    number: int
+    actor: Any
+    """A `Checkpoints` as an actor of Ray."""
+
+    def store(self, files: Mapping[str, bytes]) -> None:
+        """Replace the checkpoint: its files by name."""
+        import ray
+
+        ray.get(self.actor.store.remote(self.number, dict(files)))
+
+    def load(self) -> dict[str, bytes]:
+        """Return the files of the newest checkpoint, by name; none if there is no checkpoint."""
+        import ray
+
+        files: dict[str, bytes] = ray.get(self.actor.load.remote(self.number))
+        return files
+
+
 def spread(
-    work: Callable[[Any], Any], items: Sequence[Any], processes: int | None = None, address: str | None = None
+    work: Callable[..., Any],
+    items: Sequence[Any],
+    processes: int | None = None,
+    address: str | None = None,
+    *,
+    resumable: bool = False,
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
     """Yield the results of items in separate processes, as many in parallel as there are processors if None; in this
     process if 1.
@@ -249,6 +293,7 @@ def spread(
         items: What it is called with, each by itself.
         processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
         address: HOST:PORT of a Ray cluster on which it is done instead, or auto.
+        resumable: Whether on a cluster the work is called with an item and an `OwnCheckpoint`, from which it resumes.
 
     Yields:
         An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
@@ -257,7 +302,7 @@ def spread(
         ClusterError: Ray is not installed, or nothing answers at the address.
     """
     if address is not None:
-        yield from _on_cluster(work, items, address)
+        yield from _on_cluster(work, items, address, resumable)
         return
     processes = processes or os.cpu_count() or 1
     if processes == 1:
@@ -315,12 +360,13 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _on_cluster(
-    work: Callable[[Any], Any], items: Sequence[Any], address: str
+    work: Callable[..., Any], items: Sequence[Any], address: str, resumable: bool
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
     if not items:
         return
     try:
         import ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ImportError as error:
         raise ClusterError("a cluster needs Ray: pip install 'finssim[sweep]'") from error
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -333,7 +379,12 @@ def _on_cluster(
         raise ClusterError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
     try:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
-        waiting = {task.remote(work, item): item for item in items}
+        extra: list[tuple[Any, ...]] = [()] * len(items)
+        if resumable:
+            here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+            actor = ray.remote(num_cpus=0)(Checkpoints).options(scheduling_strategy=here).remote()
+            extra = [(OwnCheckpoint(number, actor),) for number in range(len(items))]
+        waiting = {task.remote(work, item, *more): item for item, more in zip(items, extra, strict=True)}
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             outcome: Future[Any] = Future()
@@ -348,9 +399,9 @@ def _on_cluster(
         ray.shutdown()
 
 
-def _call(work: Callable[[Any], Any], item: Any) -> Any:
+def _call(work: Callable[..., Any], *arguments: Any) -> Any:
     """Call the work in a worker: Ray takes plain functions alone."""
-    return work(item)
+    return work(*arguments)
 
 
 def _knock(address: str) -> None:
@@ -427,7 +478,7 @@ def _play_away(
         if policy:
             job = dataclasses.replace(job, controller=str(controller))  # type: ignore[call-arg]
         played = play(job, out / key)
-        return played, {path.name: path.read_bytes() for path in out.iterdir()}
+        return played, contents(out)
 
 
 def _come_back(

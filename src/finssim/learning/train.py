@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -115,6 +115,7 @@ def train(
     *,
     out: Path,
     resume: bool = False,
+    saved: Callable[[Path], None] = lambda checkpoint: None,
     console: Console | None = None,
     as_json: bool = False,
 ) -> Path:
@@ -136,6 +137,7 @@ def train(
         settings: What it is trained with.
         out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
         resume: Resume a killed training from its last checkpoint.
+        saved: Called with the directory of every checkpoint.
         console: Where progress is shown; standard error if None.
         as_json: Print one JSON object about the policy, to standard output.
 
@@ -160,7 +162,7 @@ def train(
     randomization = Randomization(settings.randomize) if settings.randomize is not None else None
     refuse_unwritable(atomic_directory(out, replaces=DESCRIPTION_FILE))
     start_warp()
-    side = Path(out).with_name(f"{Path(out).name}-training")
+    side = training_folder(out)
 
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
@@ -196,7 +198,8 @@ def train(
         loop = TrainingLoop(
             kind(environment, values, seed=seed, device=device), description, side,
             evaluate=HeldEvaluation(held, device), show=view.update, progress=environment.set_progress,
-            identity=_identity(description), until=until, project=settings.wandb,
+            identity=_identity(description), until=until, saved=saved,
+            project=settings.wandb,
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)
@@ -211,6 +214,11 @@ def train(
     if as_json:
         print(json.dumps({"policy": str(folder), "best_steps": loop.best.steps, **loop.curves[-1]}))
     return folder
+
+
+def training_folder(policy: Path) -> Path:
+    """Return the folder of checkpoints and logs of the training that writes a policy directory."""
+    return Path(policy).with_name(f"{Path(policy).name}-training")
 
 
 def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> Any:

@@ -142,6 +142,8 @@ class TrainingLoop:
     """Values that must be equal for a training to continue from a checkpoint."""
     until: float | None = None
     """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
+    saved: Callable[[Path], None] = lambda checkpoint: None
+    """Called with the directory of every checkpoint."""
     project: str | None = None
     """Project of Weights & Biases that receives the curves too; None: nothing is sent."""
     curves: list[dict[str, Any]] = field(default_factory=list)
@@ -237,6 +239,7 @@ class TrainingLoop:
             "learner": self.learner.state(),
             "curves": self.curves,
             "seconds": self.seconds,
+            "resumed_after": self.description.training.get("resumed_after", []),
             "best": [*self.best.score, self.best.steps, np.frombuffer(self.best.network, np.uint8)]
             if self.best
             else None,
@@ -253,6 +256,7 @@ class TrainingLoop:
         after_this = checkpoints.index(checkpoint) + 1
         for other in (*checkpoints[: max(after_this - RETAINED, 0)], *checkpoints[after_this:]):
             shutil.rmtree(other)
+        self.saved(checkpoint)
 
     def resume(self, state: Mapping[str, Any]) -> None:
         """Continue from the result of `last_checkpoint`.
@@ -271,6 +275,9 @@ class TrainingLoop:
             raise ResumeError(f"{self.side}: the checkpoint is of an earlier version: leave out --resume")
         self.learner.load(state["learner"])
         self.curves, self.seconds = list(state["curves"]), float(state["seconds"])
+        resumed = [*state.get("resumed_after", []), self.learner.steps]
+        record = {**self.description.training, "resumed_after": resumed}
+        self.description = self.description.model_copy(update={"training": record})
         if state["best"]:
             success, total, steps, network = state["best"]
             self.best = Best((success, total), steps, network.tobytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
@@ -18,9 +19,9 @@ from rich.console import Console
 from finssim.agents.controllers import COSTLY
 from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
-from finssim.core.files import atomic_directory, plain_name
+from finssim.core.files import atomic_directory, contents, plain_name
 from finssim.core.provenance import provenance
-from finssim.evaluation.campaign import Progress, Show, check_choices, spread, write_json
+from finssim.evaluation.campaign import OwnCheckpoint, Progress, Show, check_choices, spread, write_json
 from finssim.evaluation.evaluate import T1_COLUMNS
 from finssim.evaluation.figures import ENVELOPE, TRACKS, draw_envelopes, draw_tracking, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS, paper_row, paper_t2_row
@@ -37,7 +38,8 @@ from finssim.evaluation.robot_trials import (
 from finssim.evaluation.statistics import Statistic, paired_difference, with_interval
 from finssim.evaluation.tables import Columns, Table, cells
 from finssim.evaluation.trials import T2_TRAJECTORIES
-from finssim.learning.train import TrainingSettings, train
+from finssim.learning.resume import ResumeError
+from finssim.learning.train import TrainingSettings, train, training_folder
 from finssim.localization.fusion.estimator import MODELS
 from finssim.vehicles import Vehicle, load_vehicle
 
@@ -347,6 +349,8 @@ def train_policies(
 ) -> Generator[tuple[Path, BaseException | None], None, None]:
     """Train policies in parallel, on this machine or a cluster.
 
+    A training that was killed, or whose machine was lost, resumes from its last checkpoint.
+
     Args:
         trainings: Directory of the policy -> its task, and the settings of its training.
         processes, address: As of `campaign.spread`.
@@ -354,24 +358,52 @@ def train_policies(
     Yields:
         A directory as soon as its policy is written, and None; or the error of its training.
     """
-    with closing(
-        spread(_trained, list(trainings.items()), 1 if len(trainings) == 1 else processes, address)
-    ) as done:
+    work = _train_here if address is None else _train_away
+    at_once = 1 if len(trainings) == 1 else processes
+    with closing(spread(work, list(trainings.items()), at_once, address, resumable=True)) as done:
         for (policy, _), outcome in done:
             error = outcome.exception()
-            if error is None:
+            if error is None and address is not None:
                 with atomic_directory(policy, replaces=DESCRIPTION_FILE) as scratch:
                     for name, content in outcome.result().items():
                         (scratch / plain_name(name, "file of a policy", PolicyError)).write_bytes(content)
             yield policy, error
 
 
-def _trained(policy: tuple[Path, tuple[str, TrainingSettings]]) -> dict[str, bytes]:
-    """Train, on whatever machine: the files of the policy directory by name."""
+Planned = tuple[Path, tuple[str, TrainingSettings]]
+"""Directory of a policy; its task, and the settings of its training."""
+
+
+def _train_here(planned: Planned) -> None:
+    """Train on this machine into the directory of the policy, and remove the checkpoints."""
+    policy, _ = planned
+    _train(planned, policy)
+    shutil.rmtree(training_folder(policy), ignore_errors=True)
+
+
+def _train_away(planned: Planned, checkpoint: OwnCheckpoint) -> dict[str, bytes]:
+    """Train on whatever machine; return the files of the policy directory by name."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "policy"
-        train(*policy[1], out=out, console=Console(stderr=True, quiet=True))
-        return {path.name: path.read_bytes() for path in out.iterdir()}
+        if files := checkpoint.load():
+            earlier = training_folder(out) / "checkpoint-0"
+            earlier.mkdir(parents=True)
+            for name, content in files.items():
+                (earlier / plain_name(name, "file of a checkpoint", PolicyError)).write_bytes(content)
+        _train(planned, out, saved=lambda path: checkpoint.store(contents(path)))
+        return contents(out)
+
+
+def _train(planned: Planned, out: Path, **options: Any) -> None:
+    """Train a policy into a directory, from the last checkpoint beside it if that is of the same training."""
+    console = Console(stderr=True, quiet=True)
+    if training_folder(out).is_dir():
+        try:
+            train(*planned[1], out=out, resume=True, console=console, **options)
+            return
+        except ResumeError:
+            pass  # of other settings, or of an earlier version
+    train(*planned[1], out=out, console=console, **options)
 
 
 def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
