@@ -8,7 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from finssim.core.registry import COMMANDS, FAMILIES, SENSORS, TASKS, VEHICLES, Family, RegistryError
+from finssim.core.registry import (
+    COMMANDS,
+    FAMILIES,
+    SENSORS,
+    TASKS,
+    VEHICLES,
+    Family,
+    RegistryError,
+    RegistryWarning,
+)
 from finssim.learning.learners import LearningError, learner_named
 from finssim.sim import site
 from finssim.tasks import EnvironmentSetupError, StationKeeping, task_named
@@ -107,7 +116,8 @@ def test_a_broken_package_is_named_and_stops_only_what_needs_it(broken):
     with pytest.raises(VehicleError, match=sentence):
         load_vehicle("bluerov2").replace({"sensors.lost": {"rate": 1.0, "position": [0.0, 0.0, 0.0]}})
     assert load_vehicle("bluerov2") and task_named("t1") and learner_named("ppo")
-    assert "lost" not in TASKS.usable() and "lost" in TASKS
+    with pytest.warns(RegistryWarning, match=sentence):
+        assert "lost" not in TASKS.usable() and "lost" in TASKS
 
 
 def test_an_object_that_is_no_member_is_refused(tmp_path, monkeypatch):
@@ -168,8 +178,11 @@ def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken, capsy
     assert "t1" in report["registered"]["tasks"]["finssim"]
     assert sum("package broken 1.0" in sentence for sentence in report["failures"]) == len(FAMILIES)
     assert not any("outside" in sentence for sentence in report["failures"])
-    assert finssim("doctor") == 0 and finssim("vehicles") == 0
-    assert "package broken 1.0 cannot be used" in " ".join(capsys.readouterr().out.split())
+    assert finssim("doctor") == 0 and finssim("vehicles") == 0 and finssim("tasks") == 0
+    printed = capsys.readouterr()
+    assert "package broken 1.0 cannot be used" in " ".join(printed.out.split())
+    for left_out in ("vehicle", "task"):
+        assert f"warning: {left_out} 'lost' of package broken 1.0" in printed.err
     lost = command("lost", path=broken)
     assert lost.returncode == 2 and "package broken 1.0" in lost.stderr and "Traceback" not in lost.stderr
     assert "lost" in command("--help", path=broken).stdout

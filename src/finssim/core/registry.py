@@ -11,6 +11,7 @@ A member is imported and checked when it is first used, so that a broken package
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, MutableMapping
 from functools import cache
 from importlib import import_module
@@ -30,12 +31,17 @@ __all__ = [
     "WORLDS",
     "Family",
     "RegistryError",
+    "RegistryWarning",
     "object_at",
 ]
 
 
 class RegistryError(ValueError):
     """A member of a family cannot be used; the message names the package that registers it."""
+
+
+class RegistryWarning(UserWarning):
+    """A member of a family is left out, since it cannot be used."""
 
 
 class Family(MutableMapping[str, Any]):
@@ -146,8 +152,10 @@ class Family(MutableMapping[str, Any]):
         return sentences
 
     def usable(self) -> dict[str, Any]:
-        """Return all members but those of packages that cannot be used; `finssim doctor` reports these."""
+        """Return all members but those of packages that cannot be used, of which a warning says why."""
         failed = self.failures()
+        for sentence in failed.values():
+            warnings.warn(sentence, RegistryWarning, stacklevel=2)
         return {name: self[name] for name in self if name in self._shipped or name not in failed}
 
     def reference(self, name: str) -> str:
