@@ -59,6 +59,7 @@ HOMES = {
         "learning/learners/sb3.py",
         "learning/learners/torchrl_ppo.py",
         "learning/network.py",
+        "learning/parallel.py",
         "learning/torch_networks.py",
         "learning/resume.py",
         "learning/rsl_rl_env.py",

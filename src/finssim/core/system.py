@@ -65,7 +65,17 @@ def follow_parent() -> None:
     """End with the process that started this one, even if that was killed."""
     parent = os.environ.get(PARENT, "")
     if parent.isdecimal():
-        threading.Thread(target=_follow, args=(int(parent),), name="launcher", daemon=True).start()
+        _end_with(int(parent))
+
+
+def prepare_worker(parent: int) -> None:
+    """Prepare a process of `multiprocessing`: it ends with `parent`, which alone handles Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with(parent)
+
+
+def _end_with(parent: int) -> None:
+    threading.Thread(target=_follow, args=(parent,), name="launcher", daemon=True).start()
 
 
 def _follow(parent: int) -> None:

@@ -10,11 +10,8 @@ import logging
 import multiprocessing
 import os
 import re
-import signal
 import socket
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
@@ -30,15 +27,13 @@ from finssim.control.policy import DESCRIPTION_FILE, NETWORK_FILE
 from finssim.core.files import atomic_write, contents, plain_name
 from finssim.core.progress import Progress, progress_bar
 from finssim.core.quiet import start_warp
-from finssim.core.system import parent_runs
+from finssim.core.system import prepare_worker
 from finssim.core.yaml_file import json_value, read_json
 from finssim.evaluation.tables import Table, print_tables, write_page
 from finssim.vehicles import load_vehicle
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "FINSSIM_THREADS": "1"}
 """Environment of a worker: one thread each, for there are as many workers as processors."""
-WATCH = 1.0
-"""Time between two looks of a worker at its parent [s]."""
 SETTINGS = 4
 """Type of a frame of HTTP/2."""
 PATIENCE = 10.0
@@ -428,16 +423,8 @@ def _knock(address: str) -> None:
 
 def _prepare(parent: int) -> None:
     """Prepare a worker: one thread, since there are as many workers as processors, and an end with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends its workers
     os.environ.update(ONE_THREAD)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
-    """End this process when its parent has gone, however that ended."""
-    while parent_runs(parent):
-        time.sleep(WATCH)
-    os._exit(1)
+    prepare_worker(parent)
 
 
 def _play_job(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any] | None:

@@ -12,9 +12,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from finssim.learning.parallel import Group
 
 Array = Any
 """A NumPy array or a torch tensor, float32."""
@@ -38,10 +41,17 @@ class Arrays:
         xp: The library.
     """
 
-    def __init__(self, seed: int, torch_device: str | None = None) -> None:
-        """Take torch on a device such as `cuda`, or NumPy if that is None; everything random comes from `seed`."""
+    def __init__(self, seed: int, torch_device: str | None = None, group: Group | None = None) -> None:
+        """Take torch on a device such as `cuda`, or NumPy if that is None.
+
+        Args:
+            seed: Seed of everything random.
+            torch_device: Device of torch.
+            group: Processes that share a training, with torch; None: this process alone.
+        """
         self.xp: ModuleType = np
-        self.device = torch_device
+        self.device, self.group = torch_device, group
+        self.processes = 1 if group is None else group.size
         self._rng: Any = np.random.Generator(np.random.SFC64(seed))
         """Of first weights and orders of samples; of noise too with NumPy."""
         if torch_device is not None:
@@ -49,7 +59,7 @@ class Arrays:
 
             self.xp = torch
             self._noise = torch.Generator(device=torch_device)
-            self._noise.manual_seed(seed)
+            self._noise.manual_seed(seed if group is None else group.seed(seed))
 
     def view(self, array: Any) -> Array:
         """A Warp array in the same memory."""
@@ -92,6 +102,12 @@ class Arrays:
     def copy(self, array: Array) -> Array:
         """A copy."""
         return array.copy() if self.device is None else array.clone()
+
+    def average(self, array: Array) -> Array:
+        """Return an array after replacing it by its mean over the processes of a training."""
+        if self.group is not None:
+            self.group.average(array)
+        return array
 
     def noise(self, out: Array) -> Array:
         """Fill with standard normal numbers."""
@@ -320,14 +336,14 @@ class Adam:
 
     def __init__(self, parameters: NetworkParameters, arrays: Arrays, largest: float) -> None:
         """Take what to optimise."""
-        self.parameters, self.xp, self.largest = parameters, arrays.xp, largest
+        self.parameters, self.arrays, self.xp, self.largest = parameters, arrays, arrays.xp, largest
         n = len(parameters.values)
         self.mean, self.square = arrays.zeros(n), arrays.zeros(n)
         self.count = 0
 
     def step(self, rate: float, b1: float = 0.9, b2: float = 0.999, epsilon: float = 1e-5) -> None:
         """One step down the gradient, of a learning rate [-]."""
-        g = self.parameters.gradient
+        g = self.arrays.average(self.parameters.gradient)
         norm = self.xp.sqrt((g * g).sum())
         g *= self.largest / self.xp.clip(norm, self.largest, None)
         self.count += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -72,6 +73,9 @@ class TrainingSettings:
     are stored beside the policy for 'wandb sync'."""
     device: str = "cpu"
     """(DEVICE) Compute device: cpu or cuda."""
+    processes: Annotated[int, (1, 1024)] = 1
+    """Processes that share the worlds and each batch (ppo only, with torch), one for each GPU; on a CPU a single
+    process is faster."""
 
     def check(self) -> None:
         """Refuse numbers that do not fit, and Weights & Biases where it is missing.
@@ -167,6 +171,7 @@ def train(
     from finssim.learning.episodes import HELD_WORLDS, HeldEvaluation, held_seed
     from finssim.learning.export import description_of
     from finssim.learning.layers import single_thread
+    from finssim.learning.parallel import leading
     from finssim.learning.training_loop import TrainingLoop, TrainingView, has_tensorboard, last_checkpoint
 
     if not has_tensorboard():
@@ -177,8 +182,9 @@ def train(
     checkpoint = last_checkpoint(side) if resume else None
     values = _values(settings, kind, learner, the_task)
     seed, device, until = settings.seed, settings.device, settings.until
-    asymmetric = randomization is not None and getattr(values, "asymmetric", False)
-    environment = settings.environment(the_task, values.worlds, randomization, seed, privileged=asymmetric)
+    if settings.processes > 1:
+        _check_processes(settings, learner, values.worlds, resume)
+    environment = _share(settings, the_task, values, seed)
     fitted = environment.task
     if until is not None and "success" not in fitted.metrics(environment.arrays):
         raise TrainingError(
@@ -187,16 +193,20 @@ def train(
     description = description_of(
         environment, learner=learner, algorithm=kind.what, **asdict(values), device=device,
         observe={"name": settings.observe}, until=until,
+        **({} if settings.processes == 1 else {"processes": settings.processes}),
         **({} if settings.water is None else {"water": asdict(load_water(settings.water))}),
     )  # fmt: skip
     began = time.perf_counter()
     full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
     held = settings.environment(fitted, HELD_WORLDS, full, held_seed(seed))
-    with single_thread(), TrainingView(values.steps, console) as view, warnings.catch_warnings():
+    with (
+        single_thread(), leading(settings.processes, device, _follow, task, settings) as group,
+        TrainingView(values.steps, console) as view, warnings.catch_warnings(),
+    ):  # fmt: skip
         warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = TrainingLoop(
-            kind(environment, values, seed=seed, device=device), description, side,
+            _learner(kind, environment, values, settings, group), description, side,
             evaluate=HeldEvaluation(held, device), show=view.update, progress=environment.set_progress,
             identity=_identity(description), until=until, saved=saved,
             project=settings.wandb,
@@ -214,6 +224,74 @@ def train(
     if as_json:
         print(json.dumps({"policy": str(folder), "best_steps": loop.best.steps, **loop.curves[-1]}))
     return folder
+
+
+def _check_processes(settings: TrainingSettings, learner: str, worlds: int, resume: bool) -> None:
+    """Refuse a training that several processes cannot share.
+
+    Raises:
+        TrainingError: Another learner than ppo, worlds that cannot be divided, too few GPUs, or a training to resume.
+        ModuleNotFoundError: The package torch is missing.
+    """
+    torch = import_module("torch")
+    n = settings.processes
+    if learner != "ppo":
+        raise TrainingError(
+            f"processes is {n}, but learner '{learner}' trains in one: leave it out, or use ppo"
+        )
+    if worlds % n:
+        raise TrainingError(
+            f"{worlds} worlds cannot be shared by {n} processes: give a multiple of {n} worlds"
+        )
+    if settings.device != "cpu" and n > torch.cuda.device_count():
+        raise TrainingError(
+            f"processes is {n}, but there are {torch.cuda.device_count()} GPUs: one process each"
+        )
+    if resume:
+        raise TrainingError(
+            "a training in several processes cannot be resumed: its checkpoints hold the first's state"
+        )
+
+
+def _share(settings: TrainingSettings, task: Task, values: Any, seed: int) -> Environment:
+    """Return the worlds of this process.
+
+    Args:
+        settings: Settings of the training.
+        task: Task.
+        values: Settings of the learner.
+        seed: Seed of these worlds.
+    """
+    randomization = Randomization(settings.randomize) if settings.randomize is not None else None
+    asymmetric = randomization is not None and getattr(values, "asymmetric", False)
+    worlds = values.worlds // settings.processes
+    return settings.environment(task, worlds, randomization, seed, privileged=asymmetric)
+
+
+def _learner(kind: Any, environment: Environment, values: Any, settings: TrainingSettings, group: Any) -> Any:
+    """Return the learner, whose arrays are the group's where several processes train."""
+    from finssim.learning.layers import Arrays
+
+    shared = {} if group is None else {"arrays": Arrays(settings.seed, group.device, group)}
+    return kind(environment, values, seed=settings.seed, device=settings.device, **shared)
+
+
+def _follow(group: Any, task: str | Task, settings: TrainingSettings) -> None:
+    """Take part in the training of a group's first process, until that ends this one."""
+    from finssim.learning.layers import single_thread
+
+    start_warp()
+    the_task = task_named(task)
+    kind = learner_named("ppo")
+    values = _values(settings, kind, "ppo", the_task)
+    settings = replace(settings, device=group.device)
+    environment = _share(settings, the_task, values, group.seed(settings.seed))
+    with single_thread():
+        learner = _learner(kind, environment, values, settings, group)
+        while learner.steps < values.steps:
+            environment.set_progress(learner.steps / values.steps)
+            learner.update()
+    threading.Event().wait()
 
 
 def training_folder(policy: Path) -> Path:

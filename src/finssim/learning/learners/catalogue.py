@@ -93,14 +93,23 @@ class LearnerKind:
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )
 
-    def __call__(self, environment: Environment, settings: Any, *, seed: int, device: str = "cpu") -> Learner:
+    def __call__(
+        self, environment: Environment, settings: Any, *, seed: int, device: str = "cpu", **options: Any
+    ) -> Learner:
         """A learner in an environment; it owns the environment's episodes from then on.
+
+        Args:
+            environment: Environment.
+            settings: Settings of the learner.
+            seed: Seed of everything random.
+            device: cpu or cuda.
+            options: Further arguments of the learner's class.
 
         Raises:
             LearningError: It cannot train the task's number of agents.
         """
         self.check(environment.task)
-        learner: Learner = self._class()(environment, settings, seed=seed, device=device)
+        learner: Learner = self._class()(environment, settings, seed=seed, device=device, **options)
         return learner
 
     def check(self, task: Task) -> None:

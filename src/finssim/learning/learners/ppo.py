@@ -18,6 +18,7 @@ Where time ends an episode, the value of its last observation follows; where the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,7 +104,7 @@ class Ppo(ActingLearner):
             settings: Of the training.
             seed: Of first weights, action noise and the order of samples.
             device: cpu or cuda.
-            arrays: NumPy on a processor and torch on a GPU, unless given.
+            arrays: NumPy on a processor and torch on a GPU, unless given; in a training of several processes theirs.
         """
         self.arrays = A = arrays or Arrays(seed, None if device == "cpu" else device)
         super().__init__(environment, settings, A)
@@ -166,7 +167,7 @@ class Ppo(ActingLearner):
             losses = self._learn(*self._advantages(), before, rate)
             if self.settings.normalize:
                 self._rescale()
-        self.steps += self.environment.worlds * self.settings.rollout
+        self.steps += self.environment.worlds * self.arrays.processes * self.settings.rollout
         return {**self.tally.row(), **losses}
 
     # Rollout
@@ -218,7 +219,7 @@ class Ppo(ActingLearner):
         xp, k = self.arrays.xp, self._window
         x = (observation - self._mean) * self._scale if self.settings.normalize else observation
         policy_input = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
-        h = self._cell.step(policy_input, self._memory[:, k:]) if self.gru else None
+        h = self._cell_of().step(policy_input, self._memory[:, k:]) if self.gru else None
         parts = [part for part in (policy_input, h, drawn) if part is not None]
         return x, policy_input, h, xp.concatenate(parts, 1) if len(parts) > 1 else policy_input
 
@@ -273,7 +274,8 @@ class Ppo(ActingLearner):
         samples = [x[:T] for x in (self._x, self._c, actions, advantage, target, self._density)]
         if self.gru is None:
             samples = [x.reshape(T * self._rows, *x.shape[2:]) for x in samples]
-        n, size = (self._rows, max(1, s.batch // T)) if self.gru else (T * self._rows, s.batch)
+        n, size = (self._rows, s.batch // T) if self.gru else (T * self._rows, s.batch)
+        size = max(1, size // A.processes)
         edges = [n * k // max(1, n // size) for k in range(max(1, n // size) + 1)]
         log_std = A.copy(self.noise.values)
         losses = A.zeros(4)
@@ -361,12 +363,13 @@ class Ppo(ActingLearner):
 
     def _rescale(self) -> None:
         """Take the rollout's observations into the running mean and variance (Chan et al. 1979)."""
-        n = self.environment.observation_size
+        A, n = self.arrays, self.environment.observation_size
         x = self._x[:-1, :, :n].reshape(-1, n)
-        centre = x.mean(0)
-        variance = ((x - centre) ** 2).mean(0) / self._scale**2
+        centre = A.average(x.mean(0))
+        variance = A.average(((x - centre) ** 2).mean(0)) / self._scale**2
         shift = centre / self._scale
-        new, total = len(x), self._seen + len(x)
+        new = len(x) * A.processes
+        total = self._seen + new
         self._mean += shift * (new / total)
         self._variance *= self._seen / total
         self._variance += variance * (new / total) + shift**2 * (self._seen * new / total**2)
@@ -376,28 +379,29 @@ class Ppo(ActingLearner):
     def _scale(self) -> Array:
         return 1.0 / self.arrays.xp.sqrt(self._variance + 1e-6)
 
-    @property
-    def _cell(self) -> Cell:
-        W_x, b_x, W_h, b_h = self.gru.weights  # type: ignore[union-attr]
+    def _cell_of(self, take: Callable[[Array], Array] = lambda array: array) -> Cell:
+        """Return the GRU's weights, each as `take` makes it."""
+        W_x, b_x, W_h, b_h = map(take, self.gru.weights)  # type: ignore[union-attr]
         return Cell(Linear(W_x, b_x), Linear(W_h, b_h))
 
     # What others need of a learner
 
     def network(self) -> Network:
-        """Observation to mean action, with what the policy remembers; a copy."""
+        """Observation to mean action, with what the policy remembers; a copy, in NumPy where training is on a CPU."""
         A, s = self.arrays, self.settings
-        weights = [A.copy(x) for x in self.actor.weights]
+        copy = A.numpy if A.group is not None and A.device == "cpu" else A.copy
+        weights = [copy(x) for x in self.actor.weights]
         layers: list[Linear | Activation] = []
         for W, b in zip(weights[::2], weights[1::2], strict=True):
             layers += [Linear(W, b), Activation("Tanh")]
-        scaling = {"mean": A.copy(self._mean), "scale": self._scale} if s.normalize else {}
+        scaling = {"mean": copy(self._mean), "scale": copy(self._scale)} if s.normalize else {}
         return Network(
             tuple(layers[:-1]),
             errors=self._errors,
             history=s.history,
             last_action=self.environment.action_size if s.last_action else 0,
             observation_size=self.environment.observation_size,
-            cell=self._cell if self.gru else None,
+            cell=self._cell_of(copy) if self.gru else None,
             **scaling,
         )
 
