@@ -472,6 +472,26 @@ def snow_seen(
     return wp.vec4(light[0], light[1], light[2], 1.0 - clear)
 
 
+@wp.func
+def reflectance_at(scene: RayScene, shape: int, position: wp.vec3, normal: wp.vec3):
+    """Return the reflectance of a surface at a position of the world [m], with its texture."""
+    reflectance = scene.surfaces[shape].colour
+    kind = scene.surfaces[shape].texture
+    if kind > 0:
+        inverse = scene.surfaces[shape].inverse
+        local = wp.transform_point(inverse, position) / scene.surfaces[shape].size
+        contrast = scene.surfaces[shape].contrast
+        if kind == 4:
+            reflectance = (1.0 + contrast * mottled(local, scene.grain)) * reflectance
+        elif kind == 5:
+            face = wp.transform_vector(inverse, normal)
+            which = scene.surfaces[shape].picture
+            reflectance = painted(scene.pictures, which, local, face, contrast, reflectance)
+        else:
+            reflectance = patterned(kind, local, reflectance, scene.surfaces[shape].second, contrast)
+    return reflectance
+
+
 @wp.kernel(enable_backward=False)
 def _take_picture(
     traced: Traced, poses: wp.array(dtype=wp.transform), scene: RayScene, film: Film, share: float, last: int, key: int,
@@ -525,22 +545,7 @@ def _take_picture(
         if index != MISS and traced.depth[v, i, j] < path:
             path = traced.depth[v, i, j]
             shape = int(index)
-            reflectance = scene.surfaces[shape].colour
-            kind = scene.surfaces[shape].texture
-            if kind > 0:
-                local = (
-                    wp.transform_point(scene.surfaces[shape].inverse, origin + path * ray)
-                    / scene.surfaces[shape].size
-                )
-                contrast = scene.surfaces[shape].contrast
-                if kind == 4:
-                    reflectance = (1.0 + contrast * mottled(local, scene.grain)) * reflectance
-                elif kind == 5:
-                    face = wp.transform_vector(scene.surfaces[shape].inverse, n)
-                    which = scene.surfaces[shape].picture
-                    reflectance = painted(scene.pictures, which, local, face, contrast, reflectance)
-                else:
-                    reflectance = patterned(kind, local, reflectance, scene.surfaces[shape].second, contrast)
+            reflectance = reflectance_at(scene, shape, origin + path * ray, n)
             above = 0.5 * (1.0 + n[2])
             level = wp.max(wp.dot(n, sun), 0.0) + diffuse * above
             start = wp.cw_mul(reflectance, level * daylight + (1.0 - above) * veil)

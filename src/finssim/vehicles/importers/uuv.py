@@ -344,6 +344,77 @@ def _managed(model: Model, base: str) -> float | None:
     return None
 
 
+def _put_buoyancy(
+    model: Model, links: Mapping[str, Element], base: str, draft: Draft
+) -> dict[str, list[float]]:
+    """Put what the links displace, and return the size of each link's box: width, length and height [m].
+
+    Args:
+        model: Robot.
+        links: Name -> element of each link of the underwater object.
+        base: Name of the link that has the hydrodynamics.
+        draft: Vehicle, whose density of water is known.
+
+    Raises:
+        VehicleError: A link floats as a ship does, is not in the robot, or cannot be read.
+    """
+    density = draft.values["water"]["density"]
+    lifts, boxes = [], {}
+    for link, words in links.items():
+        where = f"{draft.label}: underwater object, link '{link}'"
+        if any(words.find(word) is not None for word in SURFACE):
+            raise VehicleError(
+                f"{where}: floats as a ship does ({SURFACE[0]}), expected a vehicle under water"
+            )
+        refuse_unknown(words, WORDS["link"], where)
+        if link not in model.links:
+            raise VehicleError(f"{where}: the robot has no such link: correct it")
+        mass, centre = _fixed(model, link)
+        neutral = flag(words, "neutrally_buoyant", where)
+        share = mass / density if neutral else number(words, "volume", where, 0.0)
+        offset = numbers(words.findtext("center_of_buoyancy") or "0 0 0", 3, f"{where}: center_of_buoyancy")
+        lifts.append((share, centre + model.pose(link).turn @ offset))
+        box = words.find("box")
+        if box is not None:
+            refuse_unknown(box, WORDS["box"], where)
+            boxes[link] = [number(box, side, where) for side in ("width", "length", "height")]
+        if link != base:
+            draft.not_read[f"hydrodynamics of link {link} (its buoyancy is read)"] += 1
+    put_displacement(
+        lifts, density, "volume, or mass where neutrally_buoyant; from the centre of gravity", draft
+    )
+    return boxes
+
+
+def _put_hydrodynamics(model: Model, link: Element, base: str, box: list[float] | None, draft: Draft) -> None:
+    """Put added mass and damping.
+
+    Args:
+        model: Robot.
+        link: Element of the link in the underwater object.
+        base: Name of the link.
+        box: Its width, length and height [m], if it has a box.
+        draft: Vehicle.
+
+    Raises:
+        VehicleError: They are missing or cannot be read.
+    """
+    _, centre = _fixed(model, base)
+    where = f"{draft.label}: hydrodynamic_model of '{base}'"
+    hydrodynamics = link.find("hydrodynamic_model")
+    if hydrodynamics is None:
+        raise VehicleError(f"{where} is missing: add it")
+    refuse_unknown(hydrodynamics, WORDS["hydrodynamic_model"], where)
+    for word, matrix in coefficients(hydrodynamics, box, where).items():
+        turned = (matrix + matrix.T) / 2.0 if word == "added_mass" else matrix
+        if word != "surge_damping" or np.any(matrix):
+            draft.put(f"hydrodynamics.calibrated.{word}", plain(flu_of_frd(turned)))
+    draft.put(
+        "hydrodynamics.calibrated.reference_point", plain(centre), "derived", "centre of gravity of base_link"
+    )
+    _note_differences(hydrodynamics, centre, draft)
+
+
 def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draft:
     """Read a model with the plugins of uuv_simulator.
 
@@ -380,49 +451,9 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
         draft.guess("water.density", DENSITY, "the file gives none: that of uuv_simulator")
     else:
         draft.put("water.density", number(objects[0], "fluid_density", f"{path}: underwater object"))
-    density = draft.values["water"]["density"]
     put_body(model, draft)
-
-    lifts, boxes = [], {}
-    for link, words in links.items():
-        where = f"{path}: underwater object, link '{link}'"
-        if any(words.find(word) is not None for word in SURFACE):
-            raise VehicleError(
-                f"{where}: floats as a ship does ({SURFACE[0]}), expected a vehicle under water"
-            )
-        refuse_unknown(words, WORDS["link"], where)
-        if link not in model.links:
-            raise VehicleError(f"{where}: the robot has no such link: correct it")
-        mass, centre = _fixed(model, link)
-        neutral = flag(words, "neutrally_buoyant", where)
-        share = mass / density if neutral else number(words, "volume", where, 0.0)
-        offset = numbers(words.findtext("center_of_buoyancy") or "0 0 0", 3, f"{where}: center_of_buoyancy")
-        lifts.append((share, centre + model.pose(link).turn @ offset))
-        box = words.find("box")
-        if box is not None:
-            refuse_unknown(box, WORDS["box"], where)
-            boxes[link] = [number(box, side, where) for side in ("width", "length", "height")]
-        if link != base:
-            draft.not_read[f"hydrodynamics of link {link} (its buoyancy is read)"] += 1
-    put_displacement(
-        lifts, density, "volume, or mass where neutrally_buoyant; from the centre of gravity", draft
-    )
-
-    _, centre = _fixed(model, base)
-    where = f"{path}: hydrodynamic_model of '{base}'"
-    hydrodynamics = links[base].find("hydrodynamic_model")
-    if hydrodynamics is None:
-        raise VehicleError(f"{where} is missing: add it")
-    refuse_unknown(hydrodynamics, WORDS["hydrodynamic_model"], where)
-    for word, matrix in coefficients(hydrodynamics, boxes.get(base), where).items():
-        turned = (matrix + matrix.T) / 2.0 if word == "added_mass" else matrix
-        if word != "surge_damping" or np.any(matrix):
-            draft.put(f"hydrodynamics.calibrated.{word}", plain(flu_of_frd(turned)))
-    draft.put(
-        "hydrodynamics.calibrated.reference_point", plain(centre), "derived", "centre of gravity of base_link"
-    )
-    _note_differences(hydrodynamics, centre, draft)
-
+    boxes = _put_buoyancy(model, links, base, draft)
+    _put_hydrodynamics(model, links[base], base, boxes.get(base), draft)
     managed = _managed(model, base)
     names = [f"thruster_{(plugin.findtext('thrusterID') or '').strip()}" for plugin in thrusters]
     if len(set(names)) < len(names) or not all(n[9:].isdigit() and len(n) < 20 for n in names):
