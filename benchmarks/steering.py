@@ -7,6 +7,7 @@ Every policy is `finssim train TASK --randomize cruise --seed S`; one that --out
 options, is used again. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`.
 Intervals hold 95 % of 2000 redrawn figures: each redraws learner seeds and plants with replacement, of a policy and the
 baseline the same plants. `less error` is the baseline's error less the policy's, in the plants where both have one.
+`fast` is the baseline with action 1 for its speed, the fastest that the autopilot is asked for.
 """
 
 from __future__ import annotations
@@ -22,14 +23,28 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from finssim.agents.agent import BaselineAgent
 from finssim.core.provenance import provenance
 from finssim.evaluation.evaluate import evaluate_controller
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.statistics import bootstrap
 from finssim.learning.train import TrainingSettings, train
-from finssim.tasks import task_named
+from finssim.tasks import Task, task_named
+from finssim.vehicles import Vehicle
 
 Array = NDArray[np.float64]
+
+
+class Fast(BaselineAgent):
+    """The baseline of a task, as fast as the autopilot can be asked to be."""
+
+    def __init__(self, vehicle: Vehicle, task: Task) -> None:
+        super().__init__(next(iter(task.baselines)), vehicle, task)
+
+    def act(self, memory: Any, reading: Any, goal: Any) -> Any:
+        """Actions as of the baseline, with 1 for the speed."""
+        action, memory = super().act(memory, reading, goal)
+        return np.column_stack([np.ones_like(action[:, :1]), action[:, 1:]]), memory
 
 
 def tried(controller: str, given: argparse.Namespace) -> dict[str, Array]:
@@ -92,10 +107,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     (baseline,) = task_named(given.task).baselines
-    classical, learned, costs = tried(baseline, given), [], []
-    print(
-        f"{baseline}: success {np.mean(classical['success']):.3f}, error {np.nanmean(classical['error']):.3f} m"
-    )
+    classical = {baseline: tried(baseline, given), "fast": tried(f"{__file__}:Fast", given)}
+    learned, costs = [], []
+    for name, one in classical.items():
+        print(f"{name}: success {np.mean(one['success']):.3f}, error {np.nanmean(one['error']):.3f} m")
     for seed in map(int, given.seeds.split(",")):
         folder, cost = trained(given, seed)
         learned.append(tried(folder, given))
@@ -105,21 +120,22 @@ def main() -> None:
             f"seed {seed}: success {means['success']:.3f}, error {means['error']:.3f} m, {cost:.0f} s",
             flush=True,
         )
-    every = {name: np.array([one[name] for one in learned]) for name in classical}
-    figures = {
-        f"{who} {name}": figure(values)
-        for name in classical
-        for who, values in ((baseline, classical[name][None]), ("learned", every[name]))
-    }
-    figures["more success"] = figure(every["success"] - classical["success"])
-    figures["less error"] = figure(classical["error"] - every["error"])
+    every = {name: np.array([one[name] for one in learned]) for name in learned[0]}
+    figures = {f"learned {name}": figure(values) for name, values in every.items()}
+    for who, one in classical.items():
+        figures |= {f"{who} {name}": figure(values[None]) for name, values in one.items()}
+        figures[f"more success than {who}"] = figure(every["success"] - one["success"])
+        figures[f"less error than {who}"] = figure(one["error"] - every["error"])
     for name, one in figures.items():
-        print(f"{name:24s} {one['value']:.3f} [{one['ci95'][0]:.3f}, {one['ci95'][1]:.3f}]")
+        print(f"{name:32s} {one['value']:.3f} [{one['ci95'][0]:.3f}, {one['ci95'][1]:.3f}]")
     if given.json:
         about = {key: str(value) for key, value in vars(given).items()} | {"processor_s": costs}
         per_plant = {key: np.round(values, 4).tolist() for key, values in (*every.items(),)}
         record = {"settings": about, "provenance": provenance(), "figures": figures, "learned": per_plant}
-        record["baseline"] = {key: np.round(values, 4).tolist() for key, values in classical.items()}
+        record["baselines"] = {
+            who: {key: np.round(values, 4).tolist() for key, values in one.items()}
+            for who, one in classical.items()
+        }
         given.json.write_text(json.dumps(record) + "\n", encoding="utf-8")
 
 

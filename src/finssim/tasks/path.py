@@ -124,9 +124,9 @@ def on_path(p: Any, e: float) -> float:
 
 @wp.func
 def path_advance(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Speed along the path as a part of cruising speed, at most 1."""
+    """Speed along the path as a part of cruising speed."""
     e = leg_direction(arrays.path, w, arrays.path.leg[w])
-    return wp.min(wp.dot(world_velocity(state, w, 0), e) / p.fit.speed, 1.0)
+    return wp.dot(world_velocity(state, w, 0), e) / p.fit.speed
 
 
 @wp.func
