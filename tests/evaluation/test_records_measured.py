@@ -231,7 +231,7 @@ def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held)
     pipe = referee.arrays.reference.position.numpy()[0]
     drawn = Referee("pipeline", [FINSROV], seed=1).arrays.reference.position.numpy()[0]
     np.testing.assert_array_equal(pipe, drawn)
-    with pytest.raises(ControlError, match="needs the poses of rope_0, .* drawn with its world"):
+    with pytest.raises(ControlError, match="needs the places of rope_0, .* drawn with its world"):
         read_record(held[0], "net", FINSROV).scores("net", FINSROV)
 
 

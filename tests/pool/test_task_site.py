@@ -11,10 +11,13 @@ from finssim.agents.catalogue import baselines_of
 from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control import ControlError
+from finssim.control.guidance import Station, Track
 from finssim.control.trajectories import TRAJECTORIES
+from finssim.core.rotations import quat_from_euler
 from finssim.pool.fleet import Medium
 from finssim.pool.positioning import Exposure
-from finssim.robot.pilots import AgentPilot
+from finssim.pool.task_site import Referee
+from finssim.robot.pilots import AgentPilot, make_pilot
 from finssim.tasks import TASKS, Environment, task_named
 from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
@@ -33,16 +36,18 @@ SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [name for name in TASKS if name not in ("terrain", "velocity6")]
-)  # the seabed and the commands of these are in training alone
+    "name", [name for name in TASKS if name != "velocity6"]
+)  # whose commands are in training alone
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
     (who, *_), task = baselines_of(name), task_named(name)
-    if task.pictures:
+    if task.pictures or task.ranges:
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
+    if name == "terrain":
+        task = replace(task, line=40.0)
     task = replace(task, time_limit=SHORT.get(name, task.time_limit))
     guide = TRAJECTORIES["lemniscate"] if name == "t2" else None
-    vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints", "homing") else FINSROV
+    vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints", "homing", "terrain") else FINSROV
     site = site_of(task, who, [vehicle] * len(task.vehicles), seed=SEEDS.get(name, 1), guide=guide)
     measured = site.run()
     assert measured["success"] == 1.0
@@ -92,6 +97,48 @@ def test_what_a_task_sees_is_what_it_would_see_in_training():
     seen = batch.sight.pictures["front_camera"].numpy()[0]
     assert picture.shape == seen.shape
     assert np.corrcoef(picture.ravel(), seen.ravel())[0, 1] > 0.98
+
+
+@pytest.mark.slow
+def test_altimeters_measure_the_seabed_of_training(tmp_path):
+    """Narrow beams in the described world, wherever the vehicle is, to 3 cm: the seabed is straight within a metre."""
+    pytest.importorskip("newton", reason="finssim[perception] is not installed")
+    device = tmp_path / "narrow.yaml"
+    device.write_text(
+        "{kind: range, about: one ray, source: this test, minimum_range: 0.1, range: 100.0, rate: 10.0}"
+    )
+    body = load_vehicle("remus100")
+    names = ("altimeter", "altimeter_ahead")
+    down = quat_from_euler(0.0, 0.5 * np.pi, 0.0)
+    sensors = {
+        name: body.perception[name].model_copy(update={"device": str(device), "orientation": q})
+        for name, q in zip(names, (down, body.perception[names[1]].orientation), strict=True)
+    }
+    vehicle = body.model_copy(update={"perception": sensors})
+    batch = Environment(task_named("terrain"), vehicle=vehicle, worlds=1, seed=5, auto_reset=False)
+    world = batch.task.site(batch.arrays, 5).sensors(vehicle, names, 5)
+    for _ in range(4):
+        pose = [batch.simulator.numpy(key)[0, 0].astype(float) for key in ("position", "quaternion")]
+        measured = [
+            world.develop(Exposure(0, 0.0, 0.0, tuple(pose), tuple(pose), name)).ranges[0] for name in names
+        ]
+        np.testing.assert_allclose(measured, batch.arrays.ranges.numpy()[0], atol=0.03)
+        for _ in range(40):
+            batch.step(np.array([[1.0, 0.2, 0.1]]))
+
+
+def test_a_vehicle_without_altimeters_follows_no_seabed_as_a_robot():
+    body = load_vehicle("remus100")
+    blind = body.model_copy(update={"perception": {"altimeter": body.perception["altimeter"]}})
+    with pytest.raises(ControlError, match="altimeter sees altimeter_ahead, which remus100 does not have"):
+        make_pilot("altimeter", blind, task="terrain")
+
+
+def test_an_episode_over_a_seabed_that_is_in_no_record_is_not_scored():
+    here = Track(np.array([0.0, 0.0, -15.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
+    guide = Station((50.0, 0.0, -15.0), 0.0)
+    with pytest.raises(ControlError, match="'terrain' needs the places of the seabed, .* in no record"):
+        Referee("terrain", [load_vehicle("remus100")], guide=guide, start=here)
 
 
 @pytest.mark.slow

@@ -15,8 +15,6 @@ from finssim.tasks.observer import Observer
 from finssim.tasks.task import Batch
 from finssim.vehicles import load_vehicle
 
-NUMERIC = [name for name in numeric_tasks() if name != "terrain"]
-
 FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 OWN = [f"{EXAMPLES / 'own_task.py'}:KeepDepth", f"{EXAMPLES / 'own/task/keep_depth.py'}:KeepDepth"]
@@ -61,7 +59,7 @@ def with_tracks(reading, tracks):
     return known
 
 
-@pytest.mark.parametrize("name", [*NUMERIC, *OWN])
+@pytest.mark.parametrize("name", [*numeric_tasks(), *OWN])
 def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
     """Random actions, measurement noise, every agent; goals are exact poses on both sides."""
     task = task_named(name, time_limit=200.0) if name == "t2" else task_named(name)
@@ -93,7 +91,8 @@ def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
                 guide = PathGuide(env.arrays.path.points.numpy()[w].astype(float))
             for a, observer in enumerate(observers):
                 reading = with_tracks(track(env, w, a), tracks)
-                given = observer.observe(reading, guide, float(np.float32(steps[w]) * np.float32(0.1)))
+                t, ranges = float(np.float32(steps[w]) * np.float32(0.1)), env.arrays.ranges.numpy()[w]
+                given = observer.observe(reading, guide, t, ranges=ranges)
                 np.testing.assert_array_equal(given, seen[w, a])
 
 
@@ -200,10 +199,3 @@ def test_a_heading_out_of_reach_is_seen_on_the_way_to_it():
     )
     np.testing.assert_allclose(half, edge, atol=1e-6)
     assert not np.allclose(near, edge, atol=1e-3)
-
-
-def test_a_task_over_a_seabed_of_its_own_is_refused_on_a_robot():
-    with pytest.raises(
-        ControlError, match="task 'terrain' cannot be observed on a robot: its ranges are those"
-    ):
-        Observer("terrain", FINSROV)

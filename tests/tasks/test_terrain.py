@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from finssim.agents import baseline, restarted
-from finssim.core.rotations import quat_from_euler
+from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.sim import Water
 from finssim.tasks import make
-from finssim.tasks.terrain import AHEAD_BEAM, TerrainFollowing
+from finssim.tasks.terrain import TerrainFollowing
 from reference.tails import tailed
 
 VEHICLE = tailed("cruciform")
+AHEAD_BEAM = math.radians(30.0)
+UNDER = VEHICLE.perception["altimeter"].position
 
 
 def heights(seabed, floor, x, y):
@@ -38,11 +40,11 @@ def test_beams_over_a_flat_seabed_in_closed_form():
     env = make("terrain", worlds=1, vehicle=VEHICLE, seed=1, auto_reset=False)
     env.arrays.seabed.zero_()
     floor = env.task.fit.size * env.task.floor
-    ranges, at, _ = seen(env, [0, 0, floor + 6.0], quat_from_euler(0.0, 0.0, 0.0))
-    height = at[2] - floor
+    ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(0.0, 0.0, 0.0))
+    height = at[2] + quat_rotate(q, UNDER)[2] - floor
     assert ranges == pytest.approx([height, height / math.cos(AHEAD_BEAM)], rel=1e-3)
     ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(0.2, -0.15, 1.0))
-    height = at[2] - floor
+    height = at[2] + quat_rotate(q, UNDER)[2] - floor
     down = [2 * (q[0] * q[2] - q[3] * q[1]), 1 - 2 * (q[0] ** 2 + q[1] ** 2)]  # z of the body's x and z axes
     cosines = [down[1], math.cos(AHEAD_BEAM) * down[1] - math.sin(AHEAD_BEAM) * down[0]]
     assert ranges == pytest.approx(height / np.array(cosines), rel=2e-3)
@@ -54,6 +56,7 @@ def test_beams_end_on_the_seabed_that_is_drawn():
     seabed = env.arrays.seabed.numpy()[0]
     for yaw in (0.0, 2.0, -1.0):
         ranges, at, q = seen(env, [20.0, -5.0, floor + 7.0], quat_from_euler(0.0, 0.0, yaw))
+        at = at + quat_rotate(q, UNDER)
         for far, angle in zip(ranges, (0.0, AHEAD_BEAM), strict=True):
             x, y, z = (
                 at[0] + far * math.sin(angle) * math.cos(yaw),

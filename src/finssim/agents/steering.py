@@ -12,7 +12,7 @@ from finssim.control.course import STEEPEST, WIDEST
 from finssim.control.path_following import LineOfSight, PathErrors, SeabedFollower
 from finssim.core.rotations import cross
 from finssim.tasks.path import ERROR_SCALE, Cruise
-from finssim.tasks.terrain import TerrainFollowing
+from finssim.tasks.terrain import Beam, TerrainFollowing
 from finssim.vehicles import Vehicle
 
 Array = NDArray[np.float64]
@@ -75,6 +75,8 @@ class TerrainPilot:
     cruise: Cruise
     guide: LineOfSight
     follower: SeabedFollower
+    beam: Beam
+    """Of the altimeter."""
     period: float = PERIOD
     """Time between two actions [s]."""
 
@@ -84,7 +86,8 @@ class TerrainPilot:
         cruise = Cruise.of(vehicle)
         guide = LineOfSight(LOOK_AHEAD_TIME * cruise.speed, gain=0.1, steepest=STEEPEST)
         follower = SeabedFollower(TerrainFollowing().altitude * cruise.size, time_constant=0.5, ahead=1.0)
-        return cls(cruise=cruise, guide=guide, follower=follower)
+        beam = TerrainFollowing().fitted([vehicle]).below
+        return cls(cruise=cruise, guide=guide, follower=follower, beam=beam)
 
     def reset(self, n: int) -> tuple[Array, Array]:
         """Return empty integrals [m s], (n, 2), and an unknown seabed [m, m/s], (n, 2)."""
@@ -96,7 +99,8 @@ class TerrainPilot:
         size = self.cruise.size
         line, velocity, up = o[:, 4:7], o[:, 7:10], o[:, 13:16]
         depth = 10.0 * size * o[:, 2]
-        altitude = 5.0 * size * o[:, 0] * up[:, 2]  # the beam points down in the body
+        point = np.asarray(self.beam.position) + 5.0 * size * o[:, :1] * np.asarray(self.beam.direction)
+        altitude = -(point * up).sum(axis=1)
         wanted, rate, seabed = self.follower.depth(memory[1], depth, altitude, self.period)
         slope = np.arcsin(np.clip(rate / self.cruise.speed, -1.0, 1.0))
         nothing = np.zeros(len(o))

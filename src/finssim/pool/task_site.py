@@ -213,15 +213,16 @@ class Referee:
                 with its world, for an episode played elsewhere.
         """
         self.task = task = fitted_task(task, vehicles)
-        if start is not None and task.marks:
-            raise ControlError(
-                f"task '{task.name}' needs the poses of {', '.join(task.marks)}, which are drawn with its world and "
-                "are in no record: python -m studies.stack scores it during the run"
-            )
         if start is not None:
             task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
         size = action_size or len(action_mode(task.action, vehicles[0]).labels)
         self._state, self.arrays = one_world(task, size)
+        drawn = ", ".join(task.marks) if self.arrays.seabed is None else "the seabed"
+        if start is not None and drawn:
+            raise ControlError(
+                f"task '{task.name}' needs the places of {drawn}, which are drawn with its world and are in no record: "
+                "python -m studies.stack scores it during the run"
+            )
         device = self._state.steps.device
         follows = not task.world and (start is None or self.arrays.reference.position is not None)
         if guide is not None and follows:
@@ -239,6 +240,7 @@ class Referee:
         task.add_spawn(opening, batch, mask)
         task.add_observe(opening, batch, mask)
         opening.run()
+        self.world = self.world or task.site(self.arrays, seed)
         task.add_evaluate(self._evaluate, batch)
         self.over = False
         begun = self.arrays.answers.begun

@@ -178,11 +178,6 @@ class Observer:
     def _build(self, task: Task) -> None:
         """Arrays of one world, and what observes it; nothing is scored there."""
         state, self._arrays = one_world(task, self._action_size)
-        if self._arrays.seabed is not None:
-            raise ControlError(
-                f"task '{task.name}' cannot be observed on a robot: its ranges are those of the task's own seabed; use "
-                "finssim.control.course and path_following there"
-            )
         self._in_torch = unscored(self._arrays)
         self._steps = state.steps.numpy()
         self._pipeline = KernelSequence(1, state.steps.device)

@@ -177,6 +177,15 @@ class Task:
         """Return the dock in every world for the vehicle to enter, whose pose is the goal's; None without one."""
         return None
 
+    def site(self, arrays: TaskArrays, seed: int) -> Any:
+        """Return the described world that an episode has drawn, in which a virtual site's sensors measure; or None.
+
+        Args:
+            arrays: Of the episode.
+            seed: Of noise in the world.
+        """
+        return None
+
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Allocate the arrays that only this task uses; none by default."""
 

@@ -1,13 +1,22 @@
 """A task over a seabed, for vehicles that must move to steer: a constant altitude along a line."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
+from finssim.control.guidance import Reference
+from finssim.core.rotations import quat_rotate
+from finssim.sim.site import described_world
 from finssim.sim.state import State
 from finssim.tasks.arrays import PathTable, TaskArrays, allocated
+from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.path import (
     ERROR_SCALE,
     PathFollowing,
@@ -32,13 +41,15 @@ from finssim.tasks.terms import (
     turn_rates,
     world_up,
 )
+from finssim.vehicles import Vehicle
+from finssim.vehicles.device_files import RangeDevice, device_of
 
 RIPPLES = 4
 """Number of waves that a seabed is made of."""
 FARTHEST_RANGE = 60.0
 """Range beyond which a beam sees nothing: it is shown as this far [m]."""
-AHEAD_BEAM = math.radians(30.0)
-"""Angle between the beam ahead and that straight down, as of a Doppler log [rad]."""
+SPACING = 1.0
+"""Grid of the seabed as a described world [m]."""
 
 
 @wp.func
@@ -72,12 +83,30 @@ def beam_range(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, direction: wp.vec
 
 
 @wp.func
+def sounded(state: State, arrays: TaskArrays, p: Any, w: int, beam: Any) -> float:
+    """Range that an altimeter measures [m]."""
+    x, q = state.position[w, 0], state.quaternion[w, 0]
+    return beam_range(arrays, p, w, x + wp.quat_rotate(q, beam.position), wp.quat_rotate(q, beam.direction))
+
+
+@wp.func
+def sound(state: State, arrays: TaskArrays, p: Any, w: int):
+    """Measure the ranges of both altimeters."""
+    arrays.ranges[w, 0] = sounded(state, arrays, p, w, p.below)
+    arrays.ranges[w, 1] = sounded(state, arrays, p, w, p.before)
+
+
+@wp.func
+def go_on(state: State, arrays: TaskArrays, p: Any, w: int):
+    """Change legs, and measure the ranges."""
+    change_legs(state, arrays, p, w)
+    sound(state, arrays, p, w)
+
+
+@wp.func
 def seen_range(arrays: TaskArrays, p: Any, w: int, k: int) -> float:
-    """Range of a beam [m] in proportion to the vehicle's speed: 0 is straight down in the body, 1 that ahead."""
-    angle = wp.where(k == 0, 0.0, wp.static(AHEAD_BEAM))
-    beam = wp.vec3(wp.sin(angle), 0.0, -wp.cos(angle))
-    x = arrays.position[w, 0]
-    return beam_range(arrays, p, w, x, wp.quat_rotate(arrays.quaternion[w, 0], beam)) / p.fit.size
+    """Measured range [m] in proportion to the vehicle's speed: 0 is that of the altimeter below, 1 of that ahead."""
+    return wp.min(arrays.ranges[w, k], wp.static(FARTHEST_RANGE)) / p.fit.size
 
 
 @wp.func
@@ -134,11 +163,12 @@ def start_over(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
     arrays.path.points[w, 0] = x
     arrays.path.points[w, 1] = x + size * p.line * wp.vec3(wp.cos(course), wp.sin(course), 0.0)
     start_beside(state, arrays, p, wp.rand_init(key, 4 * w + 1), w)
+    sound(state, arrays, p, w)
 
 
 OBSERVATION = (
-    ObservationPart("range straight down in the body", 1, "m", 5.0, 6.0, seen_range, errors=()),
-    ObservationPart("range ahead, 30° from straight down", 1, "m", 5.0, 6.0, seen_range, index=1),
+    ObservationPart("range of the altimeter", 1, "m", 5.0, 6.0, seen_range, errors=()),
+    ObservationPart("range of the altimeter ahead", 1, "m", 5.0, 6.0, seen_range, index=1),
     ObservationPart("depth", 1, "m", 10.0, 6.0, depth_by_size),
     ObservationPart("distance to the left of the line", 1, "m", ERROR_SCALE, 3.0, seen_across, errors=(0,)),
     ObservationPart("direction of the line, body frame", 3, "1", term=path_direction),
@@ -150,15 +180,38 @@ OBSERVATION = (
 )
 
 
+@dataclass(frozen=True)
+class Beam:
+    """Where the beam of an altimeter begins and where it points, body frame."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m]"""
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """Unit vector."""
+
+    def on(self, vehicle: Vehicle, name: str) -> "Beam":
+        """Return the beam of an altimeter in the vehicle's `perception`; this one if it has none of that name."""
+        if name not in vehicle.perception:
+            return self
+        device = device_of(vehicle, name)
+        if not isinstance(device, RangeDevice) or device.beams != 1:
+            raise EnvironmentSetupError(
+                f"{vehicle.name}: perception.{name} is no altimeter of one beam, as task 'terrain' expects"
+            )
+        along = quat_rotate(device.mount.quaternion, [1.0, 0.0, 0.0])
+        return Beam(tuple(device.mount.position.tolist()), tuple(along.tolist()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TerrainFollowing(PathFollowing):
-    """Keep an altitude over a seabed that two beams see, along a straight line, by orders to the autopilot.
+    """Keep an altitude over a seabed that two altimeters see, along a straight line, by orders to the autopilot.
 
     Lengths in metres, angles in radians, times in seconds. Lengths as for `PathFollowing`.
     """
 
     title: ClassVar[str] = "keep an altitude over a seabed"
     baselines: ClassVar = {"altimeter": "finssim.agents.steering:TerrainPilot"}
+    ranges: ClassVar[tuple[str, ...]] = ("altimeter", "altimeter_ahead")
     name: str = "terrain"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     legs: int = 1
@@ -178,11 +231,51 @@ class TerrainFollowing(PathFollowing):
     """So it does farther than this from the altitude [m] ..."""
     width: float = 5.0
     """... or from the line [m]."""
+    below: Beam = Beam()
+    """Beam of the altimeter, straight down ..."""
+    before: Beam = Beam(direction=(0.5, 0.0, -math.sqrt(0.75)))
+    """... and of that ahead, 30° from it, unless the vehicle carries them otherwise; the environment sets both."""
+
+    def fitted(self, vehicles: Sequence[Vehicle]) -> "TerrainFollowing":
+        """Return the task for the speed and the altimeters of the vehicle."""
+        one, two = self.ranges
+        below, before = self.below.on(vehicles[0], one), self.before.on(vehicles[0], two)
+        return replace(super().fitted(vehicles), below=below, before=before)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Room for every world's line and seabed."""
         arrays.path = allocated(PathTable, worlds, device, points=self.legs + 1)
         arrays.seabed = wp.zeros((worlds, RIPPLES), dtype=wp.vec4, device=device)
+
+    def straight(self, here: NDArray[np.float64], goal: Reference) -> NDArray[np.float64]:
+        """Return the level line from a place to the place of a goal [m], (2, 3)."""
+        end = np.asarray(goal.position, float)
+        return np.stack([here, [end[0], end[1], here[2]]])
+
+    def site(self, arrays: TaskArrays, seed: int) -> Any:
+        """Return the seabed of the first world as a described world; see `Task`.
+
+        Raises:
+            SurroundingsError: The extension for perception, which measures in it, is not installed.
+        """
+        depth, half = -self.fit.size * self.floor, self.fit.size * (self.line + 30.0)
+        x = np.linspace(-half, half, math.ceil(2.0 * half / SPACING) + 1)
+        height, number, course, phase = np.moveaxis(arrays.seabed.numpy()[0].astype(float), 1, 0)[
+            :, :, None, None
+        ]
+        along = x * np.cos(course) + x[:, None] * np.sin(course)
+        with TemporaryDirectory() as folder:
+            np.savetxt(
+                Path(folder) / "heights.csv", (height * np.sin(number * along + phase)).sum(0), "%.4f", ","
+            )
+            file = Path(folder) / "seabed.yaml"
+            file.write_text(
+                f"about: seabed of task {self.name}\nwater: {{jerlov: II, veil: [0.0, 0.1, 0.1]}}\n"
+                f"seabed: {{depth: {depth}, size: [{2 * half}, {2 * half}], spacing: {SPACING}, "
+                "heights: heights.csv}\n"
+                f"viewpoint: {{position: [0, 0, {0.5 * -depth}]}}\n"
+            )
+            return described_world(file).drawn_for(self, arrays, seed)
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -196,7 +289,7 @@ class TerrainFollowing(PathFollowing):
         r = self.reward
         return Terms(
             start=start_over,
-            advance=change_legs,
+            advance=go_on,
             shared={"e": altitude_error, "across": beside_line},
             meanings={"track": f"1 at the altitude, 1/e at {self.fit.size * r.track_scale:.3g} m from it."},
             rewards=(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from finssim.core.rotations import quat_from_euler
 from finssim.vehicles.equipment import (
     Compass,
     DepthSensor,
@@ -62,7 +63,8 @@ QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 DEFAULTS: Mapping[str, str] = {
     "sensors": "IMU and pressure gauge of a small MEMS unit, at the body origin",
     "perception": "altimeter under the hull and imaging sonar at the nose (128 beams, 5 Hz), and a camera (48 px wide, "
-    "10 Hz) on a vehicle that hovers: devices of small ROVs, delays and losses guessed",
+    "10 Hz) on a vehicle that hovers, on others an altimeter 30° ahead of straight down: devices of small "
+    "ROVs, delays and losses guessed",
     "tags": "two tag25h9 (15 ahead, 16 astern) on the top, as large as fits, as on FinsROV",
     "mcu": "an output for each thruster in the order of the file, positive forward; full scale is the fastest shaft",
     "safety": "silences of 0.5 s; 45 degrees of tilt, 60 for a vehicle that does not control its heave; the published "
@@ -95,7 +97,8 @@ def default_sensors() -> Sensors:
 
 
 def default_perception(values: Mapping[str, Any]) -> dict[str, RaySensor]:
-    """Camera, sonar and altimeter on the envelope: what a small ROV carries; one that does not hover has no camera.
+    """Camera, sonar and altimeter on the envelope, as a small ROV carries them; a vehicle that does not hover has in
+    place of the camera an altimeter that looks 30° ahead of straight down.
 
     Devices are those of the catalogue; pictures are as coarse as policies take them, delays and losses are guesses.
     """
@@ -114,8 +117,10 @@ def default_perception(values: Mapping[str, Any]) -> dict[str, RaySensor]:
         latency=0.1,
     )
     altimeter = RaySensor(device="ping", position=under, rate=10.0, latency=0.05)
-    hovers = "heave" in values["controlled_axes"]
-    return {**({"front_camera": camera} if hovers else {}), "sonar": sonar, "altimeter": altimeter}
+    if "heave" in values["controlled_axes"]:
+        return {"front_camera": camera, "sonar": sonar, "altimeter": altimeter}
+    ahead = altimeter.model_copy(update={"orientation": quat_from_euler(0.0, math.radians(60.0), 0.0)})
+    return {"sonar": sonar, "altimeter": altimeter, "altimeter_ahead": ahead}
 
 
 def default_tags(values: Mapping[str, Any]) -> Tags:

@@ -33,7 +33,9 @@ def first_draw(seed: int) -> int:
 
 
 def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
-    """Set a task's goal to the place of its landmark in each world, and the reference to the places of its marks."""
+    """Set a task's goal to the place of its landmark, if it has one, and the reference to the places of its marks."""
+    if not task.landmark:
+        return
     pose = layout.poses(task.landmark)
     arrays.goal_position.assign(np.float32(pose[:, :3]))
     arrays.goal_quaternion.assign(np.float32(pose[:, 3:]))
