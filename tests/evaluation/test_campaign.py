@@ -176,3 +176,20 @@ def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, 
             campaign._knock(address)
         stranger.join(10.0)
     assert not stranger.is_alive()
+
+
+@pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_further_jobs_are_prepared_while_others_are_played(tmp_path, processes):
+    """Their results follow, and a second call plays none of either."""
+    shown = []
+
+    def more():
+        return JOBS[2:]
+
+    for _ in range(2):
+        results = run_jobs(
+            JOBS[:2], tmp_path, played.known, processes=processes, more=more,
+            show=lambda job, result: shown.append(job.target),
+        )  # fmt: skip
+        assert [result["job"]["target"] for result in results] == [job.target for job in JOBS]
+    assert sorted(shown) == sorted({job.target for job in JOBS})

@@ -197,6 +197,7 @@ def run_jobs(
     address: str | None = None,
     progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
+    more: Callable[[], Sequence[Job]] = tuple,
 ) -> list[dict[str, Any]]:
     """Play the jobs that have no result yet; after Ctrl-C or a kill the next call continues.
 
@@ -209,26 +210,39 @@ def run_jobs(
             back; vehicle files must be at the same place on each machine.
         progress: Told the share that is done and what is left.
         show: Called with each trial that is played now and its result, as soon as there is one.
+        more: Prepares further jobs, as of `spread`.
 
     Returns:
         The results in the order of the jobs, each with its `job` and `key`; jobs without a result are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    files = {job.key(): folder / f"{job.key()}.json" for job in jobs}
-    missing = {job.key(): job for job in jobs if not files[job.key()].is_file()}
+    files: list[Path] = []
+    left: set[str] = set()
+
+    def planned(jobs: Sequence[Job]) -> list[tuple[Any, ...]]:
+        """Return what `spread` takes of the jobs that have no result."""
+        keys = [job.key() for job in jobs]
+        files.extend(folder / f"{key}.json" for key in keys)
+        missing = {
+            key: job for key, job in zip(keys, jobs, strict=True) if not (folder / f"{key}.json").is_file()
+        }
+        left.update(missing)
+        return [(k, j) if address is None else (k, j, _policy_files(j)) for k, j in missing.items()]
+
     if address is None:
-        work, items = partial(_play_job, folder=folder, play=play), list(missing.items())
+        work: Callable[..., Any] = partial(_play_job, folder=folder, play=play)
     else:
-        work, items = partial(_play_away, play=play), [(k, j, _policy_files(j)) for k, j in missing.items()]
-    with closing(spread(work, items, processes, address)) as played:
-        for remaining, ((key, job, *_), outcome) in zip(reversed(range(len(missing))), played, strict=True):
+        work = partial(_play_away, play=play)
+    with closing(spread(work, planned(jobs), processes, address, more=lambda: planned(more()))) as played:
+        for (key, job, *_), outcome in played:
             result = outcome.result()
             if address is not None:
                 result = _come_back(job, folder / key, *result)
             if result is not None:
                 show(job, result)
-            progress(1.0 - remaining / len(files), f"{remaining} trials left")
-    return [load_result(files[job.key()]) for job in jobs if files[job.key()].is_file()]
+            left.remove(key)
+            progress(1.0 - len(left) / len(files), f"{len(left)} trials left")
+    return [load_result(file) for file in files if file.is_file()]
 
 
 class Checkpoints:
@@ -277,6 +291,7 @@ def spread(
     address: str | None = None,
     *,
     resumable: bool = False,
+    more: Callable[[], Sequence[Any]] = tuple,
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
     """Yield the results of items in separate processes, as many in parallel as there are processors if None; in this
     process if 1.
@@ -289,6 +304,7 @@ def spread(
         processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
         address: HOST:PORT of a Ray cluster on which it is done instead, or auto.
         resumable: Whether on a cluster the work is called with an item and an `OwnCheckpoint`, from which it resumes.
+        more: Called in this process while others do the work, and returns further items.
 
     Yields:
         An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
@@ -297,22 +313,22 @@ def spread(
         ClusterError: Ray is not installed, or nothing answers at the address.
     """
     if address is not None:
-        yield from _on_cluster(work, items, address, resumable)
+        yield from _on_cluster(work, [*items, *more()], address, resumable)
         return
     processes = processes or os.cpu_count() or 1
     if processes == 1:
-        for item in items:
-            outcome: Future[Any] = Future()
-            try:
-                outcome.set_result(work(item))
-            except Exception as error:
-                outcome.set_exception(error)
-            yield item, outcome
+        for given in (lambda: items, more):
+            for item in given():
+                outcome: Future[Any] = Future()
+                try:
+                    outcome.set_result(work(item))
+                except Exception as error:
+                    outcome.set_exception(error)
+                yield item, outcome
         return
-    if not items:
-        return
-    with _workers(min(processes, len(items))) as executor:
+    with _workers(processes) as executor:
         futures = {executor.submit(work, item): item for item in items}
+        futures |= {executor.submit(work, item): item for item in more()}
         for future in as_completed(futures):
             yield futures[future], future
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -262,7 +263,8 @@ def transfer_experiment(
     pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
     firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
     action, site, sees = FIRMWARES[firmware]
-    controllers = controllers_of(
+    train_missing = partial(
+        controllers_of,
         spec.name, chosen, run_seeds, folder, TrainingSettings(vehicle=vehicle, steps=steps, action=action),
         lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
     )  # fmt: skip
@@ -271,17 +273,28 @@ def transfer_experiment(
         site = robot.site if firmware != "mcu" else site
     elif firmware != "mcu":
         camera = sees
-    jobs = [
-        RobotJob(
-            row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
-            pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site, firmware=firmware,
-            estimator=estimator, **{"camera": camera, **row.changes},
-        )
-        for name, row in chosen.items() for plant in pools for s in run_seeds for target in row.targets or targets
-    ]  # fmt: skip
+
+    def jobs_of(names: Sequence[str], controllers: Mapping[tuple[str, int], str]) -> list[RobotJob]:
+        return [
+            RobotJob(
+                row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
+                pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site,
+                firmware=firmware, estimator=estimator, **{"camera": camera, **chosen[name].changes},
+            )
+            for name in names for plant in pools for s in run_seeds for target in chosen[name].targets or targets
+        ]  # fmt: skip
+
+    ready, beside = [name for name, row in chosen.items() if row.training is None], {}
+    controllers = {(name, s): chosen[name].controller for name in ready for s in run_seeds}
+    if robot is None and address is None and seeds == 1:  # so few trainings leave processors to other rows
+        learned = [name for name in chosen if name not in ready]
+        beside["more"] = lambda: jobs_of(learned, train_missing())
+    else:
+        controllers, ready = train_missing(), list(chosen)
     results = play_jobs(
-        jobs, folder / "trials", robot, attendant=attendant, console=console, processes=processes, address=address,
-        show=show, progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
+        jobs_of(ready, controllers), folder / "trials", robot, attendant=attendant, console=console,
+        processes=processes, address=address, show=show, **beside,
+        progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
