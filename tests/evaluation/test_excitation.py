@@ -83,7 +83,10 @@ def test_equal_runs_have_equal_keys_and_every_setting_counts():
 
 
 def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
-    """Rolled hard and left so: the tilt watchdog ends it. What was finished beside it is kept; alone it is refused."""
+    """Rolled hard and left so: the tilt watchdog ends it. What was finished beside it is kept; alone it is refused.
+
+    So is what was finished before Ctrl-C.
+    """
     n = 300
     tau = np.zeros((n, 6))
     tau[50:, 3] = FINSROV.wrench_limits[3]
@@ -93,6 +96,12 @@ def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
     write_vehicle(FINSROV.replace({"safety.max_tilt": 0.05}), tmp_path / "light.yaml")
     faults = {}
 
+    def show(run, result):
+        faults[run.target] = result["fault"]
+        if len(faults) == 2 and not (tmp_path / "interrupted").exists():
+            (tmp_path / "interrupted").touch()
+            raise KeyboardInterrupt
+
     def recorded(plan, out):
         return record_programmes(
             {"fit": plan},
@@ -101,9 +110,12 @@ def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
             pool_vehicle="finsrov",
             severity="nominal",
             processes=1,
-            show=lambda run, result: faults.update({run.target: result["fault"]}),
+            show=show,
         )
 
+    with pytest.raises(KeyboardInterrupt):
+        recorded([still, hard], "both")
+    assert sorted(path.name for path in (tmp_path / "both").iterdir()) == ["records", "still"]
     assert recorded([hard, still], "both") == {"fit": [tmp_path / "both" / "still"]}
     assert "tilt" in faults["roll_hard"] and not faults["still"]
     with pytest.raises(CalibrationError, match="stopped every fit trial in the virtual pool: .*tilt"):

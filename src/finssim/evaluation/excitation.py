@@ -498,17 +498,23 @@ def _in_pool(
     body = load_vehicle(vehicle)
     for run in runs:  # what cannot be is refused before anything is played
         start_of(run.programme, body, runs[0].water)
-    with tempfile.TemporaryDirectory() as scratch:
+    for folder in folders.values():
+        folder.mkdir(parents=True, exist_ok=True)
+    beside = next(iter(folders.values()))  # on the same file system a trial moves whole or not at all
+    with tempfile.TemporaryDirectory(prefix=".recording-", dir=beside) as scratch:
+
+        def keep(run: PoolRun, result: Mapping[str, Any]) -> None:
+            """Move a trial to its folder as soon as there is one: an interruption then loses no other."""
+            if not result["fault"]:
+                source, folder = Path(scratch) / result["key"], folders[run.row]
+                (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+                shutil.move(source / f"{run.target}.mcap", folder / RECORDS)
+                shutil.move(source / run.target, folder / run.target)
+            show(run, result)
+
         results = run_jobs(
-            runs, Path(scratch), play_programme, processes=processes, progress=progress, show=show
+            runs, Path(scratch), play_programme, processes=processes, progress=progress, show=keep
         )
-        for run, result in zip(runs, results, strict=True):
-            if result["fault"]:
-                continue
-            source, folder = Path(scratch) / result["key"], folders[run.row]
-            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
-            shutil.move(source / run.target, folder / run.target)
-            shutil.move(source / f"{run.target}.mcap", folder / RECORDS)
     for role, plan in plans.items():
         if not any((folders[role] / programme.name).is_dir() for programme in plan):
             raise CalibrationError(

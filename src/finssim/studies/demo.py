@@ -28,7 +28,7 @@ from finssim.core.palette import BLUE, VERMILION
 from finssim.core.quiet import start_warp
 from finssim.evaluation.campaign import Progress, running
 from finssim.evaluation.evaluate import T1_COLUMNS
-from finssim.evaluation.excitation import record_programmes, trimmed
+from finssim.evaluation.excitation import PoolRun, record_programmes, trimmed
 from finssim.evaluation.figures import clean, legend_below, new_figure, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import (
@@ -680,13 +680,18 @@ class _Demonstration:
                 record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
                 severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware,
                 processes=self.processes, progress=progress,
-                show=lambda run, result: self.report(
-                    f"  {run.target}: {'left out: ' if result['fault'] else ''}{result['fault'] or result['text']}"
-                ),
             )  # fmt: skip
 
             def recorded(folders: Mapping[str, Path], rough: str) -> Mapping[str, Sequence[Trial]]:
-                trials = {role: load_trials(paths) for role, paths in record(folders, rough).items()}
+                def show(run: PoolRun, result: Mapping[str, Any]) -> None:
+                    left_out = "left out: " if result["fault"] else ""
+                    self.report(f"  {run.target}: {left_out}{result['fault'] or result['text']}")
+                    if not (left_out or (self.out / REPORT_FILE).exists()):
+                        self._show_recorded(load_trials([folders[run.row] / run.target]))
+
+                trials = {
+                    role: load_trials(paths) for role, paths in record(folders, rough, show=show).items()
+                }
                 self._show_recorded([trial for of_role in trials.values() for trial in of_role])
                 if not (self.out / "t1" / "policies").exists():
                     beside.enter_context(running(_compile_training, rough, FIRMWARES[self.firmware].action))
@@ -718,9 +723,7 @@ class _Demonstration:
             self.out / REPORT_FILE,
             self._title,
             [],
-            lead=[
-                f"{len(trials)} trials are recorded. Identification, training and trials of it are still to come."
-            ],
+            lead=[f"Trials recorded so far: {len(trials)}. Identification and training are still to come."],
             first={"trials.png": "Paths of the recorded trials from above and from the side [m]"},
         )
         self.report(f"report so far: {self.out / REPORT_FILE}")
