@@ -45,7 +45,17 @@ from finssim.physics.plant import VehicleCommand, VehicleParameters, mass_matrix
 from finssim.physics.solids import Solids, solids_within, solids_wrench
 from finssim.physics.terms.composed import Item, composed, row_length
 from finssim.physics.tether import Tether, tether_wrench
-from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, symmetric_times, vec6, vec8
+from finssim.physics.types import (
+    MAX_THRUSTERS,
+    angular,
+    join,
+    linear,
+    mat66,
+    symmetric_times,
+    vec6,
+    vec8,
+    vec9,
+)
 from finssim.physics.water import Flow, WaterArrays, flow_at
 from finssim.sim.midpoint import (
     DOCK_STEP,
@@ -485,6 +495,49 @@ def lag_function(speed_lag: bool, play: bool) -> Any:
 
 
 @cache
+def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
+    """Return the Warp function of what masses that move within a vehicle do to it; None without such masses."""
+    carried, mass_shift = composed(terms, "carry"), composed(terms, "shift")
+    if carried is None or mass_shift is None:
+        return None
+    thrust_of = thrust_function(speed_lag)
+
+    @wp.func
+    def carrying(plant: VehicleParameters, shift: vec9) -> mat66:
+        """Mass matrix of the submerged vehicle, from the change of its first moment and inertia [kg m, kg m²]."""
+        r_g = plant.r_g + wp.vec3(shift[0], shift[1], shift[2]) / plant.mass
+        return mass_matrix(plant.mass, r_g, plant.inertia + symmetric_inertia(shift), plant.M_A)
+
+    @wp.func
+    def recoiled(vehicles: Vehicles, density: float, w: int, v: int, before: vec8, course: Course) -> Course:
+        """The course once the masses have moved from where they were `before`, at equal momentum.
+
+        d = -M⁻¹ (c - c_before),   π = M_before nu,   nu' = M⁻¹ (π - C(d) π)
+
+        The body goes by d, where c's rate is the masses' momentum relative to the body. nu is the body's velocity when
+        they stand still: M nu is the momentum of all.
+        """
+        out = course
+        q, nu, plant = course.quaternion, course.velocity, vehicles.plant[w, v]
+        up = up_in_body(q)
+        depth = -(course.start[2] + course.moved[2])
+        last = thrust_of(vehicles.plant, w, v, before)
+        now = thrust_of(vehicles.plant, w, v, course.actuator)
+        change = carried(vehicles.extra, w, v, nu, up, depth, density, now)
+        change -= carried(vehicles.extra, w, v, nu, up, depth, density, last)
+        momentum = carrying(plant, mass_shift(vehicles.extra, w, v, nu, up, depth, density, last)) * nu
+        M = carrying(plant, mass_shift(vehicles.extra, w, v, nu, up, depth, density, now))
+        d = solve_spd(M, -change)
+        out.velocity = solve_spd(M, momentum - coriolis_wrench(momentum, d))
+        out.moved = course.moved + wp.quat_rotate(q, linear(d))
+        out.quaternion = rotate_by(q, angular(d), 1.0)
+        out.x_dot = position_rate(out.quaternion, out.velocity)
+        return out
+
+    return recoiled
+
+
+@cache
 def runge_kutta_function(features: Features) -> Any:
     """Return the Warp function of one substep by the rule of Runge and Kutta."""
     motion_at = motion_function(features.model, True, features.water_moving, features.tether, features.terms)
@@ -778,6 +831,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
     runge_kutta, solids = features.runge_kutta, features.solids
     substep = (runge_kutta_function if runge_kutta else midpoint_function)(features)
     set_out, arrive = ends_of(features.speed_lag, features.funnel, solids)
+    recoiled = recoil_function(features.speed_lag, features.terms)
 
     @wp.func
     def step_vehicle(
@@ -811,7 +865,10 @@ def physics_kernel(features: Features) -> wp.Kernel:
             # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
             first = wp.where(beat.step == 0, -1, 0)
         for k in range(first, substeps):
-            course = substep(state.commands, vehicles, around, w, v, beat, k, course)
+            after = substep(state.commands, vehicles, around, w, v, beat, k, course)
+            if wp.static(recoiled is not None):
+                after = recoiled(vehicles, around.water.density, w, v, course.actuator, after)
+            course = after
         arrive(state, vehicles, around, w, v, slot, course)
         if wp.static(solids):
             around.obstacles.solids.force[w, v] = course.struck

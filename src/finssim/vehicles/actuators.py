@@ -89,6 +89,9 @@ class ActuatorKind:
     shift: Any = None
     """`wp.func` -> vec9: change of the body's first moment of mass [kg m] and of its inertia about the body origin
     [kg m²] (xx, yy, zz, xy, xz, yz), body frame."""
+    carry: Any = None
+    """`wp.func` -> vec6: momentum about the body origin per rate of the value, times the value, of what moves within
+    the body [kg m, kg m²], body frame; the body recoils from its changes."""
     numbers: Callable[[Any, Vehicle], Mapping[str, Any]] | None = None
     """Function from section and vehicle to the parameters that no key of the section gives."""
 

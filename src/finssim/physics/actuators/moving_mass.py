@@ -1,10 +1,10 @@
 """A mass that moves along an axis within the vehicle: batteries on a spindle."""
 
-# mypy: disable-error-code="call-overload,index,no-any-return,no-untyped-call,valid-type"
+# mypy: disable-error-code="arg-type,call-overload,index,no-any-return,no-untyped-call,valid-type"
 
 import warp as wp
 
-from finssim.physics.types import vec9
+from finssim.physics.types import join, vec6, vec9
 from finssim.vehicles.actuators import Actuator, ActuatorKind
 from finssim.vehicles.part import Axis, Positive, Vector3
 
@@ -12,7 +12,8 @@ from finssim.vehicles.part import Axis, Positive, Vector3
 class MovingMass(Actuator):
     """Section of a moving mass; its value is the way from `position` along `axis` [m].
 
-    `body` contains the mass, at `position`.
+    `body` contains the mass, at `position`. The body recoils while the mass moves: it is moved by -M⁻¹ m Δδ [a; p × a],
+    M with the added mass; its velocity is given as if the mass stood still.
     """
 
     mass: Positive
@@ -51,10 +52,28 @@ def moved_mass(value: float, mass: float, position: wp.vec3, axis: wp.vec3) -> v
     )
 
 
+@wp.func
+def carried_mass(value: float, mass: float, position: wp.vec3, axis: wp.vec3) -> vec6:
+    """m δ [a; p × a]: its rate is the momentum of the mass relative to the body.
+
+    Args:
+        value: Way δ along the axis [m].
+        mass: m [kg].
+        position: p, body frame [m].
+        axis: a, body frame [-].
+
+    Returns:
+        Linear and angular part about the body origin [kg m, kg m²].
+    """
+    moved = mass * value * axis
+    return join(moved, wp.cross(position, moved))
+
+
 MOVING_MASS = ActuatorKind(
     name="moving_mass",
     schema=MovingMass,
     unit="m",
     units={"mass": "kg", "position": "m", "axis": "1"},
     shift=moved_mass,
+    carry=carried_mass,
 )

@@ -39,8 +39,9 @@ STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density":
 """Arguments that a term's functions may take besides its parameters."""
 VALUE: dict[str, Any] = {**STATE, "value": float}
 """Arguments that an actuator's functions may take besides its parameters."""
-ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "yield": vec6, "shift": vec9}
-"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push`, `yield` (slope) and `shift`."""
+ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "yield": vec6, "shift": vec9, "carry": vec6}
+"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push`, `yield` (slope), `shift` and
+`carry`."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "vec8": vec8, "mat66": mat66}
 """Types of a parameter."""
 PIECE = 8
@@ -143,7 +144,8 @@ def _require_zero(item: Item, role: str) -> None:
 
 def _functions(item: Item) -> dict[str, Any]:
     if isinstance(item, InstalledActuator):
-        functions = {"push": item.kind.wrench, "yield": item.kind.slope, "shift": item.kind.shift}
+        kind = item.kind
+        functions = {"push": kind.wrench, "yield": kind.slope, "shift": kind.shift, "carry": kind.carry}
     else:
         functions = {"wrench": item.wrench, "slope": item.slope}
     return {role: function for role, function in functions.items() if function is not None}
