@@ -4,7 +4,11 @@
 
 import warp as wp
 
+from finssim.physics.lanes import sum_in_lanes
 from finssim.physics.types import angular, join, linear, vec6
+
+CORNERS = 8
+"""Corners of the envelope box."""
 
 
 @wp.struct
@@ -88,6 +92,42 @@ def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.
 
 
 @wp.func
+def corner_wrench(
+    i: int, walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3
+) -> vec6:
+    """`contact_wrench` of corner i of the box, 0 to 7, body frame [N, N m]; arguments in the same frames and units."""
+    R = wp.quat_to_matrix(q)
+    sx = 1.0 - 2.0 * float(i & 1)
+    sy = 1.0 - 2.0 * float((i >> 1) & 1)
+    sz = 1.0 - 2.0 * float((i >> 2) & 1)
+    r = wp.cw_mul(wp.vec3(sx, sy, sz), half_size)
+    x = position + R * r
+    v_w = R * (linear(nu) + wp.cross(angular(nu), r))
+    f = wall_force(-(x[2] + walls.depth), v_w, wp.vec3(0.0, 0.0, 1.0), walls)
+    side_x = wp.sign(x[0])
+    f += wall_force(wp.abs(x[0]) - walls.half_length, v_w, wp.vec3(-side_x, 0.0, 0.0), walls)
+    side_y = wp.sign(x[1])
+    f += wall_force(wp.abs(x[1]) - walls.half_width, v_w, wp.vec3(0.0, -side_y, 0.0), walls)
+    f_b = wp.transpose(R) * f
+    return join(f_b, wp.cross(r, f_b))
+
+
+@wp.func
+def corners_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
+    """`contact_wrench` of a box that touches something, body frame [N, N m]; arguments in the same frames and units."""
+    tau = vec6()
+    corners = int(
+        CORNERS
+    )  # a variable, so that the loop is not unrolled: contact is rare, its code need not be near
+    for i in range(corners):
+        tau += corner_wrench(i, walls, position, q, nu, half_size)
+    return tau
+
+
+sum_in_lanes(corners_wrench, corner_wrench, few=CORNERS)
+
+
+@wp.func
 def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
     """Wrench of walls and floor on the eight corners of the vehicle's envelope box.
 
@@ -101,27 +141,6 @@ def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, ha
     Returns:
         Wrench about the body origin, body frame [N, N m].
     """
-    tau = vec6()
     if not walls_within(walls, position, q, half_size, 0.0):
-        return tau
-    R = wp.quat_to_matrix(q)
-    v = linear(nu)
-    omega = angular(nu)
-    corners = int(
-        8
-    )  # a variable, so that the loop is not unrolled: contact is rare, its code need not be near
-    for i in range(corners):
-        sx = 1.0 - 2.0 * float(i & 1)
-        sy = 1.0 - 2.0 * float((i >> 1) & 1)
-        sz = 1.0 - 2.0 * float((i >> 2) & 1)
-        r = wp.cw_mul(wp.vec3(sx, sy, sz), half_size)
-        x = position + R * r
-        v_w = R * (v + wp.cross(omega, r))
-        f = wall_force(-(x[2] + walls.depth), v_w, wp.vec3(0.0, 0.0, 1.0), walls)
-        side_x = wp.sign(x[0])
-        f += wall_force(wp.abs(x[0]) - walls.half_length, v_w, wp.vec3(-side_x, 0.0, 0.0), walls)
-        side_y = wp.sign(x[1])
-        f += wall_force(wp.abs(x[1]) - walls.half_width, v_w, wp.vec3(0.0, -side_y, 0.0), walls)
-        f_b = wp.transpose(R) * f
-        tau += join(f_b, wp.cross(r, f_b))
-    return tau
+        return vec6()
+    return corners_wrench(walls, position, q, nu, half_size)

@@ -127,8 +127,10 @@ def solve_spd(M: mat66, b: vec6) -> vec6:
         for j in range(6):
             A[i, j] = wp.float64(M[i, j])
     # Loops of constant length, which Warp unrolls: conditions on their counters cost nothing.
+    pivots = vec6d()
     for k in range(6):
         pivot = wp.float64(1.0) / A[k, k]
+        pivots[k] = pivot
         for i in range(6):
             if i > k:
                 factor = pivot * A[k, i]
@@ -143,6 +145,6 @@ def solve_spd(M: mat66, b: vec6) -> vec6:
         for j in range(6):
             if j > i:
                 total = total - A[i, j] * x[j]
-        x[i] = total / A[i, i]
+        x[i] = total * pivots[i]
         out[i] = wp.float32(x[i])
     return out

@@ -4,9 +4,11 @@ A compiler that sees one world at a time fills one place of eight in a processor
 a step are called here once, from plain Python, with *lane numbers* in place of floats: each operation writes a line of
 C++ that does it for eight worlds at once. There is one source of the equations, and no second one.
 
-Where a function branches, the trace follows the branch that its example takes (a submerged vehicle in open water), and
-notes the condition: a world for which it does not hold is left to the kernel for one world. So what happens in a world
-depends on that world alone, whoever shares its block.
+Where a function branches, the trace follows both ways, and each world takes the results of its own: at a wall, at the
+surface. What only another way than the example's (a submerged vehicle in open water) needs is computed if a world of
+the block goes it; blocks are made of worlds that went the same ways in the last step. A world that goes a way which
+cannot be traced is left to the kernel for one world. So what happens in a world depends on that world alone, whoever
+shares its block.
 """
 
 # mypy: disable-error-code="no-any-return"
@@ -14,16 +16,23 @@ depends on that world alone, whoever shares its block.
 from __future__ import annotations
 
 import builtins
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import CellType, FunctionType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 LANES = 8
 """Worlds in a block."""
+GROUP = 1024
+"""Worlds that are sorted into blocks by the ways that they went in the last step."""
+WAYS = 5
+"""Ways aside, of the first of which a world's own are remembered."""
 
 
 class LaneError(TypeError):
@@ -31,10 +40,10 @@ class LaneError(TypeError):
 
 
 class Lane:
-    """A number in each of a block's worlds, with an example of it that decides where branches go.
+    """A number in each of a block's worlds, with an example of it, whose way through branches is followed first.
 
     Attributes:
-        kind: F (float32), I (int32) or M (a truth).
+        kind: F (float32), D (float64), I (int32) or M (a truth).
     """
 
     __hash__ = None  # type: ignore[assignment]
@@ -51,10 +60,10 @@ class Lane:
         return self.trace.apply(self.kind, f"({{}} {symbol} {{}})", function, other, self)
 
     def __add__(self, other: Any) -> Any:
-        return self._with(other, "+", lambda a, b: a + b)
+        return self if _is(other, 0.0) else self._with(other, "+", lambda a, b: a + b)
 
     def __radd__(self, other: Any) -> Any:
-        return self._from(other, "+", lambda a, b: a + b)
+        return self if _is(other, 0.0) else self._from(other, "+", lambda a, b: a + b)
 
     def __sub__(self, other: Any) -> Any:
         return self._with(other, "-", lambda a, b: a - b)
@@ -63,9 +72,13 @@ class Lane:
         return self._from(other, "-", lambda a, b: a - b)
 
     def __mul__(self, other: Any) -> Any:
+        if _is(other, 0.0) or _is(other, 1.0):
+            return self if other else 0.0
         return self._with(other, "*", lambda a, b: a * b)
 
     def __rmul__(self, other: Any) -> Any:
+        if _is(other, 0.0) or _is(other, 1.0):
+            return self if other else 0.0
         return self._from(other, "*", lambda a, b: a * b)
 
     def __truediv__(self, other: Any) -> Any:
@@ -76,6 +89,12 @@ class Lane:
 
     def __mod__(self, other: Any) -> Any:
         return self._with(other, "%", lambda a, b: a % b)
+
+    def __and__(self, other: Any) -> Any:
+        return self._with(other, "&", lambda a, b: a & b)
+
+    def __rshift__(self, other: Any) -> Any:
+        return self._with(other, ">>", lambda a, b: a >> b)
 
     def __neg__(self) -> Any:
         return self.trace.apply(self.kind, "(-{})", lambda a: -a, self)
@@ -99,10 +118,19 @@ class Lane:
         return self._with(other, "!=", lambda a, b: a != b, "M")
 
     def __bool__(self) -> bool:
-        """A branch: the example's way, which is the way of the worlds that stay in the block."""
+        """A branch: both ways in turn where the trace explores, else the example's, where other worlds leave."""
         truth = self if self.kind == "M" else self != 0
-        self.trace.require(truth)
-        return bool(truth.example)
+        return self.trace.decide(truth) if isinstance(truth, Lane) else bool(truth)
+
+    def __index__(self) -> int:
+        """A number of passes: the example's; worlds with another leave."""
+        self.trace.require(self == self.example)
+        return int(self.example)
+
+
+def _is(x: Any, value: float) -> bool:
+    """Return whether x is that constant: times or plus it, nothing need be computed."""
+    return isinstance(x, float | int) and x == value
 
 
 def _divide(a: Any, b: Any) -> Any:
@@ -177,32 +205,92 @@ def _sum(terms: Sequence[Any]) -> Any:
     return total
 
 
+class _Path:
+    """Answers to the branches of one run of a function."""
+
+    def __init__(self, answers: Sequence[bool]) -> None:
+        self.given = list(answers)
+        self.taken: list[tuple[Lane, bool]] = []
+
+
+BRANCHES = 8
+"""Branches of a function on one way through it."""
+SHORT = 24
+"""Lines below which another way is computed for every block, whether a world goes it or not."""
+
+
 class Trace:
     """Lines of C++, as the functions that are called with its lane numbers write them.
 
     A line stands outside the loop over substeps if all that it needs does.
+
+    Attributes:
+        sections: Lines before the loop, in it, after it.
+        level: Section of the lines that need nothing.
+        active: Traces that follow branches both ways: each call of a function runs once for every way through it,
+            and worlds take the result of theirs. What only some ways need is computed where a world of the block goes
+            one of them.
     """
+
+    active: ClassVar[list[Trace]] = []
 
     def __init__(self) -> None:
         self.sections: list[list[str]] = [[], [], []]
-        """Before the loop, in it, after it."""
         self.level = 0
-        """Section of the lines that need nothing."""
-        self._known: dict[tuple[str, str, int], Lane] = {}
+        self._known: ChainMap[Any, Any] = ChainMap()
+        self._names, self._ways = itertools.count(), itertools.count()
+        self._aside: list[tuple[Lane, list[str]]] = []
+        self._path: _Path | None = None
+        self._world_by_world = False
+        self.written = 0
+        """Assignments to `WorldArray`s."""
+        self.arrays: dict[str, WorldArray] = {}
+        """Those that have been used, by name in C++."""
+        self.outside: dict[str, None] = {}
+        """Declarations before the loop over blocks."""
+
+    @property
+    def aside(self) -> bool:
+        """Return whether the lines are those of another way than the example's."""
+        return bool(self._aside)
+
+    @contextmanager
+    def exploration(self) -> Iterator[None]:
+        """Follow branches both ways meanwhile."""
+        Trace.active.append(self)
+        try:
+            yield
+        finally:
+            Trace.active.pop()
 
     def symbol(self, kind: str, name: str, example: Any) -> Lane:
         """A lane number that the C++ around the trace declares."""
         return Lane(self, kind, name, example, self.level)
+
+    def place(self, level: int) -> list[str]:
+        """Return the lines of a section, or of the way that is followed aside."""
+        return self._aside[-1][1] if self._aside else self.sections[level]
 
     def line(self, kind: str, expression: str, example: Any, level: int | None = None) -> Lane:
         """A lane number by its C++ expression; the same one for the same expression in the same section."""
         level = self.level if level is None else level
         key = (kind, expression, level)
         if key not in self._known:
-            name = f"n{len(self._known)}"
-            self.sections[level].append(f"const {kind} {name} = {expression};")
+            name = f"n{next(self._names)}"
+            self.place(level).append(f"const {kind} {name} = {expression};")
             self._known[key] = Lane(self, kind, name, example, level)
         return self._known[key]
+
+    def once(self, statement: str, level: int) -> None:
+        """Write a statement, unless it is there."""
+        if (statement, level) not in self._known:
+            self._known[statement, level] = True
+            self.place(level).append(statement)
+
+    def assume(self, truth: Lane, value: bool) -> None:
+        """Take a truth to be known from now on."""
+        key = next(key for key, lane in self._known.items() if lane is truth)
+        self._known[key] = value
 
     def apply(self, kind: str, form: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """An operation on lane numbers and constants; of constants alone, the constant that it gives."""
@@ -214,9 +302,218 @@ class Trace:
         operands = [a.name if isinstance(a, Lane) else _constant(operand, a) for a in arguments]
         return self.line(kind, form.format(*operands), example, max(a.level for a in lanes))
 
-    def require(self, truth: Lane) -> None:
+    def require(self, truth: Any) -> None:
         """Leave the worlds to the kernel for one in which this is not as in the example."""
-        self.sections[truth.level].append(f"ok &= {'' if truth.example else '~'}{truth.name};")
+        if isinstance(truth, Lane):
+            elsewhere = "".join(f" | ~{mask.name}" for mask, _ in self._aside)
+            self._keep(f"{'' if truth.example else '~'}{truth.name}{elsewhere}", truth.level)
+
+    def _keep(self, truth: str, level: int) -> None:
+        if self._world_by_world:
+            raise LaneError("a sum over an index cannot leave a world out")
+        self.place(level).append(f"ok &= {truth};")
+
+    def size(self, name: str, value: int) -> int:
+        """Return a number that all worlds share: it is what it is here, or they all leave."""
+        self.once(f"if ({name} != {value}) return 0;", 0)
+        return value
+
+    def decide(self, truth: Lane) -> bool:
+        """Return which way the run that is traced goes."""
+        if self._path is None:
+            self.require(truth)
+            return bool(truth.example)
+        for known, answer in self._path.taken:
+            if known.name == truth.name:
+                return answer
+        i = len(self._path.taken)
+        if i == BRANCHES:
+            raise LaneError(f"a function branches more than {BRANCHES} times")
+        answer = self._path.given[i] if i < len(self._path.given) else bool(truth.example)
+        self._path.taken.append((truth, answer))
+        return answer
+
+    def call(self, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+        """Call a function: once for every way through it, or if it writes into arrays the example's way alone."""
+        key = (function, *(_signature(a) for a in arguments))
+        if key in self._known:
+            return _mapped(lambda x: x, self._known[key])
+        written = self.written
+        result = self._explored(function, arguments, [])
+        if self.written == written:
+            self._known[key] = result
+        return _mapped(lambda x: x, result)
+
+    def sum_over(self, function: Callable[..., Any], first: Lane, end: Lane, arguments: Sequence[Any]) -> Any:
+        """Sum a function over its first argument in a loop of C++, whose ends all worlds of the block share."""
+        lines: list[str] = []
+        ends = [_shared(number) for number in (first, end)]
+        known, self._known = self._known, self._known.new_child()
+        self._aside.append((Lane(self, "M", "all_i(-1)", True, self.level), lines))
+        each = function(Lane(self, "I", "all_i(index)", 0, self.level), *arguments)
+        self._aside.pop()
+        self._known = known
+        names = [f"n{next(self._names)}" for _ in each.numbers]
+        self.place(self.level).extend(
+            [
+                *(f"F {name} = all(0.0f);" for name in names),
+                f"for (int index = {ends[0]}; index < {ends[1]}; ++index) {{",
+                *lines,
+                *(f"{name} += {_word(x)};" for name, x in zip(names, each.numbers, strict=True)),
+                "}",
+            ]
+        )
+        return each.like([Lane(self, "F", name, 0.0, self.level) for name in names])
+
+    def world_by_world(self, function: Callable[..., Any], count: int, arguments: Sequence[Any]) -> Any:
+        """Sum a function over its first argument, 0 to count - 1, for one world after the other in all lanes.
+
+        It is computed for the worlds that go the way that is followed aside.
+        """
+        if count > LANES or not self._aside:
+            return _row_sum([function(i, *arguments) for i in range(count)])
+        lines: list[str] = []
+        known, self._known = self._known, self._known.new_child()
+        truth = " & ".join(f"{mask.name}[world]" for mask, _ in self._aside)
+        self._aside.append((self._aside[-1][0], lines))
+        index = self.line("I", "all_i(0) + I{" + ", ".join(map(str, range(LANES))) + "}", 0)
+        alike = [
+            _mapped(
+                lambda x: (
+                    self.line(x.kind, f"all{'' if x.kind == 'F' else '_i'}({x.name}[world])", x.example)
+                    if isinstance(x, Lane)
+                    else x
+                ),
+                a,
+            )
+            for a in arguments
+        ]
+        self._world_by_world = True
+        try:
+            each = function(index, *alike)
+        finally:
+            self._world_by_world = False
+        self._aside.pop()
+        self._known = known
+        names = [f"n{next(self._names)}" for _ in each.numbers]
+        lines += [
+            f"{name}[world] = total({_word(number)}, {count});"
+            for name, number in zip(names, each.numbers, strict=True)
+        ]
+        self.place(self.level).extend(
+            [
+                *(f"F {name} = all(0.0f);" for name in names),
+                f"for (int world = 0; world < LANES; ++world) if (ok[world] & {truth}) {{",
+                "const M ok = all_i(-1);",
+                *lines,
+                "}",
+            ]
+        )
+        return each.like([Lane(self, "F", name, 0.0, self.level) for name in names])
+
+    def _explored(self, function: Callable[..., Any], arguments: Sequence[Any], answers: list[bool]) -> Any:
+        outer, self._path, written = self._path, _Path(answers), self.written
+        result = function(*(_mapped(lambda x: x, a) for a in arguments))
+        taken, self._path = self._path.taken, outer
+        if self.written != written:
+            for truth, _ in taken:
+                self.require(truth)
+            return result
+        # Of several branches the first counts: its other way is chosen last.
+        for i in reversed(range(len(answers), len(taken))):
+            truth, answer = taken[i]
+            mask = self.apply("M", "(~{})", lambda a: not a, truth) if answer else truth
+            other_answers = [other for _, other in taken[:i]] + [not answer]
+            result = self._chosen(mask, function, arguments, other_answers, result)
+        return result
+
+    def _chosen(
+        self,
+        mask: Lane,
+        function: Callable[..., Any],
+        arguments: Sequence[Any],
+        answers: list[bool],
+        result: Any,
+    ) -> Any:
+        """Return the result, and for the worlds of the mask that of the way with other answers."""
+        depth, lines = len(self._aside), list[str]()
+        known, path, self._known = self._known, self._path, self._known.new_child()
+        self._aside.append((mask, lines))
+        try:
+            other = self._explored(function, arguments, answers)
+        except LaneError:
+            del self._aside[depth:]
+            self._known, self._path = known, path
+            self.place(self.level).append(
+                f"ok &= ~({' & '.join([mask.name, *(m.name for m, _ in self._aside)])});"
+            )
+            return result
+        self._aside.pop()
+        if len(lines) <= SHORT:
+            known.update(self._known.maps[0])
+            self._known = known
+            self.place(self.level).extend(lines)
+            return _mapped(lambda a, b: a if _same(a, b) else _Library.where(mask, b, a), result, other)
+        self._known = known
+        names: list[str] = []
+
+        def merged(a: Any, b: Any) -> Any:
+            if _same(a, b):
+                return a
+            kind, (first, second) = _alike(a, b)
+            name = f"n{next(self._names)}"
+            names.append(f"{kind} {name} = {first};")
+            lines.append(f"{name} = choose({mask.name}, {second}, {name});")
+            return Lane(self, kind, name, a.example if isinstance(a, Lane) else a, self.level)
+
+        result = _mapped(merged, result, other)
+        if not self._aside and (bit := next(self._ways)) < WAYS:
+            lines.append(f"ways |= {mask.name} & all_i({1 << bit});")
+        self.place(self.level).extend([*names, f"if (any({mask.name} & ok)) {{", *lines, "}"])
+        return result
+
+
+def _same(a: Any, b: Any) -> bool:
+    return (
+        a.name == b.name
+        if isinstance(a, Lane) and isinstance(b, Lane)
+        else a is b or _signature(a) == _signature(b)
+    )
+
+
+def _alike(a: Any, b: Any) -> tuple[str, list[str]]:
+    """Return the kind that two numbers have in common, and their words in C++."""
+    kind = next((x.kind for x in (a, b) if isinstance(x, Lane)), "")
+    if not kind:
+        kind = "M" if isinstance(a, bool) else "F" if isinstance(a, float) or isinstance(b, float) else "I"
+    return kind, [x.name if isinstance(x, Lane) else _constant(kind, x) for x in (a, b)]
+
+
+def _mapped(function: Callable[..., Any], first: Any, *others: Any) -> Any:
+    """Return a result of the same form, with a function of its numbers, and of those of others of its form."""
+    if isinstance(first, SimpleNamespace):
+        rest = [vars(other) for other in others]
+        return SimpleNamespace(
+            **{k: _mapped(function, v, *(other[k] for other in rest)) for k, v in vars(first).items()}
+        )
+    if isinstance(first, LaneRow):
+        columns = [first.numbers, *(other.numbers for other in others)]
+        return first.like([function(*numbers) for numbers in zip(*columns, strict=True)])
+    return function(first, *others) if isinstance(first, Lane | float | int) else first
+
+
+def _row_sum(rows: Sequence[LaneRow]) -> LaneRow:
+    return rows[0].like([_sum(numbers) for numbers in zip(*(row.numbers for row in rows), strict=True)])
+
+
+def _signature(value: Any) -> Any:
+    if isinstance(value, Lane):
+        return value.name
+    if isinstance(value, LaneRow):
+        return (value.quaternion, *value.shape, *map(_signature, value.numbers))
+    if isinstance(value, SimpleNamespace):
+        return tuple(_signature(x) for x in vars(value).values())
+    return (type(value), value) if isinstance(value, float | int) else id(value)
 
 
 def _eight(elements: Sequence[str | None]) -> str:
@@ -228,8 +525,10 @@ def _word(number: Any) -> str:
 
 
 def _constant(kind: str, value: Any) -> str:
-    if kind == "I":
-        return f"all_i({int(value)})"
+    if kind in "IM":
+        return f"all_i({-int(value) if kind == 'M' else int(value)})"
+    if kind == "D":
+        return f"all_d({float(value)!r})"
     return f"all({float(value)!r}f)" if math.isfinite(value) else f"all({'-' if value < 0 else ''}INFINITY)"
 
 
@@ -257,7 +556,8 @@ class _Library:
     sqrt = staticmethod(_each("root({})", lambda x: math.sqrt(max(x, 0.0))))
     sin = staticmethod(_each("sine({})", math.sin))
     cos = staticmethod(_each("cosine({})", math.cos))
-    exp = staticmethod(_each("exponential({})", math.exp))
+    exp = staticmethod(_each("exponential({})", lambda x: math.exp(min(x, 80.0))))
+    acos = staticmethod(_each("arccosine({})", lambda x: math.acos(min(max(x, -1.0), 1.0))))
     atan2 = staticmethod(_each("arctangent({}, {})", math.atan2))
     ceil = staticmethod(_each("ceiling({})", math.ceil))
     min = staticmethod(_each("least({}, {})", min))
@@ -274,6 +574,14 @@ class _Library:
         return LaneRow((3,), numbers if len(numbers) == 3 else (numbers or (0.0,)) * 3)
 
     @staticmethod
+    def vec4(*numbers: Any) -> LaneRow:
+        return LaneRow((4,), numbers if len(numbers) == 4 else (numbers or (0.0,)) * 4)
+
+    @staticmethod
+    def mat33(*numbers: Any) -> LaneRow:
+        return LaneRow((3, 3), numbers if len(numbers) == 9 else (numbers or (0.0,)) * 9)
+
+    @staticmethod
     def quat(*numbers: Any) -> LaneRow:
         return LaneRow((4,), numbers or (0.0,) * 4, quaternion=True)
 
@@ -287,12 +595,32 @@ class _Library:
             return a.like([cls.where(truth, x, y) for x, y in zip(a.numbers, b.numbers, strict=True)])
         if not isinstance(truth, Lane):
             return a if truth else b
-        kind = next((x.kind for x in (a, b) if isinstance(x, Lane)), "F" if isinstance(a, float) else "I")
-        operands = [x.name if isinstance(x, Lane) else _constant(kind, x) for x in (a, b)]
+        kind, operands = _alike(a, b)
         examples = [x.example if isinstance(x, Lane) else x for x in (a, b)]
         level = max(x.level for x in (truth, a, b) if isinstance(x, Lane))
         expression = f"choose({truth.name}, {operands[0]}, {operands[1]})"
         return truth.trace.line(kind, expression, examples[0 if truth.example else 1], level)
+
+    @staticmethod
+    def float64(x: Any) -> Any:
+        return x.trace.apply("D", "to_double({})", float, x) if isinstance(x, Lane) else float(x)
+
+    @staticmethod
+    def float32(x: Any) -> Any:
+        return _to_float(x)
+
+    @staticmethod
+    def transpose(M: LaneRow) -> LaneRow:
+        rows, columns = M.shape
+        return LaneRow((columns, rows), [M[i, j] for j in range(columns) for i in range(rows)])
+
+    @staticmethod
+    def skew(a: LaneRow) -> LaneRow:
+        return LaneRow((3, 3), [0.0, -a[2], a[1], a[2], 0.0, -a[0], -a[1], a[0], 0.0])
+
+    @staticmethod
+    def quat_inverse(q: LaneRow) -> LaneRow:
+        return q.like([-q[0], -q[1], -q[2], q[3]])
 
     @classmethod
     def clamp(cls, x: Any, low: Any, high: Any) -> Any:
@@ -345,12 +673,14 @@ class _Library:
 
 def zero_of(kind: Any) -> Any:
     """Zero of a scalar, vector or matrix type of Warp."""
-    if kind in (float, wp.float32):
+    if kind in (float, wp.float32, wp.float64):
         return 0.0
     if kind in (int, wp.int32):
         return 0
     if kind in (bool, wp.bool):
         return False
+    if not hasattr(kind, "_shape_"):
+        raise LaneError(f"numbers of type {kind} are not available for several worlds together")
     shape = tuple(kind._shape_)
     return LaneRow(shape, [0.0] * math.prod(shape), quaternion=issubclass(kind, wp.quat))
 
@@ -392,7 +722,31 @@ def _to_int(x: Any = 0) -> Any:
     return int(x)
 
 
+def _range(*ends: Any) -> range:
+    if len(ends) > 1 and any(isinstance(end, Lane) for end in ends):
+        raise LaneError("a loop's ends differ between worlds")
+    return range(*ends)
+
+
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {}
+
+
+def sum_in_lanes(function: Any, term: Any, few: int = 0) -> None:
+    """Declare that a Warp function is the sum of another over an index, its additional first argument.
+
+    Args:
+        function: Its first two arguments are the first index and the one after the last, unless there are few.
+        term: The other one.
+        few: How many indices, from 0 on, if they are few and the sum is one that few worlds need.
+    """
+
+    def traced(*arguments: Any) -> Any:
+        trace, summand = Trace.active[-1], lane_function(term)
+        if few:
+            return trace.world_by_world(summand, few, arguments)
+        return trace.sum_over(summand, arguments[0], arguments[1], arguments[2:])
+
+    _FUNCTIONS[function] = traced
 
 
 def lane_function(function: Any) -> Callable[..., Any]:
@@ -400,11 +754,13 @@ def lane_function(function: Any) -> Callable[..., Any]:
     if function in _FUNCTIONS:
         return _FUNCTIONS[function]
     python = function.func
-    names: dict[str, Any] = {"__builtins__": builtins, "float": _to_float, "int": _to_int}
+    names: dict[str, Any] = {"__builtins__": builtins, "float": _to_float, "int": _to_int, "range": _range}
     cells = tuple(CellType(_exchanged(cell.cell_contents)) for cell in python.__closure__ or ())
     plain = FunctionType(python.__code__, names, python.__name__, python.__defaults__, cells)
 
     def traced(*arguments: Any) -> Any:
+        if Trace.active:
+            return Trace.active[-1].call(plain, arguments)
         # Warp passes vectors by value: what a function writes into one, its caller does not see.
         return plain(*(a.like(a.numbers) if isinstance(a, LaneRow) else a for a in arguments))
 
@@ -430,8 +786,10 @@ def _exchanged(value: Any) -> Any:
 class StructArray:
     """An array of structs by (world, vehicle): what is read is loaded once, what is assigned is stored in the end."""
 
-    def __init__(self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any]) -> None:
-        """Take its name in C++, its type, and examples of fields, which are 1 otherwise."""
+    def __init__(
+        self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any], shared: bool = False
+    ) -> None:
+        """Take its name in C++, its type, examples of fields (1 otherwise), and whether worlds may share it."""
         layout = np.dtype(struct.numpy_dtype())
         if layout.itemsize < 4 * LANES:
             raise LaneError(f"{name} has {layout.itemsize // 4} numbers, expected at least {LANES}")
@@ -442,7 +800,7 @@ class StructArray:
             _fields=fields,
             _examples=examples,
             _size=layout.itemsize // 4,
-            _pieces={},
+            _shared=shared,
             _assigned={},
         )
 
@@ -466,9 +824,13 @@ class StructArray:
         """C++ of the number at that index of the struct, read with its seven neighbours."""
         first = min(LANES * (index // LANES), self._size - LANES)
         name = f"{self._name}_{first}"
-        if name not in self._pieces:
-            self._pieces[name] = True
-            self._trace.sections[0].append(f"F {name}[LANES]; fetch({self._name}_at, {4 * first}, {name});")
+        statement = f"fetch({self._name}_at, {4 * first}, {name});"
+        if self._shared and (f"F {name}[LANES];" in self._trace.outside or not self._trace.aside):
+            # What all worlds share is read for the first block of a group.
+            self._trace.outside[f"F {name}[LANES];"] = None
+            self._trace.once(f"if (first == 0 || {self._name}_at.world != 0) {statement}", 0)
+        else:
+            self._trace.once(f"F {name}[LANES]; {statement}", 0)
         return f"{name}[{index - first}]"
 
     def __setattr__(self, field: str, value: Any) -> None:
@@ -498,7 +860,7 @@ class NumberArray(StructArray):
 
     def __init__(self, trace: Trace, name: str, size: int) -> None:
         """Take its name in C++ and the size of the last axis."""
-        self.__dict__.update(_trace=trace, _name=name, _size=size, _pieces={}, _assigned={})
+        self.__dict__.update(_trace=trace, _name=name, _size=size, _assigned={}, _shared=False)
 
     def __getitem__(self, index: Any) -> Any:
         return self._trace.line("F", self._place(index[2]), 1.0, 0)
@@ -511,16 +873,11 @@ class VectorArray:
         """Take its name in C++, its type, and which index the lane number is."""
         self._trace, self._name, self._size, self._slot = trace, name, math.prod(kind._shape_), slot
         self._written: list[tuple[Lane, LaneRow]] = []
-        self._read: set[str] = set()
 
     def __getitem__(self, index: Any) -> LaneRow:
         slot = index[self._slot]
         name = f"{self._name}_{slot.name}"
-        if name not in self._read:
-            self._read.add(name)
-            self._trace.sections[slot.level].append(
-                f"F {name}[LANES]; gather({self._name}_at, {slot.name}, {name});"
-            )
+        self._trace.once(f"F {name}[LANES]; gather({self._name}_at, {slot.name}, {name});", slot.level)
         row = LaneRow(
             (self._size,), [self._trace.line("F", f"{name}[{i}]", 0.0, slot.level) for i in range(LANES)]
         )
@@ -543,24 +900,182 @@ class VectorArray:
         ]
 
 
+class Untraced:
+    """Anything that the functions for several worlds cannot use: a world that needs it leaves its block."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, field: str) -> Any:
+        raise LaneError(f"{self._name}.{field} is not available for several worlds together")
+
+
 class UniformStruct:
     """A struct that all worlds share."""
 
-    def __init__(self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any]) -> None:
-        """Take its name in C++, its type, and examples of fields, which are 1 otherwise."""
-        self._trace, self._name, self._fields, self._examples = (
+    def __init__(
+        self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any], **known: Any
+    ) -> None:
+        """Take its name in C++, its type, examples of fields, which are 1 otherwise, and what is known of it."""
+        self._trace, self._name, self._fields, self._examples, self._known = (
             trace,
             name,
             struct.cls.__annotations__,
             examples,
+            known,
         )
 
     def __getattr__(self, field: str) -> Any:
+        if field in self._known:
+            return self._known[field]
         value = zero_of(self._fields[field])
         if isinstance(value, LaneRow):
             raise LaneError(f"field {field} of {self._name} is not a number")
         kind, call = ("I", "all_i") if isinstance(value, int) else ("F", "all")
         return self._trace.line(kind, f"{call}({self._name}.{field})", self._examples.get(field, 1), 0)
+
+
+class WorldStruct:
+    """A struct of arrays whose first index is the world, and of numbers that all worlds share."""
+
+    def __init__(self, trace: Trace, name: str, actual: Any, examples: Mapping[str, Any]) -> None:
+        """Take its name in C++, one that is used, for sizes, and examples of numbers, which are 1 otherwise."""
+        self._trace, self._name, self._actual, self._examples = trace, name, actual, examples
+
+    def __getattr__(self, field: str) -> Any:
+        kind, name = self._actual._cls.vars[field].type, f"{self._name}.{field}"
+        value = getattr(self._actual, field)
+        if isinstance(kind, wp.array):
+            return self._trace.arrays.setdefault(
+                name, WorldArray(self._trace, name, kind.dtype, value, self._examples.get(field, 1))
+            )
+        if hasattr(value, "_cls"):
+            return WorldStruct(self._trace, name, value, self._examples)
+        if isinstance(value, int):
+            return self._trace.size(name, int(value))
+        row = zero_of(kind)
+        if isinstance(row, LaneRow) and kind._wp_scalar_type_ is wp.float32:
+            return row.like(
+                [self._trace.line("F", f"all({name}[{i}])", 1.0, 0) for i in range(len(row.numbers))]
+            )
+        return self._trace.line("F", f"all({name})", self._examples.get(field, 1.0), 0)
+
+
+class WorldArray:
+    """An array by world, whose other indices are known."""
+
+    def __init__(self, trace: Trace, name: str, kind: Any, actual: Any, example: float) -> None:
+        """Take its name in C++, its elements' type, one that is used, for its shape, and an example of a number."""
+        self._trace, self._name, self._kind, self._actual, self._example = trace, name, kind, actual, example
+        self._now: dict[tuple[tuple[int, ...], int], Any] = {}
+        if getattr(kind, "_wp_scalar_type_", kind) not in (float, int, wp.float32, wp.int32):
+            raise LaneError(f"numbers of {name} are not available for several worlds together")
+        if actual.ndim > 1 and not isinstance(zero_of(kind), LaneRow):
+            trace.size(f"{name}.strides[{actual.ndim - 1}]", 4)
+
+    @property
+    def shape(self) -> dict[int, int]:
+        """Sizes after the first."""
+        return {
+            i: self._trace.size(f"{self._name}.shape[{i}]", n) for i, n in enumerate(self._actual.shape) if i
+        }
+
+    def _row(self, index: Any) -> tuple[tuple[int, ...], int | None]:
+        """Return the indices of a row of numbers, and which of its numbers is meant; of a vector None: all."""
+        others = index[1:] if isinstance(index, tuple) else ()
+        if not all(isinstance(i, int) for i in others):
+            raise LaneError(f"an index of {self._name} differs between worlds")
+        return (others, None) if isinstance(zero_of(self._kind), LaneRow) else (others[:-1], (0, *others)[-1])
+
+    def _width(self) -> int:
+        row = zero_of(self._kind)
+        return len(row.numbers) if isinstance(row, LaneRow) else int((1, *self._actual.shape[1:])[-1])
+
+    def _offset(self, row: Sequence[int]) -> str:
+        return "".join(f"{i} * (int){self._name}.strides[{k}] + " for k, i in enumerate(row, 1) if i)
+
+    def _read(self, row: tuple[int, ...], i: int) -> Any:
+        if (row, i) in self._now:
+            return self._now[row, i]
+        kind = "I" if isinstance(zero_of(self._kind), int) else "F"
+        if self._actual.ndim == 1 and self._width() == 1:
+            return self._trace.line(kind, f"({kind})pick({self._name})", self._example, 0)
+        first, count = max(0, min(LANES * (i // LANES), self._width() - LANES)), min(self._width(), LANES)
+        name = "_".join(map(str, (self._name.replace(".", "_"), *row, first)))
+        offset = f"{self._offset(row)}{4 * first}"
+        self._trace.once(f"F {name}[LANES]; fetch_world({self._name}, {offset}, {count}, {name});", 0)
+        return self._trace.line(kind, f"({kind}){name}[{i - first}]", self._example, 0)
+
+    def __getitem__(self, index: Any) -> Any:
+        row, i = self._row(index)
+        if i is not None:
+            return self._read(row, i)
+        value = zero_of(self._kind)
+        return value.like([self._read(row, k) for k in range(len(value.numbers))])
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        if self._trace._aside:
+            raise LaneError(f"{self._name} is written by some worlds alone")
+        self._trace.written += 1
+        row, i = self._row(index)
+        for k, number in enumerate(value.numbers) if i is None else [(i, value)]:
+            self._now[row, k] = number
+
+    def stores(self) -> list[str]:
+        """C++ that writes what was assigned, neighbours together."""
+        lines, kind = [], "I" if isinstance(zero_of(self._kind), int) else "F"
+        words = {
+            key: f"(F){x.name if isinstance(x, Lane) else _constant(kind, x)}"
+            for key, x in sorted(self._now.items())
+        }
+        while words:
+            row, first = next(iter(words))
+            piece = [words.pop((row, first))]
+            if self._actual.ndim == 1 and self._width() == 1:
+                lines.append(f"keep({self._name}, {piece[0]});")
+                continue
+            while len(piece) < LANES and (row, first + len(piece)) in words:
+                piece.append(words.pop((row, first + len(piece))))
+            offset = f"{self._offset(row)}{4 * first}"
+            lines.append(f"put_world({self._name}, {offset}, {len(piece)}, {_eight(piece)});")
+        return lines
+
+
+def _shared(index: Any) -> str:
+    """Return the C++ of an index that all worlds of a block share: those with another than the first's leave."""
+    if not isinstance(index, Lane):
+        return str(index)
+    if index.name != "all_i(index)":
+        index.trace.require(
+            index.trace.line("M", f"({index.name} == all_i({index.name}[0]))", True, index.level)
+        )
+    return f"{index.name}[0]"
+
+
+class SharedStruct:
+    """A struct of arrays that all worlds share, by one index."""
+
+    def __init__(self, trace: Trace, name: str, struct: Any) -> None:
+        """Take its name in C++ and its type."""
+        self._trace, self._name, self._struct = trace, name, struct
+
+    def __getattr__(self, field: str) -> Any:
+        return _SharedArray(self._trace, f"{self._name}.{field}", self._struct.vars[field].type.dtype)
+
+
+class _SharedArray:
+    def __init__(self, trace: Trace, name: str, kind: Any) -> None:
+        self._trace, self._name, self._kind = trace, name, kind
+
+    def __getitem__(self, index: Any) -> Any:
+        value, level = zero_of(self._kind), index.level if isinstance(index, Lane) else 0
+        kind, call, number = ("I", "all_i", "int") if isinstance(value, int) else ("F", "all", "float")
+        place = f"((const {number}*)((const char*){self._name}.data + {_shared(index)} * {self._name}.strides[0]))"
+        numbers = [
+            self._trace.line(kind, f"{call}({place}[{i}])", 1, level)
+            for i in range(len(value.numbers) if isinstance(value, LaneRow) else 1)
+        ]
+        return value.like(numbers) if isinstance(value, LaneRow) else numbers[0]
 
 
 class LaneLoop:
@@ -608,21 +1123,23 @@ def _numbers(struct: SimpleNamespace) -> list[Any]:
     ]
 
 
-def block_source(
-    trace: Trace, arrays: Sequence[StructArray | VectorArray], declarations: str, loop: str
+def group_source(
+    trace: Trace, arrays: Sequence[StructArray | VectorArray], declarations: str, loop: str, way: str
 ) -> str:
-    """The text of a native function that takes a block of worlds from `w` on, `count` of them, through the trace.
+    """The text of a native function that takes a group of worlds from `w` on, `count` of them, through the trace.
 
     Args:
         trace: Its lines.
         arrays: What it reads and writes.
         declarations: C++ of the symbols, and of the place NAME_at of each array.
         loop: Head of the C++ loop around section 1.
-
-    Returns:
-        C++ whose value says by bit which worlds are done; the others are as they were.
+        way: C++ of the number that says which ways `world` of the group went, by bit, in the last step. It is written
+            again; -1 leaves the world as it was. On it depends who shares a block, and nothing else.
     """
     lines = [
+        FLOATS,
+        *trace.outside,
+        GATHERING,
         PREAMBLE,
         declarations,
         *trace.sections[0],
@@ -630,38 +1147,102 @@ def block_source(
         *trace.sections[1],
         "}",
         *trace.sections[2],
-        "int done = 0;",
-        f"for (int l = 0; l < {LANES}; ++l) if (l < count && ok[l]) done |= 1 << l;",
-        "STORES",
+        "for (int l = 0; l <= last; ++l) way_of(at[l]) = ok[l] ? ways[l] : -1;",
         *(line for array in arrays for line in array.stores()),
-        "return done;",
+        "}",
     ]
-    return "\n".join(lines).replace("STORES", STORES).replace("LANES", str(LANES))
+    text = "\n".join(lines).replace("WAY_OF", way)
+    return text.replace("LANES", str(LANES)).replace("GROUP", str(GROUP)).replace("KINDS", str(1 << WAYS))
 
 
+def world_source(trace: Trace, truth: Any) -> str:
+    """The text of a native function that takes `count` worlds from `w` on through a trace that writes by world.
+
+    Its value says by bit which worlds are done, the others are as they were; and, LANES bits further, for which of
+    these a truth holds.
+    """
+    lines = [
+        "const int last = count - 1; int at[LANES]; for (int l = 0; l < LANES; ++l) at[l] = l < last ? l : last;",
+        FLOATS,
+        PREAMBLE,
+        *itertools.chain(*trace.sections),
+        *(line for array in trace.arrays.values() for line in array.stores()),
+        "unsigned bits = 0;",
+        f"for (int l = 0; l <= last; ++l) bits |= (ok[l] & 1u) << l | (ok[l] & {_word(truth)}[l] & 1u) << (LANES + l);",
+        "return bits;",
+    ]
+    return "\n".join(lines).replace("LANES", str(LANES))
+
+
+GATHERING = """
+const auto way_of = [&](int world) -> int& { return WAY_OF; };
+int order[GROUP], kinds[KINDS + 1] = {};
+for (int i = 0; i < count; ++i) ++kinds[way_of(i) < 0 ? KINDS : way_of(i) + 1];
+for (int k = 1; k < KINDS; ++k) kinds[k] += kinds[k - 1];
+for (int i = 0; i < count; ++i) order[kinds[way_of(i) < 0 ? KINDS - 1 : way_of(i)]++] = i;
+for (int first = 0; first < count; first += LANES) {
+const int last = (count - first < LANES ? count - first : LANES) - 1;
+int at[LANES];
+for (int l = 0; l < LANES; ++l) at[l] = order[first + (l < last ? l : last)];
+"""
+"""Sorts the group by counting, and begins the loop over its blocks."""
+
+FLOATS = "typedef float F __attribute__((vector_size(4 * LANES)));"
 PREAMBLE = """
-typedef float F __attribute__((vector_size(4 * LANES)));
 typedef int I __attribute__((vector_size(4 * LANES)));
 typedef int M __attribute__((vector_size(4 * LANES)));
+typedef double D __attribute__((vector_size(8 * LANES)));
 struct At { char* p; long world; long slot; };
 struct Eight { F y[LANES]; };
 const auto all = [](float x) { F y; for (int l = 0; l < LANES; ++l) y[l] = x; return y; };
 const auto all_i = [](int x) { I y; for (int l = 0; l < LANES; ++l) y[l] = x; return y; };
+const auto all_d = [](double x) { D y; for (int l = 0; l < LANES; ++l) y[l] = x; return y; };
+const auto any = [](M m) { return __builtin_reduce_or(m) != 0; };
+const auto total = [](F x, int count) {
+    for (int half = count / 2; half; half /= 2) for (int l = 0; l < half; ++l) x[l] += x[l + half];
+    return x[0];
+};
 const auto choose = [](M m, auto a, auto b) { return m ? a : b; };
 const auto least = [](auto a, auto b) { return a < b ? a : b; };
 const auto most = [](auto a, auto b) { return a > b ? a : b; };
 const auto absolute = [](F x) { return (F)((I)x & 0x7fffffff); };
 const auto signum = [&](F x) { return x < 0.0f ? all(-1.0f) : all(1.0f); };
 const auto finite = [&](F x) { return (M)(absolute(x) < all(INFINITY)); };
-const auto root = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = __builtin_sqrtf(x[l]); return y; };
+const auto nearest = [](F x) {
+    const F half = (F)(((I)x & (int)0x80000000) | 0x3f000000);
+    return __builtin_convertvector(__builtin_convertvector(x + half, I), F);
+};
+const auto root = [](F x) { return __builtin_elementwise_sqrt(x); };
 const auto sine = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::sinf(x[l]); return y; };
 const auto cosine = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::cosf(x[l]); return y; };
-const auto exponential = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = ::expf(x[l]); return y; };
-const auto arctangent = [](F y, F x) { F z; for (int l = 0; l < LANES; ++l) z[l] = ::atan2f(y[l], x[l]); return z; };
-const auto ceiling = [](F x) { F y; for (int l = 0; l < LANES; ++l) y[l] = __builtin_ceilf(x[l]); return y; };
-const auto to_float = [](I x) { return __builtin_convertvector(x, F); };
+const auto exponential = [&](F x) {
+    const F r = least(all(88.0f), most(all(-87.0f), x)), n = nearest(1.44269504f * r);
+    const F z = r - n * 0.693359375f + n * 2.12194440e-4f;
+    F y = 1.9875691500e-4f * z + 1.3981999507e-3f;
+    y = ((y * z + 8.3334519073e-3f) * z + 4.1665795894e-2f) * z + 1.6666665459e-1f;
+    y = (y * z + 5.0000001201e-1f) * z * z + z + 1.0f;
+    return x > 88.0f ? all(INFINITY) : y * (F)((__builtin_convertvector(n, I) + 127) << 23);
+};
+const auto arctangent = [&](F y, F x) {
+    const F a = absolute(y), b = absolute(x), greater = most(a, b);
+    const F t = greater > 0.0f ? least(a, b) / greater : all(0.0f);
+    const M far = t > 0.41421356f;
+    const F s = far ? (t - 1.0f) / (t + 1.0f) : t, z = s * s;
+    F r = ((8.05374449538e-2f * z - 1.38776856032e-1f) * z + 1.99777106478e-1f) * z - 3.33329491539e-1f;
+    r = r * z * s + s + (far ? all(0.78539816f) : all(0.0f));
+    r = a > b ? 1.57079633f - r : r;
+    r = (I)x < 0 ? 3.14159265f - r : r;
+    return (F)((I)r | ((I)y & (int)0x80000000));
+};
+const auto arccosine = [&](F x) {
+    const F c = least(all(1.0f), most(all(-1.0f), x));
+    return arctangent(root((1.0f - c) * (1.0f + c)), c);
+};
+const auto ceiling = [](F x) { return __builtin_elementwise_ceil(x); };
+const auto to_double = [](F x) { return __builtin_convertvector(x, D); };
+const auto to_float = [](auto x) { return __builtin_convertvector(x, F); };
 const auto to_int = [](F x) { return __builtin_convertvector(x, I); };
-const long last = count - 1;
+M ok = all_i(-1), ways = all_i(0);
 const auto transpose = [](F* y) {
     F a[LANES], b[LANES];
     for (int i = 0; i < 8; i += 2) {
@@ -678,33 +1259,44 @@ const auto transpose = [](F* y) {
         y[k + 4] = __builtin_shufflevector(b[k], b[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
     }
 };
-const auto fetch = [&](const At& a, int offset, F* y) {
-    if (a.world == 0) {
-        for (int i = 0; i < LANES; ++i) y[i] = all(*(const float*)(a.p + offset + 4 * i));
-        return;
-    }
-    for (int l = 0; l < LANES; ++l) __builtin_memcpy(y + l, a.p + (l < last ? l : last) * a.world + offset, sizeof(F));
+const auto load = [&](const char* p, const I& from, long world, int count, F* y) {
+    for (int l = 0; l < LANES; ++l) __builtin_memcpy(y + l, p + at[l] * world + from[l], 4 * count);
     transpose(y);
 };
-const auto gather = [&](const At& a, I slot, F* y) {
-    for (int l = 0; l < LANES; ++l)
-        __builtin_memcpy(y + l, a.p + (l < last ? l : last) * a.world + slot[l] * a.slot, sizeof(F));
-    transpose(y);
-};
-M ok = all_i(-1);
-"""
-"""Types and functions of the traced lines; a lambda may occur within a function, as in a native function's text."""
-
-STORES = """
-const auto put_at = [&](const At& a, I slot, int offset, const Eight& eight) {
+const auto save = [&](char* p, const I& from, long world, int count, const Eight& eight) {
     Eight e = eight;
-    F* y = e.y;
-    transpose(y);
-    for (int l = 0; l < LANES; ++l)
-        if (done >> l & 1) __builtin_memcpy(a.p + l * a.world + slot[l] * a.slot + offset, y + l, sizeof(F));
+    transpose(e.y);
+    for (int l = 0; l <= last; ++l)
+        if (ok[l]) __builtin_memcpy(p + at[l] * world + from[l], e.y + l, 4 * count);
+};
+const auto fetch = [&](const At& a, int offset, F* y) {
+    if (a.world != 0) return load(a.p, all_i(offset), a.world, LANES, y);
+    for (int i = 0; i < LANES; ++i) y[i] = all(*(const float*)(a.p + offset + 4 * i));
+};
+const auto gather = [&](const At& a, I slot, F* y) { load(a.p, slot * (int)a.slot, a.world, LANES, y); };
+const auto put_at = [&](const At& a, I slot, int offset, const Eight& eight) {
+    save(a.p, slot * (int)a.slot + offset, a.world, LANES, eight);
 };
 const auto put = [&](const At& a, int offset, const Eight& eight) { put_at(a, all_i(0), offset, eight); };
 const auto put_one = [&](const At& a, int offset, F x) {
-    for (int l = 0; l < LANES; ++l) if (done >> l & 1) *(float*)(a.p + l * a.world + offset) = x[l];
+    for (int l = 0; l <= last; ++l) if (ok[l]) *(float*)(a.p + at[l] * a.world + offset) = x[l];
+};
+const auto fetch_world = [&](const auto& a, int offset, int count, F* y) {
+    load((const char*)a.data + w * a.strides[0] + offset, all_i(0), a.strides[0], count, y);
+};
+const auto put_world = [&](const auto& a, int offset, int count, const Eight& eight) {
+    save((char*)a.data + w * a.strides[0] + offset, all_i(0), a.strides[0], count, eight);
+};
+const auto pick = [&](const auto& a) {
+    F y; const char* p = (const char*)a.data + w * a.strides[0];
+    if (a.strides[0] == 4 && last == LANES - 1) __builtin_memcpy(&y, p, sizeof(F));
+    else for (int l = 0; l < LANES; ++l) y[l] = *(const float*)(p + at[l] * a.strides[0]);
+    return y;
+};
+const auto keep = [&](const auto& a, auto y) {
+    char* p = (char*)a.data + w * a.strides[0];
+    if (a.strides[0] == 4 && last == LANES - 1 && !any(~ok)) __builtin_memcpy(p, &y, sizeof(F));
+    else for (int l = 0; l <= last; ++l) if (ok[l]) __builtin_memcpy(p + l * a.strides[0], (const char*)&y + 4 * l, 4);
 };
 """
+"""Types and functions of the traced lines; a lambda may occur within a function, as in a native function's text."""

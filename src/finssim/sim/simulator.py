@@ -19,7 +19,7 @@ from finssim.physics.contact import PoolWalls
 from finssim.physics.funnel import Funnel
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, hull_mesh
-from finssim.physics.lanes import LANES
+from finssim.physics.lanes import GROUP
 from finssim.physics.plant import VehicleCommand, refresh_plant
 from finssim.physics.solids import Solids
 from finssim.physics.terms.composed import composed
@@ -27,12 +27,13 @@ from finssim.physics.tether import Tether
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.physics.water import advance_drift
 from finssim.sim.launch import KernelSequence
+from finssim.sim.midpoint import WALL_STEP
 from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.site import Dock, RectangularPool, TetherLine
 from finssim.sim.solids import WorldSolids, layout_of, pool_of, refresh_clearing
 from finssim.sim.state import HISTORY, VehicleState, clear_actuators, new_state
-from finssim.sim.step import Features, SimSurroundings, Vehicles, physics_kernel, tick
+from finssim.sim.step import MOST_PARTS, Features, SimSurroundings, Vehicles, physics_kernel, tick
 from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import ReferenceWater as Fluid
@@ -200,11 +201,13 @@ class Simulator:
             pipeline.add(refresh_clearing, inputs, len(self.vehicles))
         # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
         general = self.device.is_cpu and not self.in_lanes
+        walls = general or self.surroundings[1] is not None
+        parts = math.ceil(self.control_step / self.substeps / WALL_STEP - 1e-4)
         features = Features(
             self.hydrodynamics,
             self.integrator,
             water_moving=bool(self.water.moving),
-            walls=general or self.surroundings[1] is not None,
+            walls=walls,
             tether=general or self.surroundings[2] is not None,
             speed_lag=general or bool(self.plant.speed_lag.numpy().any()),
             terms=self.plant.terms,
@@ -212,21 +215,24 @@ class Simulator:
             solids=self._solids is not None,
             play=bool(self.plant.play.numpy().any()),
             lanes=self.in_lanes,
+            # More would be a kernel that takes long to compile: a world near a wall then goes alone.
+            parts=parts if self.in_lanes and walls and parts <= MOST_PARTS else 1,
         )
         machines, around = Vehicles(), SimSurroundings()
         machines.command, machines.plant = self.command.array, self.plant.array
         machines.extra, machines.shared = self.plant.extra, self._shared
+        machines.way = self.ways = wp.zeros(self.plant.array.shape, dtype=wp.int32, device=self.device)
         around.hull, around.water, around.tether = self.hull, self.water, self.tether.array
         for name in ("walls", "funnel", "solids"):
             setattr(around.obstacles, name, getattr(self, name))
         inputs = [self.state, machines, around, self.control_step, self.substeps]
-        pipeline.add(physics_kernel(features), inputs, len(self.vehicles), LANES if self.in_lanes else None)
+        pipeline.add(physics_kernel(features), inputs, len(self.vehicles), GROUP if self.in_lanes else None)
         pipeline.add(tick, [self.state])
 
     @property
     def in_lanes(self) -> bool:
         """True if blocks of worlds are stepped together: on a processor, for what the traced code supports."""
-        traceable = self.integrator == "midpoint" and self.hydrodynamics != "mesh"
+        traceable = self.integrator == "midpoint"
         # A moving mass changes the mass matrix, which takes double precision to solve: one world at a time.
         traceable = traceable and composed(self.plant.terms, "shift") is None
         return self.device.is_cpu and traceable and not self.water.moving and self.dock is None

@@ -23,14 +23,17 @@ from finssim.physics.inertia import (
 )
 from finssim.physics.kinematics import position_rate, quaternion_rate, rotate_by, up_in_body
 from finssim.physics.lanes import (
+    GROUP,
     LANES,
     LaneLoop,
     NumberArray,
+    SharedStruct,
     StructArray,
     Trace,
     UniformStruct,
+    Untraced,
     VectorArray,
-    block_source,
+    group_source,
     lane_function,
 )
 from finssim.physics.motors import (
@@ -184,6 +187,7 @@ class Vehicles:
     plant: wp.array2d(dtype=VehicleParameters)
     extra: wp.array3d(dtype=float)  # parameters of terms and actuators, each in its unit [-]
     shared: wp.array(dtype=int)  # 1: all worlds have equal parameters
+    way: wp.array2d(dtype=int)  # through a block of worlds in the last step; -1: outside blocks
 
 
 @wp.struct
@@ -274,6 +278,9 @@ class Features:
     """True if some actuator has play."""
     lanes: bool = False
     """True if worlds go in blocks of `LANES`, on a processor; see `finssim.physics.lanes`."""
+
+    parts: int = 1
+    """Steps of contacts in a substep, of blocks of worlds near walls."""
 
     @property
     def runge_kutta(self) -> bool:
@@ -389,7 +396,7 @@ def motion_function(
             damped = wp.where(wet.wet > 0.0, 1.0, 0.0)
         share = vec6(damped, damped, damped, damped, damped, damped)
         if wp.static(added_mass or mass_shift is not None):
-            if wp.static(mass_shift is None) and wet.wet == 1.0 and wet.wet_rate <= 0.0:
+            if wp.static(mass_shift is None) and wp.max(1.0 - wet.wet, wet.wet_rate) <= 0.0:
                 out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + moment.pushed
             else:
                 s_dot = wp.max(wet.wet_rate, 0.0)
@@ -891,7 +898,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
     if not features.lanes:
         return physics_step
 
-    block = lane_block(set_out, substep, arrive, row_length(features.terms))
+    blocks = lane_blocks(set_out, substep, arrive, row_length(features.terms), features.parts)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_blocks(
@@ -899,16 +906,18 @@ def physics_kernel(features: Features) -> wp.Kernel:
         world_offset: int,
     ):  # fmt: skip
         i, v = wp.tid()
-        w = world_offset + wp.static(LANES) * i
-        count = wp.min(wp.static(LANES), worlds - wp.static(LANES) * i)
-        done = block(state, vehicles, around, control_step, substeps, w, v, count)
+        w = world_offset + wp.static(GROUP) * i
+        count = wp.min(wp.static(GROUP), worlds - wp.static(GROUP) * i)
+        blocks(state, vehicles, around, control_step, substeps, w, v, count)
         for k in range(count):
-            if ((done >> k) & 1) == 0 and state.frozen[w + k] == 0:
+            if vehicles.way[w + k, v] < 0 and state.frozen[w + k] == 0:
                 step_vehicle(state, vehicles, around, control_step, substeps, w + k, v)
 
     return physics_blocks
 
 
+MOST_PARTS = 4
+"""Steps of contacts in a substep that are traced one after the other."""
 SUBMERGED = {
     "position": (0.0, 0.0, -5.0),
     "quaternion": (0.0, 0.0, 0.0, 1.0),
@@ -919,11 +928,11 @@ WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
 """Example of a pool, whose walls are far away."""
 
 
-def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> Any:
-    """A native function that takes a block of worlds through a control step, traced from the functions for one.
+def lane_blocks(set_out: Any, substep: Any, arrive: Any, term_numbers: int, parts: int) -> Any:
+    """A native function that takes a group of worlds through a control step, traced from the functions for one.
 
-    Worlds are left out whose episode has just begun, that are frozen, whose command is not finite, that are not wholly
-    under water in still water, or that are near a wall.
+    Worlds are left out whose episode has just begun, that are frozen, whose command is not finite, or that are near a
+    solid.
     """
     trace = Trace()
     row, command = (
@@ -934,60 +943,69 @@ def lane_block(set_out: Any, substep: Any, arrive: Any, term_numbers: int) -> An
     commands.shape = (0, 0, trace.symbol("I", "slots", 4))
     state = SimpleNamespace(vehicle=row, commands=commands, history=history)
     plant, extra = (
-        StructArray(trace, "plant", VehicleParameters, {}),
+        StructArray(trace, "plant", VehicleParameters, {}, shared=True),
         NumberArray(trace, "extra", term_numbers),
     )
     vehicles = SimpleNamespace(command=command, plant=plant, extra=extra)
     around = SimpleNamespace(
-        hull=None,
-        water=UniformStruct(trace, "around.water", WaterArrays, {}),
-        obstacles=SimpleNamespace(walls=UniformStruct(trace, "around.obstacles.walls", PoolWalls, WIDE)),
+        hull=SharedStruct(trace, "around.hull", HullMesh),
+        water=UniformStruct(trace, "around.water", WaterArrays, {}, moving=0),
+        obstacles=SimpleNamespace(
+            walls=UniformStruct(trace, "around.obstacles.walls", PoolWalls, WIDE), solids=Untraced("solids")
+        ),
         tether=StructArray(trace, "tether", Tether, {}),
     )
     step, head, slot = (trace.symbol("I", name, 2) for name in ("step", "head", "place"))
-    h, control_step = (trace.symbol("F", name, 0.1) for name in ("h", "control"))
+    # A substep in which a contact takes so many parts.
+    h = trace.symbol("F", "h", (parts - 0.5) * WALL_STEP)
+    control_step = trace.symbol("F", "control", 0.1)
     for number in command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers:
         trace.require(trace.apply("M", "finite({})", math.isfinite, number))
     loop = LaneLoop(trace, "course", lane_function(set_out)(state, vehicles, 0, 0, head))
     trace.level = 1
     trace.sections[1].append("const I k = all_i(pass);")
     k = trace.symbol("I", "k", 1)
+    trace.assume(k < 0, False)
+    trace.assume(k >= 0, True)
     beat = SimpleNamespace(step=step, head=head, control_step=control_step, h=h)
-    loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, beat, k, loop.value()))
+    with trace.exploration():
+        loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, beat, k, loop.value()))
     trace.level = 2
     lane_function(arrive)(state, vehicles, around, 0, 0, slot, loop.value())
-    source = block_source(
+    source = group_source(
         trace,
         [row, commands, history],
         f"""
 const long row = vehicles.shared.data[0] ? 0 : vehicles.plant.strides[0];
 const long term_row = vehicles.shared.data[0] ? 0 : vehicles.extra.strides[0];
-const auto at = [&](const auto& a, long world) {{
+const auto place_of = [&](const auto& a, long world) {{
     return At{{(char*)a.data + w * world + v * a.strides[1], world, 0}};
 }};
-const At state_at = at(state.vehicle, state.vehicle.strides[0]), plant_at = at(vehicles.plant, row);
-const At command_at = at(vehicles.command, vehicles.command.strides[0]), extra_at = at(vehicles.extra, term_row);
-const At tether_at = at(around.tether, around.tether.strides[0]);
+const At state_at = place_of(state.vehicle, state.vehicle.strides[0]), plant_at = place_of(vehicles.plant, row);
+const At command_at = place_of(vehicles.command, vehicles.command.strides[0]);
+const At extra_at = place_of(vehicles.extra, term_row);
+const At tether_at = place_of(around.tether, around.tether.strides[0]);
 const auto& c = state.commands;
 const At commands_at = {{(char*)c.data + w * c.strides[0] + v * c.strides[1], c.strides[0], c.strides[2]}};
 const auto& y = state.history;
 const At history_at = {{(char*)y.data + w * y.strides[1] + v * y.strides[2], y.strides[1], y.strides[0]}};
 I step; for (int l = 0; l < {LANES}; ++l)
-    step[l] = l < count && state.frozen.data[w + l] == 0 ? state.steps.data[w + l] : 0;
+    step[l] = l <= last && state.frozen.data[w + at[l]] == 0 ? state.steps.data[w + at[l]] : 0;
 ok &= step != 0;
 const I slots = all_i(c.shape[2]), head = step % slots, place = step % all_i({HISTORY});
 const F control = all(control_step), h = all(control_step / (float)substeps);
 """,
         "for (int pass = 0; pass < substeps; ++pass)",
+        "((int*)((char*)vehicles.way.data + (w + world) * vehicles.way.strides[0]))[v]",
     )
 
     @wp.func_native(source)
-    def block(
+    def blocks(
         state: State, vehicles: Vehicles, around: SimSurroundings, control_step: float, substeps: int, w: int, v: int,
         count: int,
-    ) -> int: ...  # fmt: skip
+    ): ...  # fmt: skip
 
-    return block
+    return blocks
 
 
 @wp.kernel(enable_backward=False)

@@ -3,7 +3,7 @@
 The water surface is given as a plane in body axes: its upward normal and the signed height of the body origin above it.
 """
 # mypy: disable-error-code="call-overload,valid-type,no-untyped-call,misc,attr-defined,operator,no-any-return"
-# mypy: disable-error-code="assignment"
+# mypy: disable-error-code="assignment,arg-type"
 
 from collections.abc import Sequence
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
 from finssim.physics.hydrostatics import Afloat, WaterWrench, hydrostatic_wrench
+from finssim.physics.lanes import sum_in_lanes
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
 from finssim.physics.water import Flow, WaterArrays
@@ -208,6 +209,31 @@ def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
 
 
 @wp.func
+def wet_face_drag(
+    i: int, hull: HullMesh, v_origin: wp.vec3, turn: wp.mat33, form: float, skin: float
+) -> vec6:
+    """Drag of face i, wholly below the surface, about the body origin [N, N m]; see `mesh_drag` and `face_drag`."""
+    f = hull.face[i]
+    c = wp.vec3(f[0], f[1], f[2])
+    pull = f[6] * face_drag(v_origin + turn * c, wp.vec3(f[3], f[4], f[5]), form, skin)
+    return join(pull, wp.cross(c, pull))
+
+
+@wp.func
+def faces_drag(
+    first: int, end: int, hull: HullMesh, v_origin: wp.vec3, turn: wp.mat33, form: float, skin: float
+) -> vec6:
+    """Sum of `wet_face_drag` over the faces from `first` to before `end` [N, N m]."""
+    tau = vec6()
+    for i in range(first, end):
+        tau += wet_face_drag(i, hull, v_origin, turn, form, skin)
+    return tau
+
+
+sum_in_lanes(faces_drag, wet_face_drag)
+
+
+@wp.func
 def mesh_drag(
     hull: HullMesh,
     kind: int,
@@ -249,12 +275,7 @@ def mesh_drag(
     middle = surface_height + wp.dot(surface_normal, hull.box_center[kind])
     reach = wp.dot(wp.abs(surface_normal), hull.box_half[kind])
     if middle + reach <= 0.0:
-        for i in range(hull.start[kind], hull.start[kind + 1]):
-            f = hull.face[i]
-            c = wp.vec3(f[0], f[1], f[2])
-            pull = f[6] * face_drag(v_origin + turn * c, wp.vec3(f[3], f[4], f[5]), form, skin)
-            force += pull
-            moment += wp.cross(c, pull)
+        return faces_drag(hull.start[kind], hull.start[kind + 1], hull, v_origin, turn, form, skin)
     elif middle - reach < 0.0:
         for i in range(hull.start[kind], hull.start[kind + 1]):
             wet = wet_part(hull.corners[i], surface_normal, surface_height)
