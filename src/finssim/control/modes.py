@@ -131,6 +131,16 @@ def past_dead_band(part: float, dead_band: float) -> float:
 
 
 @wp.func
+def thrusts_of_shares(shares: vec8, lower: vec8, upper: vec8) -> vec8:
+    """Thrusts [N] that are shares [-1, 1] of the least and greatest [N]; shares beyond saturate."""
+    f = vec8()
+    for k in range(MAX_THRUSTERS):
+        share = wp.clamp(shares[k], -1.0, 1.0)
+        f[k] = wp.where(share >= 0.0, share * upper[k], -share * lower[k])
+    return f
+
+
+@wp.func
 def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
     """Thrusts that an action asks for, canonical order [N].
 
@@ -149,11 +159,7 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
         return allocate(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.allocation)
     if data.pilot:
         return mixed_thrusts(vec6(x[0], x[1], x[2], x[3], x[4], x[5]), vehicle, data.mixer)
-    f = vec8()
-    for k in range(MAX_THRUSTERS):
-        share = wp.clamp(x[k], -1.0, 1.0)
-        f[k] = wp.where(share >= 0.0, share * data.upper[vehicle][k], -share * data.lower[vehicle][k])
-    return f
+    return thrusts_of_shares(x, data.lower[vehicle], data.upper[vehicle])
 
 
 @wp.kernel(enable_backward=False)

@@ -17,6 +17,9 @@ from finssim.sim.plant_arrays import SimulatorError
 MIN_SLICE = 64
 """Number of worlds below which a slice is not given to another thread."""
 
+MANY = 1024
+"""Worlds from which on a second kernel is compiled that takes several together."""
+
 
 class _Job:
     """One slice of one run: done when its event is set."""
@@ -141,6 +144,11 @@ class KernelSequence:
         edges = [worlds * i // count for i in range(count + 1)]
         self.slices = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
         self._parts: list[_Kernels | Callable[[], None]] = []
+
+    @property
+    def in_blocks(self) -> bool:
+        """Return whether kernels that take several worlds together are worth their time to compile."""
+        return self.device.is_cpu and self.worlds >= MANY
 
     def add(
         self, kernel: wp.Kernel, inputs: Sequence[Any], vehicles: int | None = None, block: int | None = None

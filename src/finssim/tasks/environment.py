@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
 from finssim.control.course import CourseData, Memory, course_data, order_of, steer
-from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of
+from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of, thrusts_of_shares
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
 from finssim.sim import RectangularPool, Simulator, SimulatorError, TetherLine, Water
@@ -76,6 +76,29 @@ def act(
         else:
             a[k] = arrays.scripted[w, (v - agents) * size + k]
     command[w, v].thrust = thrusts_of(a, v, data)
+
+
+@wp.kernel(enable_backward=False)
+def act_by_shares(
+    arrays: TaskArrays,
+    command: wp.array2d(dtype=VehicleCommand),
+    data: ModeData,
+    agents: int,
+    world_offset: int,
+):
+    """`act` for modes whose components are shares of the thrusters' limits: the same, in less code."""
+    i, v = wp.tid()
+    w = world_offset + i
+    size = data.columns.shape[1]
+    x = vec8()
+    for k in range(size):
+        part = float(0.0)
+        if v < agents:
+            part = arrays.action[w, v * size + k]
+        else:
+            part = arrays.scripted[w, (v - agents) * size + k]
+        x += wp.clamp(part, -1.0, 1.0) * data.columns[v, k]
+    command[w, v].thrust = thrusts_of_shares(x, data.lower[v], data.upper[v])
 
 
 @wp.kernel(enable_backward=False)
@@ -200,6 +223,7 @@ class Environment:
         self.randomization = randomization
         self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         self._steps = self._reported = 0
+        self._views: dict[int, NDArray[Any]] = {}
         self._arena = pool or task.arena()
         drawn = bool(randomization and randomization.changes_sensors)
         sensed = isinstance(self.noise, Sensing)
@@ -285,7 +309,8 @@ class Environment:
             self._step.add(act_by_course, inputs, vehicles=len(self.nominal))
         else:
             modes = mode_data(self.action_mode, self.nominal, scales, self.device)
-            self._step.add(act, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
+            kernel = act if kind.wrench or kind.pilot else act_by_shares
+            self._step.add(kernel, [self.arrays, command, modes, self.agents], vehicles=len(self.nominal))
         if self.draws is not None:
             self.draws.add_step(self._step, self.seed)
         self.simulator.add_step(self._step)
@@ -388,9 +413,17 @@ class Environment:
             self.sight.begin(mask)
             self._look.run()
 
+    def _numpy(self, array: wp.array) -> NDArray[Any]:
+        """Return a NumPy array of an array of this environment: on a processor a view, which is made once."""
+        if not self.device.is_cpu:
+            return array.numpy()
+        if array.ptr not in self._views:
+            self._views[array.ptr] = array.numpy()
+        return self._views[array.ptr]
+
     def _observed(self, which: str) -> Any:
         """Observations, or with which = `final_` the last of the episodes that ended last; views."""
-        rows = getattr(self.arrays, f"{which}observation").numpy()
+        rows = self._numpy(getattr(self.arrays, f"{which}observation"))
         rows = rows if self.agents == 1 else rows.reshape(self.worlds, self.agents, -1)
         if self.sight is None:
             return rows
@@ -436,7 +469,11 @@ class Environment:
         Raises:
             EnvironmentSetupError: the shape is wrong or a number is not finite.
         """
-        self.arrays.action.assign(checked_action(action, self.worlds, self.agents, self.action_size))
+        checked = checked_action(action, self.worlds, self.agents, self.action_size)
+        if self.device.is_cpu:
+            self._numpy(self.arrays.action)[:] = checked
+        else:
+            self.arrays.action.assign(checked)
         self.advance()
         return self.outcome()
 
@@ -456,7 +493,7 @@ class Environment:
                     self._begin(self._restart, ended)
         # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
         inspect = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
-        if inspect and self.simulator.state.frozen.numpy().any():
+        if inspect and self._numpy(self.simulator.state.frozen).any():
             self._revive()
 
     def set_progress(self, done: float) -> None:
@@ -484,7 +521,7 @@ class Environment:
         a = self.arrays
         reward = a.reward if self.agents == 1 else a.agent_reward
         return Step(
-            self._observed(""), reward.numpy(), a.terminated.numpy() != 0, a.truncated.numpy() != 0,
+            self._observed(""), self._numpy(reward), self._numpy(a.terminated) != 0, self._numpy(a.truncated) != 0,
             self._observed("final_"),
         )  # fmt: skip
 
@@ -593,7 +630,8 @@ def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> ND
         row_of = "world" if agents == 1 else "agent"
         raise EnvironmentSetupError(f"action has shape {a.shape}, expected {expected}: one row per {row_of}")
     a = a.reshape(worlds, -1)
-    if not np.isfinite(a).all():
+    # A sum of squares is finite if all numbers are, and quicker; where it overflows, they are looked at one by one.
+    if not np.isfinite(np.vdot(a, a)) and not np.isfinite(a).all():
         world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
         raise EnvironmentSetupError(
             f"action of world {world} has a number that is not finite: {a[world].tolist()}"

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from finssim.control.policy import ObservationEntry, ObservationSchema
 from finssim.core.page import notebook_html
+from finssim.physics.lanes import LANES
 from finssim.sim import Dock, RectangularPool
 from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
 from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
+from finssim.tasks.blocks import evaluate_in_blocks
 from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.picture import ObservedPicture
@@ -226,7 +228,8 @@ class Task:
         kernels, terms = kernels_of(self), self.terms()
         weights = [reward.weight for reward in terms.rewards] + [end.reward for end in terms.ends]
         inputs = [batch.state, batch.arrays, settings_of(self), kernels.weights(*(weights or [0.0]))]
-        pipeline.add(kernels.evaluate, inputs)
+        blocks = evaluate_in_blocks(kernels.score, inputs) if pipeline.in_blocks else None
+        pipeline.add(blocks or kernels.evaluate, inputs, block=LANES if blocks else None)
 
     def add_spawn(self, pipeline: KernelSequence, batch: Batch, mask: wp.array) -> None:
         """Append the start of an episode where mask (by world, int32) is not 0."""
@@ -301,6 +304,15 @@ STAGES = {
     "command": "state: State, arrays: TaskArrays, p: P, seed: int, world_offset: int",
 }
 """The kernels and what they take."""
+SCORE = "score(state: State, arrays: TaskArrays, p: P, weights: W, w: int) -> bool"
+"""Function of a step of a world that is not frozen, and whether its episode ends."""
+EVALUATE = [
+    "w = world_offset + wp.tid()",
+    "if state.frozen[w] != 0:",
+    "    report_frozen(state, arrays, w)",
+    "elif score(state, arrays, p, weights, w):",
+    "    close_episode(state, arrays, w)",
+]
 KEY = "seed + 15485863 * state.episode[w]"
 
 
@@ -309,6 +321,8 @@ class Kernels(NamedTuple):
 
     weights: Any
     """Type of the vector of reward weights: of the terms, then of the ends."""
+    score: Any
+    """Function of a world's step; see `SCORE`."""
     evaluate: wp.Kernel
     """After each step."""
     spawn: wp.Kernel
@@ -348,9 +362,11 @@ class _Writer:
 
     def text(self) -> str:
         """All of it."""
-        stages = {name: getattr(self, f"_{name}")() for name in STAGES}
+        stages = {name: getattr(self, f"_{name}")() for name in STAGES if name != "evaluate"}
+        stages = {"evaluate": EVALUATE, **stages}
         sources = [_function(f"{name}({STAGES[name]})", lines) for name, lines in stages.items() if lines]
-        return "\n".join([_function("look(arrays: TaskArrays, p: P, w: int)", self._look()), *sources])
+        look = _function("look(arrays: TaskArrays, p: P, w: int)", self._look())
+        return "\n".join([look, _function(SCORE, self._score()), *sources])
 
     def _value(self, term: Any, role: str, **values: str) -> str:
         """Return a term in the source: a call with its arguments by name, or a value by its name."""
@@ -404,7 +420,7 @@ class _Writer:
             first[row] += part.size
         return [self._agents, *_indented([*values, *writes] or ["pass"])]
 
-    def _evaluate(self) -> list[str]:
+    def _score(self) -> list[str]:
         """All terms are computed before anything is written, so that the compiler does what they share only once."""
         terms, scope = self.terms, {"state": "state", **self._totals}
         advance = [] if terms.advance is None else [self._value(terms.advance, "advance", **scope)]
@@ -412,15 +428,12 @@ class _Writer:
         inside = "False" if terms.inside is None else self._value(terms.inside, "inside", **scope)
         scope["held"] = "held"
         ends = [
-            f"e{i} = {self._value(end.term, f'end {end.name!r}', **scope)} and not ended\nended = ended or e{i}"
+            f"e{i} = first_time({self._value(end.term, f'end {end.name!r}', **scope)}, ended)\n"
+            f"ended = either(ended, e{i})"
             for i, end in enumerate(terms.ends)
         ]
         counts, counted = self._counts(scope)
         return [
-            "w = world_offset + wp.tid()",
-            "if state.frozen[w] != 0:",
-            "    report_frozen(state, arrays, w)",
-            "    return",
             "t = float(state.steps[w]) * p.control_step",
             "arrays.time[w] = t",
             *advance,
@@ -434,13 +447,13 @@ class _Writer:
             *counted,
             "arrays.held[w] = held",
             "arrays.terminated[w] = wp.where(ended, 1, 0)",
-            "arrays.truncated[w] = wp.where(late and not ended, 1, 0)",
-            "arrays.done[w] = wp.where(ended or late, 1, 0)",
+            "over = either(ended, late)",
+            "arrays.truncated[w] = wp.where(first_time(late, ended), 1, 0)",
+            "arrays.done[w] = wp.where(over, 1, 0)",
             "arrays.episode_return[w] = arrays.episode_return[w] + reward",
             "remember_actions(arrays, w)",
             "look(arrays, p, w)",
-            "if ended or late:",
-            "    close_episode(state, arrays, w)",
+            "return over",
         ]
 
     def _rewards(self, scope: Mapping[str, str]) -> list[str]:
@@ -542,11 +555,12 @@ def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
     }  # fmt: skip
     exec(compile(text, path, "exec"), space)
     module = wp.get_module(name)
-    space["look"] = wp.func(space["look"], module=module)
+    for name_of in ("look", "score"):
+        space[name_of] = wp.func(space[name_of], module=module)
     compiled = [
         wp.kernel(space[stage], enable_backward=False, module=module) for stage in STAGES if stage in space
     ]
-    return Kernels(W, *compiled)
+    return Kernels(W, space["score"], *compiled)
 
 
 def settings_of(task: Task) -> Any:

@@ -139,6 +139,18 @@ def report_frozen(state: State, arrays: TaskArrays, w: int):
 
 
 @wp.func
+def either(a: bool, b: bool) -> bool:
+    """Return whether one of two is true."""
+    return a or b
+
+
+@wp.func
+def first_time(now: bool, before: bool) -> bool:
+    """Return whether something is true now and was not before."""
+    return now and not before
+
+
+@wp.func
 def remember_actions(arrays: TaskArrays, w: int):
     """Keep the actions for the next step's change."""
     for i in range(arrays.action.shape[1]):
