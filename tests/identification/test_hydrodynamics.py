@@ -202,12 +202,12 @@ def test_published_numbers_are_data(joystick, by_sticks):
     vehicle = load_vehicle("bluerov2_heavy")
     before, pull = by_sticks.estimates["thrust_scale"], 0.8 * float(vehicle.wrench_limits[0])
     fit = fit_hydrodynamics(
-        fitted, vehicle, published={"bollard_pull": pull, "top_speed": 1.0}, held_out=held
+        fitted, vehicle, published={"bollard_pull": pull, "top_speed": 1.25}, held_out=held
     )
     after = fit.estimates["thrust_scale"]
     assert before.estimate < after.estimate < 0.8
     assert np.diff(after.ci95)[0] < 0.9 * np.diff(before.ci95)[0]
-    assert fit.settings["published"] == {"bollard_pull": pull, "top_speed": 1.0}
+    assert fit.settings["published"] == {"bollard_pull": pull, "top_speed": 1.25}
     said = " ".join(_remarks(replay([t for t in held if t.name == "surge_060"], calibrated(fit))))
     assert "surge reaches 0.79 m/s, the fitted trials 0.4" in said and "extrapolated" in said
     yaw = [t for t in fitted if t.name.startswith("yaw")]

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.identification.rollout import Rollouts, Segment
+from finssim.identification.rollout import Rollouts, Segment, segments, streams
 from finssim.sim.simulator import Simulator
 from finssim.trials.findings import CalibrationError
+from finssim.trials.trial import Header, Trial
 from finssim.vehicles import load_vehicle
 
 STEP = 0.02
@@ -215,3 +216,40 @@ def test_segments_of_different_steps_are_refused():
         Rollouts(vehicle, pair)
     with pytest.raises(CalibrationError, match="nothing to simulate"):
         Rollouts(vehicle, [])
+
+
+def test_a_sampled_command_changes_when_it_is_told_to():
+    """Old before and new after a time between two samples, 0.2 s apart, is the command that changed then."""
+    vehicle = load_vehicle("bluerov2")
+    old, new = steps_of(vehicle, 20)[[0, 10]]
+    n, which = np.arange(60), np.full(60, -1)
+    which[20:30] = 0
+    sampled = segment(
+        vehicle,
+        np.where((n < 30)[:, None], old, new),
+        change=np.where((which == 0)[:, None], new - old, 0.0),
+        which=which,
+        place=np.stack([n - 20, n - 19], axis=-1) / 10.0,
+    )
+    rollouts = Rollouts(vehicle, [sampled])
+    for at, earlier in ((25, None), (27, -0.2), (21, 0.4)):
+        told = Rollouts(vehicle, [segment(vehicle, np.where((n < at)[:, None], old, new))]).run().nu
+        found = rollouts.run(earlier=None if earlier is None else np.full((1, 1, 1), earlier)).nu
+        np.testing.assert_allclose(found, told, atol=2e-6)
+
+
+def test_a_slow_command_is_halfway_between_samples_unless_stated_to_hold():
+    """Pulses at 5 Hz change in the middle on average; `inputs_between: held` keeps them as they are."""
+    vehicle = load_vehicle("bluerov2")
+    t = 0.2 * np.arange(20)
+    columns = {f"command_{name}": np.where(t < 2.0, 0.0, 5.0) for name in vehicle.thrusters}
+    columns["u"] = 0.0 * t
+    for stated in (None, "held"):
+        header = Header(inputs_between=stated)
+        trial = Trial(name="made up", t=t, channels=columns, header=header, phase=None)
+        part = segments(streams(trial, vehicle), vehicle, changes=True)[0]
+        if stated:
+            assert part.change is None and part.force[99, 0] == 0.0 and part.force[100, 0] == 5.0
+        else:
+            np.testing.assert_array_equal(np.flatnonzero(part.which == 0), np.arange(90, 100))
+            assert (part.force[:100] == 0.0).all() and (part.change[90:100, 0] == 5.0).all()

@@ -46,7 +46,7 @@ class Decays:
     def residuals(self, points):
         return self.value[:, None] - self.predicted(points)
 
-    def linearise(self, point):
+    def linearise(self, point, *, one_sided=False):
         residual = self.residuals(Point(*(part[None] for part in point)))[:, 0]
         decay = np.exp(-point.theta[0] * self.t)
         theta = (-self.t * decay * point.z).reshape(-1, 1)

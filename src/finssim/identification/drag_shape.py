@@ -207,7 +207,8 @@ def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     kept = problem.low, problem.high
     problem.low, problem.high = kept[0].copy(), kept[1].copy()
     problem.low[at] = problem.high[at] = theta[at]
-    end = solve(problem, solution.point._replace(theta=theta), iterations=POLISH, std=solution.std)
+    polish = RELEASED_POLISH if problem.released else POLISH
+    end = solve(problem, solution.point._replace(theta=theta), iterations=polish, std=solution.std)
     problem.low, problem.high = kept
     if not np.isfinite(end.cost):
         return stage
@@ -218,8 +219,8 @@ def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     return Stage(problem, replace(end, converged=solution.converged, step=solution.step), found)
 
 
-POLISH = 3
-"""Iterations with which the other numbers follow the drag."""
+POLISH, RELEASED_POLISH = 1, 3
+"""Iterations with which the other numbers follow the drag, with thrust and without: there they trade off closely."""
 
 
 USEFUL_DRAG = 0.5

@@ -160,6 +160,7 @@ def _information(
 
 
 def _std_by_channel(stage: Stage) -> list[float]:
-    """Return the noise of each channel of a fit, in its unit."""
-    channel = stage.problem.measured.channel
-    return [float(stage.solution.std[channel == j][0]) for j in range(len(stage.problem.measured.names))]
+    """Return the noise of each channel of a fit, of trials that drive its axis where there are any, in its unit."""
+    m, std = stage.problem.measured, stage.solution.std
+    driven = [std[m.kind == j] if (m.kind == j).any() else std[m.channel == j] for j in range(len(m.names))]
+    return [float(one[0]) for one in driven]

@@ -127,8 +127,8 @@ def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, fl
 
 LIKELY_SCALE, SCALE_STD = 0.88, 0.17
 """Thrust of a battery on its way from full to empty, over that at the voltage of the thruster's table, and the standard
-deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell (0.14), and propellers of
-one make differ by a tenth."""
+deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell, 0.68 to 1.10 of the
+table's at 16 V (0.14), and propellers of one make differ by a tenth."""
 
 ADDED_MASS_STD, RIGID_STD, INERTIA_STD = 0.7, 0.35, 0.5
 """Standard deviation of an added mass, as parts of the vehicle file's and of its rigid mass, whichever is more, and of

@@ -110,7 +110,7 @@ def replay_pairs(
     for trial in trials:
         try:
             s = streams(trial, vehicle)
-            parts = segments(s, vehicle, step=STEP, index=len(prepared))
+            parts = segments(s, vehicle, step=STEP, index=len(prepared), changes=True)
         except CalibrationError as error:
             excluded.append(finding("unusable", trial.name, reason=error.reason))
             continue
@@ -301,7 +301,7 @@ def replay_predictions(
             parts = int((trial.duration - start) / horizon)
             if parts > 0:
                 length = (trial.duration - start) / parts
-                cut += segments(s, vehicle, length=length, step=STEP, start=start, index=i)
+                cut += segments(s, vehicle, length=length, step=STEP, start=start, index=i, changes=True)
     if not cut:
         return {}
     steps = round(horizon / STEP)

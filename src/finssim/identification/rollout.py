@@ -27,12 +27,19 @@ Array = NDArray[np.float64]
 STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
 """Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
 
-MEMORY = 1.0
-"""Commands before a segment that are kept, for delay and lag of the motors [s]."""
+MEMORY, SETTLED = 1.0, 10.0
+"""Commands before a segment that are kept, for delay and lag of the motors [s]; time constants after which an older
+command does not show."""
 
 DEEP = -30.0
 """Added to the height of a vehicle that never came near the surface [m]: deep enough for its drift, not so deep that
 single precision would lose slow motion. Where nobody measured the depth that does not matter, and it is much deeper."""
+
+SLOW = 0.09
+"""Time between commands from which on their changes between two samples are unknown [s]."""
+
+CHANGES = 6
+"""Changes of a command within a segment whose times can be fitted: the largest ones."""
 
 FLIES = 0.15
 """Height of the origin above the reach of a floating vehicle that is no height above the surface any more [m]."""
@@ -89,6 +96,15 @@ class Segment:
     held: Array | None = None
     """nu [m/s, rad/s] that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is
     free."""
+    change: Array | None = None
+    """Change of the command in its unit within whose sample interval each step lies, (steps, k); `force` there is the
+    command before it. None without any."""
+    which: NDArray[np.int64] | None = None
+    """Index of that change, -1 outside of all, (steps,)."""
+    place: Array | None = None
+    """Begin and end of each step as parts of that interval [-], (steps, 2)."""
+    aside: frozenset[str] = frozenset()
+    """Columns that show axes which its trial does not drive: what moves them besides has a noise of its own."""
 
     @property
     def steps(self) -> int:
@@ -178,6 +194,7 @@ def segments(
     step: float = 0.02,
     start: float = 0.0,
     index: int = 0,
+    changes: bool = False,
 ) -> list[Segment]:
     """Cut a trial into stretches of about equal length; a gap in the recording always ends one.
 
@@ -188,6 +205,8 @@ def segments(
         step: Of the simulation [s].
         start: Left out at the beginning [s].
         index: Which of several trials this is.
+        changes: Whether a command that was logged slowly, and is not stated to hold, may have changed at any time since
+            the sample before: it then does so in the middle, and the times of the largest changes are free.
 
     Returns:
         In order of time; none where nothing measured lies inside.
@@ -200,13 +219,14 @@ def segments(
             f"segments of {length} s in steps of {step} s, expected times above 0 s", s.trial.name
         )
     out, begin = list[Segment](), float(s.trial.t[0]) + start
+    sampled = changes and is_sampled(s)
     for a, b in ((max(float(a), begin), float(b)) for a, b in s.drive.spans):
         steps = int(round((b - a) / step - 1e-6))
         parts = 1 if length is None else max(1, round(steps * step / length))
         edges = [steps * i // parts for i in range(parts + 1)]
         for low, high in zip(edges, edges[1:], strict=False):
             if high - low >= 2:
-                segment = _segment(s, vehicle, a + low * step, high - low, step, index)
+                segment = _segment(s, vehicle, a + low * step, high - low, step, index, sampled)
                 if segment.measured:
                     out.append(segment)
     return out
@@ -222,10 +242,44 @@ def without(s: Streams, gaps: Sequence[tuple[float, float]]) -> Streams:
     return replace(s, drive=replace(s.drive, spans=np.array(spans).reshape(-1, 2)))
 
 
-def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int) -> Segment:
-    header, d = s.trial.header, s.drive
+def is_sampled(s: Streams) -> bool:
+    """Return whether a command was sampled so slowly that the times of its changes are unknown."""
+    d, between = s.drive, np.diff(s.drive.t)
+    if not (d.commanded and d.held) or s.trial.header.inputs_between is not None or len(between) < 3:
+        return False
+    usual = float(np.median(between))
+    return SLOW <= usual and float(np.percentile(between, 90.0)) <= 1.5 * usual
+
+
+def _changes(d: InputForces, t0: float, steps: int, step: float) -> dict[str, Array]:
+    """Return `Segment.change`, `which` and `place` of a stretch; nothing without a change."""
+    begin = t0 + step * np.arange(steps)
+    row = np.searchsorted(d.t, begin + 0.5 * step, side="right")  # first sample after each step
+    change = np.diff(d.force, axis=0)
+    size = np.abs(change / np.maximum(np.ptp(d.force, axis=0), 1e-12)).sum(axis=1)
+    inside = np.unique(row[(row > 0) & (row < len(d.t))]) - 1
+    largest = np.sort(inside[np.argsort(-size[inside])[:CHANGES]])
+    largest = largest[size[largest] > 0.0]
+    if not len(largest):
+        return {}
+    which = np.where(np.isin(row - 1, largest), np.searchsorted(largest, row - 1), -1)
+    own = largest[which]
+    place = (np.stack([begin, begin + step], axis=-1) - d.t[own, None]) / (d.t[own + 1] - d.t[own])[:, None]
+    return {"change": np.where(which[:, None] < 0, 0.0, change[own]), "which": which, "place": place}
+
+
+def _segment(
+    s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int, sampled: bool
+) -> Segment:
+    header, d, found = s.trial.header, s.drive, dict[str, Any]()
     memory = max(1, int(round(MEMORY / step)))
+    if sampled:
+        found = _changes(d, t0, steps, step)
+        d = replace(d, t=np.concatenate([d.t[:1], 0.5 * (d.t[1:] + d.t[:-1])]))
     force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
+    if found:
+        inside = found["which"] >= 0
+        force[memory:][inside] = s.drive.at(t0 + step * (np.flatnonzero(inside) + 0.5))
     position, quaternion, nu, known = _start(s, t0)
     measured = {}
     for column, (t, values) in s.measured.items():
@@ -256,6 +310,7 @@ def _segment(s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, i
         velocity_in_water=header.velocity == "water",
         position_at=np.asarray(header.position_at, float),
         depth_at=depth_place(s.trial, vehicle),
+        **found,
     )
 
 
@@ -421,6 +476,13 @@ class Rollouts:
             self._force[s.steps :, i, :k] = s.force[-1]
             self._before[:, i, :k] = s.before[:1]
             self._before[memory - len(s.before) :, i, :k] = s.before
+        self.changes = np.array([0 if s.which is None else s.which.max() + 1 for s in segments])
+        self._change, self._which = np.zeros_like(self._force), np.full(self._force.shape[:2], -1)
+        self._interval = np.zeros((*self._force.shape[:2], 2))
+        for i, s in enumerate(segments):
+            if s.change is not None and s.which is not None and s.place is not None:
+                self._change[: s.steps, i, : s.change.shape[1]] = s.change
+                self._which[: s.steps, i], self._interval[: s.steps, i] = s.which, s.place
         self.own = self._own_fields()
         self._held = self._imposed()
 
@@ -468,6 +530,7 @@ class Rollouts:
         *,
         initial: Mapping[str, ArrayLike] | None = None,
         disturbance: ArrayLike | None = None,
+        earlier: Array | None = None,
         candidates: int | None = None,
     ) -> Response:
         """Simulate every candidate over every segment.
@@ -477,6 +540,8 @@ class Rollouts:
                 those in the vehicle file's water: a trial's own density scales them.
             initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
             disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
+            earlier: By how much each change of a sampled command comes before the middle between its samples, as a
+                part of the time between them [-], (C, S, `changes.max()`).
             candidates: C; the longest first axis among the arrays if None.
 
         Returns:
@@ -485,6 +550,7 @@ class Rollouts:
         arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
         arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
         arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
+        arrays |= {} if earlier is None else {"earlier": earlier}
         C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
         n, S = self._force.shape[:2]
         out = {
@@ -536,9 +602,12 @@ class Rollouts:
         self._place(sim, write, {})
         sim.reset()
         # Motors without lag come to the first command in one step; with theirs they then follow the others.
-        lagged = any(np.any(fields[name]) for name in ("time_constant", "delay"))
+        longest = float(np.max(fields["delay"])) + SETTLED * float(np.max(fields["time_constant"]))
+        limited = (fields["slew"] > 0.0) & (fields["slew"] < NO_LIMIT)
+        needed = len(self._before) if limited.any() else math.ceil(longest / self.step)
+        past = self._before[max(len(self._before) - needed - 1, 0) :]
         swift = fields | {"time_constant": 0.0, "delay": 0.0, "slew": NO_LIMIT}
-        for own, commands in ((swift, self._before[:1]), (fields, self._before[1:] if lagged else ())):
+        for own, commands in ((swift, past[:1]), (fields, past[1:])):
             for name, values in own.items():
                 write(sim.plant.fields[name], values)
             sim.refresh()
@@ -549,7 +618,7 @@ class Rollouts:
                 ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
                 ring[...] = sim.state.actuator.numpy().reshape(C, S, 1, MAX_THRUSTERS)
         self._place(sim, write, start)
-        return self._march(sim, C, out)
+        return self._march(sim, C, out, given.get("earlier", np.zeros((C, S, int(self.changes.max())))))
 
     def _place(
         self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
@@ -580,7 +649,7 @@ class Rollouts:
             now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
             nu[:, those] = now
 
-    def _march(self, sim: Simulator, C: int, out: dict[str, Single]) -> NDArray[np.bool_]:
+    def _march(self, sim: Simulator, C: int, out: dict[str, Single], earlier: Array) -> NDArray[np.bool_]:
         """Simulate the segments; write the response of every world and return which reached the end."""
         n, S = self._force.shape[:2]
         command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
@@ -595,6 +664,12 @@ class Rollouts:
             out[name][0] = view
         for k in range(n):
             command[...] = self._force[k]
+            if len(those := np.flatnonzero(self._which[k] >= 0)):
+                low, high = self._interval[k, those].T
+                after = high - 0.5 + earlier[:, those, self._which[k, those]]
+                command[:, those] += (
+                    np.clip(after / (high - low), 0.0, 1.0)[..., None] * self._change[k, those]
+                )
             sim.step()
             self._impose(views["nu"], impulses, k + 1)
             for name, view in views.items():

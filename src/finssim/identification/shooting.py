@@ -169,7 +169,7 @@ def solve(
         The best point; after Ctrl-C the best until then, with `interrupted`.
     """
     point, damping, done = start, 1e-2, 0
-    linear = problem.linearise(point)
+    linear = problem.linearise(point, one_sided=rough)
     if not np.isfinite(linear.residual).all():
         return FitSolution(
             point, np.ones(len(linear.residual)), np.inf, linear, 0, False, np.full(len(point.theta), np.inf)
@@ -205,7 +205,7 @@ def solve(
                 damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
                 stuck = cost - costs[best] < (1e-2 * cost if rough else SMALL)
                 point = Point(points.theta[best], points.z[best])
-                linear = problem.linearise(point)
+                linear = problem.linearise(point, one_sided=rough)
             else:
                 damping = min(damping * 1e5, 1e12)
                 stuck = damping >= 1e12
@@ -228,6 +228,7 @@ class Residuals:
     Attributes:
         names: Channels in use.
         channel: Index into `names` of each sample, (N,).
+        kind: The same, `len(names)` more where its trial does not drive the axis: samples of one noise, (N,).
         segment: Index of its segment, (N,).
         edges: First sample of each segment, and N, (S + 1,).
         value: Measured, (N,).
@@ -252,24 +253,26 @@ class Residuals:
         self.time = time * segments[0].step
         self._steps = np.array([s.steps for s in segments])[self.segment]
         self.edges = np.searchsorted(self.segment, np.arange(len(segments) + 1))
+        aside = np.array([[c in s.aside for c in self.names] for s in segments])
+        self.kind = self.channel + len(self.names) * aside[self.segment, self.channel]
 
     def __len__(self) -> int:
         return len(self.value)
 
     def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
-        """Return the readings of every candidate's sensors at the samples' times, and their rate of change.
+        """Return the readings of every candidate's sensors at the samples' times, and the first one's rate of change.
 
         Args:
             response: Of the candidates.
             late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
 
         Returns:
-            (N, C) each [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
+            (N, C) and (N, 1) [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
             segment's start it is extrapolated in a straight line.
         """
         step = self.segments[0].step
         candidates = response.nu.shape[1]
-        value, rate = (np.empty((len(self), candidates)) for _ in range(2))
+        value, rate = np.empty((len(self), candidates)), np.empty((len(self), 1))
         for j, name in enumerate(self.names):
             which = np.flatnonzero(self.channel == j)
             grid = channel(name, response, self.segments)
@@ -283,7 +286,8 @@ class Residuals:
                 if name in EULER:
                     rise = wrap_angle(rise)
                 value[which, those] = a + (at - row)[:, None] * rise
-                rate[which, those] = rise / step
+                if c == 0:
+                    rate[which, 0] = rise[:, 0] / step
         return value, rate
 
     def difference(self, predicted: Array) -> Array:
@@ -296,7 +300,7 @@ class Residuals:
         return np.asarray(out)
 
     def noise(self, residual: Array, floor: Array) -> Array:
-        """Standard deviation of each channel from clipped residuals, (channels,).
+        """Standard deviation of each kind of sample from clipped residuals, (2 channels,).
 
         It has the unit of the channel.
 
@@ -304,9 +308,10 @@ class Residuals:
             residual: Measured minus predicted in the unit of the channel, (N,).
             floor: Smallest per channel, in its unit, (channels,).
         """
+        floor = np.tile(floor, 2)
         out = np.array(floor, float)
-        for j in range(len(self.names)):
-            r = residual[self.channel == j]
+        for j in np.unique(self.kind):
+            r = residual[self.kind == j]
             r = np.abs(r[np.isfinite(r)])
             sigma = 1.4826 * float(np.median(r)) if len(r) else 0.0
             sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
@@ -419,11 +424,15 @@ PULL, COASTING = 0.003, (0, 1, 5)
 """Standard deviation of a constant pull on a vehicle that coasts, as of a tether, as a part of its weight, with half
 its length as the lever; and the axes that coast."""
 
+CHANGE_STD = 12.0**-0.5
+"""Standard deviation of the time of a change between two samples of a command, as a part of the time between them."""
+
 LATEST = 0.3
 """Greatest lag or lead of a stream relative to the inputs [s]."""
 
-LATE_STD = 0.05
-"""Prior standard deviation of the lag of streams [s]: noisy data do not distinguish a lag from inertia."""
+CLOCK_STD, LATE_STD = 0.05, 0.03
+"""Prior standard deviations of the lag that all streams of a log share and of what each adds [s]: noisy data do not
+distinguish a lag from inertia."""
 
 
 # Where each segment begins: what was measured there, and how far a fit may move it.
@@ -552,6 +561,19 @@ class Shooting:
             self.free = np.concatenate([self.free, 12 + np.array(pulled, int)])
             states_std = np.hstack([states_std, np.where(swinging[:, None], pull, 1e-9)])
         self._steps = np.append(STEPS, np.full(6, 0.1 * PULL * parameters.vehicle.weight))
+        self.rollouts = Rollouts(
+            parameters.vehicle,
+            segments,
+            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
+        )
+        changes = np.arange(
+            self.rollouts.changes.max()
+        )  # unknowns from 18 on are times of changes of the command
+        self.free = np.concatenate([self.free, 18 + changes])
+        states_std = np.hstack(
+            [states_std, np.where(changes < self.rollouts.changes[:, None], CHANGE_STD, 1e-9)]
+        )
+        self._steps = np.append(self._steps, np.full(len(changes), 0.5 * CHANGE_STD))
         self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
         # The initial height already takes up an offset of the depth, unless z is measured too.
         self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
@@ -568,11 +590,6 @@ class Shooting:
                 self._offset = np.column_stack([self._offset, column])
                 offsets_std = np.column_stack([offsets_std, np.where(swinging, DRIFT_STD, 1e-9)])
                 offsets_std[swinging, self.offsets.index(angle)] = REST_STD
-        self.rollouts = Rollouts(
-            parameters.vehicle,
-            segments,
-            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
-        )
         # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
         vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
         by_thruster, sideways = np.array([s.thrusters for s in segments]), horizontal(vehicle)
@@ -596,21 +613,25 @@ class Shooting:
         known = size**-1.0
         rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
         self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
-        self._known = np.concatenate([known, 0.0 * far + LATE_STD**-1.0])
+        self._known = np.concatenate([known, 0.0 * far])
         forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
         self._relative_step = np.where(np.array(forces) & self.released, FORCE_STEP, RELATIVE_STEP)
+        clocks = LATE_STD**2 * np.eye(len(far)) + CLOCK_STD**2
         if "thrust_delay" in parameters.names or self.released:
             # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
-            self._known[len(parameters.names)] = EXACT_CLOCK**-1.0
+            clocks = np.diag(np.where(np.arange(len(far)) == 0, EXACT_CLOCK, CLOCK_STD) ** 2)
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
-        self._latest: tuple[Point, Linearization] | None = None
+        self._latest: tuple[Point, Linearization, bool] | None = None
         self.repeats, self._correlated = 1.0, correlated
         rows, target = parameters.published_rows()
-        self._published = np.pad(rows, ((0, 0), (0, len(self.streams)))), target
+        P, clock = len(parameters.names), np.linalg.inv(np.linalg.cholesky(clocks))
+        self._rows = np.zeros((len(rows) + len(far), P + len(far)))
+        self._rows[: len(rows), :P], self._rows[len(rows) :, P:] = rows, clock
+        self._target = np.concatenate([target, 0.0 * far])
 
     def prior(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
@@ -622,10 +643,9 @@ class Shooting:
         logarithmic = np.isfinite(self._rigid)
         whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
         off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.prior_mean)
-        rows, target = self._published
         weight = np.sqrt(self.repeats)
-        off = weight * np.concatenate([off * self._known, theta @ rows.T - target], axis=-1)
-        return off, weight * np.concatenate([np.diag(np.atleast_2d(self._known / whole)[0]), rows])
+        off = weight * np.concatenate([off * self._known, theta @ self._rows.T - self._target], axis=-1)
+        return off, weight * np.concatenate([np.diag(np.atleast_2d(self._known / whole)[0]), self._rows])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -653,7 +673,7 @@ class Shooting:
         return self.measured.difference(value + out)
 
     def _predicted(self, points: Point) -> tuple[Array, Array]:
-        """Return the readings of sensors without offsets and their rate of change, (N, C) each."""
+        """Return the readings of sensors without offsets, (N, C), and the rate of change of the first, (N, 1)."""
         P, C = len(self.parameters.names), len(points.theta)
         p = self.parameters.plants(points.theta[:, :P])
         fields = dict(p.fields)
@@ -665,7 +685,7 @@ class Shooting:
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
         if p.lower is not None:
             fields["B"] = own["B"] + p.lower[:, None, None, None] * self._leverage
-        full = np.zeros((*points.z.shape[:2], 18))
+        full = np.zeros((*points.z.shape[:2], 18 + int(self.rollouts.changes.max())))
         full[..., self.free] = points.z[..., : len(self.free)]
         nu, quaternion, position = (
             np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
@@ -676,32 +696,43 @@ class Shooting:
             "position": position + full[..., 9:12],
         }
         response = self.rollouts.run(
-            fields, initial=initial, disturbance=p.bias + full[..., 12:], candidates=C
+            fields,
+            initial=initial,
+            disturbance=p.bias + full[..., 12:18],
+            earlier=full[..., 18:],
+            candidates=C,
         )
         late = points.theta[:, P:]
         same = bool((late == late[:1]).all())
         return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
 
-    def linearise(self, point: Point) -> Linearization:
-        """Residuals and derivatives: central differences for what moves the vehicle, exact for what sensors add.
+    def linearise(self, point: Point, *, one_sided: bool = False) -> Linearization:
+        """Residuals and derivatives: differences for what moves the vehicle, exact for what sensors add.
 
         Those of the latest point are kept, because one solution often begins where another ended.
-        """
-        if self._latest is None or not all(map(np.array_equal, self._latest[0], point)):
-            self._latest = point, self._linearised(point)
-        return self._latest[1]
 
-    def _linearised(self, point: Point) -> Linearization:
-        points, wide = self._neighbours(point)
+        Args:
+            point: Where.
+            one_sided: Whether differences to one side suffice, in place of central ones; never without thrust, where
+                numbers trade off more closely.
+        """
+        one_sided = one_sided and not self.released
+        latest = self._latest
+        known = latest is not None and all(map(np.array_equal, latest[0], point))
+        if latest is None or not known or (latest[2] and not one_sided):
+            latest = self._latest = point, self._linearised(point, one_sided), one_sided
+        return latest[1]
+
+    def _linearised(self, point: Point, one_sided: bool) -> Linearization:
+        points, wide = self._neighbours(point, one_sided)
         value, rate = self._predicted(points)
-        rise = value[:, 1::2] - value[:, 2::2]
+        rise = value[:, 1:] - value[:, :1] if one_sided else value[:, 1::2] - value[:, 2::2]
         for j, name in enumerate(self.measured.names):
             if name in EULER:
                 which = self.measured.channel == j
                 rise[which] = wrap_angle(rise[which])
-        slopes = np.nan_to_num(rise / np.where(wide > 0.0, wide, np.inf))
-        rate = np.nan_to_num(rate[:, :1])
-        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -rate, 0.0)
+        slopes = np.nan_to_num(rise / np.where(wide != 0.0, wide, np.inf))
+        late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -np.nan_to_num(rate), 0.0)
         P = len(self.parameters.names)
         one = Point(*(part[:1] for part in points))
         return Linearization(
@@ -710,21 +741,29 @@ class Shooting:
             np.concatenate([slopes[:, P:], self._offset], axis=1),
         )
 
-    def _neighbours(self, point: Point) -> tuple[Point, Array]:
-        """The point, one on either side of it for every unknown that moves the vehicle, and their distances."""
+    def _neighbours(self, point: Point, one_sided: bool) -> tuple[Point, Array]:
+        """The point, one on one side of it or on either for every unknown that moves the vehicle, and distances."""
         P = len(self.parameters.names)
         count, steps = P + len(self.free), self._steps[self.free]
-        theta, z = (np.repeat(part[None], 1 + 2 * count, axis=0) for part in point)
-        up, down = 1 + 2 * np.arange(count), 2 + 2 * np.arange(count)
-        i = np.arange(P)
+        sides = 1 if one_sided else 2
+        theta, z = (np.repeat(part[None], 1 + sides * count, axis=0) for part in point)
+        up, i = 1 + sides * np.arange(count), np.arange(P)
         step = self._relative_step * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
-        theta[up[:P], i] = np.minimum(point.theta[:P] + step, self.high[:P])
-        theta[down[:P], i] = np.maximum(point.theta[:P] - step, self.low[:P])
-        wide = theta[up[:P], i] - theta[down[:P], i]
+        high, low = (
+            np.minimum(point.theta[:P] + step, self.high[:P]),
+            np.maximum(point.theta[:P] - step, self.low[:P]),
+        )
+        if one_sided:  # away from a bound
+            theta[up[:P], i] = np.where(high > point.theta[:P], high, low)
+            wide = theta[up[:P], i] - point.theta[:P]
+        else:
+            theta[up[:P], i], theta[up[:P] + 1, i] = high, low
+            wide = high - low
         for k, step_k in enumerate(steps):
             z[up[P + k], :, k] += step_k
-            z[down[P + k], :, k] -= step_k
-        return Point(theta, z), np.concatenate([wide, 2.0 * steps])
+            if not one_sided:
+                z[up[P + k] + 1, :, k] -= step_k
+        return Point(theta, z), np.concatenate([wide, sides * steps])
 
     def growth(self, point: Point) -> Array:
         """Return the largest factor by which a small change of the initial velocity grows within each segment, (S,).
@@ -765,9 +804,9 @@ class Shooting:
         The samples per independent one follow from the same residuals.
         """
         m, found = self.measured, []
-        for j in range(len(m.names) if self._correlated else 0):
-            rows = np.flatnonzero((m.channel == j) & np.isfinite(residual))
+        for j in np.unique(m.kind) if self._correlated else ():
+            rows = np.flatnonzero((m.kind == j) & np.isfinite(residual))
             if len(rows) > FEWEST_CORRELATED:
                 found.append(correlated_samples(residual[rows], np.flatnonzero(np.diff(m.segment[rows])) + 1))
         self.repeats = float(np.mean(found)) if found else 1.0
-        return np.asarray(self.measured.noise(residual, self._floor)[self.measured.channel])
+        return np.asarray(m.noise(residual, self._floor)[m.kind])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -46,7 +47,14 @@ from finssim.identification.excitation import (
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.judgement import fit_findings, held_out, pictures, quality, unexplained
 from finssim.identification.next_dive import next_dive
-from finssim.identification.parameters import EXTRAS, LIKELY_SCALE, Parameters, actuator_fields, places
+from finssim.identification.parameters import (
+    EXTRAS,
+    LIKELY_SCALE,
+    PLACES,
+    Parameters,
+    actuator_fields,
+    places,
+)
 from finssim.identification.plant_terms import matrices
 from finssim.identification.rollout import (
     Segment,
@@ -78,6 +86,9 @@ STEP = 0.02
 
 SHORT = 2.5
 """Initial length of the segments [s]: over so short a time every problem is nearly linear."""
+
+ENOUGH = 120.0
+"""Length of all segments together that suffices for a start [s]."""
 
 OWN_ERROR, BETWEEN = 0.003, 0.05
 """Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
@@ -127,7 +138,6 @@ class Stages:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known, self.likely = length, dict(known), likely
         self.excites = [excites(s, vehicle) for s in prepared]
-        self.fitted = self._fitted_axes()
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
         # without thrust nothing does.
         driven = any(one.drive.source != "passive" for one in prepared)
@@ -152,6 +162,7 @@ class Stages:
         driven = {a for a in swinging if a not in self.free and a not in self.held}
         if driven and any(s.drive.thrusters for s in prepared):
             self.extras |= set(places(vehicle))
+        self.fitted = self._fitted_axes()
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
@@ -175,11 +186,14 @@ class Stages:
     def _fitted_axes(self) -> list[list[str]]:
         """Return the axes of each trial whose motion is simulated and compared; the others move as they were seen to.
 
-        A surge, sway or yaw that a trial does not excite comes from couplings and disturbances, which the model lacks:
-        compared, it would determine the added mass of other axes through their Coriolis moments. Where it is only noise
-        it stays, for it keeps the initial state in place. So do heave, roll and pitch: weight acts on them in every
-        trial.
+        A surge, sway or yaw that a trial does not excite comes from couplings and disturbances. Where the centre of
+        gravity is not free the model lacks these: compared, it would determine the added mass of other axes through
+        their Coriolis moments. Where it is only noise it stays, for it keeps the initial state in place. So do heave,
+        roll and pitch: weight acts on them in every trial. With a free centre of gravity all stay: it shows in what a
+        push along one axis does to the others, and as an imposed motion their noise would shake roll and pitch.
         """
+        if self.extras & set(PLACES):
+            return [list(self.axes) for _ in self.prepared]
         out, nowhere = list[list[str]](), set(self.axes).difference(*self.excites)
         for one, moved in zip(self.prepared, self.excites, strict=True):
             own = moved if one.released else moved | nowhere | {"heave", *SWINGING}
@@ -252,6 +266,7 @@ class Stages:
         """
         short = max(SHORT, 15.0 * sampling(self.prepared))
         self.cut(min(short, self.given or short))
+        self.thin_out()
         problem = min((self.problem(kinds, start) for start in starts), key=lambda one: one.cost(one.start()))
         point = problem.start()
         problem.hold_clocks(True)
@@ -261,6 +276,16 @@ class Stages:
         self.refuse_divergence(rough)
         problem.hold_clocks(False)
         return Stage(problem, rough, confidence(problem, rough))
+
+    def thin_out(self) -> None:
+        """Keep the segments of each trial in which the inputs change most, about `ENOUGH` of all."""
+        part = min(1.0, ENOUGH / sum(s.duration for s in self.segments))
+        kept = list[Segment]()
+        for g in range(len(self.used)):
+            own = [s for s in self.segments if s.index == g]
+            own.sort(key=lambda s: -float(np.ptp(s.force, axis=0).sum()))
+            kept += own[: math.ceil(part * len(own))] if np.any(own[0].force) else own
+        self.segments = kept
 
     def refuse_divergence(self, solution: FitSolution) -> None:
         """Raise a `CalibrationError` if the simulation has no finite answer."""
@@ -346,12 +371,18 @@ class Stages:
     def cut(self, length: float) -> None:
         """Cut the trials into segments of about a length [s]."""
         shown = {column for axis in self.axes for column in DETERMINED_BY[axis]}
+        aside = [
+            frozenset(
+                c for axis in ("surge", "sway", "yaw") if axis not in moved for c in DETERMINED_BY[axis]
+            )
+            for moved in self.excites
+        ]
         cut = [
             [
-                compared(s, one.motion, axes, free=bool(one.released))
-                for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP)
+                replace(compared(s, one.motion, axes, free=bool(one.released)), aside=own)
+                for s in segments(one, self.vehicle, length=length * self._part(one), step=STEP, changes=True)
             ]
-            for one, axes in zip(self.prepared, self.fitted, strict=True)
+            for one, axes, own in zip(self.prepared, self.fitted, aside, strict=True)
         ]
         kept = [[s for s in stretch if shown & set(s.measured)] for stretch in cut]
         self.length = length
@@ -361,9 +392,6 @@ class Stages:
             raise CalibrationError(
                 f"no interval of these trials has both inputs and measurements of {', '.join(self.axes)}"
             )
-        commanded = np.array([s.commanded for s in self.segments])
-        # If every input is stated to have acted, a request for a lag doubts that.
-        self.lagged = commanded if commanded.any() else np.ones_like(commanded)
 
     def _part(self, one: Streams) -> float:
         return self.shorter.get(one.trial.name, 1.0)
@@ -395,11 +423,13 @@ class Stages:
         The start has the units of the coordinates.
         """
         swinging = np.array([not other and bool(self.used[s.index].released) for s in other or self.segments])
+        # If every input is stated to have acted, a request for a lag doubts that.
+        acted = not any(s.commanded for s in self.segments)
         return Shooting(
             other or self.segments,
             self.parameters(kinds, start),
             sorted({c for s in self.segments for c in s.measured}),
-            lagged=None if other else self.lagged,
+            lagged=np.ones(len(self.segments), bool) if acted and not other else None,
             swinging=swinging,
             twisted=self.twisted,
             few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
