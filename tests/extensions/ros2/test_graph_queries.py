@@ -105,4 +105,5 @@ def test_who_has_left_is_neither_found_nor_kept(nodes):
         time.sleep(0.01)
     assert talker.get_publishers_info_by_topic("/fleeting") == []
     reader, known = talker.context.participant._builtin["publications"]
-    assert not reader.read(N=10_000) and len(known) < 20
+    assert not reader.read(N=10_000)
+    assert not [one for one in known.values() if "fleeting" in one.topic]  # other graphs have endpoints too
