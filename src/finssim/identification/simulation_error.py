@@ -59,6 +59,7 @@ from finssim.identification.plant_terms import matrices
 from finssim.identification.rollout import (
     Segment,
     Streams,
+    is_sampled,
     released,
     segments,
     streams,
@@ -189,10 +190,12 @@ class Stages:
         A surge, sway or yaw that a trial does not excite comes from couplings and disturbances. Where the centre of
         gravity is not free the model lacks these: compared, it would determine the added mass of other axes through
         their Coriolis moments. Where it is only noise it stays, for it keeps the initial state in place. So do heave,
-        roll and pitch: weight acts on them in every trial. With a free centre of gravity all stay: it shows in what a
-        push along one axis does to the others, and as an imposed motion their noise would shake roll and pitch.
+        roll and pitch: weight acts on them in every trial. In slow logs with a free centre of gravity all stay: it
+        shows in what a push along one axis does to the others, and as an imposed motion their noise would shake roll
+        and pitch. A fast log averages that noise, and what its thrusters do to other axes, being unequal, would be
+        taken for a bias.
         """
-        if self.extras & set(PLACES):
+        if self.extras & set(PLACES) and any(map(is_sampled, self.prepared)):
             return [list(self.axes) for _ in self.prepared]
         out, nowhere = list[list[str]](), set(self.axes).difference(*self.excites)
         for one, moved in zip(self.prepared, self.excites, strict=True):
