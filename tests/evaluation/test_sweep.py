@@ -1,5 +1,6 @@
 """`finssim sweep`: results of every job, from one machine or from two of which one is lost."""
 
+import asyncio
 import contextlib
 import json
 import threading
@@ -176,9 +177,11 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
     ended = threading.Event()
 
     class WatchedCheckpoints(Checkpoints):  # a class of this function is sent to Ray with its code
-        def store(self, number, files):
+        async def store(self, number, files):
             super().store(number, files)
             (tmp_path / str(number)).touch()
+            while not (tmp_path / "killed").exists():  # neither ends before the other has begun
+                await asyncio.sleep(0.05)
 
     monkeypatch.setattr(campaign, "Checkpoints", WatchedCheckpoints)
 
@@ -186,6 +189,7 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
         while len(list(tmp_path.glob("[01]"))) < 2 and not ended.wait(0.05):
             pass
         cluster.remove_node(second, allow_graceful=False)
+        (tmp_path / "killed").touch()
 
     killer = threading.Thread(target=kill_when_both_have_begun)
     killer.start()
@@ -200,6 +204,16 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
     assert sorted(map(len, resumed)) == [0, 1]
     (steps,) = max(resumed, key=len)
     assert 0 < steps < 8 * 4096 and steps % (2 * 4096) == 0
+
+
+def test_an_interrupted_training_of_several_processes_begins_anew(tmp_path, monkeypatch):
+    """Its checkpoints hold the state of the first process alone, and `train` refuses to resume it."""
+    called = []
+    monkeypatch.setattr(transfer, "train", lambda *_, resume=False, **__: called.append(resume))
+    (tmp_path / "run-training").mkdir()
+    settings = TrainingSettings(worlds=16, processes=2)
+    assert list(transfer.train_policies({tmp_path / "run": ("t1", settings)}))[0][1] is None
+    assert called == [False]
 
 
 @pytest.mark.slow

@@ -262,28 +262,6 @@ class Checkpoints:
         return self._files.get(number, {})
 
 
-@dataclass(frozen=True)
-class OwnCheckpoint:
-    """Checkpoint of one piece of work on a cluster."""
-
-    number: int
-    actor: Any
-    """A `Checkpoints` as an actor of Ray."""
-
-    def store(self, files: Mapping[str, bytes]) -> None:
-        """Replace the checkpoint: its files by name."""
-        import ray
-
-        ray.get(self.actor.store.remote(self.number, dict(files)))
-
-    def load(self) -> dict[str, bytes]:
-        """Return the files of the newest checkpoint, by name; none if there is no checkpoint."""
-        import ray
-
-        files: dict[str, bytes] = ray.get(self.actor.load.remote(self.number))
-        return files
-
-
 def spread(
     work: Callable[..., Any],
     items: Sequence[Any],
@@ -303,7 +281,8 @@ def spread(
         items: What it is called with, each by itself.
         processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
         address: HOST:PORT of a Ray cluster on which it is done instead, or auto.
-        resumable: Whether on a cluster the work is called with an item and an `OwnCheckpoint`, from which it resumes.
+        resumable: Whether on a cluster the work is called with an item, the files of its newest checkpoint by name,
+            none at first, and a function that stores such files.
         more: Called in this process while others do the work, and returns further items.
 
     Yields:
@@ -390,12 +369,11 @@ def _on_cluster(
         raise ClusterError(f"no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
     try:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
-        extra: list[tuple[Any, ...]] = [()] * len(items)
+        actor = None
         if resumable:
             here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
             actor = ray.remote(num_cpus=0)(Checkpoints).options(scheduling_strategy=here).remote()
-            extra = [(OwnCheckpoint(number, actor),) for number in range(len(items))]
-        waiting = {task.remote(work, item, *more): item for item, more in zip(items, extra, strict=True)}
+        waiting = {task.remote(work, item, number, actor): item for number, item in enumerate(items)}
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             outcome: Future[Any] = Future()
@@ -410,9 +388,23 @@ def _on_cluster(
         ray.shutdown()
 
 
-def _call(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Call the work in a worker: Ray takes plain functions alone."""
-    return work(*arguments)
+def _call(work: Callable[..., Any], item: Any, number: int, checkpoints: Any) -> Any:
+    """Call the work in a worker: Ray takes plain functions alone.
+
+    Args:
+        work: What is called.
+        item: What it is called with.
+        number: Number of this piece of work.
+        checkpoints: Actor that keeps a checkpoint of each; None for work that does not resume.
+    """
+    if checkpoints is None:
+        return work(item)
+    import ray
+
+    def store(files: dict[str, bytes]) -> None:
+        ray.get(checkpoints.store.remote(number, files))
+
+    return work(item, ray.get(checkpoints.load.remote(number)), store)
 
 
 def _knock(address: str) -> None:

@@ -22,7 +22,7 @@ from finssim.control.policy import DESCRIPTION_FILE, Policy, PolicyError
 from finssim.control.trajectories import TRAJECTORIES
 from finssim.core.files import atomic_directory, contents, plain_name
 from finssim.core.provenance import provenance
-from finssim.evaluation.campaign import OwnCheckpoint, Progress, Show, check_choices, spread, write_json
+from finssim.evaluation.campaign import Progress, Show, check_choices, spread, write_json
 from finssim.evaluation.evaluate import T1_COLUMNS
 from finssim.evaluation.figures import ENVELOPE, TRACKS, draw_envelopes, draw_tracking, save_figure
 from finssim.evaluation.metrics import T1_SETPOINTS, paper_row, paper_t2_row
@@ -394,23 +394,34 @@ def _train_here(planned: Planned) -> None:
     shutil.rmtree(training_folder(policy), ignore_errors=True)
 
 
-def _train_away(planned: Planned, checkpoint: OwnCheckpoint) -> dict[str, bytes]:
-    """Train on whatever machine; return the files of the policy directory by name."""
+def _train_away(
+    planned: Planned, checkpoint: Mapping[str, bytes], store: Callable[[dict[str, bytes]], None]
+) -> dict[str, bytes]:
+    """Train on whatever machine; return the files of the policy directory by name.
+
+    Args:
+        planned: The training.
+        checkpoint: Files of the checkpoint from which it resumes, by name; none at first.
+        store: Stores the files of a checkpoint.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "policy"
-        if files := checkpoint.load():
+        if checkpoint:
             earlier = training_folder(out) / "checkpoint-0"
             earlier.mkdir(parents=True)
-            for name, content in files.items():
+            for name, content in checkpoint.items():
                 (earlier / plain_name(name, "file of a checkpoint", PolicyError)).write_bytes(content)
-        _train(planned, out, saved=lambda path: checkpoint.store(contents(path)))
+        _train(planned, out, saved=lambda path: store(contents(path)))
         return contents(out)
 
 
 def _train(planned: Planned, out: Path, **options: Any) -> None:
-    """Train a policy into a directory, from the last checkpoint beside it if that is of the same training."""
+    """Train a policy into a directory, from the last checkpoint beside it if that is of the same training.
+
+    A training of several processes begins anew: its checkpoints do not hold the state of all.
+    """
     console = Console(stderr=True, quiet=True)
-    if training_folder(out).is_dir():
+    if planned[1][1].processes == 1 and training_folder(out).is_dir():
         try:
             train(*planned[1], out=out, resume=True, console=console, **options)
             return
