@@ -63,11 +63,9 @@ class Group:
 
     def seed(self, seed: int) -> int:
         """Return the seed of this process's worlds and action noise: the training's own in the first process."""
-        return (
-            seed
-            if self.rank == 0
-            else int(np.random.SeedSequence([seed, self.rank]).generate_state(1)[0] >> 1)
-        )
+        if self.rank == 0:
+            return seed
+        return int(np.random.SeedSequence([seed, self.rank]).generate_state(1)[0] >> 1)
 
     def close(self) -> None:
         """Leave the group."""

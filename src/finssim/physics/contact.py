@@ -116,9 +116,8 @@ def corner_wrench(
 def corners_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
     """`contact_wrench` of a box that touches something, body frame [N, N m]; arguments in the same frames and units."""
     tau = vec6()
-    corners = int(
-        CORNERS
-    )  # a variable, so that the loop is not unrolled: contact is rare, its code need not be near
+    # A variable, so that the loop is not unrolled: contact is rare, its code need not be near.
+    corners = int(CORNERS)
     for i in range(corners):
         tau += corner_wrench(i, walls, position, q, nu, half_size)
     return tau

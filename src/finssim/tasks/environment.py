@@ -57,6 +57,14 @@ class Step:
     """Last observation of the episodes that ended in this step; older rows elsewhere."""
 
 
+@wp.func
+def component(arrays: TaskArrays, w: int, v: int, k: int, agents: int, size: int) -> float:
+    """Return component k of an agent's own action, or of the task's action for one of the other vehicles."""
+    if v < agents:
+        return arrays.action[w, v * size + k]
+    return arrays.scripted[w, (v - agents) * size + k]
+
+
 @wp.kernel(enable_backward=False)
 def act(
     arrays: TaskArrays,
@@ -65,16 +73,12 @@ def act(
     agents: int,
     world_offset: int,
 ):
-    """Write the thrusts of every vehicle: of an agent's own action, or of the task's action for one of the others."""
+    """Write the thrusts of every vehicle."""
     i, v = wp.tid()
     w = world_offset + i
-    size = data.columns.shape[1]
     a = vec8()
-    for k in range(size):
-        if v < agents:
-            a[k] = arrays.action[w, v * size + k]
-        else:
-            a[k] = arrays.scripted[w, (v - agents) * size + k]
+    for k in range(data.columns.shape[1]):
+        a[k] = component(arrays, w, v, k, agents, data.columns.shape[1])
     command[w, v].thrust = thrusts_of(a, v, data)
 
 
@@ -89,14 +93,9 @@ def act_by_shares(
     """`act` for modes whose components are shares of the thrusters' limits: the same, in less code."""
     i, v = wp.tid()
     w = world_offset + i
-    size = data.columns.shape[1]
     x = vec8()
-    for k in range(size):
-        part = float(0.0)
-        if v < agents:
-            part = arrays.action[w, v * size + k]
-        else:
-            part = arrays.scripted[w, (v - agents) * size + k]
+    for k in range(data.columns.shape[1]):
+        part = component(arrays, w, v, k, agents, data.columns.shape[1])
         x += wp.clamp(part, -1.0, 1.0) * data.columns[v, k]
     command[w, v].thrust = thrusts_of_shares(x, data.lower[v], data.upper[v])
 
