@@ -206,7 +206,7 @@ class Simulator:
         features = Features(
             self.hydrodynamics,
             self.integrator,
-            water_moving=bool(self.water.moving),
+            water_moving=general or bool(self.water.moving),
             walls=walls,
             tether=general or self.surroundings[2] is not None,
             speed_lag=general or bool(self.plant.speed_lag.numpy().any()),
