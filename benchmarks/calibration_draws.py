@@ -1,6 +1,6 @@
 """Calibration of drawn plants from logs as people have them: is it better than the catalogue's file, and honest?
 
-    python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE] [--passive]
+    python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE] [--passive] [--unequal 0.05]
 
 Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
 pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
@@ -10,7 +10,8 @@ pitch. Fitted on the lowest level, compared on two higher ones; intervals agains
 these trials no better than its tether, noise and clock allow; a file that does as well by chance leaves nothing to
 gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated. With
 --passive, five spins and five coasts of every draw instead, let go without thrust: measured at 20, 5 or 1 Hz, pulled
-at a little, with centres as in the file and the inertia given.
+at a little, with centres as in the file and the inertia given. With --unequal, the thrust of every thruster is
+multiplied by a number of its own, 1 with that standard deviation.
 """
 
 from __future__ import annotations
@@ -107,8 +108,13 @@ def logged(trial: Trial, lead: float, tilt: bool) -> Trial:
     return replace(trial, t=trial.t[rows] - trial.t[rows[0]], channels=channels, phase=None, header=header)
 
 
-def draw(seed: int) -> dict[str, object]:
-    """One plant: scores of both files by axis, and each interval with its truth."""
+def draw(seed: int, unequal: float = 0.0) -> dict[str, object]:
+    """One plant: scores of both files by axis, and each interval with its truth.
+
+    Args:
+        seed: Of the plant, its trials and its noise.
+        unequal: Standard deviation of the thrusts of single thrusters, as a part of their own [-].
+    """
     rng = np.random.default_rng([7, seed])
     vehicle = load_vehicle("bluerov2_heavy")
     plant, scale, tether = drawn(vehicle, rng)
@@ -118,7 +124,8 @@ def draw(seed: int) -> dict[str, object]:
         for axis in FITTED
         for level in LEVELS
     ]
-    recording = record(programmes, plant, seed=seed, plant={"gain": scale}, disturbance=tether)
+    gains = scale * (1.0 + unequal * np.random.default_rng([9, seed]).standard_normal(len(plant.thrusters)))
+    recording = record(programmes, plant, seed=seed, plant={"gain": gains}, disturbance=tether)
     trials = trials_of(
         recording, programmes, plant, noise=NOISE, seed=seed, rate=RATE, inputs=("pwm",),
         columns=("u", "v", "w", "p", "q", "r", "x", "y", "z", "qx", "qy", "qz", "qw"),
@@ -130,11 +137,11 @@ def draw(seed: int) -> dict[str, object]:
     spent = time.process_time() - begin
     after = calibrated(fit)
     held = [t for t in trials if not t.name.endswith(low)]
-    true = plant.replace(scaled_thrust(plant, scale))
+    true = plant.replace(scaled_thrust(plant, 1.0, gains.tolist()))
     bodies = {"file": vehicle, "calibrated": after, "truth": true}
     scores = {name: _by_axis(body, held) for name, body in bodies.items()}
     chosen = plant.hydrodynamics["calibrated"]
-    truth: dict[str, float] = {"thrust_scale": scale}
+    truth: dict[str, float] = {"thrust_scale": float(gains.mean())}
     rigid = np.diag(plant.rigid_body_mass_matrix())
     for axis in AXES:
         i = AXES.index(axis)
@@ -147,6 +154,7 @@ def draw(seed: int) -> dict[str, object]:
     k = plant.buoyancy * body.center_of_buoyancy[2] - plant.weight * body.center_of_gravity[2]
     truth |= {"roll.k": k, "pitch.k": k, "thruster_height": horizontal(plant)[0][1].position[2]}
     truth |= {f"gravity_{c}": float(x) for c, x in zip("xyz", body.center_of_gravity, strict=True)}
+    truth |= {f"gain.{n}": float(g / gains.mean()) for n, g in zip(plant.thrusters, gains, strict=True)}
     truth["buoyancy_excess"] = plant.buoyancy - plant.weight + float(tether[2])
     found = {
         name: [fit.estimates[name].estimate, *fit.estimates[name].ci95, value]
@@ -240,6 +248,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--passive", action="store_true")
+    parser.add_argument("--unequal", type=float, default=0.0)
     args = parser.parse_args()
     rows: list[dict[str, object]] = []
     if args.json and args.json.exists():
@@ -249,7 +258,7 @@ def main() -> None:
         if seed in done:
             continue
         begin = time.perf_counter()
-        rows.append((draw_released if args.passive else draw)(seed))
+        rows.append(draw_released(seed) if args.passive else draw(seed, args.unequal))
         scores = rows[-1].get("scores")
         shown = rows[-1].get("written") if scores is None else {
             a: f"{scores['calibrated'][a]:.3f} < {v:.3f}" for a, v in scores["file"].items()

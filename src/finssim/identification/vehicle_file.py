@@ -445,11 +445,12 @@ SCALED = ("c_plus", "c_minus", "force_min", "force_max")
 """Numbers of a thruster that `thrust_scale` multiplies."""
 
 
-def scaled_thrust(vehicle: Vehicle, scale: float) -> dict[str, float]:
-    """Changes of the vehicle file that multiply every thrust by a scale [-]."""
+def scaled_thrust(vehicle: Vehicle, scale: float, gains: Sequence[float] = ()) -> dict[str, float]:
+    """Changes of the vehicle file that multiply every thrust by a scale, and by a gain of its thruster if given [-]."""
+    gains = gains or [1.0] * len(vehicle.thrusters)
     return {
-        f"thrusters.{name}.{key}": scale * float(getattr(thruster, key))
-        for name, thruster in vehicle.thrusters.items()
+        f"thrusters.{name}.{key}": scale * gain * float(getattr(thruster, key))
+        for (name, thruster), gain in zip(vehicle.thrusters.items(), gains, strict=True)
         for key in SCALED
     }
 
