@@ -17,7 +17,7 @@ from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
-from finssim.vehicles import load_vehicle
+from finssim.vehicles import AXES, load_vehicle
 
 DATA = Path(__file__).parents[1] / "data" / "standins"
 DOCS = Path(__file__).parents[2] / "docs" / "reference" / "trial_format.md"
@@ -246,3 +246,29 @@ def test_a_replay_allows_for_two_clocks(lead):
     result = replay([moved], vehicle)
     assert result.pairs[0].late.get("calibrated", 0.0) == pytest.approx(-lead, abs=0.011)
     assert result.scores["calibrated"][0]["yaw"].value < 0.03
+
+
+@pytest.mark.slow
+def test_unequal_thrusters_are_found_in_a_slow_log():
+    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1 %, and in the file."""
+    vehicle, axes = load_vehicle("bluerov2_heavy"), ("surge", "sway", "heave", "yaw")
+    gains = np.array([1.06, 0.95, 1.0, 0.97, 1.03, 0.98, 1.05, 0.96])
+    levels = {a: [part * vehicle.wrench_limits[AXES.index(a)] for part in (0.12, 0.25)] for a in axes}
+    plan = [p for p in programmes(axes, vehicle, levels=levels) if "dive" not in p.name]
+    trials = simulate_programme(
+        plan, vehicle, seed=3, plant={"gain": gains}, rate=5.0, inputs=("pwm",),
+        columns=("u", "v", "w", "p", "q", "r", "qx", "qy", "qz", "qw"),
+    )  # fmt: skip
+    told = {"axis": (), "description": "", "voltage": 16.0}
+    fit = fit_hydrodynamics([replace(t, header=t.header.model_copy(update=told)) for t in trials], vehicle)
+    assert "thrust_scale" not in fit.estimates
+    after = calibrated(fit)
+    for (name, thruster), gain in zip(vehicle.thrusters.items(), gains, strict=True):
+        found = fit.estimates[f"gain.{name}"]
+        assert found.ci95[0] < gain < found.ci95[1] < found.ci95[0] + 0.03 and found.identifiable
+        assert after.thrusters[name].c_plus == pytest.approx(found.estimate * thruster.c_plus, rel=1e-6)
+    true = vehicle.hydrodynamic_set("calibrated")
+    assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == pytest.approx(
+        true.quadratic_damping[5, 5], rel=0.02
+    )
+    assert max(after.body.center_of_gravity[i] - vehicle.body.center_of_gravity[i] for i in range(3)) < 0.002

@@ -112,3 +112,21 @@ def test_a_set_without_coefficients_is_refused():
     bare = VEHICLES["finsrov"].model_copy(update={"hydrodynamics": {"calibrated": sets["mesh"]}})
     with pytest.raises(CalibrationError, match="no coefficients in hydrodynamics.calibrated"):
         Parameters(bare, axes=("surge",), damping={"surge": "both"})
+
+
+def test_gains_of_thrusters_average_to_one_and_scale_their_columns():
+    """Each gain is that of its thruster, 5 % from 1 beforehand; a common factor of all is left to `thrust_scale`."""
+    p = made("bluerov2_heavy", ("surge", "yaw"), ("thrust_scale", "thruster_gains"))
+    x = p.expected.copy()
+    x[p.names.index("gain.T3")], x[p.names.index("thrust_scale")] = 0.9, 0.7
+    plants = p.plants(x)
+    np.testing.assert_allclose(plants.gains, [[1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(plants.fields["gain"], 0.7)
+    assert {c.std for c in p.coordinates if c.name.startswith("gain.")} == {0.05}
+    rows, target = p.prior_rows()
+    assert rows @ p.expected == pytest.approx(target)
+    common = np.where([name.startswith("gain.") for name in p.names], 1.01, p.expected)
+    assert rows @ common - target == pytest.approx([10.0])
+    assert (
+        made("bluerov2_heavy", ("surge",)).plants(made("bluerov2_heavy", ("surge",)).expected).gains is None
+    )

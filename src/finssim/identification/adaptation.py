@@ -100,7 +100,7 @@ class _Coordinates:
         self.scale = np.full(n, COARSE_STEP)
         self.coordinates = [Coordinate(name, "-", 0.0, -FAR, FAR, COARSE_STEP, 1.0) for name in of.names]
 
-    def published_rows(self) -> tuple[Array, Array]:
+    def prior_rows(self) -> tuple[Array, Array]:
         """Return no rows (0, P) and no targets (0,): nothing else is known of the vehicle."""
         return np.zeros((0, len(self.names))), np.zeros(0)
 

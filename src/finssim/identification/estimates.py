@@ -13,6 +13,7 @@ from finssim.identification.confidence import Confidence, Stage
 from finssim.identification.fit import Estimate
 from finssim.identification.parameters import (
     DETERMINED,
+    GAIN_STD,
     PLACES,
     Parameters,
     horizontal,
@@ -258,6 +259,9 @@ LEVER = 1.0
 difference of large accelerations."""
 
 
+NO_BETTER = "the trials determine it no better than the vehicle file"
+
+
 def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
     """Every coordinate with its 95 % interval, by name.
 
@@ -313,7 +317,7 @@ def other_estimates(
 ) -> tuple[dict[str, Estimate], list[Finding]]:
     """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
     out, bounds = dict[str, Estimate](), list[Finding]()
-    reported = {*PATHS, *PLACES, *p.terms, *p.actuators}
+    reported = {*PATHS, *PLACES, *p.terms, *p.actuators, *p.gains}
     paths = PATHS | places(p.vehicle)
     units = {c.name: c.unit for c in p.coordinates if c.name in reported}
     for name, unit in units.items():
@@ -327,11 +331,13 @@ def other_estimates(
             bounds.append(finding("at_bound", name, free=free, unit=unit))
         elif not np.isfinite(half):
             note = "the trials do not determine it"
+        elif name in p.gains:
+            note = NO_BETTER if half / 1.96 > DETERMINED * GAIN_STD else ""
         elif name in PLACES:
             coordinate = p.coordinates[p.names.index(name)]
             known, std = half / 1.96, float(coordinate.std or np.inf)
             if known > DETERMINED * std:
-                note = "the trials determine it no better than the vehicle file"
+                note = NO_BETTER
             else:  # what the trials alone say, without the file
                 variance = 1.0 / (known**-2.0 - std**-2.0)
                 alone = variance * (value / known**2.0 - coordinate.start / std**2.0)
@@ -410,8 +416,9 @@ def changes(
     for name in p.actuators:
         if found[name].identifiable:
             out |= scaled_actuators(p.vehicle, name, found[name].estimate)
-    if "thrust_scale" in found and (found["thrust_scale"].identifiable or p.likely) and scaled:
-        out |= scaled_thrust(p.vehicle, found["thrust_scale"].estimate)
+    scale, gains = found.get("thrust_scale"), [found[name].estimate for name in p.gains]
+    if scaled and (bool(gains) if scale is None else scale.identifiable or p.likely):
+        out |= scaled_thrust(p.vehicle, scale.estimate if scale else 1.0, gains)
     return out
 
 

@@ -30,7 +30,7 @@ class Estimate:
 
     name: str
     """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`,
-    `thrust_scale`, `thrust_lag`, `thrust_delay`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`,
+    `thrust_scale`, `thrust_lag`, `thrust_delay`, `gain.T1`, `CC.c_plus`, ...; coupled terms `added_mass.surge.pitch`,
     `d1.sway.yaw`."""
     estimate: float
     """Value in `unit`."""

@@ -153,7 +153,10 @@ def _file_kept(fit: Fit, axis: str) -> Fit:
         if not any(path.startswith(f"{SET}.{name}.{i}.") for name in own)
         and not (axis == "heave" and path == "body.displaced_volume")
     }
-    if f"thrusters.{next(iter(fit.before.thrusters))}.c_plus" in fit.changes:
+    if (
+        f"thrusters.{next(iter(fit.before.thrusters))}.c_plus" in fit.changes
+        and "thrust_scale" in fit.estimates
+    ):
         scale, rigid = fit.estimates["thrust_scale"].estimate, float(plant.M_RB[i, i])
         for name, matrix in own.items():
             value = scale * float(matrix[i, i]) + (scale - 1.0) * rigid * (name == "added_mass")

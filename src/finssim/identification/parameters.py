@@ -71,6 +71,8 @@ class Plants:
     """[s], (W,)"""
     lower: Array | None = None
     """Heights of the horizontal thrusters above those of the file [m], (W,)."""
+    gains: Array | None = None
+    """Thrust of each thruster over the vehicle file's, times the scale of all [-], (W, MAX_THRUSTERS)."""
 
 
 def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
@@ -136,6 +138,10 @@ the logarithm of an effective moment of inertia: published sets of one vehicle d
 
 PLACE_STD = {"measured": 0.005, "derived": 0.03, "published": 0.03, "guessed": 0.05}
 """Standard deviation of a height or centre of the vehicle file by its origin [m]."""
+
+GAINS, GAIN_STD, COMMON_STD = "thruster_gains", 0.05, 1e-3
+"""Word for the thrusts of single thrusters over the file's, each a coordinate `gain.NAME`; their standard deviation;
+and that of their mean, for what they have in common is the scale of thrust."""
 
 DETERMINED = 0.8
 """Standard deviation of a place, as a part of that of its prior, up to which it goes to the vehicle file."""
@@ -208,7 +214,8 @@ class Parameters:
             vehicle: Gives the start and everything that is not free.
             axes: Whose added mass and damping are free.
             damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
-            extras: Of `EXTRAS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its actuators.
+            extras: Of `EXTRAS`, `GAINS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its
+                actuators.
             biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
                 M nu_dot + D nu + b = tau.
             start: Coordinate -> where it starts, in its unit, in place of the vehicle file's number.
@@ -233,6 +240,7 @@ class Parameters:
         self.likely, self.published = likely, dict(published or {})
         self.terms = tuple(path for path in self.set.term_scalars if path in extras)
         self.actuators = {name: fields for name, fields in actuator_fields(vehicle).items() if name in extras}
+        self.gains = tuple(f"gain.{name}" for name in vehicle.thrusters if GAINS in extras)
         self.biases = tuple(a for a in AXES if a in biases)
         self.r_h = np.asarray(self.set.reference_point, float)
         self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
@@ -292,6 +300,7 @@ class Parameters:
         out += [Coordinate(name, *numbers) for name, numbers in table.items() if name in self.extras]
         out += [term_coordinate(self.set, w, path) for path in self.terms]
         out += [Coordinate(name, "-", 1.0, 0.02, 50.0, 1.0) for name in self.actuators]
+        out += [Coordinate(name, "-", 1.0, 0.0, 2.0, 1.0, GAIN_STD) for name in self.gains]
         out += [self._of_axis(axis, "bias", -inf) for axis in self.biases]
         for axis in self.imposed:
             i = AXES.index(axis)
@@ -315,10 +324,11 @@ class Parameters:
             std = max(ADDED_MASS_STD * float(own[i, i]), RIGID_STD * rigid) / m if i < 3 else INERTIA_STD
         return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size, std, rigid)
 
-    def published_rows(self) -> tuple[Array, Array]:
-        """Return rows (R, P) and targets (R,) of what is published of the vehicle, each over its standard deviation.
+    def prior_rows(self) -> tuple[Array, Array]:
+        """Return rows (R, P) and targets (R,) of what is known of sums of coordinates, over the standard deviations.
 
-        Drag at the top speed equals the largest thrust, and so does a bollard pull; scale 1 where it is not free.
+        Drag at the top speed equals the largest thrust, and so does a bollard pull; scale 1 where it is not free. The
+        mean of the gains of single thrusters is 1.
         """
         largest = float(self.vehicle.wrench_limits[0]) if self.published else 1.0
         rows, target = np.zeros((len(self.published), len(self.names))), np.zeros(len(self.published))
@@ -331,7 +341,11 @@ class Parameters:
             else:
                 target[k] = -value
             row[[] if scale is None else scale] = -largest
-        return rows / (PUBLISHED_STD * largest), target / (PUBLISHED_STD * largest)
+        rows, target = rows / (PUBLISHED_STD * largest), target / (PUBLISHED_STD * largest)
+        if self.gains:
+            mean = np.isin(self.names, self.gains) / len(self.gains)
+            rows, target = np.vstack([rows, mean / COMMON_STD]), np.append(target, 1.0 / COMMON_STD)
+        return rows, target
 
     @property
     def nuisances(self) -> int:
@@ -434,6 +448,9 @@ class Parameters:
             gain = np.repeat(self.value(x, "thrust_scale")[:, None, None], MAX_THRUSTERS, axis=-1)
             gain[..., n : n + others] = 1.0
             fields["gain"] = gain
+        gains = np.ones((W, MAX_THRUSTERS))
+        for j, name in enumerate(self.gains):
+            gains[:, j] = self.value(x, name)
         bias = np.zeros((W, 1, 6))
         for axis in self.biases:
             bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
@@ -443,4 +460,5 @@ class Parameters:
             lag=self.value(x, "thrust_lag"),
             delay=self.value(x, "thrust_delay"),
             lower=None if (z := self.value(x, PLACES[0])) is None else z - self.expected[self._at[PLACES[0]]],
+            gains=gains if self.gains else None,
         )

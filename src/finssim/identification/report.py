@@ -326,7 +326,8 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
 
     `unsure`: written, though the data tell it together with another, as a part of the drag, and not alone.
     """
-    if estimate.name == "thrust_scale" and any(path.startswith("thrusters.") for path in fit.changes):
+    scales = estimate.name == "thrust_scale" or estimate.name.startswith("gain.")
+    if scales and any(path.endswith(".c_plus") for path in fit.changes):
         return "written"
     if estimate.path is None:
         return "" if estimate.identifiable else "not told"

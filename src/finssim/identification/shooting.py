@@ -593,6 +593,7 @@ class Shooting:
         # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
         vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
         by_thruster, sideways = np.array([s.thrusters for s in segments]), horizontal(vehicle)
+        self._by_thruster = by_thruster[:, None, None]
         for j, (name, thruster) in enumerate(vehicle.thrusters.items()):
             if name in sideways:
                 self._leverage[by_thruster, 3, j] = -thruster.axis[1]
@@ -627,7 +628,7 @@ class Shooting:
         self.first_noise = np.maximum(noise, self._floor)
         self._latest: tuple[Point, Linearization, bool] | None = None
         self.repeats, self._correlated = 1.0, correlated
-        rows, target = parameters.published_rows()
+        rows, target = parameters.prior_rows()
         P, clock = len(parameters.names), np.linalg.inv(np.linalg.cholesky(clocks))
         self._rows = np.zeros((len(rows) + len(far), P + len(far)))
         self._rows[: len(rows), :P], self._rows[len(rows) :, P:] = rows, clock
@@ -685,6 +686,9 @@ class Shooting:
                 fields[name] = np.where(mask, values.reshape(-1, 1, *tail), own[name])
         if p.lower is not None:
             fields["B"] = own["B"] + p.lower[:, None, None, None] * self._leverage
+        if p.gains is not None:
+            gains = np.where(self._by_thruster, p.gains[:, None, None], 1.0)
+            fields["B"] = fields.get("B", own["B"]) * gains
         full = np.zeros((*points.z.shape[:2], 18 + int(self.rollouts.changes.max())))
         full[..., self.free] = points.z[..., : len(self.free)]
         nu, quaternion, position = (

@@ -49,8 +49,8 @@ from finssim.identification.judgement import fit_findings, held_out, pictures, q
 from finssim.identification.next_dive import next_dive
 from finssim.identification.parameters import (
     EXTRAS,
+    GAINS,
     LIKELY_SCALE,
-    PLACES,
     Parameters,
     actuator_fields,
     places,
@@ -160,9 +160,13 @@ class Stages:
         self.held, self.notes = self._assumed(swinging)
         if any(a not in self.free or a in self.held for a in swinging):
             self.extras.add("k")
+        self.slow = False
         driven = {a for a in swinging if a not in self.free and a not in self.held}
         if driven and any(s.drive.thrusters for s in prepared):
             self.extras |= set(places(vehicle))
+            # Unequal thrusters show in what a push along one axis does to all others.
+            self.slow = any(map(is_sampled, prepared))
+            self.extras |= {GAINS} if self.slow and not self.imposed else set()
         self.fitted = self._fitted_axes()
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
         self.remarks: list[Finding] = []
@@ -195,7 +199,7 @@ class Stages:
         and pitch. A fast log averages that noise, and what its thrusters do to other axes, being unequal, would be
         taken for a bias.
         """
-        if self.extras & set(PLACES) and any(map(is_sampled, self.prepared)):
+        if self.slow:
             return [list(self.axes) for _ in self.prepared]
         out, nowhere = list[list[str]](), set(self.axes).difference(*self.excites)
         for one, moved in zip(self.prepared, self.excites, strict=True):
