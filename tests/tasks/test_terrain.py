@@ -10,11 +10,13 @@ from finssim.core.rotations import quat_from_euler, quat_rotate
 from finssim.sim import Water
 from finssim.tasks import make
 from finssim.tasks.terrain import TerrainFollowing
+from finssim.vehicles.device_files import load_device
 from reference.tails import tailed
 
 VEHICLE = tailed("cruciform")
 AHEAD_BEAM = math.radians(30.0)
-UNDER = VEHICLE.perception["altimeter"].position
+BARE = VEHICLE.model_copy(update={"perception": {}})
+"""Whose altimeters are single rays from the body origin."""
 
 
 def heights(seabed, floor, x, y):
@@ -35,28 +37,42 @@ def seen(env, position, q):
     return 5.0 * env.task.fit.size * o[:2], at, turned
 
 
-def test_beams_over_a_flat_seabed_in_closed_form():
-    """Height over the cosine of the beam's angle from the vertical, which a pitch with the bow up opens."""
-    env = make("terrain", worlds=1, vehicle=VEHICLE, seed=1, auto_reset=False)
+def echo(beta, height):
+    """Range at which a tenth of the echo of a Ping's pattern from a plane has come, by quadrature [m]."""
+    width = load_device("ping").beam_width
+    u, v = np.meshgrid(*[np.linspace(-width, width, 401)] * 2)
+    angle = np.hypot(u, v)
+    facing = np.cos(angle) * math.cos(beta) + np.sin(angle) * math.sin(beta) * u / np.maximum(angle, 1e-12)
+    share = np.exp(-8.0 * math.log(2.0) * (angle / width) ** 2) * facing**3 * (angle <= width)
+    order = np.argsort(-facing, axis=None)
+    sums = np.cumsum(share.ravel()[order])
+    return height / facing.ravel()[order][np.searchsorted(sums, 0.1 * sums[-1])]
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.2, -0.15, 1.0), (0.0, -0.4, 2.0)])
+@pytest.mark.parametrize(
+    ("vehicle", "range_of", "tolerance"),
+    [(BARE, lambda beta, height: height / math.cos(beta), 2e-3), (VEHICLE, echo, 5e-3)],
+    ids=["rays", "ping"],
+)
+def test_beams_over_a_flat_seabed(vehicle, range_of, tolerance, pose):
+    """Of rays the height over the cosine of the angle from the vertical, which a bow up opens; of beams less."""
+    env = make("terrain", worlds=1, vehicle=vehicle, seed=1, auto_reset=False)
     env.arrays.seabed.zero_()
     floor = env.task.fit.size * env.task.floor
-    ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(0.0, 0.0, 0.0))
-    height = at[2] + quat_rotate(q, UNDER)[2] - floor
-    assert ranges == pytest.approx([height, height / math.cos(AHEAD_BEAM)], rel=1e-3)
-    ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(0.2, -0.15, 1.0))
-    height = at[2] + quat_rotate(q, UNDER)[2] - floor
+    ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(*pose))
+    height = at[2] + quat_rotate(q, env.task.below.position)[2] - floor
     down = [2 * (q[0] * q[2] - q[3] * q[1]), 1 - 2 * (q[0] ** 2 + q[1] ** 2)]  # z of the body's x and z axes
     cosines = [down[1], math.cos(AHEAD_BEAM) * down[1] - math.sin(AHEAD_BEAM) * down[0]]
-    assert ranges == pytest.approx(height / np.array(cosines), rel=2e-3)
+    assert ranges == pytest.approx([range_of(math.acos(c), height) for c in cosines], rel=tolerance)
 
 
 def test_beams_end_on_the_seabed_that_is_drawn():
-    env = make("terrain", worlds=1, vehicle=VEHICLE, seed=4, auto_reset=False)
+    env = make("terrain", worlds=1, vehicle=BARE, seed=4, auto_reset=False)
     floor = env.task.fit.size * env.task.floor
     seabed = env.arrays.seabed.numpy()[0]
     for yaw in (0.0, 2.0, -1.0):
-        ranges, at, q = seen(env, [20.0, -5.0, floor + 7.0], quat_from_euler(0.0, 0.0, yaw))
-        at = at + quat_rotate(q, UNDER)
+        ranges, at, _ = seen(env, [20.0, -5.0, floor + 7.0], quat_from_euler(0.0, 0.0, yaw))
         for far, angle in zip(ranges, (0.0, AHEAD_BEAM), strict=True):
             x, y, z = (
                 at[0] + far * math.sin(angle) * math.cos(yaw),
@@ -99,3 +115,16 @@ def test_the_baseline_keeps_the_altitude(current):
         memory, observation = restarted(memory, player.reset(n), ended), step.observation
     assert found["success"].min() == 1.0 and found["grounded"].max() == 0.0
     assert found["error"].mean() < 0.35
+
+
+def test_the_baseline_takes_ranges_as_the_beams_of_training_give_them():
+    """Its closed form of the echo of a level seabed and the kernel's, on a pitched and rolled vehicle."""
+    env = make("terrain", worlds=1, vehicle=VEHICLE, seed=1, auto_reset=False)
+    env.arrays.seabed.zero_()
+    floor = env.task.fit.size * env.task.floor
+    for pose in ((0.05, 0.0, 0.0), (0.3, 0.2, 1.0), (-0.1, -0.5, 2.0)):
+        ranges, at, q = seen(env, [0, 0, floor + 6.0], quat_from_euler(*pose))
+        beam = env.task.below
+        height = at[2] + quat_rotate(q, beam.position)[2] - floor
+        beta = np.arccos(-quat_rotate(q, beam.direction)[2])
+        assert ranges[0] * math.cos(beam.echo_angle(beta)) == pytest.approx(height, rel=1e-3)

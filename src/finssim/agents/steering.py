@@ -99,8 +99,10 @@ class TerrainPilot:
         size = self.cruise.size
         line, velocity, up = o[:, 4:7], o[:, 7:10], o[:, 13:16]
         depth = 10.0 * size * o[:, 2]
-        point = np.asarray(self.beam.position) + 5.0 * size * o[:, :1] * np.asarray(self.beam.direction)
-        altitude = -(point * up).sum(axis=1)
+        # The height over a level seabed, of which a beam of some width hears more than the point on its axis.
+        beta = np.arccos(np.clip(-(up * self.beam.direction).sum(axis=1), -1.0, 1.0))
+        below = 5.0 * size * o[:, 0] * np.cos(self.beam.echo_angle(beta))
+        altitude = below - (up * self.beam.position).sum(axis=1)
         wanted, rate, seabed = self.follower.depth(memory[1], depth, altitude, self.period)
         slope = np.arcsin(np.clip(rate / self.cruise.speed, -1.0, 1.0))
         nothing = np.zeros(len(o))

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import NormalDist
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
@@ -64,8 +65,37 @@ def seabed_height(arrays: TaskArrays, p: Any, w: int, x: wp.vec3) -> float:
 
 
 @wp.func
+def seabed_normal(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec3:
+    """Return the unit normal of the seabed below or above a point, upwards, world frame [-]."""
+    slope = wp.vec3(0.0, 0.0, 1.0)
+    for i in range(arrays.seabed.shape[1]):
+        ripple = arrays.seabed[w, i]
+        course = wp.vec3(wp.cos(ripple[2]), wp.sin(ripple[2]), 0.0)
+        steepness = ripple[0] * ripple[1] * wp.cos(ripple[1] * wp.dot(x, course) + ripple[3])
+        slope -= steepness * course
+    return wp.normalize(slope)
+
+
+@wp.func
+def echo_angle(beta: float, beam: Any) -> float:
+    """Return the angle from a plane's normal at which a beam's echo is taken [rad], of a beam at an angle from it.
+
+    A plane returns from the angle ψ to its normal, at the range h / cos ψ, a share cos³ ψ exp(-u²/2σ²), u = β - ψ. To
+    first order that is a Gaussian of variance s² = σ² / (1 + 3σ²), nearer to the normal by 3s² tan ψ; across it, the
+    quantile q of the angle is at sqrt(-2s² ln(1 - q)) where the beam is along the normal.
+
+    Args:
+        beta: Angle of the beam's axis from the normal [rad].
+        beam: The beam.
+    """
+    aside = wp.max(beta - beam.lead, 0.0)
+    aside = wp.max(aside - 3.0 * beam.variance * wp.tan(wp.min(aside, 1.2)), 0.0)
+    return wp.sqrt(aside * aside + beam.least * beam.least)
+
+
+@wp.func
 def beam_range(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, direction: wp.vec3) -> float:
-    """Return the range of the seabed along a beam [m], by fixed-point steps.
+    """Return the range of the seabed along a ray [m], by fixed-point steps.
 
     Args:
         arrays: With the seabed.
@@ -86,7 +116,11 @@ def beam_range(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, direction: wp.vec
 def sounded(state: State, arrays: TaskArrays, p: Any, w: int, beam: Any) -> float:
     """Range that an altimeter measures [m]."""
     x, q = state.position[w, 0], state.quaternion[w, 0]
-    return beam_range(arrays, p, w, x + wp.quat_rotate(q, beam.position), wp.quat_rotate(q, beam.direction))
+    start, direction = x + wp.quat_rotate(q, beam.position), wp.quat_rotate(q, beam.direction)
+    far = beam_range(arrays, p, w, start, direction)
+    # Of a beam of some width, the part that meets the seabed more squarely is back earlier.
+    facing = wp.clamp(-wp.dot(seabed_normal(arrays, w, start + far * direction), direction), 0.1, 1.0)
+    return far * facing / wp.cos(echo_angle(wp.acos(facing), beam))
 
 
 @wp.func
@@ -182,12 +216,24 @@ OBSERVATION = (
 
 @dataclass(frozen=True)
 class Beam:
-    """Where the beam of an altimeter begins and where it points, body frame."""
+    """Where the beam of an altimeter begins, where it points, body frame, and how wide it is."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """[m]"""
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
     """Unit vector."""
+    lead: float = 0.0
+    """Angle towards the normal of a surface at which the echo is taken [rad], see `echo_angle`; 0 for a ray."""
+    least: float = 0.0
+    """The same where the beam is along the normal [rad]."""
+    variance: float = 0.0
+    """Of the echo over the angle [rad²]."""
+
+    def echo_angle(self, beta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `echo_angle` of this beam for angles of its axis from a plane's normal [rad], of the same shape."""
+        aside = np.maximum(beta - self.lead, 0.0)
+        aside = np.maximum(aside - 3.0 * self.variance * np.tan(np.minimum(aside, 1.2)), 0.0)
+        return np.hypot(aside, self.least)
 
     def on(self, vehicle: Vehicle, name: str) -> "Beam":
         """Return the beam of an altimeter in the vehicle's `perception`; this one if it has none of that name."""
@@ -199,7 +245,19 @@ class Beam:
                 f"{vehicle.name}: perception.{name} is no altimeter of one beam, as task 'terrain' expects"
             )
         along = quat_rotate(device.mount.quaternion, [1.0, 0.0, 0.0])
-        return Beam(tuple(device.mount.position.tolist()), tuple(along.tolist()))
+        # Two ways, a pattern of half power at half the width is exp(-8 ln 2 (angle / width)²); rays end at the width.
+        width = device.beam_width if device.rays > 1 else 0.0
+        pattern = width**2 / (16.0 * math.log(2.0))
+        variance = pattern / (1.0 + 3.0 * pattern)
+        share = min(max(device.quantile, 1e-9), 1.0 - 1e-9)
+        lead = -math.sqrt(variance) * NormalDist().inv_cdf(share)
+        return Beam(
+            tuple(device.mount.position.tolist()),
+            tuple(along.tolist()),
+            lead=max(min(lead, width), -width),
+            least=min(math.sqrt(-2.0 * variance * math.log(1.0 - share)), width),
+            variance=variance,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
