@@ -294,6 +294,46 @@ class Features:
 
 
 @cache
+def relaxation_function(model: str, terms: tuple[Item, ...] = ()) -> Any:
+    """Return the Warp function of θ of the midpoint rule, by which damping takes velocity away implicitly.
+
+    Args:
+        model: A key of `HYDRODYNAMICS`.
+        terms: As for `motion_function`.
+    """
+    term_slope, actuator_slope = composed(terms, "slope"), composed(terms, "yield")
+
+    @wp.func
+    def relaxed_by(
+        vehicles: Vehicles, hull: HullMesh, water: WaterArrays, w: int, v: int, body: Afloat, thrust: vec8,
+        share: vec6,
+    ) -> vec6:  # fmt: skip
+        """θ [-] of each axis by all of the damping, of which a vehicle has some share [-] at the surface."""
+        plant = vehicles.plant
+        extra = vehicles.extra
+        relaxation = vec6()
+        if wp.static(model == "mesh"):
+            slope = drag_slope(
+                hull, plant[w, v].hull, body.nu_r, water.density, plant[w, v].form_drag, plant[w, v].skin_drag
+            )
+            relaxation = wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, slope))
+        else:
+            relaxation = wp.cw_mul(share, relaxation_of(plant, w, v, body.nu_r))
+            if wp.static(term_slope is not None):
+                nu_m = twist_at(body.nu_r, plant[w, v].r_m)
+                falls = term_slope(extra, w, v, nu_m, body.up, -body.position[2], water.density, thrust)
+                relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
+            if wp.static(actuator_slope is not None):
+                falls = actuator_slope(
+                    extra, w, v, body.nu_r, body.up, -body.position[2], water.density, thrust
+                )
+                relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
+        return relaxation
+
+    return relaxed_by
+
+
+@cache
 def motion_function(
     model: str,
     runge_kutta: bool,
@@ -310,10 +350,8 @@ def motion_function(
         tethered: Whether there is a tether.
         terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
     """
-    hydrodynamic_wrench = HYDRODYNAMICS[model]
-    term_wrench, term_slope = composed(terms, "wrench"), composed(terms, "slope")
-    actuator_wrench, mass_shift = composed(terms, "push"), composed(terms, "shift")
-    actuator_slope = composed(terms, "yield")
+    hydrodynamic_wrench, relaxed_by = HYDRODYNAMICS[model], relaxation_function(model, terms)
+    term_wrench, actuator_wrench, mass_shift = (composed(terms, kind) for kind in ("wrench", "push", "shift"))
     added_mass = model != "simplified"
 
     @wp.func
@@ -412,25 +450,7 @@ def motion_function(
             out.nu_dot = symmetric_times(plant[w, v].M_inv, tau) + wet.wet * moment.pushed
         out.wet = wet.wet
         if wp.static(not runge_kutta):
-            if wp.static(model == "mesh"):
-                slope = drag_slope(
-                    hull,
-                    plant[w, v].hull,
-                    nu_r,
-                    water.density,
-                    plant[w, v].form_drag,
-                    plant[w, v].skin_drag,
-                )
-                out.relaxation = wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, slope))
-            else:
-                out.relaxation = wp.cw_mul(share, relaxation_of(plant, w, v, nu_r))
-                if wp.static(term_slope is not None):
-                    nu_m = twist_at(nu_r, plant[w, v].r_m)
-                    falls = term_slope(extra, w, v, nu_m, up, -position[2], water.density, thrust)
-                    out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
-                if wp.static(actuator_slope is not None):
-                    falls = actuator_slope(extra, w, v, nu_r, up, -position[2], water.density, thrust)
-                    out.relaxation += wp.cw_mul(share, wp.cw_mul(plant[w, v].relax, wp.max(falls, vec6())))
+            out.relaxation = relaxed_by(vehicles, hull, water, w, v, body, thrust, share)
         return out
 
     return motion_at
@@ -546,11 +566,13 @@ def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
 
 
 @cache
-def runge_kutta_function(features: Features) -> Any:
-    """Return the Warp function of one substep by the rule of Runge and Kutta."""
+def rates_function(features: Features) -> Any:
+    """Return the Warp function of the rates of a state, for the rule of Runge and Kutta."""
     motion_at = motion_function(features.model, True, features.water_moving, features.tether, features.terms)
-    contact_at = contact_function(features.walls, features.funnel, features.solids)
-    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
+    contact_at, contacts = (
+        contact_function(features.walls, features.funnel, features.solids),
+        features.contacts,
+    )
 
     @wp.func
     def rates_at(
@@ -578,6 +600,16 @@ def runge_kutta_function(features: Features) -> Any:
         out.q_dot = quaternion_rate(on.quaternion, angular(on.velocity))
         out.nu_dot = motion_at(vehicles, around.hull, around.water, around.tether, w, v, on).nu_dot
         return out
+
+    return rates_at
+
+
+@cache
+def runge_kutta_function(features: Features) -> Any:
+    """Return the Warp function of one substep by the rule of Runge and Kutta."""
+    rates_at = rates_function(features)
+    contact_at = contact_function(features.walls, features.funnel, features.solids)
+    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
 
     @wp.func
     def substep(
@@ -636,12 +668,9 @@ def runge_kutta_function(features: Features) -> Any:
 
 
 @cache
-def midpoint_function(features: Features) -> Any:
-    """Return the Warp function of one substep by the midpoint rule; see `finssim.sim.midpoint`."""
-    motion_at = motion_function(features.model, False, features.water_moving, features.tether, features.terms)
-    contact_at = contact_function(features.walls, features.funnel, features.solids)
-    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
-    walls, funnel, solids = features.walls, features.funnel, features.solids
+def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
+    """Return the Warp function of a substep of the midpoint rule beside what a vehicle can bump into."""
+    contact_at = contact_function(walls, funnel, solids)
     contact_step = DOCK_STEP if funnel else WALL_STEP
 
     @wp.func
@@ -697,6 +726,47 @@ def midpoint_function(features: Features) -> Any:
         out.struck = struck
         return out
 
+    return bump
+
+
+@cache
+def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
+    """Return the Warp function that says whether a vehicle may touch something within a substep."""
+
+    @wp.func
+    def is_near(
+        obstacles: Obstacles,
+        w: int,
+        position: wp.vec3,
+        h: float,
+        half_size: wp.vec3,
+        guess: vec6,
+        course: Course,
+    ) -> bool:
+        """Whether something is nearer than the way of a substep h [s], at a guess of the acceleration."""
+        near = bool(False)
+        nu = course.velocity
+        turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
+        slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
+        if wp.static(walls):
+            near = walls_within(obstacles.walls, position, course.quaternion, half_size, h * slack)
+        if wp.static(funnel):
+            near = near or funnel_within(obstacles.funnel, w, position, half_size, h * slack)
+        if wp.static(solids):
+            near = near or solids_within(course.clearing, position, half_size, h * slack)
+        return near
+
+    return is_near
+
+
+@cache
+def midpoint_function(features: Features) -> Any:
+    """Return the Warp function of one substep by the midpoint rule; see `finssim.sim.midpoint`."""
+    motion_at = motion_function(features.model, False, features.water_moving, features.tether, features.terms)
+    lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
+    touchable = (features.walls, features.funnel, features.solids)
+    bump, is_near, funnel = bump_function(*touchable), nearness_function(*touchable), features.funnel
+
     @wp.func
     def substep(
         commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
@@ -714,14 +784,7 @@ def midpoint_function(features: Features) -> Any:
         near = bool(False)
         if wp.static(contacts):
             half_size = vehicles.plant[w, v].half_size
-            turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
-            slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
-            if wp.static(walls):
-                near = walls_within(around.obstacles.walls, position, q, half_size, h * slack)
-            if wp.static(funnel):
-                near = near or funnel_within(around.obstacles.funnel, w, position, half_size, h * slack)
-            if wp.static(solids):
-                near = near or solids_within(course.clearing, position, half_size, h * slack)
+            near = is_near(around.obstacles, w, position, h, half_size, guess, course)
         # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
         # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
         lead = h * lead_of(nu, h)
