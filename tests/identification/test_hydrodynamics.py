@@ -250,7 +250,7 @@ def test_a_replay_allows_for_two_clocks(lead):
 
 @pytest.mark.slow
 def test_unequal_thrusters_are_found_in_a_slow_log():
-    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1 %, and in the file."""
+    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1.5 %, and in the file."""
     vehicle, axes = load_vehicle("bluerov2_heavy"), ("surge", "sway", "heave", "yaw")
     gains = np.array([1.06, 0.95, 1.0, 0.97, 1.03, 0.98, 1.05, 0.96])
     levels = {a: [part * vehicle.wrench_limits[AXES.index(a)] for part in (0.12, 0.25)] for a in axes}
@@ -271,4 +271,4 @@ def test_unequal_thrusters_are_found_in_a_slow_log():
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == pytest.approx(
         true.quadratic_damping[5, 5], rel=0.02
     )
-    assert max(after.body.center_of_gravity[i] - vehicle.body.center_of_gravity[i] for i in range(3)) < 0.002
+    assert np.abs(np.subtract(after.body.center_of_gravity, vehicle.body.center_of_gravity)).max() < 0.002

@@ -76,7 +76,7 @@ class TerrainPilot:
     guide: LineOfSight
     follower: SeabedFollower
     beam: Beam
-    """Of the altimeter."""
+    """Beam of the altimeter."""
     period: float = PERIOD
     """Time between two actions [s]."""
 
@@ -99,7 +99,7 @@ class TerrainPilot:
         size = self.cruise.size
         line, velocity, up = o[:, 4:7], o[:, 7:10], o[:, 13:16]
         depth = 10.0 * size * o[:, 2]
-        # The height over a level seabed, of which a beam of some width hears more than the point on its axis.
+        # Height over a level seabed; the echo of a wide beam is taken closer to the vertical than its axis.
         beta = np.arccos(np.clip(-(up * self.beam.direction).sum(axis=1), -1.0, 1.0))
         below = 5.0 * size * o[:, 0] * np.cos(self.beam.echo_angle(beta))
         altitude = below - (up * self.beam.position).sum(axis=1)

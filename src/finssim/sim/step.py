@@ -163,9 +163,7 @@ class Course:
     """A vehicle on its way through the substeps of a control step."""
 
     start: wp.vec3  # body origin at the start of the control step, world frame [m]
-    moved: (
-        wp.vec3
-    )  # way since then [m]: apart, for a float far from 0 does not hold the way of a short, slow substep
+    moved: wp.vec3  # displacement since then [m], kept apart: added to a large coordinate, that of a short substep would be lost
     quaternion: wp.quat
     velocity: vec6  # nu, body frame [m/s, rad/s]
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
@@ -569,10 +567,8 @@ def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
 def rates_function(features: Features) -> Any:
     """Return the Warp function of the rates of a state, for the rule of Runge and Kutta."""
     motion_at = motion_function(features.model, True, features.water_moving, features.tether, features.terms)
-    contact_at, contacts = (
-        contact_function(features.walls, features.funnel, features.solids),
-        features.contacts,
-    )
+    contact_at = contact_function(features.walls, features.funnel, features.solids)
+    contacts = features.contacts
 
     @wp.func
     def rates_at(
@@ -642,7 +638,7 @@ def runge_kutta_function(features: Features) -> Any:
             out.impulse = course.impulse + h * touch.push
             out.struck = wp.max(course.struck, touch.strike)
         rates, mean = Rates(), Rates()
-        # A loop that Warp does not unroll: four copies of the equation of motion take twice as long to compile.
+        # Warp unrolls loops over constants: four copies of the equation of motion would compile and run more slowly.
         stages = int(4)
         for stage in range(stages):
             outer = stage == 0 or stage == 3
@@ -731,7 +727,7 @@ def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
 
 @cache
 def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
-    """Return the Warp function that says whether a vehicle may touch something within a substep."""
+    """Return the Warp function that checks whether a vehicle may touch something within a substep."""
 
     @wp.func
     def is_near(
@@ -743,8 +739,8 @@ def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
         guess: vec6,
         course: Course,
     ) -> bool:
-        """Whether something is nearer than the way of a substep h [s], at a guess of the acceleration."""
-        near = bool(False)
+        """Return True if a vehicle could reach something in a substep h [s], at a guess of its acceleration."""
+        near = bool(False)  # a variable, which Warp lets a branch change
         nu = course.velocity
         turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
         slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)

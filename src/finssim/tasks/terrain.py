@@ -46,7 +46,7 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.device_files import RangeDevice, device_of
 
 RIPPLES = 4
-"""Number of waves that a seabed is made of."""
+"""Number of waves that are summed to a seabed."""
 FARTHEST_RANGE = 60.0
 """Range beyond which a beam sees nothing: it is shown as this far [m]."""
 SPACING = 1.0
@@ -118,7 +118,7 @@ def sounded(state: State, arrays: TaskArrays, p: Any, w: int, beam: Any) -> floa
     x, q = state.position[w, 0], state.quaternion[w, 0]
     start, direction = x + wp.quat_rotate(q, beam.position), wp.quat_rotate(q, beam.direction)
     far = beam_range(arrays, p, w, start, direction)
-    # Of a beam of some width, the part that meets the seabed more squarely is back earlier.
+    # The echo of a wide beam begins with the rays that are closest to the normal of the seabed.
     facing = wp.clamp(-wp.dot(seabed_normal(arrays, w, start + far * direction), direction), 0.1, 1.0)
     return far * facing / wp.cos(echo_angle(wp.acos(facing), beam))
 
@@ -216,7 +216,7 @@ OBSERVATION = (
 
 @dataclass(frozen=True)
 class Beam:
-    """Where the beam of an altimeter begins, where it points, body frame, and how wide it is."""
+    """Origin, direction and width of the beam of an altimeter, body frame."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """[m]"""
@@ -225,9 +225,9 @@ class Beam:
     lead: float = 0.0
     """Angle towards the normal of a surface at which the echo is taken [rad], see `echo_angle`; 0 for a ray."""
     least: float = 0.0
-    """The same where the beam is along the normal [rad]."""
+    """Angle from the normal at which the echo is taken, of a beam along the normal [rad]."""
     variance: float = 0.0
-    """Of the echo over the angle [rad²]."""
+    """Variance s² of the echo over the angle, see `echo_angle` [rad²]."""
 
     def echo_angle(self, beta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `echo_angle` of this beam for angles of its axis from a plane's normal [rad], of the same shape."""
