@@ -115,6 +115,7 @@ def two_machines():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # 15 by default, with which they wait for the other tests
         # Otherwise Ray takes 127.0.0.1 for this machine's address on the network, where these nodes do not listen.
         patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
         node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "include_dashboard": False}
