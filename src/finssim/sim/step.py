@@ -163,7 +163,9 @@ class Course:
     """A vehicle on its way through the substeps of a control step."""
 
     start: wp.vec3  # body origin at the start of the control step, world frame [m]
-    moved: wp.vec3  # displacement since then [m], kept apart: added to a large coordinate, that of a short substep would be lost
+    moved: (
+        wp.vec3
+    )  # displacement since then [m]: a short substep's would be lost in the sum with a large coordinate
     quaternion: wp.quat
     velocity: vec6  # nu, body frame [m/s, rad/s]
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
