@@ -6,8 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
+import typer
 import yaml
 from typer.main import get_command
 
@@ -272,3 +274,25 @@ def test_lists_fit_into_80_columns(words, monkeypatch, capsys):
     headings = {"vehicles": "thrusters  axes  description", "tasks": "observed  actions", "worlds": ""}[words]
     assert any(headings in " ".join(line.split()) or headings in line for line in lines)
     assert sum(len(line.split()) == 1 for line in lines) < 0.3 * len(lines)
+
+
+class Dropped:
+    """Its finalizer is interrupted, where Python drops the exception; pydantic's compiled code can drop it as well."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_control_c_in_a_finalizer_still_ends_the_command(capsys):
+    """The interruption comes again once the finalizer has ended."""
+    commands = typer.Typer()
+
+    @commands.command()
+    def work():
+        dropped = [Dropped() for _ in range(3)]
+        del dropped
+        time.sleep(30.0)
+
+    begun = time.monotonic()
+    assert boundary.run(commands, [], script="work") == boundary.INTERRUPTED
+    assert time.monotonic() - begun < 20.0 and "Exception ignored" not in capsys.readouterr().err

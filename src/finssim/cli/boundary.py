@@ -12,6 +12,7 @@ from typing import TextIO
 import typer
 
 from finssim.cli.doctor import EXTRA_OF_MODULE
+from finssim.core.system import lost_interrupts_repeated
 
 REFUSED = 2
 INTERRUPTED = 130
@@ -48,7 +49,7 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
         else:
             show(message, category, filename, lineno, file, line)
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), lost_interrupts_repeated():
         warnings.showwarning = say_ours
         return _run(app, arguments, script)
 

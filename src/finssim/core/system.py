@@ -24,6 +24,8 @@ COUNT = 1.0, 10.0
 """Time between two signs of life of a silent command, on a terminal and elsewhere [s]."""
 ORPHANED = 0.5
 """Time between two checks whether the parent is running [s]."""
+AGAIN = 0.05
+"""Time from a lost KeyboardInterrupt to the next [s]."""
 SEPARATE: dict[str, Any] = (
     {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     if os.name == "nt"
@@ -56,6 +58,39 @@ def handled(handler: Any) -> Iterator[None]:
             signal.signal(number, previous)
 
 
+@contextmanager
+def lost_interrupts_repeated() -> Iterator[None]:
+    """Interrupt again after each KeyboardInterrupt that Python had to drop.
+
+    An exception goes no further than a finalizer, or a function that C code calls and whose errors it ignores. Python
+    prints "Exception ignored in …" instead, and a command goes on as if nobody had pressed Ctrl-C.
+    """
+    report = sys.unraisablehook
+    pending: threading.Timer | None = None
+
+    def again() -> None:
+        nonlocal pending
+        pending = None
+        _interrupt(signal.SIGINT)
+
+    def repeat(lost: Any) -> None:
+        nonlocal pending
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            report(lost)
+        elif pending is None:
+            pending = threading.Timer(AGAIN, again)  # at once, it would be lost in here
+            pending.daemon = True
+            pending.start()
+
+    sys.unraisablehook = repeat
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+        if pending is not None:
+            pending.cancel()
+
+
 def interrupt(process: subprocess.Popen[Any]) -> None:
     """Ask a child that was started with `SEPARATE` to end, as Ctrl-C does."""
     process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
@@ -81,10 +116,15 @@ def _end_with(parent: int) -> None:
 def _follow(parent: int) -> None:
     while parent_runs(parent):
         time.sleep(ORPHANED)
+    _interrupt(signal.SIGTERM)
+
+
+def _interrupt(number: signal.Signals) -> None:
+    """Send this process a signal, from any of its threads."""
     if os.name == "nt":  # where os.kill ends the process immediately
-        _thread.interrupt_main(signal.SIGTERM)
+        _thread.interrupt_main(number)
     else:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
 
 
 def parent_runs(pid: int) -> bool:
