@@ -283,16 +283,42 @@ class Dropped:
         signal.raise_signal(signal.SIGINT)
 
 
-def test_control_c_in_a_finalizer_still_ends_the_command(capsys):
-    """The interruption comes again once the finalizer has ended."""
+def drop():
+    dropped = [Dropped() for _ in range(3)]
+    del dropped
+    time.sleep(30.0)
+
+
+def create_a_class():
+    class Interrupted:
+        field = type("Field", (), {"__set_name__": lambda *_: signal.raise_signal(signal.SIGINT)})()
+
+    return Interrupted
+
+
+@pytest.mark.parametrize("work", [drop, create_a_class])
+def test_control_c_that_python_drops_or_wraps_ends_the_command(work, capsys):
+    """The interruption of a finalizer comes again; that of a class is one, though Python 3.11 says RuntimeError."""
     commands = typer.Typer()
-
-    @commands.command()
-    def work():
-        dropped = [Dropped() for _ in range(3)]
-        del dropped
-        time.sleep(30.0)
-
+    commands.command()(work)
     begun = time.monotonic()
     assert boundary.run(commands, [], script="work") == boundary.INTERRUPTED
     assert time.monotonic() - begun < 20.0 and "Exception ignored" not in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_command_that_handled_control_c_ends_with_its_own_status(tmp_path):
+    """Even where it interrupted `exec`, which creates data classes: `python -m` would end by SIGINT then."""
+    (tmp_path / "work.py").write_text("""
+import contextlib, sys, typer
+from finssim.cli import boundary
+app = typer.Typer()
+
+@app.command()
+def work():
+    with contextlib.suppress(KeyboardInterrupt):
+        exec("raise KeyboardInterrupt")
+
+sys.exit(boundary.run(app, [], script="work"))
+""")
+    assert subprocess.run([sys.executable, "-m", "work"], cwd=tmp_path, timeout=60.0).returncode == 0

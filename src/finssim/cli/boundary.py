@@ -12,7 +12,7 @@ from typing import TextIO
 import typer
 
 from finssim.cli.doctor import EXTRA_OF_MODULE
-from finssim.core.system import lost_interrupts_repeated
+from finssim.core.system import caused_by_interrupt, lost_interrupts_repeated
 
 REFUSED = 2
 INTERRUPTED = 130
@@ -51,7 +51,9 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
 
     with warnings.catch_warnings(), lost_interrupts_repeated():
         warnings.showwarning = say_ours
-        return _run(app, arguments, script)
+        status = _run(app, arguments, script)
+        exec("")  # `python -m` ends by SIGINT if the last `exec` of a text was interrupted, handled or not
+        return status
 
 
 def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
@@ -68,10 +70,13 @@ def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
         status = INTERRUPTED
     except Exception as error:
         sentence = refusal(error, script or "finssim")
-        if sentence is None or os.environ.get("FINSSIM_DEBUG") == "1":
+        if caused_by_interrupt(error):
+            status = INTERRUPTED
+        elif sentence is None or os.environ.get("FINSSIM_DEBUG") == "1":
             raise
-        _say(sentence)
-        return REFUSED
+        else:
+            _say(sentence)
+            return REFUSED
     if status == INTERRUPTED:
         _say("interrupted: nothing half-written is left")
     return status if isinstance(status, int) else 0

@@ -91,6 +91,13 @@ def lost_interrupts_repeated() -> Iterator[None]:
             pending.cancel()
 
 
+def caused_by_interrupt(error: BaseException | None) -> bool:
+    """Return whether a KeyboardInterrupt caused an error, as where one stops the creation of a class (Python 3.11)."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
+
+
 def interrupt(process: subprocess.Popen[Any]) -> None:
     """Ask a child that was started with `SEPARATE` to end, as Ctrl-C does."""
     process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))

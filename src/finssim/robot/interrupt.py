@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from finssim.core.system import handled
+from finssim.core.system import caused_by_interrupt, handled
 
 
 @contextmanager
@@ -32,4 +32,9 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 def interrupting() -> Iterator[None]:
     """Raise KeyboardInterrupt for every stop signal, also where Ctrl-C was ignored at the start."""
     with handled(signal.default_int_handler):
-        yield
+        try:
+            yield
+        except Exception as error:
+            if caused_by_interrupt(error):
+                raise KeyboardInterrupt from error
+            raise
