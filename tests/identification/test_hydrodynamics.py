@@ -18,6 +18,7 @@ from finssim.trials.check import check_trials
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import AXES, load_vehicle
+from identification.made_fits import made_fit
 
 DATA = Path(__file__).parents[1] / "data" / "standins"
 DOCS = Path(__file__).parents[2] / "docs" / "reference" / "trial_format.md"
@@ -272,3 +273,19 @@ def test_unequal_thrusters_are_found_in_a_slow_log():
         true.quadratic_damping[5, 5], rel=0.02
     )
     assert np.abs(np.subtract(after.body.center_of_gravity, vehicle.body.center_of_gravity)).max() < 0.002
+
+
+def test_couplings_of_an_axis_of_the_file_stay_symmetric():
+    """Where sway keeps the file's numbers, its coupling with yaw follows yaw's alone, in both rows."""
+    vehicle, path = load_vehicle("remus100"), "hydrodynamics.calibrated.added_mass"
+    own = vehicle.hydrodynamic_set("calibrated").added_mass
+    new = {
+        f"{path}.1.1": 2.0 * own[1][1],
+        f"{path}.5.5": 4.0 * own[5][5],
+        **{f"{path}.{i}.{j}": np.sqrt(8.0) * own[i][j] for i, j in ((1, 5), (5, 1))},
+    }
+    quality = {"sway": {"held_out": 1.0, "file": 0.5}, "yaw": {"held_out": 0.5, "file": 1.0}}
+    kept = judged(made_fit(vehicle, changes=new, quality=quality))
+    twice = {f"{path}.{i}.{j}": 2.0 * own[i][j] for i, j in ((1, 5), (5, 1))}
+    assert kept.changes == pytest.approx({f"{path}.5.5": 4.0 * own[5][5], **twice})
+    assert calibrated(kept).hydrodynamic_set("calibrated").added_mass[1][5] == pytest.approx(2.0 * own[1][5])

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from finssim.identification.estimates import changes
 from finssim.identification.parameters import Parameters
 from finssim.sim.plant_arrays import vehicle_parameters
 from finssim.trials.findings import CalibrationError
@@ -130,3 +131,34 @@ def test_gains_of_thrusters_average_to_one_and_scale_their_columns():
     assert (
         made("bluerov2_heavy", ("surge",)).plants(made("bluerov2_heavy", ("surge",)).expected).gains is None
     )
+
+
+def test_couplings_follow_their_diagonals():
+    """Four times an inertia or a drag couples twice as much; so does an inertia that is given. `rexrov` couples all."""
+    p = made("remus100", ("sway", "yaw"))
+    x = p.start.copy()
+    for kind in ("sway.added_mass", "yaw.d2"):
+        x[p.names.index(kind)] *= 4.0
+    M_A, _, D2 = p.matrices(x)
+    file_M_A, file_D2 = np.asarray(p.set.added_mass), np.asarray(p.set.quadratic_damping)
+    assert M_A[0, 1, 5] == M_A[0, 5, 1] == pytest.approx(2.0 * file_M_A[1, 5])
+    assert M_A[0, 2, 4] == file_M_A[2, 4] != 0.0
+    assert (D2[0, 1, 5], D2[0, 5, 1]) == pytest.approx((2.0 * file_D2[1, 5], 2.0 * file_D2[5, 1]))
+    mass = float(p.M_RB[1, 1] + 4.0 * file_M_A[1, 1])
+    held = Parameters(
+        VEHICLES["remus100"], axes=("sway",), damping={"sway": "both"}, held={"sway": mass}
+    ).matrices(np.zeros(2))[0]
+    np.testing.assert_allclose(held[0], M_A[0])
+    every = made("rexrov", AXES)
+    doubled = every.start * np.where([n.endswith("added_mass") for n in every.names], 2.0, 1.0)
+    np.testing.assert_allclose(every.matrices(doubled)[0][0], 2.0 * np.asarray(every.set.added_mass))
+
+
+def test_the_file_keeps_couplings_symmetric():
+    """Only sway is written: its coupling with yaw, in both rows, goes with it and with the file's yaw."""
+    p = made("remus100", ("sway", "yaw"))
+    path, x = "hydrodynamics.calibrated.added_mass", 4.0 * p.start
+    written = changes(p, x, {}, {f"{path}.1.1": 142.0}, unmeasured=(), scaled=False)
+    twice = 2.0 * float(p.set.added_mass[1][5])
+    assert written == pytest.approx({f"{path}.1.1": 142.0, f"{path}.1.5": twice, f"{path}.5.1": twice})
+    assert not changes(p, x, {}, {}, unmeasured=(), scaled=False)

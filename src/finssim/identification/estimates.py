@@ -385,18 +385,21 @@ def changes(
         unmeasured: Axes that were simulated because no trial measured them: the others hold with their numbers.
         scaled: Whether a thrust scale belongs to the thrusters' curves.
     """
-    out = dict(axes)
-    for path, matrix in matrix_changes(p, x).items():
-        old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
-        for i, axis in enumerate(AXES):
-            if f"{path}.{i}.{i}" in axes or axis in unmeasured:
-                for j in range(6):
-                    # Couplings are written where the fit did away with them.
-                    if i == j or matrix[i, j] != old[i, j]:
-                        out[f"{path}.{i}.{j}"] = float(matrix[i, j])
-    written = x.copy()
+    out, written = dict(axes), x.copy()
     for c, name in enumerate(p.names):
-        written[c] = p.expected[c] if name in PLACES and not found[name].identifiable else x[c]
+        axis, _, kind = name.partition(".")
+        if name in PLACES:
+            stays = not found[name].identifiable
+        else:
+            stays = kind in KINDS and axis not in unmeasured and _diagonal(axis, kind) not in axes
+        written[c] = p.expected[c] if stays else x[c]
+    for path, matrix in matrix_changes(p, written).items():
+        old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
+        new = [f"{path}.{i}.{i}" in axes or axis in unmeasured for i, axis in enumerate(AXES)]
+        for i, j in np.ndindex(6, 6):
+            # Couplings follow the axes that are written, or the fit did away with them.
+            if new[i] and i == j or (new[i] or new[j]) and matrix[i, j] != old[i, j]:
+                out[f"{path}.{i}.{j}"] = float(matrix[i, j])
     moved = p.moved(written)
     at = [f"thrusters.{name}.position.2" for name in horizontal(p.vehicle)]
     if PLACES[0] in found:
@@ -461,7 +464,15 @@ def derived(
     return value, (value / factor, value * factor)
 
 
+KINDS = {"added_mass": "added_mass", "d1": "linear_damping", "d2": "quadratic_damping"}
+"""Coordinate of an axis -> matrix of the vehicle file."""
+
+
 def matrix_changes(p: Parameters, x: Array) -> dict[str, Any]:
     """Return the changes of the vehicle file to the matrices of a vector in the units of the coordinates, (P,)."""
-    names = ("added_mass", "linear_damping", "quadratic_damping")
-    return {f"{SET}.{name}": m[0] for name, m in zip(names, p.matrices(x), strict=True)}
+    return {f"{SET}.{name}": m[0] for name, m in zip(KINDS.values(), p.matrices(x), strict=True)}
+
+
+def _diagonal(axis: str, kind: str) -> str:
+    i = AXES.index(axis)
+    return f"{SET}.{KINDS[kind]}.{i}.{i}"

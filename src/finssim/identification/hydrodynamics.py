@@ -11,7 +11,7 @@ import numpy as np
 
 from finssim.core.progress import progress_bar
 from finssim.identification.fit import Fit
-from finssim.identification.plant_terms import SET, matrices
+from finssim.identification.plant_terms import SET, grown, matrices
 from finssim.identification.report import finish, refuse_places, usable_trials
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import CalibrationError, finding
@@ -150,7 +150,7 @@ def _file_kept(fit: Fit, axis: str) -> Fit:
     changes = {
         path: value
         for path, value in fit.changes.items()
-        if not any(path.startswith(f"{SET}.{name}.{i}.") for name in own)
+        if not (path.startswith(tuple(f"{SET}.{name}." for name in own)) and str(i) in path.split(".")[-2:])
         and not (axis == "heave" and path == "body.displaced_volume")
     }
     if (
@@ -161,6 +161,10 @@ def _file_kept(fit: Fit, axis: str) -> Fit:
         for name, matrix in own.items():
             value = scale * float(matrix[i, i]) + (scale - 1.0) * rigid * (name == "added_mass")
             changes[f"{SET}.{name}.{i}.{i}"] = max(value, 0.0)
+    for name, matrix in own.items():
+        path, pairs = f"{SET}.{name}", [pair for j in range(6) if j != i for pair in ((i, j), (j, i))]
+        new = grown(matrix, np.array([changes.get(f"{path}.{j}.{j}", matrix[j, j]) for j in range(6)]))
+        changes |= {f"{path}.{j}.{k}": float(new[j, k]) for j, k in pairs if new[j, k] != matrix[j, k]}
     found = {
         name: replace(e, identifiable=False, note=FILE_BETTER) if name.partition(".")[0] == axis else e
         for name, e in fit.estimates.items()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.registry import TERMS
-from finssim.identification.plant_terms import UNITS, matrices
+from finssim.identification.plant_terms import UNITS, follows, grown, matrices
 from finssim.identification.vehicle_file import number_in
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.physics.types import MAX_THRUSTERS
@@ -246,9 +246,11 @@ class Parameters:
         self.H, self.M_RB, self.M_A = plant.H, plant.M_RB, plant.M_A
         self.D1, self.D2 = plant.D1, plant.D2
         self.held = dict(held or {})
+        added = np.diag(self.M_A).copy()
         for a, m in self.held.items():
             i = AXES.index(a)
-            self.M_A[i, i] = m - self.M_RB[i, i]
+            added[i] = m - self.M_RB[i, i]
+        self.M_A = grown(self.M_A, added)
         for a, i in zip(self.axes, self.index, strict=True):
             if damping[a] == "linear":
                 self.D2[i, :] = self.D2[:, i] = 0.0
@@ -355,10 +357,13 @@ class Parameters:
     def mass_floor(self) -> Array:
         """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there [kg, kg m²].
 
-        M_RB (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ
-        below the smallest eigenvalue of M scaled by c.
+        It is zero where the couplings of the file's M_A decrease with the added masses of their axes. Elsewhere M_RB
+        (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ below
+        the smallest eigenvalue of M scaled by c.
         """
         couplings = self.M_A - np.diag(np.diag(self.M_A))
+        if follows(self.M_A):
+            return np.zeros(len(self.axes))
         M, base = (
             (self.M_RB, np.zeros(6)) if not couplings.any() else (self.M_RB + self.M_A, np.diag(self.M_A))
         )
@@ -375,16 +380,18 @@ class Parameters:
     def matrices(self, x: Array) -> tuple[Array, Array, Array]:
         """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each.
 
+        Couplings follow the diagonals (`grown`).
+
         Units: [kg], [N s/m] and [N s²/m²], with the corresponding ones of moments.
         """
         x = np.clip(np.atleast_2d(x), self.low, self.high)
-        M_A, D1, D2 = (np.repeat(m[None], len(x), axis=0) for m in (self.M_A, self.D1, self.D2))
-        for name, c in self._at.items():
-            axis, _, kind = name.partition(".")
-            if axis in AXES and kind != "bias":
-                i = AXES.index(axis)
-                {"added_mass": M_A, "d1": D1, "d2": D2}[kind][:, i, i] = x[:, c]
-        return M_A, D1, D2
+        out = []
+        for kind, matrix in (("added_mass", self.M_A), ("d1", self.D1), ("d2", self.D2)):
+            diagonal = np.tile(np.diag(matrix), (len(x), 1))
+            for i, axis in enumerate(AXES):
+                diagonal[:, i] = self.value(x, f"{axis}.{kind}", diagonal[:, i])
+            out.append(grown(matrix, diagonal))
+        return out[0], out[1], out[2]
 
     def centre_of_gravity(self, x: Array) -> Array:
         """Return the centre of gravity of vectors (W, P) [m], (W, 3)."""

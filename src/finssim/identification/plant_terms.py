@@ -74,3 +74,29 @@ def matrices(vehicle: Vehicle) -> Matrices:
         excess=vehicle.buoyancy - vehicle.weight,
         arm=vehicle.buoyancy * (body.center_of_buoyancy - r) - vehicle.weight * (body.center_of_gravity - r),
     )
+
+
+def grown(matrix: Array, diagonal: Array) -> Array:
+    """Return a matrix of the vehicle file with other diagonals, with couplings that follow them.
+
+    An entry that couples two axes grows with the root of the growth of both diagonals, as with the size of the hull's
+    sections: a positive semidefinite matrix stays so. One that is not keeps its couplings.
+
+    Args:
+        matrix: Added mass or damping in their units, (6, 6).
+        diagonal: In the same units, (..., 6).
+    """
+    own = np.diag(matrix)
+    out = np.broadcast_to(matrix, (*diagonal.shape, 6)).copy()
+    if follows(matrix):
+        growth = np.divide(diagonal, own, out=np.ones_like(diagonal), where=own > 0.0)
+        root = np.sqrt(np.maximum(growth, 0.0))
+        out *= root[..., :, None] * root[..., None, :]
+    out[..., range(6), range(6)] = diagonal
+    return out
+
+
+def follows(matrix: Array) -> bool:
+    """Return whether a matrix has couplings, and they follow its diagonal: it is positive semidefinite."""
+    coupled = bool(np.any(matrix - np.diag(np.diag(matrix))))
+    return coupled and bool(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= 0.0)
