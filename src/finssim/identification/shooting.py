@@ -145,7 +145,7 @@ def solve(
     problem: Shooting,
     start: Point,
     *,
-    iterations: int = 30,
+    iterations: int = 60,
     std: Array | None = None,
     rough: bool = False,
     report: Callable[[int, float], None] | None = None,
