@@ -83,8 +83,11 @@ def grown(matrix: Array, diagonal: Array) -> Array:
     sections: a positive semidefinite matrix stays so. One that is not keeps its couplings.
 
     Args:
-        matrix: Added mass or damping in their units, (6, 6).
-        diagonal: In the same units, (..., 6).
+        matrix: Added mass [kg, kg m²] or damping [N s/m, N s²/m²], with the units of moments, (6, 6).
+        diagonal: In the units of the matrix, (..., 6).
+
+    Returns:
+        (..., 6, 6), in the units of the matrix.
     """
     own = np.diag(matrix)
     out = np.broadcast_to(matrix, (*diagonal.shape, 6)).copy()
@@ -97,6 +100,6 @@ def grown(matrix: Array, diagonal: Array) -> Array:
 
 
 def follows(matrix: Array) -> bool:
-    """Return whether a matrix has couplings, and they follow its diagonal: it is positive semidefinite."""
+    """Return whether a matrix of any unit has couplings, and they follow its diagonal: it is positive semidefinite."""
     coupled = bool(np.any(matrix - np.diag(np.diag(matrix))))
     return coupled and bool(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= 0.0)
