@@ -133,7 +133,7 @@ def test_gains_of_thrusters_average_to_one_and_scale_their_columns():
     )
 
 
-def test_couplings_follow_their_diagonals():
+def test_couplings_scale_with_their_diagonals():
     """Four times an inertia or a drag couples twice as much; so does an inertia that is given. `rexrov` couples all."""
     p = made("remus100", ("sway", "yaw"))
     x = p.start.copy()
@@ -162,3 +162,13 @@ def test_the_file_keeps_couplings_symmetric():
     twice = 2.0 * float(p.set.added_mass[1][5])
     assert written == pytest.approx({f"{path}.1.1": 142.0, f"{path}.1.5": twice, f"{path}.5.1": twice})
     assert not changes(p, x, {}, {}, unmeasured=(), scaled=False)
+
+
+def test_a_parameter_of_a_term_may_be_called_like_a_damping():
+    """Only coordinates of the six axes are entries of the matrices."""
+    p = Parameters(
+        load_vehicle("slocum"), axes=("surge",), damping={"surge": "both"}, extras=("lift_drag.drag",)
+    )
+    p.names, p.terms = tuple(name.replace(".drag", ".d1") for name in p.names), ()
+    assert "lift_drag.d1" in p.names
+    assert not changes(p, p.start, {}, {}, unmeasured=(), scaled=False)

@@ -52,7 +52,8 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
     with warnings.catch_warnings(), lost_interrupts_repeated():
         warnings.showwarning = say_ours
         status = _run(app, arguments, script)
-        exec("")  # `python -m` ends by SIGINT if the last `exec` of a text was interrupted, handled or not
+        # If the last `exec` of a string was interrupted, `python -m` kills itself at exit, even if that was handled.
+        exec("")
         return status
 
 

@@ -78,7 +78,7 @@ def lost_interrupts_repeated() -> Iterator[None]:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             report(lost)
         elif pending is None:
-            pending = threading.Timer(AGAIN, again)  # at once, it would be lost in here
+            pending = threading.Timer(AGAIN, again)  # sent from here, it would be dropped again
             pending.daemon = True
             pending.start()
 

@@ -388,16 +388,15 @@ def changes(
     out, written = dict(axes), x.copy()
     for c, name in enumerate(p.names):
         axis, _, kind = name.partition(".")
-        if name in PLACES:
-            stays = not found[name].identifiable
-        else:
-            stays = kind in KINDS and axis not in unmeasured and _diagonal(axis, kind) not in axes
-        written[c] = p.expected[c] if stays else x[c]
+        unsure = name in PLACES and not found[name].identifiable
+        own = axis in AXES and kind in KINDS
+        if unsure or own and axis not in unmeasured and _diagonal(axis, kind) not in axes:
+            written[c] = p.expected[c]
     for path, matrix in matrix_changes(p, written).items():
         old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
         new = [f"{path}.{i}.{i}" in axes or axis in unmeasured for i, axis in enumerate(AXES)]
         for i, j in np.ndindex(6, 6):
-            # Couplings follow the axes that are written, or the fit did away with them.
+            # A coupling changes with either of its axes, or is zero where the damping that was chosen has none.
             if new[i] and i == j or (new[i] or new[j]) and matrix[i, j] != old[i, j]:
                 out[f"{path}.{i}.{j}"] = float(matrix[i, j])
     moved = p.moved(written)

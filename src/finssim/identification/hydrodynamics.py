@@ -11,7 +11,7 @@ import numpy as np
 
 from finssim.core.progress import progress_bar
 from finssim.identification.fit import Fit
-from finssim.identification.plant_terms import SET, grown, matrices
+from finssim.identification.plant_terms import SET, matrices, with_diagonal
 from finssim.identification.report import finish, refuse_places, usable_trials
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import CalibrationError, finding
@@ -163,7 +163,9 @@ def _file_kept(fit: Fit, axis: str) -> Fit:
             changes[f"{SET}.{name}.{i}.{i}"] = max(value, 0.0)
     for name, matrix in own.items():
         path, pairs = f"{SET}.{name}", [pair for j in range(6) if j != i for pair in ((i, j), (j, i))]
-        new = grown(matrix, np.array([changes.get(f"{path}.{j}.{j}", matrix[j, j]) for j in range(6)]))
+        new = with_diagonal(
+            matrix, np.array([changes.get(f"{path}.{j}.{j}", matrix[j, j]) for j in range(6)])
+        )
         changes |= {f"{path}.{j}.{k}": float(new[j, k]) for j, k in pairs if new[j, k] != matrix[j, k]}
     found = {
         name: replace(e, identifiable=False, note=FILE_BETTER) if name.partition(".")[0] == axis else e

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.registry import TERMS
-from finssim.identification.plant_terms import UNITS, follows, grown, matrices
+from finssim.identification.plant_terms import UNITS, has_scalable_couplings, matrices, with_diagonal
 from finssim.identification.vehicle_file import number_in
 from finssim.physics.terms.composed import parameter_row, term_wrenches
 from finssim.physics.types import MAX_THRUSTERS
@@ -250,7 +250,7 @@ class Parameters:
         for a, m in self.held.items():
             i = AXES.index(a)
             added[i] = m - self.M_RB[i, i]
-        self.M_A = grown(self.M_A, added)
+        self.M_A = with_diagonal(self.M_A, added)
         for a, i in zip(self.axes, self.index, strict=True):
             if damping[a] == "linear":
                 self.D2[i, :] = self.D2[:, i] = 0.0
@@ -357,12 +357,12 @@ class Parameters:
     def mass_floor(self) -> Array:
         """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there [kg, kg m²].
 
-        It is zero where the couplings of the file's M_A decrease with the added masses of their axes. Elsewhere M_RB
+        It is zero where the couplings of the file's M_A are scaled with its diagonal. Elsewhere M_RB
         (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ below
         the smallest eigenvalue of M scaled by c.
         """
         couplings = self.M_A - np.diag(np.diag(self.M_A))
-        if follows(self.M_A):
+        if has_scalable_couplings(self.M_A):
             return np.zeros(len(self.axes))
         M, base = (
             (self.M_RB, np.zeros(6)) if not couplings.any() else (self.M_RB + self.M_A, np.diag(self.M_A))
@@ -380,7 +380,7 @@ class Parameters:
     def matrices(self, x: Array) -> tuple[Array, Array, Array]:
         """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each.
 
-        Couplings follow the diagonals (`grown`).
+        Couplings are scaled with the diagonals (`with_diagonal`).
 
         Units: [kg], [N s/m] and [N s²/m²], with the corresponding ones of moments.
         """
@@ -390,7 +390,7 @@ class Parameters:
             diagonal = np.tile(np.diag(matrix), (len(x), 1))
             for i, axis in enumerate(AXES):
                 diagonal[:, i] = self.value(x, f"{axis}.{kind}", diagonal[:, i])
-            out.append(grown(matrix, diagonal))
+            out.append(with_diagonal(matrix, diagonal))
         return out[0], out[1], out[2]
 
     def centre_of_gravity(self, x: Array) -> Array:

@@ -76,11 +76,11 @@ def matrices(vehicle: Vehicle) -> Matrices:
     )
 
 
-def grown(matrix: Array, diagonal: Array) -> Array:
-    """Return a matrix of the vehicle file with other diagonals, with couplings that follow them.
+def with_diagonal(matrix: Array, diagonal: Array) -> Array:
+    """Return a matrix of the vehicle file with other diagonals, and with couplings scaled to match.
 
-    An entry that couples two axes grows with the root of the growth of both diagonals, as with the size of the hull's
-    sections: a positive semidefinite matrix stays so. One that is not keeps its couplings.
+    Entry (i, j) is multiplied by √(a_i a_j), where a_i is the factor on diagonal entry i. This keeps a matrix positive
+    semidefinite. A matrix that is not positive semidefinite keeps its couplings.
 
     Args:
         matrix: Added mass [kg, kg m²] or damping [N s/m, N s²/m²], with the units of moments, (6, 6).
@@ -91,15 +91,15 @@ def grown(matrix: Array, diagonal: Array) -> Array:
     """
     own = np.diag(matrix)
     out = np.broadcast_to(matrix, (*diagonal.shape, 6)).copy()
-    if follows(matrix):
-        growth = np.divide(diagonal, own, out=np.ones_like(diagonal), where=own > 0.0)
-        root = np.sqrt(np.maximum(growth, 0.0))
+    if has_scalable_couplings(matrix):
+        factor = np.divide(diagonal, own, out=np.ones_like(diagonal), where=own > 0.0)
+        root = np.sqrt(np.maximum(factor, 0.0))
         out *= root[..., :, None] * root[..., None, :]
     out[..., range(6), range(6)] = diagonal
     return out
 
 
-def follows(matrix: Array) -> bool:
-    """Return whether a matrix of any unit has couplings, and they follow its diagonal: it is positive semidefinite."""
+def has_scalable_couplings(matrix: Array) -> bool:
+    """Return whether a matrix, of any unit, has couplings and is positive semidefinite (see `with_diagonal`)."""
     coupled = bool(np.any(matrix - np.diag(np.diag(matrix))))
     return coupled and bool(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] >= 0.0)

@@ -243,8 +243,8 @@ class Stages:
     def _weak_start(self) -> dict[str, float]:
         """Return the numbers of the weak form, and cut the trials where it finds a jolt.
 
-        There are none beside fins and other actuators, whose forces that form does not know: from its numbers for a
-        torpedo the fit ended elsewhere in half of all draws.
+        A vehicle with fins or other actuators has none, because the weak form leaves out their forces: fits of a
+        torpedo that began with its numbers often ended at a wrong minimum.
         """
         if self.vehicle.actuators:
             return {}
