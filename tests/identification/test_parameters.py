@@ -164,6 +164,7 @@ def test_the_file_keeps_couplings_symmetric():
     assert not changes(p, x, {}, {}, unmeasured=(), scaled=False)
 
 
+@pytest.mark.filterwarnings("error")  # a glider has no thrusters whose lags could be averaged
 def test_a_parameter_of_a_term_may_be_called_like_a_damping():
     """Only coordinates of the six axes are entries of the matrices."""
     p = Parameters(

@@ -281,8 +281,8 @@ class Parameters:
         weight, B = w.weight, w.buoyancy
         z = self.r_h[2]
         k = B * (w.body.center_of_buoyancy[2] - z) - weight * (w.body.center_of_gravity[2] - z)
-        tc = float(np.mean([t.time_constant for t in w.thrusters.values()]))
-        late = float(np.mean([t.delay for t in w.thrusters.values()]))
+        tc = float(np.mean([t.time_constant for t in w.thrusters.values()] or [0.0]))  # a glider has none
+        late = float(np.mean([t.delay for t in w.thrusters.values()] or [0.0]))
         table = {
             "thrust_scale": (
                 "-",
