@@ -30,6 +30,7 @@ from finssim.core.rotations import quat_from_yaw
 from finssim.evaluation.metrics import T1_SETPOINTS, T1_START
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
@@ -66,7 +67,9 @@ class Stack:
         true_site, known_site, settings = camera_of(vehicle, 1, "realistic")
         x, y, z, yaw = T1_SETPOINTS["P02"]
         pilot = make_pilot(controller, vehicle, task="t1")
-        self.runtime = Runtime(vehicle, known_site, pilot, Station((x, y, z), yaw, name="P02"), arm=True)
+        self.runtime = Runtime(
+            vehicle, Perception(vehicle, known_site), pilot, Station((x, y, z), yaw, name="P02"), arm=True
+        )
         self.pool = VirtualPool(
             vehicle,
             draw_plant(vehicle, 1, "realistic"),

@@ -16,7 +16,7 @@ import numpy as np
 from finssim.control import Station
 from finssim.core import start_warp
 from finssim.pool import PoolCamera, VirtualPool, camera_of, draw_plant, read_truth
-from finssim.robot import Runtime, make_pilot, run_lockstep
+from finssim.robot import Perception, Runtime, make_pilot, run_lockstep
 from finssim.vehicles import load_vehicle
 
 SEED, DURATION = 7, 20.0
@@ -28,7 +28,8 @@ def main() -> None:
     vehicle = load_vehicle("finsrov")
     true_camera, calibrated_camera, settings = camera_of(vehicle, SEED, "realistic")
     station = Station((0.8, -0.3, -0.5), yaw=1.0)
-    robot = Runtime(vehicle, calibrated_camera, make_pilot("pid", vehicle), station, arm=True)
+    perception = Perception(vehicle, calibrated_camera)
+    robot = Runtime(vehicle, perception, make_pilot("pid", vehicle), station, arm=True)
     with tempfile.TemporaryDirectory() as folder:
         pool = VirtualPool(
             vehicle,

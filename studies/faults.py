@@ -632,11 +632,14 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
         with Recorder(record, vehicle, {"command": "python -m studies.faults"}) as recorder:
             bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **{**workspace, **scenario.settings}))
             let_in = station_of(start).position[:2]
-            reckoned = Perception(vehicle, None, mode="error-state", let_in=let_in) if aided else None
+            perception = (
+                Perception(vehicle, None, mode="error-state", let_in=let_in)
+                if aided
+                else Perception(vehicle, plan.calibrated)
+            )
             runtime = Runtime(
-                vehicle, plan.calibrated, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge,
-                recorder=recorder, perception=reckoned,
-            )  # fmt: skip
+                vehicle, perception, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge,
+                recorder=recorder, )  # fmt: skip
             if aided:
                 runtime.attach(link_of("mavlink", vehicle))
             bench = Bench(pool, FaultyWire(pool, RATE), runtime, recorder)

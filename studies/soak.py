@@ -21,6 +21,7 @@ from finssim.evaluation.tables import Table
 from finssim.pool.run import make_plan
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
@@ -68,7 +69,7 @@ def soak(
     body, station = load_vehicle(vehicle), station_of(GOAL)
     plan = make_plan(body, str(seed), severity, camera="corners", seed=seed)  # type: ignore[arg-type]
     pool, site = plan.standing(station, seed=seed), plan.calibrated
-    runtime = Runtime(body, site, make_pilot("pid", body), station, arm=True)
+    runtime = Runtime(body, Perception(body, site), make_pilot("pid", body), station, arm=True)
     began = time.perf_counter()
     samples: list[tuple[float, ...]] = []
     with (folder / "soak.csv").open("w", buffering=1, encoding="utf-8") as file:  # a line at a time

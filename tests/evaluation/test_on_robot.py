@@ -9,6 +9,7 @@ import pytest
 from finssim.control.guidance import Station
 from finssim.core.rotations import quat_from_yaw
 from finssim.evaluation.robot_trials import RobotTrial, TrialStages, start_bounds
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import WrenchPilot
 from finssim.robot.reading import Reading
 from finssim.vehicles import load_vehicle
@@ -36,7 +37,7 @@ def waited(attendant):
                 return
 
     outcome = TrialStages(trial, FINSROV, START, start_bounds("pool", True), attendant=attendant).play(
-        drive, None
+        drive, Perception(FINSROV, None)
     )
     return outcome.ended, outcome.fault, outcome.runtime.reading.time
 

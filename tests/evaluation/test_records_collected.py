@@ -16,6 +16,7 @@ from finssim.pool import draw_plant
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import AgentPilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
@@ -57,7 +58,9 @@ def driven(path, station, seed):
         seed=seed,
     )
     with Recorder(path, FINSROV, {"command": "finssim run"}, pictures="none") as recorder:
-        runtime = Runtime(FINSROV, known_site, pilot, station, arm=True, recorder=recorder)
+        runtime = Runtime(
+            FINSROV, Perception(FINSROV, known_site), pilot, station, arm=True, recorder=recorder
+        )
         run_lockstep(runtime, pool, SECONDS)
     pool.close()
     return pilot

@@ -21,6 +21,7 @@ from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.task_site import Referee
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
@@ -53,7 +54,7 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FI
     about = {"command": "finssim run", "pilot": pilot.describe()}
     guide_end = 0.0 if isinstance(guide, Station) else guide.duration
     with Recorder(record, vehicle, about, pictures="none", epoch=1e9) as recorder:
-        runtime = Runtime(vehicle, known_site, pilot, guide, arm=True, recorder=recorder)
+        runtime = Runtime(vehicle, Perception(vehicle, known_site), pilot, guide, arm=True, recorder=recorder)
         run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(20.0, guide_end) + 0.5)
     pool.close()
     return record, truth, runtime.started

@@ -54,7 +54,7 @@ class Scripted:
 def robot(recorder=None):
     perception = Perception(TORPEDO, None, let_in=START[:2])
     return Runtime(
-        TORPEDO, None, Scripted(), AHEAD, arm=True, perception=perception, bridge=Bridge(TORPEDO), recorder=recorder
+        TORPEDO, perception, Scripted(), AHEAD, arm=True, bridge=Bridge(TORPEDO), recorder=recorder
     )  # fmt: skip
 
 

@@ -12,10 +12,11 @@ from finssim.control.guidance import Station
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.links.transports import memory_pair
 from finssim.robot.messages import Picture
+from finssim.robot.perception import Perception
 from finssim.robot.pictures import TagFinder
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
-from finssim.robot.wiring import run_realtime
+from finssim.robot.wiring import Wires, run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import Rounds, overhead, without_latency
 from reference.tag_picture import draw, pose_corners
@@ -53,10 +54,16 @@ class Acted:
         self.closed = True
 
     def runtime(self):
-        return Runtime(VEHICLE, POOL, make_pilot("pid", VEHICLE), Station((0.5, 0.2, -0.5), 0.3), arm=True)
+        return Runtime(
+            VEHICLE,
+            Perception(VEHICLE, POOL),
+            make_pilot("pid", VEHICLE),
+            Station((0.5, 0.2, -0.5), 0.3),
+            arm=True,
+        )
 
     def run(self, runtime, **options):
-        return run_realtime(runtime, self.ours, self, clock=self.clock, wait=self.wait, **options)
+        return run_realtime(runtime, Wires(self.ours, self), clock=self.clock, wait=self.wait, **options)
 
     def commands(self):
         decoder = Decoder(MCU)

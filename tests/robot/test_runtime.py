@@ -13,6 +13,7 @@ from finssim.control.guidance import Station
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.messages import Delivery, Picture
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import AgentPilot, make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
@@ -75,7 +76,7 @@ class Constant:
 def test_a_decision_falls_on_every_multiple_of_the_pilots_period():
     """At 60 steps a second and 10 decisions: none is missed, and each is within a step of its time."""
     pilot = Constant()
-    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, Shown(), 3.0)
     expected = 0.1 * np.arange(len(pilot.times))
     np.testing.assert_allclose(pilot.times, expected, atol=1e-6)
@@ -85,7 +86,7 @@ def test_a_decision_falls_on_every_multiple_of_the_pilots_period():
 def test_a_late_loop_misses_decisions_and_counts_them():
     """After 0.35 s without a step, three of ten a second are gone; the grid stays where it was."""
     pilot = Constant()
-    runtime, world = Runtime(VEHICLE, POOL, pilot, STATION), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION), Shown()
     for k in range(1, 121):
         now = k / 60 if k <= 60 else k / 60 + 0.35
         delivery = world.exchange(now, ())
@@ -101,17 +102,17 @@ def test_ctrl_c_interrupts_a_trial_and_ends_a_gentle_run_in_good_order():
         if runtime.counters.decisions == 5:
             signal.raise_signal(signal.SIGINT)
 
-    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True), Shown()
     with pytest.raises(KeyboardInterrupt):
         run_lockstep(runtime, world, 2.0, show=press)
-    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True), Shown()
     assert run_lockstep(runtime, world, 2.0, gentle=True, show=press) < 1.0
     assert not any(world.commands()[-1][1].normalised)
 
 
 def test_without_arming_no_thruster_is_ever_enabled():
     """A dry run decides, and sends zeros."""
-    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION), Shown()
     run_lockstep(runtime, world, 2.0)
     assert runtime.counters.decisions > 10
     assert not any(c.enable or any(c.normalised) for _, c in world.commands())
@@ -119,7 +120,7 @@ def test_without_arming_no_thruster_is_ever_enabled():
 
 def test_an_armed_run_commands_and_ends_with_three_frames_without_thrust():
     """Armed as soon as the state is ready; disarmed at the end."""
-    runtime, world = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True), Shown()
     run_lockstep(runtime, world, 2.0)
     enabled = [c.enable for _, c in world.commands()]
     assert any(enabled) and enabled[-4:] == [True, False, False, False]
@@ -133,7 +134,7 @@ def test_an_armed_run_commands_and_ends_with_three_frames_without_thrust():
 )
 def test_a_pilot_that_fails_stops_the_vehicle(wish):
     """Fault with the reason, and zero frames until somebody acknowledges."""
-    runtime, world = Runtime(VEHICLE, POOL, Constant(wish), STATION, arm=True), Shown()
+    runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(wish), STATION, arm=True), Shown()
     run_lockstep(runtime, world, 2.0)
     assert runtime.bridge.state == "fault" and "pilot constant" in runtime.bridge.reason
     assert not any(any(c.normalised) for _, c in world.commands())
@@ -141,7 +142,7 @@ def test_a_pilot_that_fails_stops_the_vehicle(wish):
 
 def test_it_never_arms_a_second_time():
     """After a fault the vehicle stays stopped, though everything is well again."""
-    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     world = Shown(telemetry=lambda t: not 1.5 < t < 2.5)
     run_lockstep(runtime, world, 4.0)
     late = [c for t, c in world.commands() if t > 2.2]
@@ -150,7 +151,7 @@ def test_it_never_arms_a_second_time():
 
 def test_three_seconds_without_vision_hold_the_vehicle():
     """No thrust from a second after the pictures ended until they are back; then it goes on by itself."""
-    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     world = Shown(pictures=lambda t: not 2.0 < t < 5.0)
     run_lockstep(runtime, world, 7.0)
     enabled = {round(60 * t): c.enable for t, c in world.commands()}
@@ -160,7 +161,7 @@ def test_three_seconds_without_vision_hold_the_vehicle():
 
 def test_the_latency_counts_from_the_newest_picture_in_the_state():
     """In lock-step a picture waits for the next decision: at most one period of the pilot."""
-    runtime = Runtime(VEHICLE, POOL, Constant(), STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     run_lockstep(runtime, Shown(), 3.0)
     summary = runtime.counters.summary()
     assert 0.0 <= summary["latency_s"]["p50"] <= summary["latency_s"]["p99"] <= 1 / 30 + 1 / 60 + 1e-6
@@ -169,7 +170,7 @@ def test_the_latency_counts_from_the_newest_picture_in_the_state():
 def test_any_bytes_are_survived():
     """Garbage, parts of frames and frames of another kind leave the loop running."""
     runtime, rng = (
-        Runtime(VEHICLE, POOL, make_pilot("pid", VEHICLE), STATION, arm=True),
+        Runtime(VEHICLE, Perception(VEHICLE, POOL), make_pilot("pid", VEHICLE), STATION, arm=True),
         np.random.default_rng(0),
     )
     world = Shown()
@@ -217,7 +218,7 @@ class Filmed(Shown):
 def test_a_pilot_that_sees_waits_for_pictures_and_stops_when_they_stop():
     """Not armed before the first; none later than 0.5 s and the camera's 0.1 s after the last, and then no thrust."""
     pilot, world = Seeing(), Filmed(end=3.0)
-    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, world, 5.0)
     assert runtime.started == pytest.approx(1.1, abs=0.02)
     assert pilot.shown[0] == 10 and pilot.shown[-1] == 30 and len(pilot.shown) == pytest.approx(26, abs=2)
@@ -230,7 +231,7 @@ def test_a_pilot_that_sees_waits_for_pictures_and_stops_when_they_stop():
 def test_the_age_of_pictures_at_the_command_is_measured():
     """A camera of 10 Hz that is 0.1 s late: exposures are 0.1 to 0.2 s old, as the phase of decisions has it."""
     pilot = Seeing()
-    runtime = Runtime(VEHICLE, POOL, pilot, STATION, arm=True)
+    runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, Filmed(end=9.0), 6.0)
     told = runtime.counters.summary()
     assert 0.1 <= told["exposure_to_command_s"]["p50"] <= 0.2 + 1 / 60

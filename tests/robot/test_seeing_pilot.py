@@ -6,6 +6,7 @@ import pytest
 from finssim.control import ControlError
 from finssim.control.guidance import Station
 from finssim.robot.messages import Picture
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
 from finssim.robot.runtime import Runtime
@@ -47,7 +48,9 @@ def test_what_the_robot_cannot_show_is_refused(policy):
         ControlError, match="policy sees front_camera, which finsrov does not have: .*altimeter"
     ):
         make_pilot(policy, blind)
-    runtime = Runtime(FINSROV, None, make_pilot(policy, FINSROV), Station((0.0, 0.0, 0.0), 0.0))
+    runtime = Runtime(
+        FINSROV, Perception(FINSROV, None), make_pilot(policy, FINSROV), Station((0.0, 0.0, 0.0), 0.0)
+    )
     runtime.start(0.0)
     gray = reading(np.zeros((27, 48), np.uint8))
     runtime._decide(1.0, gray)

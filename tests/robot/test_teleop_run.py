@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.control.guidance import Station
 from finssim.localization.overhead_camera import write_pool
 from finssim.robot.interrupt import interruptible
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry
 from finssim.robot.links.transports import memory_pair
 from finssim.robot.messages import Telemetry
-from finssim.robot.teleop import Hands, drive
-from finssim.robot.wiring import Wiring, open_camera, run_realtime
+from finssim.robot.teleop import DriveSettings, Handover, Hands, drive
+from finssim.robot.wiring import Wires, Wiring, open_camera, run_realtime
 from finssim.vehicles import load_vehicle
 from reference.rounds import overhead
 
@@ -45,7 +46,7 @@ class World:
 
     def drive(self, runtime, **how):
         """As `wiring.connected` gives it."""
-        return run_realtime(runtime, self.ours, clock=self.clock, wait=self.wait, **how)
+        return run_realtime(runtime, Wires(self.ours), clock=self.clock, wait=self.wait, **how)
 
     def clock(self):
         return self.now
@@ -78,7 +79,7 @@ def world():
 @pytest.mark.slow
 def test_a_drive_by_hand(world):
     """Thrust only while the hand is on; the last three frames are off."""
-    runtime = drive(VEHICLE, Script(), world.drive, duration=3.0)
+    runtime = drive(VEHICLE, Script(), world.drive, settings=DriveSettings(duration=3.0))
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
     assert all(not frame.enable and not any(frame.normalised) for _, frame in world.frames[-3:])
@@ -91,7 +92,7 @@ def test_nobody_arms_nothing_moves(world):
         def read(self, now):
             return replace(super().read(now), arm=False, dead_man=True, surge=1.0)
 
-    drive(VEHICLE, Held(), world.drive, duration=2.0)
+    drive(VEHICLE, Held(), world.drive, settings=DriveSettings(duration=2.0))
     assert world.frames and not any(frame.enable for _, frame in world.frames)
 
 
@@ -101,7 +102,7 @@ def test_a_device_that_vanishes_disarms(world):
         def read(self, now):
             return super().read(now) if now < 1.5 else Hands(present=False)
 
-    runtime = drive(VEHICLE, Gone(), world.drive, duration=2.5)
+    runtime = drive(VEHICLE, Gone(), world.drive, settings=DriveSettings(duration=2.5))
     moving = [t for t, frame in world.frames if frame.enable]
     assert moving[-1] < 1.6 and runtime.bridge.state == "disarmed"
 
@@ -115,7 +116,7 @@ def test_a_drive_is_recorded(world, tmp_path):
     from finssim.robot.recorder import Recorder
 
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:
-        drive(VEHICLE, Script(), world.drive, duration=3.0, recorder=recorder)
+        drive(VEHICLE, Script(), world.drive, settings=DriveSettings(duration=3.0), recorder=recorder)
     with open_record(tmp_path / "drive.mcap") as record:
         told = describe_record(record)
     assert "armed" in [event["kind"] for event in told["events"]]
@@ -138,6 +139,9 @@ class Hold:
         return np.full(8, 1.0)
 
 
+HELD = Handover(Hold(), Station((0.0, 0.0, 0.0), 0.0))
+
+
 class Modes(Script):
     """The mode button at 1 s and at 2 s."""
 
@@ -151,7 +155,7 @@ class Modes(Script):
 @pytest.mark.slow
 def test_the_mode_button_hands_over_to_a_controller_and_back(world):
     """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
-    drive(VEHICLE, Modes(), world.drive, other=Hold(), duration=3.0)
+    drive(VEHICLE, Modes(), world.drive, settings=DriveSettings(duration=3.0), handover=HELD)
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
 
@@ -165,7 +169,14 @@ def test_who_steers_is_on_record(world, tmp_path):
     from finssim.robot.recorder import Recorder
 
     with Recorder(tmp_path / "drive.mcap", VEHICLE, {}) as recorder:
-        drive(VEHICLE, Modes(), world.drive, recorder=recorder, other=Hold(), duration=3.0)
+        drive(
+            VEHICLE,
+            Modes(),
+            world.drive,
+            settings=DriveSettings(duration=3.0),
+            recorder=recorder,
+            handover=HELD,
+        )
     with open_record(tmp_path / "drive.mcap") as record:
         told = [json.loads(entry.message.data) for entry in record.messages(["events"])]
     modes = [(event["text"], event["time"]) for event in told if event["kind"] == "mode"]

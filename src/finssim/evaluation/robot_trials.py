@@ -156,18 +156,15 @@ class TrialStages:
         self._reason = ""
         self._begun = False
 
-    def play(
-        self, drive: RobotDriver, site: Pool | None, perception: Perception | None = None
-    ) -> TrialOutcome:
+    def play(self, drive: RobotDriver, perception: Perception) -> TrialOutcome:
         """Play the trial.
 
         Args:
             drive: Runs the robot's software on its wires, or in lock-step with a world.
-            site: Camera, water and frames, as calibrated; None: no camera looks.
-            perception: Otherwise than by default.
+            perception: Estimates the state of the vehicle.
         """
         idle = WrenchPilot(lambda: np.zeros(6), self._vehicle, name="idle")
-        runtime = Runtime(self._vehicle, site, idle, self._start, arm=False, perception=perception)
+        runtime = Runtime(self._vehicle, perception, idle, self._start, arm=False)
         drive(runtime, duration=math.inf, show=self._look, until=self._over)
         fault = self._reason or (fault_of(self._trial, runtime) if self._begun else runtime.bridge.reason)
         fault = fault or ("" if self._ended == "over" else "not finished")
@@ -314,6 +311,8 @@ class OnRobot:
     """True if a person carries the vehicle to every start; False: the tuned PID steers it there."""
     unattended: bool = False
     """True without an attendant: trials begin as soon as the state is known, and a fault ends the session."""
+    attendant: Attendant | None = None
+    """The person beside it; None: whoever is at the terminal's keyboard."""
     let_in: tuple[float, float] | None = None
     """Position of the vehicle when the session begins, x and y, world frame [m]: dead reckoning continues from there
     through all trials. None: a camera or position fixes locate it."""
@@ -493,8 +492,11 @@ class Session:
                     trial, self.equipped, start, start_bounds(self.robot.site, exact), by_hand=self.robot.by_hand,
                     attendant=self.attendant, recorder=recorder,
                 )  # fmt: skip
-                prior = self._reckoning if self.robot.let_in is not None else perception and perception()
-                outcome = stages.play(self.drive, self.site, prior)
+                if self.robot.let_in is not None:
+                    estimates = self._reckoning
+                else:
+                    estimates = perception() if perception else Perception(self.equipped, self.site)
+                outcome = stages.play(self.drive, estimates)
             if recorder is not None and recorder.problem and outcome.ended == "over":
                 raise RobotError(f"{record}: {recorder.problem}")
             stopped = (
@@ -527,15 +529,12 @@ class Session:
 
 
 @contextmanager
-def session(
-    robot: OnRobot, vehicle: Vehicle, *, attendant: Attendant | None = None, console: Console | None = None
-) -> Iterator[Session]:
+def session(robot: OnRobot, vehicle: Vehicle, *, console: Console | None = None) -> Iterator[Session]:
     """Open a robot for trials.
 
     Args:
         robot: Which, and how.
         vehicle: As its file has it.
-        attendant: Instead of the terminal's keyboard.
         console: Where it is told how it stands; standard error if None.
 
     Raises:
@@ -551,6 +550,7 @@ def session(
     site = None if robot.pool_file is None else load_pool(robot.pool_file)
     with ExitStack() as stack:
         drive = stack.enter_context(connected(robot.wiring, robot.equipped(vehicle), site))
+        attendant = robot.attendant
         if attendant is None and not robot.unattended:
             if not sys.stdin.isatty():
                 raise RobotError(
@@ -734,9 +734,7 @@ def play_in_pool(
         # Dead reckoning counts from the start, whose position is exact.
         estimator = {"mode": "error-state", "let_in": start.position[:2], **estimator}
     perception = Perception(vehicle, plan.calibrated, **estimator)
-    runtime = Runtime(
-        vehicle, plan.calibrated, trial.pilot, trial.guide, arm=True, perception=perception, recorder=recorder
-    )
+    runtime = Runtime(vehicle, perception, trial.pilot, trial.guide, arm=True, recorder=recorder)
     runtime.attach(link_of("mavlink" if plan.firmware == "ardusub" else "pool", vehicle))
     longest = GETTING_READY + trial.duration
     with closing(world):
@@ -884,7 +882,6 @@ def play_jobs(
     folder: Path,
     robot: OnRobot | None = None,
     *,
-    attendant: Attendant | None = None,
     console: Console | None = None,
     **options: Any,
 ) -> list[dict[str, Any]]:
@@ -897,7 +894,6 @@ def play_jobs(
         jobs: On a robot of one vehicle; plant 0, severity and camera `HARDWARE`.
         folder: Takes KEY.json, KEY.npz and, of a robot, KEY.mcap of each, made if missing.
         robot: Which, and how; not opened where nothing is left to play. None: in pools.
-        attendant: Instead of the terminal's keyboard.
         console: Where it is told how it stands; standard error if None.
         options: Of `run_jobs`, for pools.
 
@@ -931,9 +927,7 @@ def play_jobs(
 
         def play_next(job: RobotJob, path: Path) -> dict[str, Any] | None:
             if not opened:
-                opened.append(
-                    stack.enter_context(session(robot, vehicle, attendant=attendant, console=console))
-                )
+                opened.append(stack.enter_context(session(robot, vehicle, console=console)))
             return _play_on_robot(job, path, opened[0])
 
         results = campaign.run_jobs(jobs, folder, play_next, processes=1, show=show)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from finssim.robot.links.water_linked import DvlClient, decode_line
     from finssim.robot.lockstep import run_lockstep
     from finssim.robot.messages import Telemetry, ThrusterCommand
+    from finssim.robot.perception import Perception
     from finssim.robot.pilots import make_pilot
     from finssim.robot.reading import Reading
     from finssim.robot.record_reader import open_record
@@ -27,6 +28,7 @@ __all__ = [
     "Hands",
     "MCU",
     "Operator",
+    "Perception",
     "Reading",
     "Recorder",
     "Runtime",

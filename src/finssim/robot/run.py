@@ -391,7 +391,7 @@ _SEEN = Station((0.0, 0.0, 0.0), 0.0, name="sight")
 
 def run(
     mission: Annotated[Mission, "options"],
-    wiring: Wiring,
+    wiring: Annotated[Wiring, "options"],
     localization: Annotated[Localization, "options"],
     *,
     record: Path | None = None,
@@ -487,9 +487,7 @@ def run_alone(
     with _opened(connected(wiring, ours, pool), context) as (drive, recorder):
         if not arm:
             console.print("dry run: thrusters will not turn without --arm")
-        runtime = Runtime(
-            ours, pool, pilot, guide, arm=arm, perception=perception, recorder=recorder, team=team
-        )
+        runtime = Runtime(ours, perception, pilot, guide, arm=arm, recorder=recorder, team=team)
         monitor = _Monitor(runtime, mission.duration, wiring.robot, console)
 
         def look(runtime: Runtime) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from finssim.control.guidance import Guide
-from finssim.localization.overhead_camera import Pool
 from finssim.robot.bridge import Bridge, MotorDevice
 from finssim.robot.goals import highest
 from finssim.robot.links.clock import ClockMap
@@ -257,12 +256,11 @@ class Runtime:
     def __init__(
         self,
         vehicle: Vehicle,
-        pool: Pool | None,
+        perception: Perception,
         pilot: Pilot,
         guide: Guide,
         *,
         arm: bool = False,
-        perception: Perception | None = None,
         bridge: Bridge | None = None,
         recorder: Recorder | None = None,
         team: Team | None = None,
@@ -270,17 +268,16 @@ class Runtime:
         """
         Args:
             vehicle: As its file has it.
-            pool: Camera, water and frames; None: no camera looks.
+            perception: Estimates the state, of pictures, telemetry and position fixes.
             pilot: Who steers.
             guide: Where to; its time starts when the vehicle is armed.
             arm: Arm once, as soon as the state is ready. False: thrusters never turn.
-            perception: Otherwise than by default.
             bridge: Otherwise than by default.
             recorder: Takes down everything.
             team: Hears of others and tells them of this vehicle; None: it is alone.
         """
         self.vehicle, self.pilot, self.guide = vehicle, pilot, guide
-        self.perception = perception or Perception(vehicle, pool)
+        self.perception = perception
         self.bridge = bridge or Bridge(vehicle)
         self.recorder, self.team = recorder, team
         self.told: list[bytes] = []

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal, Protocol, TextIO
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -479,18 +479,37 @@ SHOWN_EVERY = 0.2
 """Between two lines on the terminal [s]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DriveSettings:
+    """Settings of a drive by hand."""
+
+    action: str | None = None
+    """(MODE) What the sticks or keys command: wrench6, a wrench of the thrusters; of a vehicle with fins also
+    surfaces, propellers and each fin by its effect on yaw and pitch, or course_pitch, speed, course and pitch
+    by the autopilot, while the state is known. By the vehicle if not given: surfaces if it has fins."""
+    rate: Annotated[float, (20.0, 200.0)] = 60.0
+    """Rate of the loop [Hz]."""
+    duration: Annotated[float | None, (0.0, None)] = None
+    """Duration [s]; until Ctrl-C if not given."""
+
+
+class Handover(NamedTuple):
+    """Controller to which the mode button hands over."""
+
+    pilot: Pilot
+    guide: Guide
+    """Where it steers to."""
+
+
 def drive(
     vehicle: Vehicle,
     device: Device,
     connection: RobotDriver,
     *,
+    settings: DriveSettings = DriveSettings(),
     pool: Pool | None = None,
     recorder: Recorder | None = None,
-    other: Pilot | None = None,
-    guide: Guide | None = None,
-    action: str | None = None,
-    rate: float = 60.0,
-    duration: float = math.inf,
+    handover: Handover | None = None,
     show: Callable[[Runtime, Operator], None] = lambda runtime, operator: None,
 ) -> Runtime:
     """Drive until the time is over or Ctrl-C; the vehicle starts disarmed, and ends with frames without thrust.
@@ -499,36 +518,31 @@ def drive(
         vehicle: As its file has it.
         device: In the person's hands.
         connection: Runs the robot's software on its wires.
+        settings: What the person commands, the rate of the loop and its duration.
         pool: Camera, water and frames; None: the vehicle is driven, and armed, without localization.
         recorder: Takes down everything.
-        other: Whom the mode button hands over to; None: nobody.
-        guide: Where `other` steers to.
-        action: What the person commands, see `run`; by the vehicle if None.
-        rate: Rate of the loop [Hz].
-        duration: [s]
+        handover: Controller to which the mode button hands over; None: there is none.
         show: Called at every turn.
     """
 
     def swap() -> None:
-        if other is not None:
+        if handover is not None:
             switch.select("other" if switch.mode == "person" else "person")
 
     operator = Operator(device, swap=swap)
-    action = action or ("surfaces" if vehicle.actuators else "wrench6")
+    action = settings.action or ("surfaces" if vehicle.actuators else "wrench6")
+    rate, duration = settings.rate, math.inf if settings.duration is None else settings.duration
     person: Pilot
     if action == "wrench6":
         person = WrenchPilot(operator.wrench, vehicle, period=1.0 / rate)
     else:
         person = HelmPilot(operator.deflection, vehicle, action, period=1.0 / rate)
-    switch = ModeSwitch({"person": person, **({} if other is None else {"other": other})})
+    switch = ModeSwitch({"person": person, **({} if handover is None else {"other": handover.pilot})})
     runtime = Runtime(
         vehicle,
-        pool,
+        Unlocated(vehicle) if pool is None and not person.needs_state else Perception(vehicle, pool),
         switch,
-        guide or Station((0.0, 0.0, 0.0), 0.0),
-        perception=Unlocated(vehicle)
-        if pool is None and not person.needs_state
-        else Perception(vehicle, pool),
+        Station((0.0, 0.0, 0.0), 0.0) if handover is None else handover.guide,
         bridge=Bridge(vehicle, BridgeSettings.of(vehicle, need_reading=False)),
         recorder=recorder,
     )
@@ -545,21 +559,45 @@ def drive(
     return runtime
 
 
+@dataclass(frozen=True, kw_only=True)
+class DriveWiring:
+    """Connection of the vehicle that is driven, and its overhead camera."""
+
+    robot: str = "pool"
+    """(WIRE) Link to the motor controller: udp://HOST:PORT, serial:DEVICE, or pool (the virtual
+    pool on this machine); or to an autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
+    bind: str = "127.0.0.1:54321"
+    """(ADDRESS:PORT) Local address and port, for UDP."""
+    pool_file: Path | None = None
+    """(FILE) Pool file: camera, water plane and frames (.yaml); without it the position is unknown."""
+    pictures: str | None = None
+    """(ADDRESS) Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
+    otherwise none, if not given. Needs --pool-file."""
+
+    def pool(self) -> Pool | None:
+        """Return the pool of the file; None without one.
+
+        Raises:
+            LocalizationError: The file cannot be used.
+            TeleopError: Pictures are requested without it.
+        """
+        if self.pool_file is not None:
+            return load_pool(self.pool_file)
+        if self.pictures is not None:
+            raise TeleopError("--pictures needs the camera's pose: give --pool-file, too")
+        return None
+
+
 def run(
     *,
     vehicle: str = "finsrov",
     device: str = "gamepad",
-    robot: str = "pool",
-    bind: str = "127.0.0.1:54321",
-    pool_file: Path | None = None,
-    pictures: str | None = None,
+    wiring: Annotated[DriveWiring, "options"] = DriveWiring(),
     policy: str | None = None,
     goal: str | None = None,
-    action: str | None = None,
     record: Path | None = None,
     key_hold: float = 0.6,
-    rate: Annotated[float, (20.0, 200.0)] = 60.0,
-    duration: Annotated[float | None, (0.0, None)] = None,
+    settings: Annotated[DriveSettings, "options"] = DriveSettings(),
 ) -> None:
     """Drive by hand. Starts disarmed; START or enter arms; thrust needs LB or a key held.
 
@@ -568,32 +606,20 @@ def run(
     Args:
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         device (NAME): Input device: gamepad or keyboard.
-        robot (WIRE): Link to the motor controller: udp://HOST:PORT, serial:DEVICE, or pool (the virtual
-            pool on this machine); or to an autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run.
-        bind (ADDRESS:PORT): Local address and port, for UDP.
-        pool_file (FILE): Pool file: camera, water plane and frames (.yaml); without it the position is unknown.
-        pictures (ADDRESS): Overhead camera: udp://HOST:PORT or none; the virtual pool's with --robot pool,
-            otherwise none, if not given. Needs --pool-file.
+        wiring: Connection of the vehicle and its camera.
         policy (DIR|pid): Controller to which SELECT or m hands over: pid, or a policy's directory. Needs
             --pool-file and --goal.
         goal (X,Y,Z,YAW): Goal of the policy, x,y,z,yaw [m, deg].
-        action (MODE): What the sticks or keys command: wrench6, a wrench of the thrusters; of a vehicle with fins also
-            surfaces, propellers and each fin by its effect on yaw and pitch, or course_pitch, speed, course and pitch
-            by the autopilot, while the state is known. By the vehicle if not given: surfaces if it has fins.
         record (FILE): Record of the run to write (.mcap).
         key_hold (S): Time for which a key counts as held after its last press [s].
-        rate: Rate of the loop [Hz].
-        duration: Duration [s]; until Ctrl-C if not given.
+        settings: What the person commands, the rate of the loop and its duration.
 
     Raises:
         TeleopError, ControlError, LinkError, VehicleError, LocalizationError, PolicyError, OutputError: What cannot be
             used.
     """
-    body = load_vehicle(vehicle)
-    pool = load_pool(pool_file) if pool_file is not None else None
-    other, guide = _controller(policy, goal, body, pool)
-    if pictures is not None and pool is None:
-        raise TeleopError("--pictures needs the camera's pose: give --pool-file, too")
+    body, pool = load_vehicle(vehicle), wiring.pool()
+    handover = _handover(policy, goal, body, pool)
     with ExitStack() as stack:
         if device == "keyboard":
             hands, keys = stack.enter_context(Keyboard(hold=key_hold)), KEYBOARD_HELP
@@ -601,34 +627,31 @@ def run(
             hands, keys = stack.enter_context(Gamepad()), GAMEPAD_HELP
         else:
             raise TeleopError(f"unknown device '{device}': expected gamepad or keyboard")
-        connection = stack.enter_context(
-            connected(Wiring(robot=robot, bind=bind, pictures=pictures), body, pool)
-        )
-        meta = {"command": "finssim teleop", "robot": robot}
-        recorder = stack.enter_context(recording(record, body, meta, pool_file=pool_file))
+        wires = Wiring(robot=wiring.robot, bind=wiring.bind, pictures=wiring.pictures)
+        connection = stack.enter_context(connected(wires, body, pool))
+        meta = {"command": "finssim teleop", "robot": wiring.robot}
+        recorder = stack.enter_context(recording(record, body, meta, pool_file=wiring.pool_file))
         print(keys, file=sys.stderr)
         drive(
-            body, hands, connection, pool=pool, recorder=recorder, other=other, guide=guide, action=action, rate=rate,
-            duration=math.inf if duration is None else duration, show=_status_line(),
+            body, hands, connection, settings=settings, pool=pool, recorder=recorder, handover=handover,
+            show=_status_line(),
         )  # fmt: skip
         print(file=sys.stderr)
 
 
-def _controller(
-    policy: str | None, goal: str | None, vehicle: Vehicle, pool: Pool | None
-) -> tuple[Pilot | None, Station | None]:
-    """Whom the person hands over to, and where it steers to."""
+def _handover(policy: str | None, goal: str | None, vehicle: Vehicle, pool: Pool | None) -> Handover | None:
+    """Return the controller that the person hands over to, and where it steers to; None without one."""
     if policy is None:
         if goal is not None:
             raise TeleopError("--goal is where a controller steers to: give --policy, too, or omit it")
-        return None, None
+        return None
     if pool is None or goal is None:
         raise TeleopError(
             "a controller to hand over to needs a state and a goal: give --pool-file and --goal"
         )
     station = station_of(goal)
     check_reachable(station, vehicle)
-    return make_pilot(policy, vehicle), station
+    return Handover(make_pilot(policy, vehicle), station)
 
 
 def _status_line() -> Callable[[Runtime, Operator], None]:

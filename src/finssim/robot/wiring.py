@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from finssim.core import realtime
 from finssim.localization.overhead_camera import Pool
@@ -28,7 +28,16 @@ from finssim.robot.pictures import DEFAULT_CAMERA, NoPictures, PictureSource, Ta
 from finssim.robot.runtime import Link, Runtime
 from finssim.vehicles import Vehicle
 
-__all__ = ["POOL_ADDRESS", "RobotDriver", "Wiring", "connected", "link_of", "open_camera", "run_realtime"]
+__all__ = [
+    "POOL_ADDRESS",
+    "RobotDriver",
+    "Wires",
+    "Wiring",
+    "connected",
+    "link_of",
+    "open_camera",
+    "run_realtime",
+]
 
 
 # The outermost loop of a robot in real time: the only place that reads a clock and waits.
@@ -44,12 +53,21 @@ SWITCH = 0.001
 """The longest that another thread keeps Python to itself [s]."""
 
 
+class Wires(NamedTuple):
+    """Open wires of a robot."""
+
+    transport: Transport
+    """To the motor controller."""
+    pictures: PictureSource | None = None
+    """From the camera; None: there is none."""
+    mates: Transport | None = None
+    """To what carries messages between vehicles; None: this one is alone."""
+
+
 def run_realtime(
     runtime: Runtime,
-    transport: Transport,
-    pictures: PictureSource | None = None,
+    wires: Wires,
     *,
-    mates: Transport | None = None,
     rate: float = 60.0,
     duration: float = math.inf,
     until: Callable[[Runtime], bool] = lambda runtime: False,
@@ -64,9 +82,7 @@ def run_realtime(
 
     Args:
         runtime: The robot.
-        transport: To the motor controller.
-        pictures: From the camera; None: there is none.
-        mates: To what carries messages between vehicles; None: this one is alone.
+        wires: Its open wires.
         rate: Steps a second [Hz].
         duration: How long [s].
         until: Ends the run where it says so; asked after every step.
@@ -77,6 +93,7 @@ def run_realtime(
     Returns:
         How long it ran [s].
     """
+    transport, pictures, mates = wires
     period, turn = 1.0 / rate, 0
     with _calm(), interruptible() as interrupted:
         now = start = collected = clock()  # after the garbage of the start, which takes its time
@@ -247,7 +264,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[R
                 pass
             camera.receive(realtime.now())
             runtime.attach(link)
-            return run_realtime(runtime, transport, camera, mates=mates, **options)
+            return run_realtime(runtime, Wires(transport, camera, mates), **options)
 
         yield run
 

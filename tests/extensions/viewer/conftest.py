@@ -12,6 +12,7 @@ from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
@@ -42,7 +43,7 @@ def trial(tmp_path_factory):
     made = Trial(folder / "run.mcap", folder / "truth.fst")
     with Recorder(made.record, vehicle, files={"pool.yaml": folder / "pool.yaml"}) as recorder:
         pilot = make_pilot("pid", vehicle)
-        runtime = Runtime(vehicle, known, pilot, GOAL, arm=True, recorder=recorder)
+        runtime = Runtime(vehicle, Perception(vehicle, known), pilot, GOAL, arm=True, recorder=recorder)
         run_lockstep(runtime, world, made.duration)
     world.close()
     assert runtime.counters.decisions > 30

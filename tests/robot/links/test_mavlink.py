@@ -49,9 +49,7 @@ def drive(
     spec = SPEC.model_copy(update={"firmware": spec})
     pool = VirtualPool(HEAVY, spec, firmware="ardusub", start=(START, quat_from_yaw(yaw)), seed=1)
     perception = Perception(HEAVY, None, mode="error-state", let_in=START[:2])
-    runtime = Runtime(
-        HEAVY, None, make_pilot("pid", HEAVY), Station(goal, 0.4), arm=arm, perception=perception
-    )
+    runtime = Runtime(HEAVY, perception, make_pilot("pid", HEAVY), Station(goal, 0.4), arm=arm)
     link, sent, rows = MavlinkLink(HEAVY), [], []
     link.calibrate_depth = calibrate
     runtime.attach(link)
@@ -333,7 +331,7 @@ def test_a_goal_above_the_surface_by_the_pressure_is_refused_with_the_offset():
 
 def test_a_quiet_instrument_has_not_frozen():
     """Whole milli-g repeat for 2 s while attitude and rates go on; those alone, repeated, have frozen."""
-    runtime = Runtime(HEAVY, None, make_pilot("pid", HEAVY), Station(START, 0.0))
+    runtime = Runtime(HEAVY, Perception(HEAVY, None), make_pilot("pid", HEAVY), Station(START, 0.0))
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     runtime.attach(link)
 

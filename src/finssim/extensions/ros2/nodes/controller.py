@@ -139,9 +139,7 @@ class ControllerNode(RobotNode):
         self.bridge = RemoteBridge(self, lambda: f"{self.get_name()}/{self.modes.switch.mode}")
         self.state = RemoteState(self, safety.state_timeout if safety else STATE_TIMEOUT)
         nowhere = Station((0.0, 0.0, 0.0), 0.0)
-        self.runtime = Runtime(
-            self.vehicle, None, self.modes.switch, nowhere, perception=self.state, bridge=self.bridge
-        )
+        self.runtime = Runtime(self.vehicle, self.state, self.modes.switch, nowhere, bridge=self.bridge)
         self.guide: Guide | None = None
         self.armed = False
         # What the first path needs is imported and computed now: armed, the loop may not wait for it.
