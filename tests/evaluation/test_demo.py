@@ -27,7 +27,7 @@ from finssim.identification.vehicle_file import write_vehicle
 from finssim.learning.training_loop import TrainingLoop
 from finssim.pool import load_plant_spec
 from finssim.studies import demo as demo_module
-from finssim.studies.demo import FULL, Scope, demo, identify
+from finssim.studies.demo import FULL, DemoSettings, Scope, demo, identify
 from finssim.trials.trial_files import load_trials
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.capability import terminal_speed
@@ -174,15 +174,16 @@ def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
             raise KeyboardInterrupt
         return update(self, total)
 
-    options = {"steps": 32_768, "scope": replace(SMALL, pictures=()), "console": Console(quiet=True)}
+    settings = DemoSettings(steps=32_768, scope=replace(SMALL, pictures=()))
+    console = Console(quiet=True)
     with monkeypatch.context() as patch:
         patch.setattr(TrainingLoop, "_update", stop)
         with pytest.raises(KeyboardInterrupt):
-            demo(tmp_path / "demo", **options)
-    assert demo(tmp_path / "demo", **options) == tmp_path / "demo" / "report.html"
+            demo(tmp_path / "demo", settings=settings, console=console)
+    assert demo(tmp_path / "demo", settings=settings, console=console) == tmp_path / "demo" / "report.html"
     assert Policy.load(tmp_path / "demo" / "policy").description.training["complete"]
     with pytest.raises(RobotError, match="results of other settings"):
-        demo(tmp_path / "demo", **{**options, "seed": 2})
+        demo(tmp_path / "demo", settings=replace(settings, seed=2), console=console)
 
 
 CORE_ALONE = """
@@ -221,8 +222,10 @@ def installed(tmp_path):
 
 def test_a_wheel_demonstrates_itself_without_any_extra(installed, tmp_path):
     """`pip install .` is enough, without torch, OpenCV and TensorBoard, and what is left out is said."""
-    scope = replace(SMALL, duration=1.0)
-    program = f"from finssim.studies.demo import Scope, demo; demo('demo', steps=4096, scope={scope!r})"
+    settings = DemoSettings(steps=4096, scope=replace(SMALL, duration=1.0))
+    program = (
+        f"from finssim.studies.demo import DemoSettings, Scope, demo; demo('demo', settings={settings!r})"
+    )
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, env=installed, capture_output=True, text=True
     )
@@ -238,7 +241,7 @@ def test_a_wheel_demonstrates_itself_without_any_extra(installed, tmp_path):
 def test_somebodys_files_are_not_replaced(tmp_path):
     (tmp_path / "thesis.tex").write_text("years", encoding="utf-8")
     with pytest.raises(RobotError, match="holds other files"):
-        demo(tmp_path, steps=1)
+        demo(tmp_path, settings=DemoSettings(steps=1))
 
 
 def test_a_training_curve_leaves_out_rows_without_a_number():

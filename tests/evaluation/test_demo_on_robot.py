@@ -8,7 +8,7 @@ from rich.console import Console
 from finssim.control.policy import Policy
 from finssim.evaluation.robot_trials import OnRobot, RobotError
 from finssim.robot.wiring import Wiring
-from finssim.studies.demo import Scope, demo
+from finssim.studies.demo import DemoSettings, Scope, demo
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool
 
@@ -29,10 +29,10 @@ QUIET = Console(quiet=True)
 def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(tmp_path, capsys):
     """q after the first of four programmes; then the rest, a training, two controllers, and what they did."""
     out, file = tmp_path / "demo", tmp_path / "pool.yaml"
-    options = {"steps": 8192, "scope": SMALL, "console": QUIET}
+    options = {"settings": DemoSettings(steps=8192, scope=SMALL), "console": QUIET}
     with lockstep_pool(FINSROV, file) as wiring, pytest.raises(KeyboardInterrupt):
-        robot = OnRobot(wiring=wiring, pool_file=file, arm=True)
-        demo(out, robot=robot, attendant=Person(("enter:", "\r"), ("enter:", "q")), **options)
+        person = Person(("enter:", "\r"), ("enter:", "q"))
+        demo(out, robot=OnRobot(wiring=wiring, pool_file=file, arm=True, attendant=person), **options)
     (first,) = (out / "trials" / "fit" / "records").glob("*.mcap")
     before = first.stat().st_mtime_ns
     with lockstep_pool(FINSROV, file, sessions=2) as wiring:
@@ -57,4 +57,4 @@ def test_somebodys_folder_is_refused(tmp_path):
         wiring=Wiring(robot="127.0.0.1:1", lockstep=True), pool_file=tmp_path / "p.yaml", arm=True
     )
     with pytest.raises(RobotError, match="holds other files"):
-        demo(tmp_path, robot=robot, scope=SMALL, console=QUIET)
+        demo(tmp_path, robot=robot, settings=DemoSettings(scope=SMALL), console=QUIET)

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.evaluation.excitation import excite_on_robot
+from finssim.evaluation.excitation import PlanSettings, excite_on_robot
 from finssim.evaluation.robot_trials import NEAR, TURNED, OnRobot, RobotError
 from finssim.robot.record_reader import open_record
 from finssim.trials.trial_files import load_trials
@@ -32,9 +32,9 @@ def robot(tmp_path):
     return opened
 
 
-def excite(out, robot, axes="roll", **settings):
-    settings = {"levels": [1.0], **settings}
-    return excite_on_robot(axes, vehicle="finsrov", out=out, robot=robot, console=QUIET, **settings)
+def excite(out, robot, axes="roll", level=1.0):
+    plan = PlanSettings(levels=[str(level)])
+    return excite_on_robot(axes, vehicle="finsrov", out=out, robot=robot, plan=plan, console=QUIET)
 
 
 def test_trials_are_made_one_after_the_other_and_an_interrupted_session_goes_on(tmp_path, robot):
@@ -45,7 +45,7 @@ def test_trials_are_made_one_after_the_other_and_an_interrupted_session_goes_on(
         pytest.raises(KeyboardInterrupt),
     ):
         person = Person(("enter:", "\r"), ("enter:", "q"))
-        excite(out, robot(wiring), attendant=person)
+        excite(out, robot(wiring, attendant=person))
     assert [p.stem for p in (out / "records").glob("*.mcap")] == ["roll_plus_1"]
     assert any("on the way to its start" in line for line in person.read)
     before = (out / "records" / "roll_plus_1.mcap").stat().st_mtime_ns
@@ -70,7 +70,7 @@ def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
     """Surge steps of both directions tell the damping of the plant, 39.1 N s/m, within 5 %."""
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
-        excite(out, robot(wiring, unattended=True), "surge", levels=[12.0])
+        excite(out, robot(wiring, unattended=True), "surge", level=12.0)
     words = f"calibrate hydrodynamics {out} --axes surge --damping linear --vehicle finsrov".split()
     assert boundary.run(app, [*map(str, words), "--out", str(tmp_path / "new.yaml")]) == 0
     found = load_vehicle(tmp_path / "new.yaml").hydrodynamics["calibrated"].linear_damping
@@ -84,8 +84,9 @@ def test_a_robot_that_no_camera_sees_is_excited_by_its_position_fixes(tmp_path):
     with lockstep_pool(heavy, None, **how) as wiring:
         robot = OnRobot(wiring=wiring, pool_file=None, site="open-water", arm=True, unattended=True)
         assert robot.options.endswith("--pool-file none --site open-water --lockstep")
+        plan = PlanSettings(levels=["15"], coast=5.0)
         made = excite_on_robot(
-            "heave", vehicle="bluerov2_heavy", out=out, robot=robot, console=QUIET, levels=[15.0], coast=5.0
+            "heave", vehicle="bluerov2_heavy", out=out, robot=robot, plan=plan, console=QUIET
         )
     for trial in load_trials(made):
         assert np.isfinite(trial.channels["p"]).any() and np.nanmax(np.abs(trial.channels["w"])) > 0.1
@@ -99,7 +100,7 @@ def test_the_operator_stops_a_trial_which_is_put_away_and_played_again_or_skippe
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
         person = Person(("enter:", "\r"), ("3 s of", "x"), ("enter:", "\r"), ("5 s of", ""), ("enter:", "s"))
-        made = excite(out, robot(wiring), attendant=person)
+        made = excite(out, robot(wiring, attendant=person))
     assert made == [out / "roll_plus_1"]
     assert [p.name for p in (out / "records" / "aborted").iterdir()] == ["roll_plus_1_1.mcap"]
     with open_record(out / "records" / "aborted" / "roll_plus_1_1.mcap") as record:
@@ -112,7 +113,7 @@ def test_by_hand_nothing_is_armed_before_the_vehicle_is_at_its_start(tmp_path, r
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file, position=(0.6, 0.0, -0.5)) as wiring:
         person = Person(*[("bring it to its start", key) for key in ("\r", "s")] * 2)
-        assert excite(out, robot(wiring, by_hand=True), attendant=person) == []
+        assert excite(out, robot(wiring, by_hand=True, attendant=person)) == []
     assert not list((out / "records").glob("*.mcap")) and not (out / "records" / "aborted").exists()
     assert not any("enter:" in line for line in person.read)
 
@@ -129,7 +130,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     with pytest.raises(RobotError, match="--by-hand waits for enter"):
         excite(tmp_path / "b", robot(where.wiring, by_hand=True, unattended=True))
     with pytest.raises(RobotError, match="holds other files"):
-        excite(tmp_path / "a", where, levels=[0.5])
+        excite(tmp_path / "a", where, level=0.5)
     from finssim.evaluation.excitation import box_of
 
     small = FINSROV.replace(

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from finssim.core.files import OutputError
-from finssim.evaluation.excitation import excite
+from finssim.evaluation.excitation import PlanSettings, SimulationSettings, excite
 from finssim.identification.programme import programmes
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.trial_files import load_trial
@@ -18,7 +18,7 @@ BLUEROV2 = load_vehicle("bluerov2")
 
 def test_a_written_programme_holds_the_thrusts_of_its_wrench(tmp_path):
     """B times the thruster columns is the wrench column, in every row; times and phases are the programme's."""
-    folders = excite("sway,yaw", vehicle="bluerov2", out=tmp_path / "plan", levels=["5"])
+    folders = excite("sway,yaw", vehicle="bluerov2", out=tmp_path / "plan", plan=PlanSettings(levels=["5"]))
     plan = programmes("sway,yaw", BLUEROV2, levels=[5.0])
     assert [f.name for f in folders] == [p.name for p in plan]
     for folder, programme in zip(folders, plan, strict=True):
@@ -39,7 +39,12 @@ def test_a_written_programme_holds_the_thrusts_of_its_wrench(tmp_path):
 def test_simulated_trials_open_as_they_were_made(tmp_path):
     """A trial read back from its folder has the digest of the one in memory."""
     folders = excite(
-        "surge", vehicle="bluerov2", out=tmp_path / "trials", levels=["5"], simulate=True, seed=3
+        "surge",
+        vehicle="bluerov2",
+        out=tmp_path / "trials",
+        plan=PlanSettings(levels=["5"]),
+        simulation=SimulationSettings(simulate=True),
+        seed=3,
     )
     made = simulate_programme(programmes("surge", BLUEROV2, levels=[5.0]), BLUEROV2, seed=3)
     assert [load_trial(folder).sha256 for folder in folders] == [trial.sha256 for trial in made]
@@ -47,8 +52,8 @@ def test_simulated_trials_open_as_they_were_made(tmp_path):
 
 def test_an_earlier_output_is_replaced_and_a_foreign_folder_is_not(tmp_path):
     """Running again replaces the programmes; a folder with anything else in it is refused."""
-    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", levels=["5,6"])
-    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", levels=["5"])
+    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", plan=PlanSettings(levels=["5,6"]))
+    excite("surge", vehicle="bluerov2", out=tmp_path / "plan", plan=PlanSettings(levels=["5"]))
     assert len(list((tmp_path / "plan").iterdir())) == 2 + 1
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()

@@ -13,19 +13,26 @@ from finssim.evaluation.robot_trials import OnRobot, RobotError, RobotTrial, ses
 from finssim.pool import read_truth
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record
-from finssim.studies.transfer import T1, T2, transfer_experiment
+from finssim.studies.transfer import T1, T2, TransferSettings, transfer_experiment
 from finssim.vehicles import load_vehicle
 from reference.pools import Person, lockstep_pool
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 
 FINSROV = load_vehicle("finsrov")
-T1_ROWS = {"rows": ("pid",), "targets": ("P02", "P03"), "seeds": 1}
+SETPOINTS = ("P02", "P03")
 
 
-def experiment(spec, out, wiring, person=None, **options):
-    robot = OnRobot(wiring=wiring, pool_file=out.parent / "pool.yaml", arm=True, unattended=person is None)
-    return transfer_experiment(spec, out=out, robot=robot, attendant=person, **options)
+def experiment(spec, out, wiring, targets, person=None):
+    robot = OnRobot(
+        wiring=wiring,
+        pool_file=out.parent / "pool.yaml",
+        arm=True,
+        unattended=person is None,
+        attendant=person,
+    )
+    settings = TransferSettings(rows=("pid",), seeds=1)
+    return transfer_experiment(spec, out=out, robot=robot, targets=targets, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +45,10 @@ def held(brief_t1, tmp_path_factory):
     ) as wiring:
         person = Person(("enter:", "\r"), ("enter:", "q"))
         with pytest.raises(KeyboardInterrupt):
-            experiment(T1, out, wiring, person, **T1_ROWS)
+            experiment(T1, out, wiring, SETPOINTS, person)
     first = {path: path.stat().st_mtime_ns for path in (out / "trials").glob("*.json")}
     with lockstep_pool(FINSROV, folder / "pool.yaml", position=(-0.5, 0.2, -0.4)) as wiring:
-        result = experiment(T1, out, wiring, **T1_ROWS)
+        result = experiment(T1, out, wiring, SETPOINTS)
     return out, result, truth, first
 
 
@@ -79,14 +86,14 @@ def test_when_all_is_played_the_robot_is_not_opened(held):
     from finssim.robot.wiring import Wiring
 
     out, result, _, _ = held
-    again = experiment(T1, out, Wiring(robot="127.0.0.1:1", lockstep=True), **T1_ROWS)
+    again = experiment(T1, out, Wiring(robot="127.0.0.1:1", lockstep=True), SETPOINTS)
     assert again["rows"] == result["rows"]
 
 
 def test_a_trajectory_is_followed_from_its_first_pose(tmp_path):
     """T2 straight by the tuned PID: the whole way, and an error of centimetres."""
     with lockstep_pool(FINSROV, tmp_path / "pool.yaml") as wiring:
-        result = experiment(T2, tmp_path / "out", wiring, rows=("pid",), targets=("straight",), seeds=1)
+        result = experiment(T2, tmp_path / "out", wiring, ("straight",))
     row = result["rows"]["pid"]
     assert row["success"] == 1 and row["horizontal_rmse_m"]["value"] < 0.03
     assert "T2 on hardware" in (tmp_path / "out" / "t2.html").read_text()
@@ -127,7 +134,7 @@ def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp
         lockstep_pool(FINSROV, tmp_path / "pool.yaml", silent_from=12.0) as wiring,
         pytest.raises(RobotError, match=r"pid, P02: stopped, which counts: no fresh telemetry"),
     ):
-        experiment(T1, tmp_path / "out", wiring, **T1_ROWS)
+        experiment(T1, tmp_path / "out", wiring, SETPOINTS)
     (played,) = (tmp_path / "out" / "trials").glob("*.json")
     result = json.loads(played.read_text())
     assert not result["success"] and result["e_p_m"] is None

@@ -7,18 +7,32 @@ import pytest
 
 from finssim.evaluation.tables import html_of, markdown_of
 from finssim.learning.train import TrainingSettings
-from finssim.studies.transfer import T1, T2, controllers_of, row_figures, scores, transfer_experiment
+from finssim.studies.transfer import (
+    T1,
+    T2,
+    TransferSettings,
+    controllers_of,
+    row_figures,
+    scores,
+    transfer_experiment,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("brief_t1")]
 
-SMALL = {"plants": 1, "seeds": 1, "rows": ("pid",), "targets": ("P01",), "processes": 1}
+SMALL = {"plants": 1, "seeds": 1, "rows": ("pid",), "processes": 1}
+
+
+def experiment(out, targets=("P01",), **changes):
+    return transfer_experiment(
+        T1, out=out, targets=targets, settings=TransferSettings(**{**SMALL, **changes})
+    )
 
 
 @pytest.fixture(scope="module")
 def small(brief_t1, tmp_path_factory):
     """One trial of the tuned PID, as long as `brief_t1` has it: its folder and result."""
     out = tmp_path_factory.mktemp("t1")
-    return out, transfer_experiment(T1, out=out, **SMALL)
+    return out, experiment(out)
 
 
 def test_the_tuned_pid_holds_a_setpoint_of_the_pool(small):
@@ -36,7 +50,7 @@ def test_a_second_call_plays_nothing_again(small):
     """What lies in the folder is taken; a new target is added."""
     out, result = small
     before = {path: path.stat().st_mtime_ns for path in (out / "trials").iterdir()}
-    again = transfer_experiment(T1, out=out, **SMALL)
+    again = experiment(out)
     assert {path: path.stat().st_mtime_ns for path in (out / "trials").iterdir()} == before
     assert again["rows"] == result["rows"]
 
@@ -65,7 +79,7 @@ def test_the_table_stands_beside_the_papers(small):
 def test_what_is_unknown_is_refused_before_anything_is_trained(tmp_path, wrong, words):
     """In one sentence that names what there is."""
     with pytest.raises(ValueError, match=words):
-        transfer_experiment(T1, out=tmp_path, **{**SMALL, **wrong})
+        experiment(tmp_path, **wrong)
     assert not list(tmp_path.iterdir())
 
 

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from finssim.evaluation.excitation import excite
+from finssim.evaluation.excitation import PlanSettings, excite
 from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
 from finssim.identification.parameters import actuator_fields, scaled_actuators
 from finssim.identification.simulation_error import fit_by_simulation
@@ -45,14 +45,14 @@ def test_tables_for_another_autopilot(tmp_path):
     """`excite --kind manoeuvres` writes the orders; what belongs to other kinds is refused."""
     file = tmp_path / "torpedo.yaml"
     file.write_text("extends: remus100\n", encoding="utf-8")
-    folders = excite("all", vehicle=str(file), kind="manoeuvres", out=tmp_path / "plan")
+    folders = excite("all", vehicle=str(file), plan=PlanSettings(kind="manoeuvres"), out=tmp_path / "plan")
     with (folders[1] / "programme.csv").open(encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     assert list(rows[0]) == ["t", "speed", "course", "depth", "turn"]
     assert {float(row["course"]) for row in rows} == {0.0, 60.0, -60.0}
     assert [float(row["speed"]) for row in rows[-2:]] == [0.0, 0.0]  # the stop, and its end
     with pytest.raises(CalibrationError, match="axes all"):
-        excite("surge", vehicle=str(file), kind="manoeuvres", out=tmp_path / "other")
+        excite("surge", vehicle=str(file), plan=PlanSettings(kind="manoeuvres"), out=tmp_path / "other")
 
 
 def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():

@@ -24,7 +24,6 @@ from finssim.core.quiet import start_warp
 from finssim.core.rotations import quat_inverse_rotate, quat_rotate
 from finssim.evaluation.campaign import Show, run_jobs
 from finssim.evaluation.robot_trials import (
-    Attendant,
     OnRobot,
     PoolJob,
     RobotTrial,
@@ -370,7 +369,6 @@ def record_programmes(
     vehicle: str,
     robot: OnRobot | None = None,
     *,
-    attendant: Attendant | None = None,
     console: Console | None = None,
     **pool: Any,
 ) -> dict[str, list[Path]]:
@@ -382,7 +380,6 @@ def record_programmes(
         vehicle: Name or file, as the robot knows it.
         robot: That plays what has no trial in its folder yet, within the workspace; not opened where nothing is left.
             None: a virtual pool does.
-        attendant: Beside the robot, instead of the terminal's keyboard.
         console: Where a robot's state is told; standard error if None.
         pool: Arguments of `_in_pool`.
 
@@ -398,7 +395,7 @@ def record_programmes(
     if robot is None:
         _in_pool(plans, folders, vehicle, **pool)
     else:
-        _on_robot(plans, folders, load_vehicle(vehicle), robot, attendant, console)
+        _on_robot(plans, folders, load_vehicle(vehicle), robot, console)
     planned = {role: [folders[role] / programme.name for programme in plan] for role, plan in plans.items()}
     return {role: [path for path in paths if path.is_dir()] for role, paths in planned.items()}
 
@@ -408,7 +405,6 @@ def _on_robot(
     folders: Mapping[str, Path],
     vehicle: Vehicle,
     robot: OnRobot,
-    attendant: Attendant | None,
     console: Console | None,
 ) -> None:
     remaining = [
@@ -422,7 +418,7 @@ def _on_robot(
     check_starts({path.name: start for path, start in starts.items()}, vehicle)
     if not remaining:
         return
-    with session(robot, vehicle, attendant=attendant, console=console) as opened:
+    with session(robot, vehicle, console=console) as opened:
         for role, programme, path in remaining:
             record = folders[role] / RECORDS / f"{programme.name}.mcap"
             if not record.is_file():
@@ -522,22 +518,83 @@ def _in_pool(
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """Settings of the programmes that are played."""
+
+    kind: str = "published"
+    """(KIND) published (steps, dive-and-coast, pulses), validation, multisine, or manoeuvres (speed runs,
+    zig-zags, circles, dives) of a vehicle that must move to steer, for which axes is all."""
+    levels: Sequence[str] | None = None
+    """(LEVELS) Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times."""
+    from_fit: Annotated[Path | None, "--from"] = None
+    """(FILE|DIR) Report of a calibration, or its fit.json: plays the dive that it recommends next."""
+    repeats: Annotated[int, (1, 100)] = 1
+    """Repeats of every programme."""
+    coast: float = 30.0
+    """Longest coast after a dive [s]."""
+    duration: float = 60.0
+    """Duration of a multi-sine [s]."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that exclude each other.
+
+        Raises:
+            CalibrationError: They do.
+        """
+        if self.from_fit is not None and (self.levels or self.kind != "published"):
+            raise CalibrationError("--from excludes --kind and --levels: the fit gives them")
+
+    def programmes(self, axes: str, vehicle: Vehicle, seed: int) -> list[Programme]:
+        """Return the programmes, in the order in which to run them; axes and seed as of `programmes`.
+
+        Raises:
+            CalibrationError: A programme is impossible.
+        """
+        return programmes(
+            axes, vehicle, kind=self.kind, levels=_levels(self.levels or ()), repeats=self.repeats, seed=seed,
+            coast=self.coast, duration=self.duration,
+            legs=() if self.from_fit is None else read_legs(self.from_fit),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationSettings:
+    """Settings of the simulation that plays the programmes, in place of a robot."""
+
+    simulate: bool = False
+    """Run them in the simulator and write the trials."""
+    pool: Annotated[int | None, (0, None)] = None
+    """(SEED) Seed of a virtual pool, in which the robot's software plays them, records, and writes trials."""
+    severity: str | None = None
+    """(NAME) Severity of that pool: nominal, realistic or hard; realistic if not given."""
+    pool_vehicle: str | None = None
+    """(NAME|FILE) Vehicle around which that pool's plant is drawn; the robot's if not given."""
+    inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench")
+    """(NAMES) Inputs logged in simulated trials, of wrench,rpm,force,pwm,command."""
+
+    def check(self, robot: OnRobot | None) -> None:
+        """Refuse settings that exclude each other.
+
+        Raises:
+            CalibrationError: They do.
+        """
+        of_pool = self.severity is not None or self.pool_vehicle is not None
+        if robot is not None and (self.simulate or self.pool is not None or of_pool):
+            raise CalibrationError("--robot excludes --simulate, --pool and their options")
+        if self.pool is not None and self.simulate:
+            raise CalibrationError("--pool excludes --simulate: give one of them")
+        if self.pool is None and of_pool:
+            raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
+
+
 def excite(
     axes: str,
     *,
     vehicle: str,
     out: Path,
-    kind: str = "published",
-    levels: Sequence[str] | None = None,
-    from_fit: Annotated[Path | None, "--from"] = None,
-    repeats: Annotated[int, (1, 100)] = 1,
-    simulate: bool = False,
-    pool: Annotated[int | None, (0, None)] = None,
-    severity: str | None = None,
-    pool_vehicle: str | None = None,
-    inputs: Annotated[Sequence[str], ","] = ("rpm", "wrench"),
-    coast: float = 30.0,
-    duration: float = 60.0,
+    plan: Annotated[PlanSettings, "options"] = PlanSettings(),
+    simulation: Annotated[SimulationSettings, "options"] = SimulationSettings(),
     robot: OnRobot | None = None,
     seed: int = 1,
     as_json: bool = False,
@@ -552,18 +609,8 @@ def excite(
         axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (DIR): Directory of the programmes or trials.
-        kind (KIND): published (steps, dive-and-coast, pulses), validation, multisine, or manoeuvres (speed runs,
-            zig-zags, circles, dives) of a vehicle that must move to steer, for which axes is all.
-        levels (LEVELS): Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times.
-        from_fit (FILE|DIR): Report of a calibration, or its fit.json: plays the dive that it recommends next.
-        repeats: Repeats of every programme.
-        simulate: Run them in the simulator and write the trials.
-        pool (SEED): Seed of a virtual pool, in which the robot's software plays them, records, and writes trials.
-        severity (NAME): Severity of that pool: nominal, realistic or hard; realistic if not given.
-        pool_vehicle (NAME|FILE): Vehicle around which that pool's plant is drawn; the robot's if not given.
-        inputs (NAMES): Inputs logged in simulated trials, of wrench,rpm,force,pwm,command.
-        coast: Longest coast after a dive [s].
-        duration: Duration of a multi-sine [s].
+        plan: Programmes that are played.
+        simulation: Simulation that plays them; without one they are written as tables.
         robot: The robot that plays them, in place of a simulation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
@@ -574,54 +621,49 @@ def excite(
     Raises:
         CalibrationError, RobotError, VehicleError, OutputError: As they say.
     """
-    plan: dict[str, Any] = {
-        "kind": kind, "levels": _levels(levels or ()), "repeats": repeats, "coast": coast, "duration": duration,
-        "legs": () if from_fit is None else read_legs(from_fit),
-    }  # fmt: skip
-    if from_fit is not None and (levels or kind != "published"):
-        raise CalibrationError("--from excludes --kind and --levels: the fit gives them")
-    of_pool = severity is not None or pool_vehicle is not None
-    if robot is not None and (simulate or pool is not None or of_pool):
-        raise CalibrationError("--robot excludes --simulate, --pool and their options")
-    if pool is not None and simulate:
-        raise CalibrationError("--pool excludes --simulate: give one of them")
-    if pool is None and of_pool:
-        raise CalibrationError("--severity and --pool-vehicle need a virtual pool: give --pool SEED")
+    simulation.check(robot)
     if robot is not None:
-        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, seed=seed, **plan)
-        print_folders(folders, as_json)
-        return folders
-    start_warp()
-    body, pool_vehicle, severity = load_vehicle(vehicle), pool_vehicle or vehicle, severity or "realistic"
-    if kind == MANOEUVRES:
-        if axes != "all" or levels or repeats > 1 or pool is not None:
+        folders = excite_on_robot(axes, vehicle=vehicle, out=out, robot=robot, plan=plan, seed=seed)
+    elif plan.kind == MANOEUVRES:
+        start_warp()
+        if axes != "all" or plan.levels or plan.repeats > 1 or simulation.pool is not None:
             raise CalibrationError(
                 f"--kind {MANOEUVRES} takes axes all, without --levels, --repeats and --pool"
             )
-        folders = _excite_by_course(body, Path(out), simulate=simulate, seed=seed)
-        print_folders(folders, as_json)
-        return folders
-    played = programmes(axes, body, seed=seed, **plan)
+        folders = _excite_by_course(load_vehicle(vehicle), Path(out), simulate=simulation.simulate, seed=seed)
+    else:
+        start_warp()
+        folders = _excite_in_simulation(axes, vehicle, out, plan, simulation, seed)
+    print_folders(folders, as_json)
+    return folders
+
+
+def _excite_in_simulation(
+    axes: str, vehicle: str, out: Path, plan: PlanSettings, simulation: SimulationSettings, seed: int
+) -> list[Path]:
+    """Play programmes in a pool or the simulator, or write them as tables; arguments as of `excite`."""
+    body, pool, simulate = load_vehicle(vehicle), simulation.pool, simulation.simulate
+    played = plan.programmes(axes, body, seed)
     if pool is not None:
         played = [trimmed(programme, body) for programme in played]
     with atomic_directory(out, replaces=PLAN_FILE) as folder:
         if pool is not None:
-            about = {"vehicle": load_vehicle(pool_vehicle).name, "plant": pool, "severity": severity}
-            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"pool": about}))
+            drawn_around, severity = simulation.pool_vehicle or vehicle, simulation.severity or "realistic"
+            about = {"vehicle": load_vehicle(drawn_around).name, "plant": pool, "severity": severity}
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"pool": about}))
             with progress_bar("playing programmes") as progress:
                 record_programmes(
-                    {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=pool_vehicle, plant=pool,
+                    {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=drawn_around, plant=pool,
                     severity=severity, seed=seed, progress=progress, show=_show_left_out,
                 )  # fmt: skip
         else:
-            take_folder(folder / PLAN_FILE, _about(body, played, seed, kind, {"simulated": simulate}))
-            for trial in simulate_programme(played, body, seed=seed, inputs=inputs) if simulate else ():
+            take_folder(folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"simulated": simulate}))
+            trials = simulate_programme(played, body, seed=seed, inputs=simulation.inputs) if simulate else ()
+            for trial in trials:
                 write_trial(trial, folder / trial.name)
             for programme in () if simulate else played:
                 write_programme(programme, body, folder / programme.name)
-    folders = [path for programme in played if (path := Path(out) / programme.name).is_dir()]
-    print_folders(folders, as_json)
-    return folders
+    return [path for programme in played if (path := Path(out) / programme.name).is_dir()]
 
 
 def _show_left_out(run: PoolRun, result: Mapping[str, Any]) -> None:
@@ -677,19 +719,19 @@ def excite_on_robot(
     vehicle: str,
     out: Path,
     robot: OnRobot,
+    plan: PlanSettings,
     seed: int = 0,
-    attendant: Attendant | None = None,
     console: Console | None = None,
-    **plan: Any,
 ) -> list[Path]:
     """Play programmes on a robot, one after the other; what lies in the folder is not played again.
 
     Args:
-        axes: As for `programmes`; so are seed and plan (kind, levels, repeats, coast, duration).
+        axes: As for `programmes`.
         vehicle: Name or file of the vehicle; its workspace is where programmes go to and fro.
         out: Takes a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
         robot: Which, and how.
-        attendant: Instead of the terminal's keyboard.
+        plan: Programmes that are played.
+        seed: Seed of a multi-sine's phases.
         console: Where it is told how it stands; standard error if None.
 
     Returns:
@@ -700,14 +742,9 @@ def excite_on_robot(
     """
     start_warp()
     body = load_vehicle(vehicle)
-    played = programmes(axes, body, seed=seed, **plan)
-    take_folder(
-        Path(out) / PLAN_FILE, _about(body, played, seed, str(plan.get("kind", "published")), {"robot": True})
-    )
-    folders = {"fit": Path(out)}
-    return record_programmes({"fit": played}, folders, vehicle, robot, attendant=attendant, console=console)[
-        "fit"
-    ]
+    played = plan.programmes(axes, body, seed)
+    take_folder(Path(out) / PLAN_FILE, _about(body, played, seed, plan.kind, {"robot": True}))
+    return record_programmes({"fit": played}, {"fit": Path(out)}, vehicle, robot, console=console)["fit"]
 
 
 def _about(

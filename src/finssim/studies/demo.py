@@ -33,7 +33,6 @@ from finssim.evaluation.figures import clean, legend_below, new_figure, save_fig
 from finssim.evaluation.metrics import T1_SETPOINTS
 from finssim.evaluation.robot_trials import (
     FIRMWARES,
-    Attendant,
     OnRobot,
     RobotError,
     RobotJob,
@@ -54,7 +53,7 @@ from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
 from finssim.sim import RectangularPool
 from finssim.studies.demo_course import demo_course
-from finssim.studies.transfer import T1, Spec, transfer_experiment
+from finssim.studies.transfer import T1, Spec, TransferSettings, transfer_experiment
 from finssim.trials.findings import Finding, sentences
 from finssim.trials.trial import Trial
 from finssim.trials.trial_files import load_trials
@@ -451,18 +450,32 @@ FULL = Scope(
 """Scope of `finssim demo`."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings:
+    """Settings of a demonstration: its vehicle, training and extent."""
+
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+    steps: Annotated[int | None, (1, None)] = None
+    """Control steps of the training, summed over all worlds; the task's default if not given."""
+    firmware: str = "mcu"
+    """(NAME) Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
+    MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
+    its camera, with setpoints three times as far)."""
+    scope: Scope | None = None
+    """`FULL` if None."""
+    processes: Annotated[int | None, "python"] = None
+    """As many as there are processors if None."""
+
+
 def demo(
     out: Annotated[Path, "--out"] = Path("demo"),
     *,
-    vehicle: str = "finsrov",
-    seed: int = 1,
-    steps: Annotated[int | None, (1, None)] = None,
-    console: Console | None = None,
-    scope: Scope | None = None,
-    processes: Annotated[int | None, "python"] = None,
-    firmware: str = "mcu",
+    settings: Annotated[DemoSettings, "options"] = DemoSettings(),
     robot: OnRobot | None = None,
-    attendant: Attendant | None = None,
+    console: Console | None = None,
     as_json: bool = False,
 ) -> Path:
     """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
@@ -483,17 +496,9 @@ def demo(
 
     Args:
         out (DIR): Directory of trials, vehicle, policy, results and report.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        seed: Seed of every random number; equal seeds give equal results.
-        steps: Control steps of the training, summed over all worlds; the task's default if not given.
-        console: Where progress is shown; standard error if None.
-        scope: How much of it; `FULL` if None.
-        processes: As many as there are processors if None.
-        firmware (NAME): Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
-            MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
-            its camera, with setpoints three times as far).
+        settings: Vehicle, training and extent.
         robot: Where trials are made and setpoints held, in place of the virtual pool.
-        attendant: The person beside that robot, instead of the terminal's keyboard.
+        console: Where progress is shown; standard error if None.
         as_json: Print one JSON object instead of tables.
 
     Returns:
@@ -503,26 +508,27 @@ def demo(
         RobotError: The folder is of another demonstration.
         KeyboardInterrupt: After Ctrl-C; the same command goes on.
     """
-    console, standing = console or Console(stderr=True), load_vehicle(vehicle)
-    firmware = firmware_of(firmware, standing, robot)
+    console, standing = console or Console(stderr=True), load_vehicle(settings.vehicle)
+    settings = replace(settings, firmware=firmware_of(settings.firmware, standing, robot))
     start_warp()
     about = {
-        "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": seed, "steps": steps,
-        "firmware": firmware, "robot": robot is not None,
+        "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": settings.seed,
+        "steps": settings.steps, "firmware": settings.firmware, "robot": robot is not None,
     }  # fmt: skip
     take_folder(Path(out) / "demo.yaml", about)
     if must_move(standing):
-        if robot is not None or firmware != "mcu":
+        if robot is not None or settings.firmware != "mcu":
             raise RobotError(
                 f"{standing.name} must move to steer: its demonstration is in the virtual site alone, without --robot "
                 "and --firmware"
             )
-        tables, report = demo_course(Path(out), standing, seed=seed, steps=steps, console=console)
+        tables, report = demo_course(
+            Path(out), standing, seed=settings.seed, steps=settings.steps, console=console
+        )
         return _shown(tables, report, as_json)
     demonstration = _Demonstration(
-        out=Path(out), name=vehicle, standing=standing, seed=seed, steps=steps, scope=scope or FULL, console=console,
-        processes=processes, robot=robot, attendant=attendant, firmware=firmware,
-    )  # fmt: skip
+        out=Path(out), settings=settings, standing=standing, console=console, robot=robot
+    )
     return _shown(demonstration.run(), Path(out) / REPORT_FILE, as_json)
 
 
@@ -561,18 +567,11 @@ class _Demonstration:
 
     out: Path
     """Directory of the results."""
-    name: str
-    """Name or file of the vehicle, as the catalogue has it."""
+    settings: DemoSettings
+    """The seed is also that of the pool, and the firmware that of the robot."""
     standing: Vehicle
-    seed: int
-    """Also of the pool."""
-    steps: int | None
-    scope: Scope
     console: Console
-    processes: int | None
     robot: OnRobot | None
-    attendant: Attendant | None
-    firmware: str
 
     def run(self) -> list[Table]:
         """Identify, train, deploy and report; returns the tables of what was held."""
@@ -585,14 +584,11 @@ class _Demonstration:
         self.report(f"report so far: {self.out / REPORT_FILE}")
         with self._working("training and holding setpoints") as progress:
             result = transfer_experiment(
-                spec, out=held, seeds=1, seed=self.seed, rows=list(spec.rows), firmware=self.firmware,
-                vehicle=str(self.out / VEHICLE_FILES[1].format(self.standing.name)), steps=self.steps,
-                processes=self.processes, robot=self.robot, attendant=self.attendant, console=self.console,
+                spec, out=held, settings=self._transfer(spec), robot=self.robot, console=self.console,
                 progress=progress, show=self._show,
-                **({} if self.robot else {"plants": 1, "severity": SEVERITY, "pool_vehicle": self.name}),
             )  # fmt: skip
         policy, tables = self.out / "policy", spec.tables(result)
-        shutil.copytree(held / "policies" / f"{POLICY}-seed{self.seed}", policy, dirs_exist_ok=True)
+        shutil.copytree(held / "policies" / f"{POLICY}-seed{self.settings.seed}", policy, dirs_exist_ok=True)
         curves = np.genfromtxt(policy / "curves.csv", delimiter=",", names=True, ndmin=1)
         save_figure(_training(curves), self.out / "training.png")
         trials = [played_trial(r, held / "trials") for r in result["trials"] if r["job"]["row"] == POLICY]
@@ -604,7 +600,12 @@ class _Demonstration:
             paths = {"paths.png": "Paths of the trials from above and from the side [m]"}
             drawn.insert(0, Table(title="Paths of the policy", pictures=paths))
         files = dict(Policy.load(policy).description.files)
-        origin = {"vehicle": result["vehicle"], "seed": self.seed, "policy": files, **result["provenance"]}
+        origin = {
+            "vehicle": result["vehicle"],
+            "seed": self.settings.seed,
+            "policy": files,
+            **result["provenance"],
+        }
         picture, caption = spec.picture
         write_page(
             self.out / REPORT_FILE,
@@ -622,20 +623,32 @@ class _Demonstration:
     def _spec(self) -> Spec:
         """Station keeping by the policy and a PID; one setpoint with pictures, which takes longest, first."""
         names = (POLICY, "pid")
-        rows = {name: replace(T1.rows[name], changes={"duration": self.scope.duration}) for name in names}
-        if self.robot is None and self.firmware == "mcu" and not find_spec("cv2"):
+        scope, by_camera = self.settings.scope or FULL, self.robot is None and self.settings.firmware == "mcu"
+        rows = {name: replace(T1.rows[name], changes={"duration": scope.duration}) for name in names}
+        if by_camera and not find_spec("cv2"):
             self.report(
                 "OpenCV is not installed (pip install 'finssim[vision]'): tag corners are computed in every trial, "
                 "and none is played with pictures"
             )
-        elif self.robot is None and self.firmware == "mcu":
-            title, changes = "The same, by pictures", {"duration": self.scope.duration, "camera": "pictures"}
+        elif by_camera:
+            title, changes = "The same, by pictures", {"duration": scope.duration, "camera": "pictures"}
             with_pictures = replace(
-                rows[POLICY], title=title, changes=changes, targets=self.scope.pictures,
+                rows[POLICY], title=title, changes=changes, targets=scope.pictures,
                 training={"name": POLICY, **(rows[POLICY].training or {})},
             )  # fmt: skip
             rows = {WITH_PICTURES: with_pictures, **rows}
-        return replace(T1, rows=rows, targets=self.scope.setpoints, bases=(POLICY,))
+        return replace(T1, rows=rows, targets=scope.setpoints, bases=(POLICY,))
+
+    def _transfer(self, spec: Spec) -> TransferSettings:
+        """Settings of the training and of the trials of its policy."""
+        settings, vehicle = self.settings, self.out / VEHICLE_FILES[1].format(self.standing.name)
+        chosen = TransferSettings(
+            seeds=1, seed=settings.seed, rows=list(spec.rows), vehicle=str(vehicle), steps=settings.steps,
+            firmware=settings.firmware, processes=settings.processes,
+        )  # fmt: skip
+        if self.robot is not None:
+            return chosen
+        return replace(chosen, plants=1, severity=SEVERITY, pool_vehicle=settings.vehicle)
 
     @property
     def _title(self) -> str:
@@ -645,7 +658,7 @@ class _Demonstration:
     @property
     def site(self) -> str:
         """Return the place of the trials."""
-        return FIRMWARES[self.firmware].site if self.robot is None else self.robot.site
+        return FIRMWARES[self.settings.firmware].site if self.robot is None else self.robot.site
 
     def report(self, text: str) -> None:
         """Show a line of progress."""
@@ -661,7 +674,7 @@ class _Demonstration:
 
     def _identified(self) -> Identification:
         """Trials, and the vehicle that they make identifiable."""
-        standing, scope = self.standing, self.scope
+        standing, settings, scope = self.standing, self.settings, self.settings.scope or FULL
         levels = {
             role: matched(x, standing) for role, x in (("fit", scope.levels), ("held-out", scope.held_out))
         }
@@ -671,15 +684,14 @@ class _Demonstration:
         }
         plans["fit"] += shuttles(matched(scope.shuttles, standing), standing) if scope.shuttles else []
         plans = {role: [trimmed(programme, standing) for programme in plan] for role, plan in plans.items()}
-        person: dict[str, Any] = {"attendant": self.attendant, "console": self.console}
         if self.robot is None:
-            spec = site_of(self.site, draw_plant(standing, self.seed, SEVERITY))
+            spec = site_of(self.site, draw_plant(standing, settings.seed, SEVERITY))
             spec.write(self.out / PLANT_FILE)
         with self._working("recording trials") as progress:
             record = partial(
-                record_programmes, plans, robot=self.robot, **person, pool_vehicle=self.name, plant=self.seed,
-                severity=SEVERITY, seed=self.seed, site=self.site, firmware=self.firmware,
-                processes=self.processes, progress=progress,
+                record_programmes, plans, robot=self.robot, console=self.console, pool_vehicle=settings.vehicle,
+                plant=settings.seed, severity=SEVERITY, seed=settings.seed, site=self.site,
+                firmware=settings.firmware, processes=settings.processes, progress=progress,
             )  # fmt: skip
 
             def recorded(folders: Mapping[str, Path], rough: str) -> Mapping[str, Sequence[Trial]]:
@@ -694,13 +706,15 @@ class _Demonstration:
                 }
                 self._show_recorded([trial for of_role in trials.values() for trial in of_role])
                 if not (self.out / "t1" / "policies").exists():
-                    beside.enter_context(running(_compile_training, rough, FIRMWARES[self.firmware].action))
+                    beside.enter_context(
+                        running(_compile_training, rough, FIRMWARES[settings.firmware].action)
+                    )
                 self.report("identifying the vehicle from these trials")
                 progress(1.0, "identifying the vehicle from them")
                 return trials
 
             with ExitStack() as beside:
-                result = identify(self.out, self.name, seed=self.seed, record=recorded)
+                result = identify(self.out, settings.vehicle, seed=settings.seed, record=recorded)
         identifiable = sum(e.identifiable for e in result.fit.estimates.values())
         self.report(
             f"identified from {len(result.fit.trials)} trials in {result.seconds:.0f} s: {identifiable} of "
@@ -736,11 +750,12 @@ class _Demonstration:
 
     def _commands(self) -> list[str]:
         """Command lines that repeat the demonstration's steps by hand."""
-        out, seed, name = self.out, self.seed, self.standing.name
+        out, seed, name = self.out, self.settings.seed, self.standing.name
+        drawn_around = self.settings.vehicle
         rough, identified = (out / file.format(name) for file in VEHICLE_FILES)
         steps = Policy.load(out / "policy").description.training["steps"]
         options = f"--randomize {RANGES} --seed {seed} --steps {steps}"
-        action = FIRMWARES[self.firmware].action
+        action = FIRMWARES[self.settings.firmware].action
         options += f" --action {action}" if action else ""
         learn = f"finssim train t1 --vehicle {identified} {options} --out policy"
         drive = f"finssim run --policy policy --vehicle {identified} --goal 1,0.3,-0.5,90"
@@ -750,15 +765,15 @@ class _Demonstration:
             robot = f"{self.robot.options} --arm"
             evaluated = f"finssim evaluate run.mcap --task t1 --vehicle {identified}"
             return [f"{excite} {robot}", *middle, f"{drive} {robot} --record run.mcap", evaluated]
-        if self.firmware != "mcu":
-            tank = f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --firmware ardusub"
+        if self.settings.firmware != "mcu":
+            tank = f"finssim pool --vehicle {drawn_around} --plant {out / PLANT_FILE} --firmware ardusub"
             robot = f"--robot mavlink --site {self.site} --pool-file none --let-in 0,0 --arm"
             tank += f" --site {self.site} --truth truth.fst"
             return [tank, f"{excite} {robot}", *middle, f"{drive} {robot}"]
         return [
             f"finssim trials import {out / TRIALS / 'fit' / 'records'}/*.mcap --split phase --out trials",
-            f"{excite} --pool {seed} --severity {SEVERITY} --pool-vehicle {self.name}",
+            f"{excite} --pool {seed} --severity {SEVERITY} --pool-vehicle {drawn_around}",
             *middle,
-            f"finssim pool --vehicle {self.name} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
+            f"finssim pool --vehicle {drawn_around} --plant {out / PLANT_FILE} --pool-file site.yaml --truth truth.fst",
             f"{drive} --robot pool --pool-file site.yaml --arm",
         ]

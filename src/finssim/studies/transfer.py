@@ -29,7 +29,6 @@ from finssim.evaluation.metrics import T1_SETPOINTS, paper_row, paper_t2_row
 from finssim.evaluation.robot_trials import (
     FIRMWARES,
     HARDWARE,
-    Attendant,
     OnRobot,
     RobotJob,
     firmware_of,
@@ -186,26 +185,65 @@ class Spec:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class TransferSettings:
+    """Settings of an experiment: its pools, vehicle, rows and trainings."""
+
+    plants: Annotated[int, (1, 1000)] = 3
+    """Number of virtual pools, each with different vehicle, water and camera."""
+    seeds: Annotated[int, (1, 1000)] = 3
+    """Trainings of each policy, each tested with different noise."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+    severity: str = "realistic"
+    """(WORD) How much the pools differ from the vehicle file: nominal, realistic or hard."""
+    camera: str = "corners"
+    """(MODE) corners (projected through the rippling water, with noise), or pictures (rendered, with tag
+    detection: several times slower)."""
+    firmware: str = "mcu"
+    """(NAME) Firmware of the vehicle: mcu, ardusub (an autopilot over MAVLink: policies use its axes,
+    in a tank with a DVL and a compass instead of the pool and its camera, with setpoints three times as
+    far), or ardusub-own (the same, by the autopilot's own position: no DVL on the network)."""
+    estimator: str = "error-state"
+    """(MODE) State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
+    the paper."""
+    rows: Annotated[Sequence[str] | None, ","] = None
+    """(NAMES) Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given."""
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    pool_vehicle: Annotated[str | None, "python"] = None
+    """Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None."""
+    steps: Annotated[int | None, (1, None)] = None
+    """Control steps of the training, summed over all worlds; the task's default if not given."""
+    processes: Annotated[int | None, (1, None)] = None
+    """Parallel trainings or trials; one per processor if not given."""
+    address: str | None = None
+    """(ADDRESS) Ray cluster to use instead, HOST:PORT or auto."""
+
+    def check(self, robot: OnRobot | None) -> None:
+        """Refuse what does not exist, and what a robot determines itself.
+
+        Raises:
+            ValueError: An unknown severity, camera or estimator, a number below 1, or a pool together with a robot.
+        """
+        if robot is not None and (self.plants, self.severity, self.camera) != (3, "realistic", "corners"):
+            raise ValueError(
+                "a robot has its own plant and camera: leave --plants, --severity and --camera out"
+            )
+        check_choices([self.severity], ("nominal", "realistic", "hard"), "severity", ValueError)
+        check_choices([self.camera], ("corners", "pictures"), "camera", ValueError)
+        check_choices([self.estimator], MODELS, "estimator", ValueError)
+        if self.plants < 1 or self.seeds < 1:
+            raise ValueError(f"plants is {self.plants}, seeds {self.seeds}: expected at least 1 of each")
+
+
 def transfer_experiment(
     spec: Spec,
     *,
     out: Path,
-    plants: Annotated[int, (1, 1000)] = 3,
-    seeds: Annotated[int, (1, 1000)] = 3,
-    seed: int = 1,
-    severity: str = "realistic",
-    camera: str = "corners",
-    firmware: str = "mcu",
-    estimator: str = "error-state",
-    rows: Annotated[Sequence[str] | None, ","] = None,
     targets: Annotated[Sequence[str] | None, "python"] = None,
-    vehicle: str = "finsrov",
-    steps: Annotated[int | None, (1, None)] = None,
-    processes: Annotated[int | None, (1, None)] = None,
-    address: str | None = None,
+    settings: Annotated[TransferSettings, "options"] = TransferSettings(),
     robot: OnRobot | None = None,
-    attendant: Attendant | None = None,
-    pool_vehicle: Annotated[str | None, "python"] = None,
     console: Console | None = None,
     progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
@@ -218,26 +256,9 @@ def transfer_experiment(
     Args:
         spec: Which experiment.
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
-        plants: Number of virtual pools, each with different vehicle, water and camera.
-        seeds: Trainings of each policy, each tested with different noise.
-        seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
-        camera (MODE): corners (projected through the rippling water, with noise), or pictures (rendered, with tag
-            detection: several times slower).
-        firmware (NAME): Firmware of the vehicle: mcu, ardusub (an autopilot over MAVLink: policies use its axes,
-            in a tank with a DVL and a compass instead of the pool and its camera, with setpoints three times as
-            far), or ardusub-own (the same, by the autopilot's own position: no DVL on the network).
-        estimator (MODE): State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
-            the paper.
-        rows (NAMES): Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given.
         targets: What is played; the published ones if None.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        steps: Control steps of the training, summed over all worlds; the task's default if not given.
-        processes: Parallel trainings or trials; one per processor if not given.
-        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
+        settings: Pools, vehicle, rows and trainings.
         robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
-        attendant: The person beside that robot, instead of the terminal's keyboard.
-        pool_vehicle: Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None.
         console: Where a robot's state is told; standard error if None.
         progress: Told the share that is done and what comes next.
         show: Given each trial of a pool and its result, as soon as there is one.
@@ -248,25 +269,21 @@ def transfer_experiment(
     Raises:
         ValueError: An unknown row, target, severity or camera, or a number below 1.
     """
-    if robot is not None and (plants, severity, camera) != (3, "realistic", "corners"):
-        raise ValueError("a robot has its own plant and camera: leave --plants, --severity and --camera out")
+    settings.check(robot)
     usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
-    rows, targets = list(rows or usual), list(targets or spec.targets)
+    rows, targets = list(settings.rows or usual), list(targets or spec.targets)
     check_choices(rows, spec.rows, "row", ValueError)
     check_choices(targets, spec.allowed_targets, "target", ValueError)
-    check_choices([severity], ("nominal", "realistic", "hard"), "severity", ValueError)
-    check_choices([camera], ("corners", "pictures"), "camera", ValueError)
-    check_choices([estimator], MODELS, "estimator", ValueError)
-    if plants < 1 or seeds < 1:
-        raise ValueError(f"plants is {plants}, seeds {seeds}: expected at least 1 of each")
-    chosen = {name: spec.rows[name] for name in rows}
-    pools, run_seeds, folder = range(seed, seed + plants), range(seed, seed + seeds), Path(out)
-    firmware = firmware_of(firmware, load_vehicle(vehicle), robot)
+    chosen, folder, vehicle = {name: spec.rows[name] for name in rows}, Path(out), settings.vehicle
+    pools, run_seeds = (range(settings.seed, settings.seed + n) for n in (settings.plants, settings.seeds))
+    firmware = firmware_of(settings.firmware, load_vehicle(vehicle), robot)
     action, site, sees = FIRMWARES[firmware]
+    severity, camera = settings.severity, settings.camera
+    spread_over: dict[str, Any] = {"processes": settings.processes, "address": settings.address}
     train_missing = partial(
         controllers_of,
-        spec.name, chosen, run_seeds, folder, TrainingSettings(vehicle=vehicle, steps=steps, action=action),
-        lambda part, text: progress(TRAINING_SHARE * part, text), processes=processes, address=address,
+        spec.name, chosen, run_seeds, folder, TrainingSettings(vehicle=vehicle, steps=settings.steps, action=action),
+        lambda part, text: progress(TRAINING_SHARE * part, text), **spread_over,
     )  # fmt: skip
     if robot is not None:  # there is one plant, whose severity was not chosen
         pools, severity, camera = range(1), HARDWARE, HARDWARE
@@ -278,30 +295,31 @@ def transfer_experiment(
         return [
             RobotJob(
                 row=name, controller=controllers[name, s], target=target, vehicle=vehicle,
-                pool_vehicle=pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site,
-                firmware=firmware, estimator=estimator, **{"camera": camera, **chosen[name].changes},
+                pool_vehicle=settings.pool_vehicle or vehicle, plant=plant, severity=severity, seed=s, site=site,
+                firmware=firmware, estimator=settings.estimator, **{"camera": camera, **chosen[name].changes},
             )
             for name in names for plant in pools for s in run_seeds for target in chosen[name].targets or targets
         ]  # fmt: skip
 
     ready, beside = [name for name, row in chosen.items() if row.training is None], {}
     controllers = {(name, s): chosen[name].controller for name in ready for s in run_seeds}
-    if robot is None and address is None and seeds == 1:  # so few trainings leave processors to other rows
+    if (
+        robot is None and settings.address is None and settings.seeds == 1
+    ):  # so few trainings leave processors to other rows
         learned = [name for name in chosen if name not in ready]
         beside["more"] = lambda: jobs_of(learned, train_missing())
     else:
         controllers, ready = train_missing(), list(chosen)
     results = play_jobs(
-        jobs_of(ready, controllers), folder / "trials", robot, attendant=attendant, console=console,
-        processes=processes, address=address, show=show, **beside,
+        jobs_of(ready, controllers), folder / "trials", robot, console=console, show=show, **spread_over, **beside,
         progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
     by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
     body = load_vehicle(vehicle)
     result = {
-        "experiment": spec.name, "severity": severity, "camera": camera, "estimator": estimator, "plants": list(pools),
-        "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
+        "experiment": spec.name, "severity": severity, "camera": camera, "estimator": settings.estimator,
+        "plants": list(pools), "seeds": list(run_seeds), "targets": targets, "robot": robot and robot.title,
         "vehicle": {"name": body.name, "sha256": body.sha256},
         **scores(spec, by_row), "trials": results, "provenance": provenance(),
     }  # fmt: skip
