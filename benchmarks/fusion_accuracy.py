@@ -16,7 +16,7 @@ import numpy as np
 
 from finssim.core.rotations import wrap_angle
 from finssim.localization.fusion.estimator import MODELS, Estimator
-from finssim.localization.fusion.fuse import fuse
+from finssim.localization.fusion.fuse import FuseSettings, fuse
 from finssim.localization.fusion.fuse_log import load_log
 from finssim.localization.fusion.fuse_settings import Settings
 from finssim.localization.overhead_camera import load_pool
@@ -104,7 +104,8 @@ def recorded(scratch: Path, trial: str) -> str:
     (scratch / "pool.yaml").write_text(POOL)
     folder, t, heading = hinsdale(scratch / trial, trial)
     vehicle = load_vehicle("finsrov")
-    found = fuse(load_log(folder, vehicle), load_pool(scratch / "pool.yaml"), vehicle, rate=100.0)
+    settings = FuseSettings(rate=100.0, estimator="constant-velocity")
+    found = fuse(load_log(folder, vehicle), load_pool(scratch / "pool.yaml"), vehicle, settings)
     rows = np.array([[row[0], row[9]] for row in found.rows], float)
     error = np.abs(wrap_angle(rows[:, 1] - np.interp(rows[:, 0], t, np.unwrap(heading))))
     error = np.degrees(error[np.isfinite(error)])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.cli.playback import PlaybackError, play
+from finssim.cli.playback import FilmSettings, PlaybackError, play
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.train import TrainingSettings, train
 from finssim.sim.site import described_world
@@ -20,7 +20,7 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = train("t1", TrainingSettings(seed=1, steps=8192, worlds=64), out=tmp_path / "hold")
     monkeypatch.setattr("finssim.cli.playback.task_named", lambda _: StationKeeping(time_limit=0.5))
-    play(policy, video=tmp_path / "hold.mp4", speed=2.0)
+    play(policy, film=FilmSettings(video=tmp_path / "hold.mp4", speed=2.0))
     film = cv2.VideoCapture(str(tmp_path / "hold.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 6 and film.get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
     good, first = film.read()
@@ -28,9 +28,9 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
     with pytest.raises(PlaybackError, match="give the film to write"):
         play(policy)
     with pytest.raises(PlaybackError, match="no directory of a policy"):
-        play(tmp_path / "run.mcap", video=tmp_path / "run.mp4")
+        play(tmp_path / "run.mcap", film=FilmSettings(video=tmp_path / "run.mp4"))
     with pytest.raises(PlaybackError, match="--speed is of a film"):
-        play(tmp_path / "run.mcap", speed=4.0)
+        play(tmp_path / "run.mcap", film=FilmSettings(speed=4.0))
 
 
 def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():

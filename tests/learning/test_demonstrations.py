@@ -9,7 +9,15 @@ import pytest
 from finssim.agents.agent import AgentError, expert_for
 from finssim.cli import boundary
 from finssim.cli.commands import app
-from finssim.learning.demonstrations import DatasetError, about, collect, load, record_episodes, save
+from finssim.learning.demonstrations import (
+    CollectSettings,
+    DatasetError,
+    about,
+    collect,
+    load,
+    record_episodes,
+    save,
+)
 from finssim.tasks import Environment, make, task_named
 from finssim.vehicles import load_vehicle
 
@@ -117,7 +125,13 @@ def test_written_and_read_back(tmp_path):
 def test_collecting_by_name(tmp_path):
     """Vehicle, expert, action and revision are kept; equal seeds give equal sets; the expert of T1 holds."""
     told = [
-        collect("pid", "t1", episodes=2, out=tmp_path / f"set{k}", vehicle="bluerov2", seed=seed)
+        collect(
+            "pid",
+            "t1",
+            episodes=2,
+            out=tmp_path / f"set{k}",
+            settings=CollectSettings(vehicle="bluerov2", seed=seed),
+        )
         for k, seed in enumerate((3, 3, 4))
     ]
     kept = about(tmp_path / "set0")
@@ -132,12 +146,11 @@ def test_collecting_by_name(tmp_path):
     assert not np.array_equal(sets[0].action, sets[2].action)
 
 
-@pytest.mark.parametrize(
-    "options", [{"episodes": 0}, {"episodes": 1, "disturb": 1.0}, {"episodes": 1, "disturb": -0.1}]
-)
-def test_numbers_that_do_not_fit_are_refused(tmp_path, options):
+@pytest.mark.parametrize(("episodes", "disturb"), [(0, 0.0), (1, 1.0), (1, -0.1)])
+def test_numbers_that_do_not_fit_are_refused(tmp_path, episodes, disturb):
     with pytest.raises(DatasetError, match="expected 1 or more, and 0 to below 1"):
-        collect("pid", "t1", out=tmp_path / "set", **options)
+        settings = CollectSettings(disturb=disturb)
+        collect("pid", "t1", episodes=episodes, out=tmp_path / "set", settings=settings)
     assert not (tmp_path / "set").exists()
 
 

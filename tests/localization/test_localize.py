@@ -54,10 +54,25 @@ def files(tmp_path):
     return tmp_path
 
 
+def given(files, **options):
+    """Arguments of `run`."""
+    tables = {
+        name: options.pop(name) for name in ("depth", "imu", "times", "tilt_std_deg") if name in options
+    }
+    named = {name: options.pop(name) for name in ("pool", "vehicle", "as_json") if name in options}
+    return {
+        "pool": files / "pool.yaml",
+        "vehicle": "finsrov",
+        "out": files / "out.csv",
+        "tables": localize.ImageTables(**tables),
+        "settings": localize.LocalizeSettings(**options),
+        **named,
+    }
+
+
 def located(files, **options):
     """What `run` wrote, and its JSON."""
-    given = {"pool": files / "pool.yaml", "vehicle": "finsrov", "out": files / "out.csv", **options}
-    found = localize.run(files / "tags.csv", **given)
+    found = localize.run(files / "tags.csv", **given(files, **options))
     with (files / "out.csv").open() as file:
         return found, list(csv.DictReader(file))
 
@@ -251,16 +266,15 @@ def test_pictures_give_what_their_detections_give(files):
     position, angles = np.array([0.2, -0.1, 0.8]), np.array([0.0, 0.0, 0.5])
     image = drawn(position, angles, UP)
     cv2.imwrite(str(files / "a_0.5.png"), image)
-    given = {"pool": files / "pool.yaml", "vehicle": "finsrov", "out": files / "out.csv"}
-    given["depth"] = -float(POOL.interface.distance(position + rotation(angles, UP) @ PORT))
-    ((frame, measured),) = localize.run([files / "a_0.5.png"], **given).rows
+    depth = -float(POOL.interface.distance(position + rotation(angles, UP) @ PORT))
+    ((frame, measured),) = localize.run([files / "a_0.5.png"], **given(files, depth=depth)).rows
     assert frame.time == 0.5
     assert measured.ok, measured.reason
     assert measured.tags == tuple(TAGS)
     assert np.abs(measured.position - position).max() < 0.005
     cv2.imwrite(str(files / "small.png"), image[:100])
     with pytest.raises(LocalizationError, match="1280 x 100 pixels, expected 1280 x 720"):
-        localize.run([files / "small.png"], **given)
+        localize.run([files / "small.png"], **given(files, depth=depth))
 
 
 def test_a_video_is_followed(files):
@@ -272,7 +286,7 @@ def test_a_video_is_followed(files):
     for position in way:
         film.write(drawn(position, np.zeros(3), UP))
     film.release()
-    found = localize.run(path, pool=files / "pool.yaml", vehicle="finsrov", out=files / "out.csv", depth=0.3)
+    found = localize.run(path, **given(files, depth=0.3))
     assert [frame.image for frame, _ in found.rows] == [f"dive.avi#{i}" for i in range(6)]
     assert (np.diff([frame.time for frame, _ in found.rows]) > 0.05).all()
     for position, (_, measured) in zip(way, found.rows, strict=True):

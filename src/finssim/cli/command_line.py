@@ -17,8 +17,8 @@ once:
 What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
 times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`, another
 `"--name"`, or `","` where one option holds several words. What is no text, number, flag or path, or is annotated
-"python", is no option and keeps its default, but for the types of `MAKERS`, and for a dataclass of the same module that
-is annotated "options", whose fields are. `**options`, "As of `module.function`, without rows, robot.", are those of
+"python", is no option and keeps its default, but for the types of `MAKERS`, and for a dataclass that is annotated
+"options", whose fields are. `**options`, "As of `module.function`, without rows, robot.", are those of
 that function but for some. What is returned is the exit status, or a result, whose `ok` makes it 0 or 3. In a module
 that defines `tables_of`, every function returns a result, of which `tables_of` makes tables.
 """
@@ -52,12 +52,8 @@ KINDS: Mapping[str, Any] = {
     "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
 }  # fmt: skip
 """Name of an annotation -> what the command line makes of a word."""
-MAKERS = {
-    "OnRobot": "finssim.evaluation.robot_trials:robot_or_none",
-    "Wiring": "finssim.robot.wiring:Wiring",
-}
-"""Name of an annotation -> function or dataclass that makes it, whose options replace the parameter; besides these, the
-dataclasses that are annotated "options"."""
+MAKERS = {"OnRobot": "finssim.evaluation.robot_trials:robot_or_none"}
+"""Name of an annotation -> function that makes it, whose options replace the parameter."""
 SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
 """Greatest magnitude of a number on the command line, in any unit."""
@@ -176,6 +172,13 @@ def _source(module: str) -> str:
     return file.read_text(encoding="utf-8")
 
 
+def _origin(name: str, module: str, source: str) -> str:
+    """Return the module from which a module of this source has a class: itself, or one that it imports from."""
+    imported = rf"^from ([\w.]+) import (?:\([^)]*|[^(\n]*)\b{name}\b"
+    match = re.search(imported, source, re.MULTILINE)
+    return module if match is None else match[1]
+
+
 def about(path: str) -> str:
     """Return the docstring of the module of module:function, the help of a group of commands."""
     return ast.get_docstring(ast.parse(_source(path.partition(":")[0]))) or ""
@@ -204,7 +207,8 @@ def read(path: str, positional: bool = False) -> Definition:
     for argument, annotation, default, by_place, (metavar, help_text) in arguments:
         kind, many, notes = _kind(annotation)
         if kind in MAKERS or "options" in notes:
-            read_arguments[argument] = read(MAKERS.get(kind, f"{module}:{kind}"), by_place)
+            maker = MAKERS.get(kind) or f"{_origin(kind, module, source)}:{kind}"
+            read_arguments[argument] = read(maker, by_place)
         elif kind is not None and "python" not in notes:
             value = inspect.Parameter.empty if default is None else _literal(default, source)
             help_text = help_text or (JSON if argument == "as_json" else "")

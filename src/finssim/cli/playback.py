@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -26,17 +27,30 @@ class PlaybackError(ValueError):
     """Something that cannot be played."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FilmSettings:
+    """Settings of the film of an episode."""
+
+    speed: float = 1.0
+    """(FACTOR) Speed factor of a film relative to the episode [-]."""
+    video: Path | None = None
+    """(FILE) Film of an episode to write (.mp4)."""
+    task: str | None = None
+    """(TASK) Task of the episode; that of the policy's training if not given. Your own: FILE.py:CLASS."""
+    vehicle: str | None = None
+    """(NAME|FILE) Vehicle in the episode; that of the policy's training if not given."""
+    plant: str = "nominal"
+    """(FILE|NAME) Plant of the episode, as in finssim evaluate."""
+    seed: int = 1
+    """Of the episode."""
+
+
 def play(
     path: Path,
     *,
-    speed: float = 1.0,
     topics: Annotated[Sequence[str] | None, ","] = None,
     start: Annotated[float, (0.0, None)] = 0.0,
-    video: Path | None = None,
-    task: str | None = None,
-    vehicle: str | None = None,
-    plant: str = "nominal",
-    seed: int = 1,
+    film: Annotated[FilmSettings, "options"] = FilmSettings(),
 ) -> None:
     """Print the messages of a record as JSON lines [SI units], or film an episode of a policy.
 
@@ -46,14 +60,9 @@ def play(
 
     Args:
         path (FILE|DIR): Record of a run (.mcap), or directory of a policy.
-        speed (FACTOR): Speed factor of a film relative to the episode [-].
         topics (NAMES): Topics of a record to print, separated by commas: odom,thruster_cmd.
         start: Offset from the start of the record [s].
-        video (FILE): Film of an episode to write (.mp4).
-        task (TASK): Task of the episode; that of the policy's training if not given. Your own: FILE.py:CLASS.
-        vehicle (NAME|FILE): Vehicle in the episode; that of the policy's training if not given.
-        plant (FILE|NAME): Plant of the episode, as in finssim evaluate.
-        seed: Of the episode.
+        film: Film of an episode.
 
     Raises:
         RecordError: Not a record, or no such topic.
@@ -61,24 +70,32 @@ def play(
         PolicyError, PlantError, EnvironmentSetupError: As they say.
     """
     if not path.is_dir():
-        if video is not None:
+        if film.video is not None:
             raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
-        if speed != 1.0:
+        if film.speed != 1.0:
             raise PlaybackError(
                 "--speed is of a film: the messages of a record are printed without waiting, leave it out"
             )
         play_record(path, topics=topics, start=start)
         return
+    _film(path, film)
+
+
+def _film(path: Path, film: FilmSettings) -> None:
+    """Film an episode of the policy in a directory."""
+    video = film.video
     if video is None or video.suffix != ".mp4":
         raise PlaybackError(f"{path} is a policy: give the film to write, --video FILE.mp4")
-    if not speed > 0.0:
-        raise PlaybackError(f"speed is {speed:g}, expected more than 0")
+    if not film.speed > 0.0:
+        raise PlaybackError(f"speed is {film.speed:g}, expected more than 0")
     start_warp()
     description = read_description(path)
-    the_task = task_named(task or description.task)
-    body = load_vehicle(vehicle) if vehicle else catalogue_vehicle(description.vehicle.name, str(path))
+    the_task = task_named(film.task or description.task)
+    body = (
+        load_vehicle(film.vehicle) if film.vehicle else catalogue_vehicle(description.vehicle.name, str(path))
+    )
     agent = agent_for(path, body, the_task)
-    environment = load_plant(plant).environment(agent, the_task, body, seed=seed, auto_reset=False)
+    environment = load_plant(film.plant).environment(agent, the_task, body, seed=film.seed, auto_reset=False)
     with atomic_write(video) as temporary, progress_bar("episode") as show:
         steps = round(the_task.time_limit / the_task.control_step)
         onlooker, pictures = described_world("pool").onlooker(environment), []
@@ -87,7 +104,7 @@ def play(
             show(k / steps)
             if step is not None and (step.terminated[0] or step.truncated[0]):
                 break
-        _write_video(temporary, pictures, speed / the_task.control_step)
+        _write_video(temporary, pictures, film.speed / the_task.control_step)
     outcome = environment.task.metrics(environment.arrays)
     success = {1.0: ", success", 0.0: ", no success"}.get(float(outcome.get("success", [np.nan])[0]), "")
     Console(stderr=True).print(

@@ -32,7 +32,7 @@ from finssim.evaluation.trials import (
     interpolated,
     localization_errors,
 )
-from finssim.learning.demonstrations import Episode, about, data_sets_in, save
+from finssim.learning.demonstrations import CollectSettings, Episode, about, data_sets_in, save
 from finssim.learning.demonstrations import collect as collect_episodes
 from finssim.pool.task_site import Referee
 from finssim.pool.virtual_pool import read_truth
@@ -409,14 +409,8 @@ def collect(
     task: str,
     out: Path,
     episodes: Annotated[int | None, (1, 1_000_000)] = None,
-    vehicle: str = "finsrov",
-    hydrodynamics: str = "calibrated",
-    action: str | None = None,
-    randomize: str | None = None,
-    observe: str = "training",
-    disturb: float = 0.0,
+    settings: Annotated[CollectSettings, "options"],
     goal: str | None = None,
-    seed: int = 1,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
     """Store episodes of a task as a Minari data set, from an expert or from records of a driven vehicle.
@@ -429,32 +423,23 @@ def collect(
         task (TASK): Task of the demonstrations; finssim tasks lists them.
         out (DATASET): Folder of the data set.
         episodes: Number of episodes, counted per agent. Not for records.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        action: Action mode: wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
-            task's own if not given.
-        randomize (FILE): Ranges of vehicle and water parameters, by name or file.
-        observe (FILE|NAME): What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
-            through a filter), a file of other fixes, estimator (about what localization is off by) or truth.
-        disturb: Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries.
+        settings: Vehicle, actions, observations, noise and seed.
         goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the final
             pose of each interval; for t2 the trajectory.
-        seed: Seed of every random number; equal seeds give equal results.
         progress: Told the share that is done.
     """
     records = [Path(word) for word in experts if word.endswith(".mcap")]
-    if records and (len(records) < len(experts) or episodes or randomize or disturb):
+    if records and (len(records) < len(experts) or episodes or settings.randomize or settings.disturb):
         raise DriveError(
             "records cannot be combined with other experts, --episodes, --randomize and --disturb"
         )
     if records:
-        return collect_records(records, task, out=out, vehicle=vehicle, action=action, goal=goal)
+        return collect_records(
+            records, task, out=out, vehicle=settings.vehicle, action=settings.action, goal=goal
+        )
     if len(experts) > 1 or episodes is None or goal is not None:
         raise DriveError("give one expert and --episodes, and no --goal, which is of records")
-    return collect_episodes(
-        experts[0], task, episodes=episodes, out=out, vehicle=vehicle, hydrodynamics=hydrodynamics,
-        action=action, randomize=randomize, observe=observe, disturb=disturb, seed=seed, show=progress,
-    )  # fmt: skip
+    return collect_episodes(experts[0], task, episodes=episodes, out=out, settings=settings, show=progress)
 
 
 def datasets(places: Sequence[Path]) -> dict[str, Any]:

@@ -219,19 +219,35 @@ WORLDS = 64
 """Greatest number of worlds."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CollectSettings:
+    """Settings of demonstrations: the vehicle and its water, its actions, and what the expert observes."""
+
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    hydrodynamics: str = "calibrated"
+    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
+    action: str | None = None
+    """Action mode: wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
+    task's own if not given."""
+    randomize: str | None = None
+    """(FILE) Ranges of vehicle and water parameters, by name or file."""
+    observe: str = "training"
+    """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
+    through a filter), a file of other fixes, estimator (about what localization is off by) or truth."""
+    disturb: float = 0.0
+    """Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries."""
+    seed: int = 1
+    """Seed of every random number; equal seeds give equal results."""
+
+
 def collect(
     expert: str | Path,
     task: str,
     *,
     episodes: int,
     out: Path,
-    vehicle: str = "finsrov",
-    hydrodynamics: str = "calibrated",
-    action: str | None = None,
-    randomize: str | Path | None = None,
-    observe: str = "training",
-    disturb: float = 0.0,
-    seed: int = 42,
+    settings: CollectSettings = CollectSettings(),
     show: Callable[[float], None] = lambda part: None,
 ) -> dict[str, Any]:
     """Run an expert and write what it did.
@@ -241,14 +257,7 @@ def collect(
         task: Key of `TASKS`.
         episodes: How many; of a task with several agents each one's is an episode of its own.
         out: Folder of the data set; an earlier one there is replaced.
-        vehicle: Name or file.
-        hydrodynamics: calibrated, mesh or simplified.
-        action: Mode; the task's own if None.
-        randomize: Name or file of ranges; none if None.
-        observe: What the expert sees: truth, estimator, sensors or training.
-        disturb: Standard deviation of a noise that is added to what is done, and not to what is written: the expert
-            is then seen to recover from where it would not have gone by itself. In parts of full action.
-        seed: Of everything random.
+        settings: Vehicle, actions, observations, noise and seed.
         show: Called with the part done.
 
     Returns:
@@ -258,12 +267,13 @@ def collect(
         DatasetError: A number does not fit.
         EnvironmentSetupError, AgentError, PolicyError, VehicleError, OutputError: As they say.
     """
+    seed, disturb = settings.seed, settings.disturb
     if episodes < 1 or not 0.0 <= disturb < 1.0:
         raise DatasetError(f"episodes {episodes} and disturb {disturb}: expected 1 or more, and 0 to below 1")
     refuse_unwritable(atomic_directory(out, replaces=DATASET_FILE))
     environment = make(
-        task, worlds=min(episodes, WORLDS), vehicle=vehicle, hydrodynamics=hydrodynamics, action=action,
-        randomize=randomize, observe=observe, seed=seed,
+        task, worlds=min(episodes, WORLDS), vehicle=settings.vehicle, hydrodynamics=settings.hydrodynamics,
+        action=settings.action, randomize=settings.randomize, observe=settings.observe, seed=seed,
     )  # fmt: skip
     body = environment.simulator.vehicles[0]
     driver = expert_for(expert, body, environment.task, environment.action_mode)
@@ -276,9 +286,9 @@ def collect(
         "observation": environment.task.schema.model_dump(mode="json"),
         "action": action_mode(environment.action_mode, body).describe(),
         "vehicle": {"name": body.name, "sha256": body.sha256},
-        "hydrodynamics": hydrodynamics,
-        "randomize": None if randomize is None else str(randomize),
-        "observe": observe,
+        "hydrodynamics": settings.hydrodynamics,
+        "randomize": settings.randomize,
+        "observe": settings.observe,
         "disturb": disturb,
         "seed": seed,
         "provenance": provenance(),

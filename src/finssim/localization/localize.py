@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -431,21 +431,53 @@ class LocalizeResult:
     interrupted: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageTables:
+    """Measurements beside the images: depth, tilt and times."""
+
+    depth: str | float | Path | None = None
+    """(FILE|Z) Table with columns t, depth, or one depth of the pressure port below the surface [m]."""
+    imu: str | Path | None = None
+    """(FILE) Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given."""
+    tilt_std_deg: float | None = None
+    """Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given."""
+    times: str | Path | None = None
+    """(FILE) Table with columns image, time [s], if the image names contain none."""
+
+    @property
+    def sources(self) -> dict[str, str | None]:
+        """Sources of depth and tilt, as plain values."""
+        return {
+            "depth": None if self.depth is None else str(self.depth),
+            "imu": None if self.imu is None else str(self.imu),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizeSettings:
+    """Method of the localization, and how corners are refined and how much they err."""
+
+    method: str = "refractive"
+    """(METHOD) refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole."""
+    refine: str = "fit"
+    """(WAY) Corner refinement: fit, or AprilTag's own edges or none."""
+    gamma: float = 1.0
+    """Exponent gamma of the images: 1 linear, 2.2 video."""
+    pixel_std: float | None = None
+    """Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
+    given."""
+    shared_pixel_std: float = 0.0
+    """Error common to all corners of an image, per axis [px]: waves."""
+
+
 def run(
     inputs: Sequence[str | Path] | str | Path,
     *,
     pool: str | Path,
     vehicle: str | Path,
     out: str | Path,
-    depth: str | float | Path | None = None,
-    imu: str | Path | None = None,
-    method: str = "refractive",
-    refine: str = "fit",
-    gamma: float = 1.0,
-    times: str | Path | None = None,
-    pixel_std: float | None = None,
-    shared_pixel_std: float = 0.0,
-    tilt_std_deg: float | None = None,
+    tables: Annotated[ImageTables, "options"] = ImageTables(),
+    settings: Annotated[LocalizeSettings, "options"] = LocalizeSettings(),
     as_json: bool = False,
 ) -> LocalizeResult:
     """Measure position and yaw in every image: x, y, z [m], yaw [rad], pool frame, with standard deviations.
@@ -457,16 +489,8 @@ def run(
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv), one row per image.
-        depth (FILE|Z): Table with columns t, depth, or one depth of the pressure port below the surface [m].
-        imu (FILE): Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given.
-        method (METHOD): refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole.
-        refine (WAY): Corner refinement: fit, or AprilTag's own edges or none.
-        gamma: Exponent gamma of the images: 1 linear, 2.2 video.
-        times (FILE): Table with columns image, time [s], if the image names contain none.
-        pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
-            given.
-        shared_pixel_std: Error common to all corners of an image, per axis [px]: waves.
-        tilt_std_deg: Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given.
+        tables: Measurements beside the images: depth, tilt and times.
+        settings: Method, refinement and errors of corners.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -480,15 +504,16 @@ def run(
     prior = prior_sources(
         site,
         body,
-        depth=depth,
-        imu=imu,
-        tilt_std=None if tilt_std_deg is None else math.radians(tilt_std_deg),
-        shared_pixel_std=shared_pixel_std,
+        depth=tables.depth,
+        imu=tables.imu,
+        tilt_std=None if tables.tilt_std_deg is None else math.radians(tables.tilt_std_deg),
+        shared_pixel_std=settings.shared_pixel_std,
     )
-    pixel_std = site.pixel_std if pixel_std is None else pixel_std
+    method = settings.method
+    pixel_std = site.pixel_std if settings.pixel_std is None else settings.pixel_std
     locator = Locator(site, body, prior, method=method, pixel_std=pixel_std)
-    find = detector(locator.family, refine=refine, gamma=gamma)
-    stamps = None if times is None else Path(times)
+    find = detector(locator.family, refine=settings.refine, gamma=settings.gamma)
+    stamps = None if tables.times is None else Path(tables.times)
     notes: list[str] = []
     frames, count = frames_of(paths, site.camera.lens, find, locator.tags_b, stamps, notes)
     result = _measure(frames, count, locator)
@@ -502,9 +527,8 @@ def run(
         "interrupted": result.interrupted,
     }
     if as_json:
-        sources = {"depth": None if depth is None else str(depth), "imu": None if imu is None else str(imu)}
-        settings = {**sources, "pixel_std": pixel_std, **prior.settings}
-        print(json.dumps(_document(result.summary, site, str(pool), body, settings), allow_nan=False))
+        about = {**tables.sources, "pixel_std": pixel_std, **prior.settings}
+        print(json.dumps(_document(result.summary, site, str(pool), body, about), allow_nan=False))
     else:
         _print(result.summary)
     if result.interrupted:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -825,15 +825,58 @@ def _residuals(fit: CameraFit) -> Figure:
     return figure
 
 
+@dataclass(frozen=True, kw_only=True)
+class BoardChoice:
+    """Calibration board that the images show."""
+
+    board: str | None = None
+    """(NxM) Inner corners of a chessboard, such as 9x6."""
+    square: float = 0.025
+    """Edge of a square [m]."""
+    charuco: str | None = None
+    """(NxM) Squares of a ChArUco board instead of a chessboard, such as 7x5."""
+    marker: float | None = None
+    """Edge of its markers [m]; three quarters of a square if not given."""
+    dictionary: str = "DICT_5X5_100"
+    """(NAME) OpenCV's name of the marker dictionary."""
+
+    def made(self) -> Board:
+        """Return the board.
+
+        Raises:
+            CalibrationError: No board is given, or two, or a size cannot be read.
+        """
+        if (self.board is None) == (self.charuco is None):
+            given = (
+                "neither --board nor --charuco is" if self.board is None else "--board and --charuco are both"
+            )
+            raise CalibrationError(
+                f"{given} given: name the one board that the pictures show, --board COLUMNSxROWS by its inner corners"
+            )
+        if self.charuco is not None:
+            columns, rows = parse_size(self.charuco, "--charuco")
+            edge = 0.75 * self.square if self.marker is None else self.marker
+            return Board(
+                columns=columns, rows=rows, square=self.square, marker=edge, dictionary=self.dictionary
+            )
+        columns, rows = parse_size(str(self.board), "--board")
+        return Board(columns=columns, rows=rows, square=self.square)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of a command line that name it."""
+        if self.charuco is None:
+            return {"square": self.square, "board": self.board}
+        return {
+            "square": self.square, "charuco": self.charuco, "dictionary": self.dictionary, "marker": self.marker
+        }  # fmt: skip
+
+
 def run(
     images: Sequence[Path],
     *,
     out: Path,
-    board: str | None = None,
-    square: float = 0.025,
-    charuco: str | None = None,
-    marker: float | None = None,
-    dictionary: str = "DICT_5X5_100",
+    board: Annotated[BoardChoice, "options"],
     model: str = "plumb_bob",
     report: Path | None = None,
     seed: int = 1,
@@ -846,11 +889,7 @@ def run(
     Args:
         images (IMAGE): Images of a board, folders of them, or videos.
         out (FILE): Camera file to write (.yaml).
-        board (NxM): Inner corners of a chessboard, such as 9x6.
-        square: Edge of a square [m].
-        charuco (NxM): Squares of a ChArUco board instead of a chessboard, such as 7x5.
-        marker: Edge of its markers [m]; three quarters of a square if not given.
-        dictionary (NAME): OpenCV's name of the marker dictionary.
+        board: Board that the images show.
         model (MODEL): Lens: plumb_bob, rational or fisheye.
         report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
@@ -866,7 +905,7 @@ def run(
         raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(MODELS)}")
     refuse_places(out, report, "camera")
     screen = Console(stderr=True)
-    chosen = _board(board, square, charuco, marker, dictionary)
+    chosen = board.made()
     views, without = _board_views(images, chosen, screen)
     for name in without:
         screen.print(str(finding("board_unseen", name)), highlight=False, markup=False)
@@ -879,30 +918,11 @@ def run(
     write_camera(out, fit.lens, {**camera_record(fit), "without_board": without})
     summary = camera_report(fit)
     if report is not None:
-        kind = {"board": board}
-        if charuco is not None:
-            kind = {"charuco": charuco, "dictionary": dictionary, "marker": marker}
-        options = {"out": out, "square": square, **kind, "model": model, "seed": seed}
+        options = {"out": out, **board.options, "model": model, "seed": seed}
         repeat = [command_line("camera", images, options)]
         summary.write(report, camera_json(fit), camera_pictures(fit), repeat, {"Views": _views_table(fit)})
     publish(camera_json(fit, out) if as_json else None, summary.show, (out, report))
     return fit
-
-
-def _board(
-    board: str | None, square: float, charuco: str | None, marker: float | None, dictionary: str
-) -> Board:
-    if (board is None) == (charuco is None):
-        given = "neither --board nor --charuco is" if board is None else "--board and --charuco are both"
-        raise CalibrationError(
-            f"{given} given: name the one board that the pictures show, --board COLUMNSxROWS by its inner corners"
-        )
-    if charuco is not None:
-        columns, rows = parse_size(charuco, "--charuco")
-        edge = 0.75 * square if marker is None else marker
-        return Board(columns=columns, rows=rows, square=square, marker=edge, dictionary=dictionary)
-    columns, rows = parse_size(str(board), "--board")
-    return Board(columns=columns, rows=rows, square=square)
 
 
 def _board_views(images: Sequence[Path], board: Board, screen: Console) -> tuple[list[BoardView], list[str]]:

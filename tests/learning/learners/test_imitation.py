@@ -8,7 +8,7 @@ import torch
 
 from finssim.agents.agent import NOWHERE
 from finssim.control.guidance import Known
-from finssim.learning.demonstrations import Episode, collect, save
+from finssim.learning.demonstrations import CollectSettings, Episode, collect, save
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.resume import read_state, write_state
 from finssim.tasks import make, task_named
@@ -34,7 +34,7 @@ def made(name, seed=3, **changes):
 def shown(tmp_path_factory):
     """Four whole episodes of the PID on T1."""
     out = tmp_path_factory.mktemp("shown") / "pid"
-    collect("pid", "t1", episodes=4, out=out, seed=2)
+    collect("pid", "t1", episodes=4, out=out, settings=CollectSettings(seed=2))
     return str(out)
 
 

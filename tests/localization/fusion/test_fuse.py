@@ -15,7 +15,7 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import tag_corners_b
 from finssim.localization.fusion.estimator import MODELS
-from finssim.localization.fusion.fuse import COLUMNS, error_figures, fuse, run
+from finssim.localization.fusion.fuse import COLUMNS, FuseSettings, error_figures, fuse, run
 from finssim.localization.fusion.fuse_log import StreamTable, load_log
 from finssim.localization.fusion.fuse_settings import site_of
 from finssim.localization.fusion.streams import refusal
@@ -36,6 +36,7 @@ camera:
 interface: {height: 1.0}
 """
 FINSROV = load_vehicle("finsrov")
+CONSTANT_VELOCITY = FuseSettings(estimator="constant-velocity")
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ def read_out(path):
 def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
     """60 rows a second with states, deviations and counts; errors against the truth file are centimetres."""
     log = write_log(tmp_path / "log", samples())
-    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", estimator=mode)
+    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", settings=FuseSettings(estimator=mode))
     columns, states = read_out(tmp_path / "out.csv")
     assert np.diff(columns["t"]) == pytest.approx(1 / 60)
     assert set(states[60:]) == {"fresh"} and states[0] == "uninitialized"
@@ -127,7 +128,7 @@ def test_one_table_of_all_columns_is_the_same_log(tmp_path, pool):
         {n: sum(s.stream == n for s in log.samples) for n in ("imu", "depth", "vision")} for log in logs
     ]
     assert counts[0] == counts[1]
-    a, b = (np.array([row[1:4] for row in fuse(log, site, FINSROV).rows]) for log in logs)
+    a, b = (np.array([row[1:4] for row in fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows]) for log in logs)
     assert np.nanmax(np.abs(a - b)) < 0.05  # the table has no deviations, and takes the settings'
 
 
@@ -167,9 +168,9 @@ def test_rows_rest_on_what_had_arrived(tmp_path, pool):
     """Rows before a time do not change when everything after it is cut off."""
     site = load_pool(pool)
     log = load_log(write_log(tmp_path / "log", samples(4.0)), FINSROV, latency=site.latency)
-    whole = fuse(log, site, FINSROV).rows
+    whole = fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows
     log.samples = [s for s in log.samples if s.arrival <= 2.5]
-    cut = fuse(log, site, FINSROV).rows
+    cut = fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows
     for a, b in zip(whole, cut, strict=False):
         np.testing.assert_array_equal(np.array(a[:11], float), np.array(b[:11], float))
     assert len(cut) > 140
@@ -199,7 +200,8 @@ def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path,
     site, items = load_pool(pool), samples(6.0)
     folder = write_log(tmp_path / "log", items)
     frames = write_pictures(folder, items, site)
-    found = fuse(load_log(folder, FINSROV, latency=site.latency), site, FINSROV, pixel_std=0.2, mode=mode)
+    settings = FuseSettings(pixel_std=0.2, estimator=mode)
+    found = fuse(load_log(folder, FINSROV, latency=site.latency), site, FINSROV, settings)
     summary = found.summary
     assert summary["accepted"]["vision"] > 0.9 * len(frames)
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
@@ -225,7 +227,7 @@ def test_the_table_of_localize_is_read_with_its_covariances_and_refusals(tmp_pat
     located = [m for _, m in found if m.ok]
     for fix, m in zip(fixes, located, strict=True):
         np.testing.assert_allclose(fix.covariance, m.covariance, rtol=1e-6, atol=1e-15)
-    summary = fuse(log, site, FINSROV).summary
+    summary = fuse(log, site, FINSROV, CONSTANT_VELOCITY).summary
     assert sum(summary["refused"]["vision"].values()) >= len(found) - len(located) >= len(found) // 5
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.03
 
@@ -246,7 +248,12 @@ def test_a_real_gyro_carries_a_heading_seen_once_a_second(trial, tmp_path, pool)
     folder, t, heading = hinsdale(tmp_path / trial, trial)
     assert np.diff(t).max() < 0.13
     assert np.abs(wrap_angle(np.diff(heading))).max() < math.radians(2.5)
-    found = fuse(load_log(folder, FINSROV), still_pool(pool), FINSROV, rate=100.0)
+    found = fuse(
+        load_log(folder, FINSROV),
+        still_pool(pool),
+        FINSROV,
+        FuseSettings(rate=100.0, estimator="constant-velocity"),
+    )
     assert found.summary["errors"]["all"]["rms_yaw"] < math.radians(1.0)
     assert found.summary["refused"].get("yaw") is None
     assert found.summary["nis_per_dimension"]["yaw"] < 1.5
@@ -258,7 +265,7 @@ def test_a_real_flip_is_refused(tmp_path, pool):
     folder, t, heading = hinsdale(tmp_path / "b", "baseline2", every=None)
     log = load_log(folder, FINSROV)
     log.samples = [s for s in log.samples if s.time < 35.5]
-    found = fuse(log, still_pool(pool), FINSROV, rate=100.0)
+    found = fuse(log, still_pool(pool), FINSROV, FuseSettings(rate=100.0, estimator="constant-velocity"))
     here = (t > 32.0) & (t < 35.5)
     flipped = np.abs(wrap_angle(heading - np.median(heading[here]))) > 0.5
     assert 1 <= np.sum(flipped & here) < 10
@@ -278,7 +285,9 @@ def test_missing_stretches_of_the_imu_cost_doubt_not_the_heading(tmp_path, pool)
     items = [s for s in items if not (s.stream == "vision" and 3.0 < s.time < 4.6)]
     site = load_pool(pool)
     log = load_log(write_log(tmp_path / "log", items), FINSROV, latency=site.latency)
-    rows = np.array([[row[0], row[9], row[17]] for row in fuse(log, site, FINSROV).rows], float)
+    rows = np.array(
+        [[row[0], row[9], row[17]] for row in fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows], float
+    )
     std = {t: rows[np.argmin(np.abs(rows[:, 0] - t)), 2] for t in (2.9, 4.4, 5.0)}
     assert std[4.4] > 10 * std[2.9] and std[5.0] < 0.5 * std[4.4]
     late = rows[:, 0] > 5.0
@@ -338,7 +347,7 @@ def test_wrong_words_are_refused(tmp_path, pool, options, sentence):
     """Each with what there is."""
     log = write_log(tmp_path / "log", samples(0.5))
     with pytest.raises(LocalizationError, match=sentence):
-        run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", **options)
+        run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", settings=FuseSettings(**options))
 
 
 def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
@@ -349,7 +358,7 @@ def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
     site = load_pool(pool)
     log = load_log(folder, FINSROV, latency=site.latency)
     assert [note.split(":")[0] for note in log.notes] == ["no IMU samples", "no depth samples"]
-    summary = fuse(log, site, FINSROV).summary
+    summary = fuse(log, site, FINSROV, CONSTANT_VELOCITY).summary
     assert summary["errors"]["fresh"]["p95_horizontal"] < 0.04
     assert summary["errors"]["fresh"]["rms_yaw"] < math.radians(2.0)
     assert summary["ready"] == 0.0
@@ -370,7 +379,7 @@ def test_acceleration_without_gravity_is_no_specific_force(tmp_path, pool):
     log = load_log(write_log(tmp_path / "log", items), FINSROV)
     assert any("hold no gravity" in note for note in log.notes)
     with pytest.raises(LocalizationError, match="needs accelerations with gravity"):
-        fuse(log, load_pool(pool), FINSROV, mode="error-state")
+        fuse(log, load_pool(pool), FINSROV, FuseSettings(estimator="error-state"))
 
 
 def test_a_pool_with_z_down_is_refused(tmp_path, pool):

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -200,16 +200,30 @@ class FuseResult:
     interrupted: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class FuseSettings:
+    """Rate of the rows, and methods of the estimation."""
+
+    rate: float = 60.0
+    """Rows per second [Hz]."""
+    estimator: str | None = None
+    """(NAME) error-state, which uses the IMU's accelerations (default where the log has them), or
+    constant-velocity (paper, eq. 14-15)."""
+    method: str = "refractive"
+    """(METHOD) Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
+    pinhole."""
+    pixel_std: float | None = None
+    """Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
+    given."""
+
+
 def run(
     log: str | Path,
     *,
     pool: str | Path,
     vehicle: str | Path,
     out: str | Path,
-    rate: float = 60.0,
-    estimator: str | None = None,
-    method: str = "refractive",
-    pixel_std: float | None = None,
+    settings: Annotated[FuseSettings, "options"] = FuseSettings(),
     as_json: bool = False,
 ) -> FuseResult:
     """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], health.
@@ -221,13 +235,7 @@ def run(
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv).
-        rate: Rows per second [Hz].
-        estimator (NAME): error-state, which uses the IMU's accelerations (default where the log has them), or
-            constant-velocity (paper, eq. 14-15).
-        method (METHOD): Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
-            pinhole.
-        pixel_std: Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
-            given.
+        settings: Rate of the rows, and methods of the estimation.
         as_json: Print one JSON object instead of tables.
 
     Raises:
@@ -239,9 +247,7 @@ def run(
     refuse_unwritable(atomic_write(out))
     site, body = load_pool(pool), load_vehicle(str(vehicle))
     read = load_log(log, body, latency=site.latency)
-    pixel_std = site.pixel_std if pixel_std is None else pixel_std
-    estimator = estimator or ("error-state" if _has_accelerations(read) else "constant-velocity")
-    fused = fuse(read, site, body, rate=rate, mode=estimator, method=method, pixel_std=pixel_std)
+    fused = fuse(read, site, body, settings)
     write_rows(fused.rows, out)
     if as_json:
         print(json.dumps({"out": str(out), "notes": read.notes, **fused.summary}, allow_nan=False))
@@ -256,21 +262,14 @@ def run(
     return fused
 
 
-def fuse(
-    log: Log,
-    pool: Pool,
-    vehicle: Vehicle,
-    *,
-    rate: float = 60.0,
-    mode: str = "constant-velocity",
-    method: str = "refractive",
-    pixel_std: float = 0.5,
-) -> FuseResult:
-    """Fuse a log at a rate of rows [Hz]; arguments as `run`. A row at time t rests on what had arrived by t.
+def fuse(log: Log, pool: Pool, vehicle: Vehicle, settings: FuseSettings) -> FuseResult:
+    """Fuse a log; arguments as `run`. A row at time t rests on what had arrived by t.
 
     Raises:
         LocalizationError: A word is unknown, the rate is out of range, or the error-state mode finds no acceleration.
     """
+    rate, method = settings.rate, settings.method
+    mode = settings.estimator or ("error-state" if _has_accelerations(log) else "constant-velocity")
     if not 0.0 < rate <= FASTEST:
         raise LocalizationError(f"rate is {rate:g} Hz, expected above 0 and up to {FASTEST:g}")
     check_method(method)
@@ -281,6 +280,7 @@ def fuse(
         )
     fixes = None
     if log.frames:  # default tags are for the virtual world
+        pixel_std = pool.pixel_std if settings.pixel_std is None else settings.pixel_std
         fixes = Fixes(TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std))
     deliveries = _deliveries(log)
     result = FuseResult()
