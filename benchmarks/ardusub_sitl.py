@@ -10,6 +10,7 @@ import socket
 import struct
 import time
 
+from finssim.control.guidance import Station
 from finssim.pool.ardusub_sitl import SitlServer, SitlWorld
 from finssim.robot.links.water_linked import DvlServer
 from finssim.sim import RectangularPool
@@ -23,7 +24,9 @@ def serve(wire, dvl: bool, duration: float) -> None:
     """In the server's process: tell the address, serve, tell the processor's time and the frames."""
     log = DvlServer(("127.0.0.1", 0)) if dvl else None
     tank = RectangularPool(length=2000.0, width=2000.0, depth=20.0)
-    world = SitlWorld(load_vehicle("bluerov2_heavy"), pool=tank, position=(0.0, 0.0, -10.0), dvl=log)
+    world = SitlWorld(
+        load_vehicle("bluerov2_heavy"), pool=tank, start=Station((0.0, 0.0, -10.0), 0.0), dvl=log
+    )
     server = SitlServer(world, ("127.0.0.1", 0))
     wire.send(server.address)
     before = time.process_time()

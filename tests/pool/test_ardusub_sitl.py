@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from finssim.control.guidance import Station
 from finssim.pool import ardusub
 from finssim.pool.ardusub_sitl import (
     GRAVITY,
@@ -41,6 +42,7 @@ HEAVY = load_vehicle("bluerov2_heavy")
 NEUTRAL = HEAVY.model_copy(
     update={"body": HEAVY.body.model_copy(update={"displaced_volume": HEAVY.body.mass / HEAVY.water.density})}
 )
+DEEP = Station((0.0, 0.0, -50.0), 0.0)
 STILL = (1500,) * 16
 PACKET = bytes.fromhex("1a48 9001 2a000000" + "dc05" * 15 + "6c07")
 """Magic 18458, 400 Hz, frame 42, fifteen channels at 1500 and the last at 1900, by hand."""
@@ -158,7 +160,7 @@ def serving():
 @pytest.fixture(scope="module")
 def shared():
     """A neutral vehicle in open water, which tests put where they want."""
-    return SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0))
+    return SitlWorld(NEUTRAL, start=DEEP)
 
 
 @pytest.fixture
@@ -201,7 +203,7 @@ def test_other_packets_are_refused_with_a_word(data, reason):
 def test_the_answer_of_a_vehicle_at_rest_is_this_line():
     """Every byte: newline, compact, the order of the names, specific force (0, 0, -9.80665), depth down, newline."""
     world = SitlWorld(
-        NEUTRAL, pool=RectangularPool(length=10.0, width=6.0, depth=5.0), position=(1.0, 0.5, -2.0)
+        NEUTRAL, pool=RectangularPool(length=10.0, width=6.0, depth=5.0), start=Station((1.0, 0.5, -2.0), 0.0)
     )
     assert world.answer() == (
         b'\n{"timestamp":0.0,"imu":{"gyro":[0.0,0.0,0.0],"accel_body":[0.0,0.0,-9.80665]},"position":[1.0,-0.5,2.0],'
@@ -341,7 +343,7 @@ def test_free_decay_is_the_simulators(world):
 def test_a_buoyant_vehicle_rises_at_its_terminal_speed():
     """d1 w + d2 w² equals its net buoyancy; up is negative down, and at constant speed the force is that of rest."""
     body = HEAVY.body.model_copy(update={"displaced_volume": 0.0142})
-    world = SitlWorld(HEAVY.model_copy(update={"body": body}), position=(0.0, 0.0, -50.0))
+    world = SitlWorld(HEAVY.model_copy(update={"body": body}), start=DEEP)
     for _ in range(1000):
         world.step((0,) * 16, 100)
     net = 9.82 * (1000.0 * 0.0142 - 13.5)
@@ -353,7 +355,7 @@ def test_a_buoyant_vehicle_rises_at_its_terminal_speed():
 
 def test_forward_moves_it_along_its_heading():
     """Turned 30° to the left, which is -30° in NED, it goes north and west."""
-    world = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), yaw=math.radians(30.0))
+    world = SitlWorld(NEUTRAL, start=Station((0.0, 0.0, -50.0), math.radians(30.0)))
     assert state_of(world)["attitude"][2] == pytest.approx(math.radians(-30.0), abs=1e-6)
     for _ in range(100):
         world.step(mixed(forward=0.4), 100)
@@ -405,8 +407,8 @@ def test_velocity_is_the_integral_of_the_specific_force(world):
 
 def test_pulses_make_the_published_thrusts_at_the_batterys_voltage():
     """1900 µs at 16 V pulls what the T200's table says; an empty battery gives less, a loaded one sags."""
-    stiff = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0))
-    weak = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), battery=Battery(full_voltage=13.0, resistance=0.02))
+    stiff = SitlWorld(NEUTRAL, start=DEEP)
+    weak = SitlWorld(NEUTRAL, start=DEEP, battery=Battery(full_voltage=13.0, resistance=0.02))
     pulses = (1900, 1100, 1500, 1520, 0, 1500, 1500, 1500)
     for world in (stiff, weak):
         for _ in range(50):
@@ -434,7 +436,7 @@ def test_a_frame_rate_that_glides_keeps_time_and_motion(world):
 
 def test_current_carries_it_away():
     """A drifting vehicle ends with the water's velocity, in NED."""
-    world = SitlWorld(NEUTRAL, position=(0.0, 0.0, -50.0), water=Water(current=(0.2, 0.1, 0.0), depth=60.0))
+    world = SitlWorld(NEUTRAL, start=DEEP, water=Water(current=(0.2, 0.1, 0.0), depth=60.0))
     for _ in range(600):
         world.step(STILL, 20)
     assert state_of(world)["velocity"] == pytest.approx([0.2, -0.1, 0.0], abs=0.02)
@@ -448,7 +450,7 @@ def test_the_doppler_log_beside_it_measures_the_same_world():
         RectangularPool(length=50.0, width=50.0, depth=5.0),
         Water(current=(0.2, 0.4, 0.0), depth=5.0),
     )
-    world = SitlWorld(NEUTRAL, pool=pool, water=water, position=(0.0, 0.0, -3.5), dvl=log)
+    world = SitlWorld(NEUTRAL, pool=pool, water=water, start=Station((0.0, 0.0, -3.5), 0.0), dvl=log)
     while not client.connected:
         client.receive()
     log.poll()
@@ -674,7 +676,7 @@ def test_one_command_starts_and_ends_sitl(tmp_path, monkeypatch, capsys):
 
 def test_the_imu_has_the_files_noise_and_repeats_it(world):
     """Rates of a vehicle at rest scatter by the density times the root of the rate; a restart draws the same."""
-    noisy = SitlWorld(NEUTRAL, position=(0.0, 0.0, -1.0), noise=True, seed=3)
+    noisy = SitlWorld(NEUTRAL, start=Station((0.0, 0.0, -1.0), 0.0), noise=True, seed=3)
     noisy.step(STILL, 400)
 
     def rates():

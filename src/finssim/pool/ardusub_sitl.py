@@ -17,8 +17,9 @@ import subprocess
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.control.ardusub import Mixer, motors_of
+from finssim.control.guidance import Station
 from finssim.core import realtime
 from finssim.core.frames import TO_FOSSEN, wxyz_from_xyzw
 from finssim.core.rotations import cross, matrix_to_quat, quat_from_yaw, quat_to_euler, quat_to_matrix
@@ -109,10 +111,9 @@ class SitlWorld:
         self,
         vehicle: Vehicle,
         *,
+        start: Station,
         pool: RectangularPool | None = None,
         water: Water | None = None,
-        position: tuple[float, float, float] = (0.0, 0.0, -1.0),
-        yaw: float = 0.0,
         battery: Battery | None = None,
         dvl: DvlServer | None = None,
         noise: bool = False,
@@ -122,10 +123,9 @@ class SitlWorld:
 
         Args:
             vehicle: Its thrusters have an `esc`; those without a `motor_index` are on the outputs in their order.
+            start: Pose of the body, world frame; yaw from world x, which is north, left positive [m, rad].
             pool: Walls and floor; open water without a floor if None.
             water: Current and waves; still water if None.
-            position: Of the body origin, world frame [m].
-            yaw: From world x, which is north, left positive [rad].
             battery: Of its motors; 16 V whatever the load if None.
             dvl: Server of its Doppler log; none if None.
             noise: Whether rates and specific force have the noise of the vehicle file's IMU.
@@ -137,7 +137,7 @@ class SitlWorld:
         self.vehicle, self.battery = vehicle, battery or Battery(full_voltage=16.0)
         self._thrusters = list(vehicle.thrusters.values())
         self._output = motors_of(vehicle)
-        self._start = position, quat_from_yaw(yaw)
+        self._start = tuple(start.position), quat_from_yaw(start.yaw)
         longest = max(t.delay for t in self._thrusters)
         self.simulator = Simulator(
             vehicle, control_step=1.0 / FASTEST, substeps=1, pool=pool, water=water, threads=1, seed=seed,
@@ -521,23 +521,106 @@ MOTOR_POWER = 385.0
 """Power of a T200 at full speed on 16 V, from its table [W]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SitlScene:
+    """Site of the vehicle, its water, and the vehicle's start."""
+
+    site: str = "tank"
+    """(NAME) Walls and floor: pool, tank or open-water (no walls near, floor at 20 m)."""
+    start: str | None = None
+    """(X,Y,Z,YAW) Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; at the
+    surface if not given, since SITL calibrates its barometers where the vehicle starts."""
+    current: str = "0,0,0"
+    """(X,Y,Z) Current, world frame [m/s]."""
+    wave: str | None = None
+    """(A,LENGTH,HEADING) One wave: amplitude [m], length [m], direction of travel [deg]; none if not given."""
+
+    def pool(self) -> RectangularPool:
+        """Return the walls and the floor.
+
+        Raises:
+            PlantSpecError: There is no such site.
+        """
+        if self.site not in SITES:
+            raise PlantSpecError(f"unknown site '{self.site}'; available: {', '.join(SITES)}")
+        length, width, depth = SITES[self.site] or POOL
+        return RectangularPool(length=length, width=width, depth=depth)
+
+    def water(self, depth: float) -> Water:
+        """Return the current and the wave in water of a depth [m].
+
+        Raises:
+            PlantSpecError: They are not three numbers each.
+        """
+        waves = []
+        if self.wave is not None:
+            amplitude, wavelength, heading = _three(self.wave, "wave")
+            waves = [Wave(amplitude=amplitude, wavelength=wavelength, heading=math.radians(heading))]
+        return Water(current=_three(self.current, "current"), waves=waves, depth=depth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Supply:
+    """Electric supply of the thrusters."""
+
+    voltage: Annotated[float, (5.0, 30.0)] = 16.0
+    """Battery voltage without load [V]."""
+    resistance: Annotated[float, (0.0, 1.0)] = 0.02
+    """Resistance of battery and wiring [ohm]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Addresses:
+    """Addresses of SITL, of its serial port and of the DVL."""
+
+    bind: str = "127.0.0.1:9002"
+    """(HOST:PORT) Address to which SITL sends its packets; only this machine if not given."""
+    dvl: str | None = None
+    """(HOST:PORT) Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
+    16171."""
+    dvl_page: str | None = None
+    """(HOST:PORT) Address of the DVL's web page, by which BlueOS' driver finds it; none if not given."""
+    mavlink: str = "127.0.0.1:5762"
+    """(HOST:PORT) TCP address of one of SITL's serial ports, by which it is given its origin and, with --dvl,
+    the DVL's velocities; SITL's second port if not given; none: nothing is sent."""
+
+    @contextmanager
+    def dvl_server(self) -> Iterator[DvlServer | None]:
+        """Serve the DVL and its web page, where they have an address."""
+        with ExitStack() as stack:
+            log = None
+            if self.dvl is not None:
+                log = DvlServer(host_port(self.dvl, "--dvl"))
+                stack.callback(log.close)
+            if self.dvl_page is not None:
+                page = serve_about(host_port(self.dvl_page, "--dvl-page"))
+                stack.callback(page.server_close)
+                stack.callback(page.shutdown)
+            yield log
+
+
+@dataclass(frozen=True, kw_only=True)
+class SitlProgram:
+    """Program of ArduSub's SITL, and its parameters."""
+
+    version: Literal["4.1", "4.5", "4.6", "4.7"] = "4.5"
+    """(VERSION) ArduSub's, which decides the names of parameters."""
+    parm: str = "finssim.parm"
+    """(FILE) Parameters for SITL, written at the start: frame, rate, barometers, satellites and, with --dvl,
+    the DVL. A file that was not written by this command is not replaced."""
+    exec: str | None = None
+    """(FILE) ArduSub's SITL program, started with these parameters in the folder of --parm and ended with this
+    command; if not given, start it yourself."""
+
+
 def run(
     *,
     vehicle: str = "bluerov2_heavy",
-    bind: str = "127.0.0.1:9002",
-    site: str = "tank",
-    start: str | None = None,
-    current: str = "0,0,0",
-    wave: str | None = None,
-    voltage: Annotated[float, (5.0, 30.0)] = 16.0,
-    resistance: Annotated[float, (0.0, 1.0)] = 0.02,
-    dvl: str | None = None,
-    dvl_page: str | None = None,
-    mavlink: str = "127.0.0.1:5762",
+    scene: Annotated[SitlScene, "options"] = SitlScene(),
+    supply: Annotated[Supply, "options"] = Supply(),
+    addresses: Annotated[Addresses, "options"] = Addresses(),
     truth: Path | None = None,
-    version: Literal["4.1", "4.5", "4.6", "4.7"] = "4.5",
-    parm: str = "finssim.parm",
-    exec: str | None = None,
+    program: Annotated[SitlProgram, "options"] = SitlProgram(),
     duration: Annotated[float | None, (0.0, None)] = None,
     seed: int = 1,
 ) -> None:
@@ -548,25 +631,11 @@ def run(
     Args:
         vehicle (NAME|FILE): Vehicle whose thrusters have an `esc`: in the catalogue, or a (calibrated) vehicle
             file.
-        bind (HOST:PORT): Address to which SITL sends its packets; only this machine if not given.
-        site (NAME): Walls and floor: pool, tank or open-water (no walls near, floor at 20 m).
-        start (X,Y,Z,YAW): Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; at the
-            surface if not given, since SITL calibrates its barometers where the vehicle starts.
-        current (X,Y,Z): Current, world frame [m/s].
-        wave (A,LENGTH,HEADING): One wave: amplitude [m], length [m], direction of travel [deg]; none if not given.
-        voltage: Battery voltage without load [V].
-        resistance: Resistance of battery and wiring [ohm].
-        dvl (HOST:PORT): Address to serve a Water Linked DVL, for BlueOS' driver or a robot; its usual port is
-            16171.
-        dvl_page (HOST:PORT): Address of the DVL's web page, by which BlueOS' driver finds it; none if not given.
-        mavlink (HOST:PORT): TCP address of one of SITL's serial ports, by which it is given its origin and, with --dvl,
-            the DVL's velocities; SITL's second port if not given; none: nothing is sent.
+        scene: Site, water and start.
+        supply: Battery and wiring.
+        addresses: Addresses of SITL, of its serial port and of the DVL.
         truth (FILE): MCAP file of the true motion, for finssim evaluate --truth; an existing one is refused.
-        version (VERSION): ArduSub's, which decides the names of parameters.
-        parm (FILE): Parameters for SITL, written at the start: frame, rate, barometers, satellites and, with --dvl,
-            the DVL. A file that was not written by this command is not replaced.
-        exec (FILE): ArduSub's SITL program, started with these parameters in the folder of --parm and ended with this
-            command; if not given, start it yourself.
+        program: SITL and its parameters.
         duration: Simulated duration [s]; until Ctrl-C or SIGTERM if not given.
         seed: Seed of every random number; equal seeds give equal results.
 
@@ -574,41 +643,21 @@ def run(
         PlantSpecError, LinkError, GoalError, VehicleError: What cannot be used.
     """
     logging.basicConfig(level=logging.INFO, format="finssim: %(message)s", stream=sys.stderr)
-    if site not in SITES:
-        raise PlantSpecError(f"unknown site '{site}'; available: {', '.join(SITES)}")
-    length, width, depth = SITES[site] or POOL
-    begin = station_of(start or "0,0,0,0")
-    known = load_vehicle(vehicle)
-    file = write_parameters(Path(parm), sitl_parameters(known, version, dvl=dvl is not None))
-    waves = []
-    if wave is not None:
-        amplitude, wavelength, heading = _three(wave, "wave")
-        waves = [Wave(amplitude=amplitude, wavelength=wavelength, heading=math.radians(heading))]
+    pool, start, known = scene.pool(), station_of(scene.start or "0,0,0,0"), load_vehicle(vehicle)
+    parameters = sitl_parameters(known, program.version, dvl=addresses.dvl is not None)
+    file = write_parameters(Path(program.parm), parameters)
+    water = scene.water(pool.depth)
+    battery = Battery(full_voltage=supply.voltage, resistance=supply.resistance, motor_power=MOTOR_POWER)
     with ExitStack() as stack:
-        log = None
-        if dvl is not None:
-            log = DvlServer(host_port(dvl, "--dvl"))
-            stack.callback(log.close)
-        if dvl_page is not None:
-            page = serve_about(host_port(dvl_page, "--dvl-page"))
-            stack.callback(page.server_close)
-            stack.callback(page.shutdown)
+        log = stack.enter_context(addresses.dvl_server())
         world = SitlWorld(
-            known,
-            pool=RectangularPool(length=length, width=width, depth=depth),
-            water=Water(current=_three(current, "current"), waves=waves, depth=depth),
-            position=tuple(begin.position),
-            yaw=begin.yaw,
-            battery=Battery(full_voltage=voltage, resistance=resistance, motor_power=MOTOR_POWER),
-            dvl=log,
-            noise=True,
-            seed=seed,
+            known, pool=pool, water=water, start=start, battery=battery, dvl=log, noise=True, seed=seed
         )
-        server = SitlServer(world, host_port(bind, "--bind"))
+        server = SitlServer(world, host_port(addresses.bind, "--bind"))
         stack.callback(server.close)
         world.truth = stack.enter_context(recording(truth, known, {"command": "finssim ardusub-sitl"}))
-        if mavlink != "none":
-            forwarder = server.forwarder = Forwarder(host_port(mavlink, "--mavlink"))
+        if addresses.mavlink != "none":
+            forwarder = server.forwarder = Forwarder(host_port(addresses.mavlink, "--mavlink"))
             stack.callback(forwarder.close)
             if world.log is not None:
                 world.log.forwarder = forwarder
@@ -617,9 +666,9 @@ def run(
         )
         if log is not None:
             print(f"DVL: {log.address[0]}:{log.address[1]}", flush=True)
-        command = sitl_command(exec or "ardusub", file, server.address)
+        command = sitl_command(program.exec or "ardusub", file, server.address)
         print("SITL: " + shlex.join(command), flush=True)
-        if exec is not None:
+        if program.exec is not None:
             stack.callback(_end, _started(command, file.parent))
         with suppress(KeyboardInterrupt), interrupting():
             server.serve(math.inf if duration is None else duration)

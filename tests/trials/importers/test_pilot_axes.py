@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from finssim.control.ardusub import Mixer
+from finssim.control.guidance import Station
 from finssim.core.frames import TO_FOSSEN
 from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.pool.ardusub_sitl import SitlWorld
@@ -178,7 +179,11 @@ def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
     """Steps ahead, astern and of yaw in the water of `ardusub-sitl`, with sticks, attitude and a DVL's deltas on the
     ground station's log: the fit finds the damping and the added mass of the vehicle file, as well as the scale of
     thrust, 6 % low by its prior, is known."""
-    world, mixer, dive = SitlWorld(HEAVY, position=(0.0, 0.0, -20.0)), Mixer.of_frame("VECTORED_6DOF"), Dive()
+    world, mixer, dive = (
+        SitlWorld(HEAVY, start=Station((0.0, 0.0, -20.0), 0.0)),
+        Mixer.of_frame("VECTORED_6DOF"),
+        Dive(),
+    )
     noise, travelled = np.random.default_rng(0), np.zeros(3)
     for i in range(4400):
         time, step = 0.02 * i, int(0.02 * i) // 4 - 1
