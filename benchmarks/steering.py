@@ -28,6 +28,7 @@ from finssim.core.provenance import provenance
 from finssim.evaluation.evaluate import evaluate_controller
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.statistics import bootstrap
+from finssim.evaluation.trials import TrialSettings
 from finssim.learning.train import TrainingSettings, train
 from finssim.tasks import Task, task_named
 from finssim.vehicles import Vehicle
@@ -49,13 +50,13 @@ class Fast(BaselineAgent):
 
 def tried(controller: str, given: argparse.Namespace) -> dict[str, Array]:
     """Success [-] and error [m] of a controller in every plant, (plants,); an error that there is not is NaN."""
+    settings = TrialSettings(trials=given.trials, seed=given.plants)
     found = evaluate_controller(
         controller,
         load_plant(given.plant),
+        settings,
         task=given.task,
         vehicle=given.vehicle,
-        trials=given.trials,
-        seed=given.plants,
     )
     rows = found.result["per_trial"]
     return {name: np.array([row[name] for row in rows], float) for name in ("success", "error")}

@@ -11,7 +11,7 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.modes import MODES
 from finssim.evaluation.plants import load_plant
-from finssim.evaluation.trials import EpisodeError, run_episodes, summarize_episodes
+from finssim.evaluation.trials import EpisodeError, TrialSettings, run_episodes, summarize_episodes
 from finssim.tasks import Environment, numeric_tasks, task_named
 from finssim.vehicles import load_vehicle
 
@@ -44,7 +44,7 @@ class Still:
 def test_every_task_can_be_played_to_its_end(name):
     """By a controller that does nothing: whatever the task measures is there for each of three short episodes."""
     task = task_named(name, time_limit=1.0)
-    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=3)
+    found = run_episodes(Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=3))
     assert [row["trial"] for row in found] == [0, 1, 2]
     assert all(row["return"] is not None for row in found)  # a time that is never reached is none
     assert all(row["length"] <= 10.0 + 1e-6 for row in found)
@@ -53,7 +53,7 @@ def test_every_task_can_be_played_to_its_end(name):
 def test_each_world_counts_its_first_episode():
     """T1 in 1 s episodes: a return that is the sum of the rewards of ten steps, as the environment gives them alone."""
     task = task_named("t1", time_limit=1.0)
-    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=2, seed=5)
+    found = run_episodes(Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=2, seed=5))
     from finssim.tasks import make
 
     alone = make(task, worlds=2, seed=5)
@@ -74,14 +74,19 @@ def test_a_world_that_breaks_has_no_measures(monkeypatch, tmp_path):
 
     monkeypatch.setattr(Environment, "step", breaking)
     task = task_named("t1", time_limit=1.0)
-    found = run_episodes(Still(task), task, FINSROV, NOMINAL, trials=3, crash_directory=tmp_path)
+    found = run_episodes(
+        Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=3, crash_directory=tmp_path)
+    )
     assert [row["return"] is not None for row in found] == [True, False, True]
     assert summarize_episodes(found)["valid"] == 2
 
 
 def test_equal_seeds_are_equal_episodes():
     task = task_named("t3", time_limit=1.0)
-    runs = [run_episodes(Still(task), task, FINSROV, NOMINAL, trials=4, seed=seed) for seed in (1, 1, 2)]
+    runs = [
+        run_episodes(Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=4, seed=seed))
+        for seed in (1, 1, 2)
+    ]
     returns = [[row["return"] for row in run] for run in runs]
     assert returns[0] == returns[1] != returns[2]
 
@@ -89,7 +94,7 @@ def test_equal_seeds_are_equal_episodes():
 def test_another_rate_is_refused():
     task = task_named("t3")
     with pytest.raises(EpisodeError, match="acts every 0.05 s, expected 0.1 s"):
-        run_episodes(Still(task, period=0.05), task, FINSROV, NOMINAL, trials=1)
+        run_episodes(Still(task, period=0.05), task, FINSROV, NOMINAL, TrialSettings(trials=1))
 
 
 def test_means_have_intervals_and_what_is_missing_is_counted():

@@ -21,7 +21,7 @@ from finssim.evaluation import trials as trials_module
 from finssim.evaluation.evaluate import EvaluationError, evaluate, evaluate_controller
 from finssim.evaluation.metrics import PAPER_T1, T1_SETPOINTS, T1_START
 from finssim.evaluation.plants import PlantChanges, PlantError, available_plants, load_plant
-from finssim.evaluation.trials import run_trials
+from finssim.evaluation.trials import TrialSettings, run_trials
 from finssim.learning.export import export_policy
 from finssim.sim import read_run
 from finssim.tasks import Environment, EnvironmentSetupError, StationKeeping
@@ -78,7 +78,7 @@ def test_a_policy_directory_is_flown(policy):
 def test_trials_are_those_of_the_protocol():
     """60 s from the published start, level and at rest, the eight setpoints in turn, at the controller's rate."""
     player = PidAgent("pid", FINSROV)
-    done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, trials=10)
+    done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, TrialSettings(trials=10))
     assert [trial.name for trial in done] == [*T1_SETPOINTS, "P01", "P02"]
     motions = [trial.motion for trial in done]
     for motion in motions:
@@ -100,14 +100,14 @@ PLANTS = [name for name in available_plants() if not load_plant(name).held_out]
 def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
     """Numbers are finite in every plant that ships (short trials)."""
     monkeypatch.setattr(trials_module, "DURATION", 2.0)
-    result = evaluate_controller(controller, load_plant(name), trials=3).result
+    result = evaluate_controller(controller, load_plant(name), TrialSettings(trials=3)).result
     assert result["plant"]["name"] == name and result["success"] == 0
     assert all(trial["e_p_m"] is None for trial in result["per_trial"])  # the window was never reached
 
 
 def positions(plant, **options):
     """Of all trials of the tuned PID, (T, n, 3)."""
-    played = evaluate_controller("pid", plant, **options).trials
+    played = evaluate_controller("pid", plant, TrialSettings(**options)).trials
     return np.stack([trial.motion.position for trial in played], axis=1)
 
 
@@ -200,9 +200,8 @@ def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
         return step(self, action)
 
     monkeypatch.setattr(Environment, "step", breaking)
-    done = run_trials(
-        PidAgent("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, trials=8, crash_directory=tmp_path
-    )
+    settings = TrialSettings(trials=8, crash_directory=tmp_path)
+    done = run_trials(PidAgent("pid", FINSROV), StationKeeping(), FINSROV, NOMINAL, settings)
     position = np.stack([trial.motion.position for trial in done], axis=1)
     assert np.isfinite(position[:100]).all()
     assert np.isnan(position[100:, 2]).all() and np.isfinite(np.delete(position, 2, axis=1)).all()
@@ -221,7 +220,9 @@ def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
     """That is what plants are for: the policy is checked against the vehicle's file."""
     monkeypatch.setattr(trials_module, "DURATION", 1.0)
     heavy = PlantChanges(name="heavy", vehicle={"body.mass": 12.5})
-    assert evaluate_controller(policy, heavy, trials=1).result["plant"]["vehicle"] == {"body.mass": 12.5}
+    assert evaluate_controller(policy, heavy, TrialSettings(trials=1)).result["plant"]["vehicle"] == {
+        "body.mass": 12.5
+    }
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from finssim.control.modes import MODES
 from finssim.control.trajectories import load_trajectory
 from finssim.evaluation import trials as trials_module
 from finssim.evaluation.plants import PlantChanges, PlantError, available_plants, load_plant
-from finssim.evaluation.trials import run_episodes, run_trials
+from finssim.evaluation.trials import TrialSettings, run_episodes, run_trials
 from finssim.sim import read_run
 from finssim.sim.ranges_file import load_ranges
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, Sensing, task_named
@@ -159,7 +159,9 @@ def commands_and_thrusts(run, plant, folder):
 def t1_trials(controller):
     def run(plant, folder):
         task = task_named("t1")
-        run_trials(agent_for(controller, FINSROV, task), task, FINSROV, plant, trials=8, record=folder)
+        run_trials(
+            agent_for(controller, FINSROV, task), task, FINSROV, plant, TrialSettings(trials=8, record=folder)
+        )
 
     return run
 
@@ -167,13 +169,14 @@ def t1_trials(controller):
 def t2_trials(plant, folder):
     task = task_named("t2")
     guides = [load_trajectory("lemniscate")]
-    run_trials(agent_for("pid", FINSROV, task), task, FINSROV, plant, guides=guides, trials=1, record=folder)
+    settings = TrialSettings(trials=1, record=folder)
+    run_trials(agent_for("pid", FINSROV, task), task, FINSROV, plant, settings, guides=guides)
 
 
 def episodes(name, action=None):
     def run(plant, folder):
         task = task_named(name, time_limit=3.0)
-        run_episodes(Restless(task, action), task, FINSROV, plant, trials=4, record=folder)
+        run_episodes(Restless(task, action), task, FINSROV, plant, TrialSettings(trials=4, record=folder))
 
     return run
 

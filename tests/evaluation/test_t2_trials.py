@@ -23,7 +23,7 @@ from finssim.evaluation.figures import draw_tracking
 from finssim.evaluation.metrics import MEASURES, PAPER_T2, paper_t2_row
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import print_tables
-from finssim.evaluation.trials import T2_TRAJECTORIES, run_trials
+from finssim.evaluation.trials import T2_TRAJECTORIES, TrialSettings, run_trials
 from finssim.learning.export import export_policy
 from finssim.learning.network import Linear, Network
 from finssim.tasks import TrajectoryTracking
@@ -83,7 +83,7 @@ def test_a_current_and_the_number_of_trials_are_heard():
     guides = [TRAJECTORIES["straight"]]
     player = agent_for("pid", FINSROV, TASK)
     still, current = (
-        run_trials(player, TASK, FINSROV, load_plant(plant), trials=2, guides=guides)
+        run_trials(player, TASK, FINSROV, load_plant(plant), TrialSettings(trials=2), guides=guides)
         for plant in ("nominal", "current")
     )
     apart = [np.abs(a.motion.position - b.motion.position).max() for a, b in (still, current)]
@@ -94,7 +94,9 @@ def test_a_current_and_the_number_of_trials_are_heard():
 def test_a_feed_forward_of_acceleration_halves_the_error():
     """The straight line within 1 mm; without the goal's acceleration it was 2.6 mm."""
     player = agent_for("pid", FINSROV, TASK)
-    trials = run_trials(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    trials = run_trials(
+        player, TASK, FINSROV, NOMINAL, TrialSettings(trials=1), guides=[TRAJECTORIES["straight"]]
+    )
     assert horizontal(trials) < 1e-3
 
 
@@ -103,7 +105,9 @@ def test_the_published_baseline_has_a_profile_for_trajectories():
     assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
     assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
     player = agent_for("pid-paper", FINSROV, TASK)
-    trials = run_trials(player, TASK, FINSROV, NOMINAL, guides=[TRAJECTORIES["straight"]], trials=1)
+    trials = run_trials(
+        player, TASK, FINSROV, NOMINAL, TrialSettings(trials=1), guides=[TRAJECTORIES["straight"]]
+    )
     published = paper_t2_row("PID", "straight")["horizontal_rmse_m"]
     assert horizontal(trials) == pytest.approx(published, rel=0.2)
 
@@ -128,7 +132,9 @@ def test_equal_seeds_are_equal_trials():
     plant = load_plant("randomised")
     player = agent_for("pid", FINSROV, TASK)
     one, again, other = (
-        run_trials(player, TASK, FINSROV, plant, trials=1, guides=guides, seed=seed)[0].motion.position
+        run_trials(player, TASK, FINSROV, plant, TrialSettings(trials=1, seed=seed), guides=guides)[
+            0
+        ].motion.position
         for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(one, again)
@@ -136,7 +142,7 @@ def test_equal_seeds_are_equal_trials():
 
 
 def test_the_result_says_who_was_tried_where():
-    result = evaluate_controller("pid", NOMINAL, task="t2", trials=1).result
+    result = evaluate_controller("pid", NOMINAL, TrialSettings(trials=1), task="t2").result
     assert (result["task"], result["trials"], result["plant"]["name"]) == ("t2", 1, "nominal")
     assert result["vehicle"]["sha256"] == FINSROV.sha256
 
@@ -176,7 +182,7 @@ def stiff_policy(folder, errors):
 
 def test_an_integral_takes_out_what_a_current_leaves(tmp_path):
     """In 0.10 m/s a policy without memory is pushed away by centimetres; one that integrates its error is not."""
-    options = {"task": "t2", "trajectories": ["broken"], "trials": 2}
+    options = {"settings": TrialSettings(trials=2), "task": "t2", "trajectories": ["broken"]}
     plain, integrating = (
         evaluate_controller(
             stiff_policy(tmp_path / str(len(errors)), errors), load_plant("current"), **options

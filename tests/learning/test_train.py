@@ -19,6 +19,7 @@ from finssim.control.policy import Policy
 from finssim.core.files import OutputError
 from finssim.evaluation.evaluate import evaluate_controller
 from finssim.evaluation.plants import load_plant
+from finssim.evaluation.trials import TrialSettings
 from finssim.learning import episodes
 from finssim.learning.export import onnx_bytes
 from finssim.learning.learners import LEARNERS, LearningError
@@ -426,5 +427,5 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
 def test_a_short_training_follows_the_straight_line(tmp_path):
     """After half of the usual steps: within 3 cm, several times better than the paper's best on hardware."""
     folder = train("t2", TrainingSettings(seed=1, steps=300_000), out=tmp_path / "t2")
-    result = evaluate_controller(folder, load_plant("nominal"), task="t2", trials=1).result
+    result = evaluate_controller(folder, load_plant("nominal"), TrialSettings(trials=1), task="t2").result
     assert result["horizontal_rmse_m"] < 0.03 and result["vertical_rmse_m"] < 0.03

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -30,8 +30,10 @@ from finssim.evaluation.plants import PlantChanges, load_plant
 from finssim.evaluation.tables import Columns, Table, cells, figure_text, html_of
 from finssim.evaluation.trials import (
     EPISODES,
+    ONCE,
     T2_TRAJECTORIES,
     GoalTrial,
+    TrialSettings,
     guide_of,
     run_episodes,
     run_trials,
@@ -379,10 +381,10 @@ def evaluate_in_plants(
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for plant_file in plants:
             target = folder and folder / TRAJECTORIES / (plant_file.name if plants[1:] else "")
-            options = {"hydrodynamics": hydrodynamics, "trials": trials, "seed": seed, "record": target}
+            settings = TrialSettings(hydrodynamics=hydrodynamics, trials=trials, seed=seed, record=target)
             evaluations.append(
                 evaluate_controller(
-                    names[0], plant_file, task=task, vehicle=vehicle, trajectories=trajectories, **options
+                    names[0], plant_file, settings, task=task, vehicle=vehicle, trajectories=trajectories
                 )
             )
         scored = Evaluations(tuple(evaluations))
@@ -465,28 +467,23 @@ def _plants(names: Sequence[str | Path]) -> list[PlantChanges]:
 def evaluate_controller(
     controller: str | Path,
     plant: PlantChanges,
+    settings: TrialSettings = ONCE,
     *,
     task: str = "t1",
     vehicle: str | Vehicle = "finsrov",
-    hydrodynamics: str = "calibrated",
     trajectories: Sequence[str | Path] = (),
-    trials: int | None = None,
-    seed: int = 1,
-    record: Path | None = None,
 ) -> Evaluation:
-    """Run the trials in one plant and measure them; arguments as `evaluate`.
+    """Run the trials in one plant and measure them; other arguments as `evaluate`.
 
     Args:
-        hydrodynamics: Model, unless the plant names one.
-        trials: How many; the eight setpoints, or the four trajectories, once if None.
-        seed: Of what the plant draws.
-        record: New folder for every state, command and thrust; none if None.
+        settings: How many, by default the eight setpoints, or the four trajectories, once; and their worlds.
     """
     if trajectories and task != "t2":
         raise EvaluationError(f"task '{task}' follows no trajectory: omit it, or evaluate t2")
     the_task = task_named(task)
     count = len(trajectories) or (len(FORMS[task].targets) if task in FORMS else EPISODES)
-    trials = count if trials is None else trials
+    trials = count if settings.trials is None else settings.trials
+    settings = replace(settings, trials=trials)
     if trials < 1:
         raise EvaluationError(f"trials is {trials}, expected 1 or more")
     start_warp()
@@ -494,20 +491,17 @@ def evaluate_controller(
     agent = agent_for(controller, body, the_task)
     played: list[GoalTrial] = []
     with progress_bar(f"{trials} trials") as show:
-        options: dict[str, Any] = {
-            "trials": trials, "hydrodynamics": hydrodynamics, "seed": seed, "record": record, "show": show,
-        }  # fmt: skip
         if task in FORMS:
             guides = [guide_of(x, body) for x in trajectories] or None
-            played = run_trials(agent, the_task, body, plant, guides=guides, **options)
+            played = run_trials(agent, the_task, body, plant, settings, guides=guides, show=show)
             limits = plant.changed(body).force_limits
             measures = [trial.measures(task, limits) for trial in played]
         else:
-            measures = run_episodes(agent, the_task, body, plant, **options)
+            measures = run_episodes(agent, the_task, body, plant, settings, show=show)
     plant_values = plant.model_dump(mode="json", exclude_defaults=True)
     about = {
-        "hydrodynamics": plant.hydrodynamics or hydrodynamics,
-        "seed": seed,
+        "hydrodynamics": plant.hydrodynamics or settings.hydrodynamics,
+        "seed": settings.seed,
         **plant.observe_record(body),
     }
     return evaluation(agent.describe(), task, body, plant_values, measures, played, **about)
@@ -528,5 +522,5 @@ class ControllerTrials(campaign.Job):
 
 def play(job: ControllerTrials, _: Path) -> dict[str, Any]:
     """Run the trials of a job, and return the result of their evaluation."""
-    options: dict[str, Any] = {"vehicle": job.vehicle, "trials": job.trials, "seed": job.noise}
-    return evaluate_controller(job.controller, job.water, task=job.task, **options).result
+    settings = TrialSettings(trials=job.trials, seed=job.noise)
+    return evaluate_controller(job.controller, job.water, settings, task=job.task, vehicle=job.vehicle).result

@@ -40,7 +40,7 @@ from finssim.evaluation.metrics import (
 )
 from finssim.evaluation.plants import PlantChanges
 from finssim.evaluation.statistics import with_interval
-from finssim.tasks import Task, follow
+from finssim.tasks import Environment, Task, follow
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
@@ -220,18 +220,44 @@ def guide_of(
     return load_trajectory(target, vehicle=vehicle)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrialSettings:
+    """Number of trials, all at once, and their worlds."""
+
+    trials: int | None = None
+    """How many; if None one for each guide, or `EPISODES`."""
+    seed: int = 1
+    """Seed of everything that the plant draws."""
+    hydrodynamics: str = "calibrated"
+    """Model, unless the plant names one."""
+    record: Path | None = None
+    """New folder for every state, command and thrust; none if None."""
+    crash_directory: Path = Path("finssim-frozen")
+    """Directory of the last states of a world that broke."""
+
+    def environment(
+        self, agent: Agent, task: Task, vehicle: Vehicle, plant: PlantChanges, worlds: int, **options: Any
+    ) -> Environment:
+        """Return so many worlds of a plant; arguments as of `run_trials`, options of `Environment`."""
+        return plant.environment(
+            agent, task, vehicle, worlds=worlds, seed=self.seed, hydrodynamics=self.hydrodynamics,
+            crash_directory=self.crash_directory, **options,
+        )  # fmt: skip
+
+
+ONCE = TrialSettings()
+"""Each setpoint or trajectory once."""
+
+
 def run_trials(
     agent: Agent,
     task: Task,
     vehicle: Vehicle,
     plant: PlantChanges,
+    settings: TrialSettings = ONCE,
     *,
     guides: Sequence[Guide] | None = None,
-    trials: int | None = None,
-    seed: int = 1,
-    record: Path | None = None,
     show: Show = lambda part: None,
-    **world: Any,
 ) -> list[GoalTrial]:
     """Run trials of T1, each 60 s from the published start, level and at rest; or of T2, from rest on the first pose.
 
@@ -240,20 +266,16 @@ def run_trials(
         task: Its observation is what the agent sees.
         vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
         plant: What differs.
+        settings: How many, and their worlds.
         guides: Setpoints or trajectories, in turn; the published ones if None.
-        trials: How many, all at once; one for each guide if None.
-        seed: Of everything that the plant draws.
-        record: New folder for every state, command and thrust; none if None.
         show: Called with the part done.
-        world: Of `Environment`: hydrodynamics (unless the plant names one), crash_directory (where the last states of a
-            world that broke are written).
 
     Returns:
         The trials; from the moment that its world broke the numbers of one are NaN.
     """
     moving = follows(task)
     ways = guides or [guide_of(name, vehicle) for name in (T2_TRAJECTORIES if moving else T1_SETPOINTS)]
-    chosen = [ways[i % len(ways)] for i in range(trials or len(ways))]
+    chosen = [ways[i % len(ways)] for i in range(settings.trials or len(ways))]
     duration = max(guide.duration for guide in chosen) if moving else DURATION
     paced: Any = replace(
         task,
@@ -261,9 +283,7 @@ def run_trials(
         substeps=math.ceil(agent.period / PHYSICS_STEP - 1e-9),
         **({"time_limit": duration + 1.0, "knot_spacing": 0.1} if moving else {}),
     )
-    environment = plant.environment(
-        agent, paced, vehicle, worlds=len(chosen), seed=seed, auto_reset=False, **world
-    )
+    environment = settings.environment(agent, paced, vehicle, plant, len(chosen), auto_reset=False)
     first = _goals(chosen, 0.0)
     if moving:
         follow(environment, chosen)
@@ -275,7 +295,7 @@ def run_trials(
     columns = {name: np.full((steps + 1, environment.worlds, n), np.nan) for name, n in widths.items()}
     episode = state.episode.numpy().copy()
     goal: Callable[[float], Goal] = (lambda t: _goals(chosen, t)) if moving else (lambda t: first)
-    for k, _ in rollout(agent, environment, steps, goal, record=record):
+    for k, _ in rollout(agent, environment, steps, goal, record=settings.record):
         same = state.episode.numpy() == episode  # a world that broke has started over
         for name, column in columns.items():
             column[k, same] = getattr(state, name).numpy()[same, 0, : widths[name]]
@@ -317,14 +337,11 @@ def run_episodes(
     task: Task,
     vehicle: Vehicle,
     plant: PlantChanges,
+    settings: TrialSettings = ONCE,
     *,
-    trials: int = EPISODES,
-    seed: int = 1,
-    record: Path | None = None,
     show: Show = lambda part: None,
-    **world: Any,
 ) -> list[dict[str, Any]]:
-    """Run one episode in each of `trials` worlds to its end; starts and goals are those of training, drawn with `seed`.
+    """Run one episode in each world to its end; starts and goals are those of training, drawn with the seed.
 
     Arguments as `run_trials`; several agents of a world share one agent, and every vehicle of it is the same.
 
@@ -340,11 +357,14 @@ def run_episodes(
             f"the controller acts every {agent.period:g} s, expected {task.control_step:g} s: "
             f"episodes of '{task.name}' are measured at the rate of the task"
         )
-    environment = plant.environment(agent, task, vehicle, worlds=trials, seed=seed, **world)
+    trials = EPISODES if settings.trials is None else settings.trials
+    environment = settings.environment(agent, task, vehicle, plant, trials)
     running = np.ones(trials, dtype=np.bool_)
     metrics = {name: np.full(trials, np.nan) for name in task.metrics(environment.arrays)}
     longest = round(task.time_limit / task.control_step) + 1
-    for k, step in rollout(agent, environment, longest, lambda t: goals_in(environment), record=record):
+    for k, step in rollout(
+        agent, environment, longest, lambda t: goals_in(environment), record=settings.record
+    ):
         if step is None:
             continue
         ended = running & (step.terminated | step.truncated)

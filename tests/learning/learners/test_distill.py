@@ -15,9 +15,9 @@ from finssim.agents.agent import NOWHERE, agent_for
 from finssim.control.guidance import Known
 from finssim.control.policy import Policy, PolicyError
 from finssim.evaluation.plants import load_plant
-from finssim.evaluation.trials import run_episodes
+from finssim.evaluation.trials import TrialSettings, run_episodes
 from finssim.extensions.perception.camera_docking import CameraDocking
-from finssim.learning.demonstrations import Episode, collect, load, save
+from finssim.learning.demonstrations import CollectSettings, Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.torch_networks import SeeingNetwork
@@ -61,7 +61,7 @@ def test_a_policy_directory_says_what_it_sees_and_runs_in_episodes(trained):
     assert policy.description.training["learner"] == "distill"
     vehicle = load_vehicle("finsrov")
     agent = agent_for(trained, vehicle, TASK)
-    rows = run_episodes(agent, TASK, vehicle, load_plant("nominal"), trials=3, seed=5)
+    rows = run_episodes(agent, TASK, vehicle, load_plant("nominal"), TrialSettings(trials=3, seed=5))
     assert all(row["return"] is not None for row in rows)
 
 
@@ -111,7 +111,7 @@ def test_the_student_learns_what_the_teacher_does():
 def test_demonstrations_keep_what_was_seen(tmp_path):
     """Bit for bit what the environment showed, by us and by Minari itself; the last picture is the episode's own."""
     task = CameraDocking(time_limit=0.5)
-    told = collect("light-servo", task, episodes=3, out=tmp_path / "set", seed=4)
+    told = collect("light-servo", task, episodes=3, out=tmp_path / "set", settings=CollectSettings(seed=4))
     assert told["episodes"] == 3 and told["steps"] == 15
     found, environment = load(tmp_path / "set"), make(task, worlds=3, seed=4, observe="training")
     seen, agent = environment.reset(seed=4), agent_for("light-servo", load_vehicle("finsrov"), task)
