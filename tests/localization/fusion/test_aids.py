@@ -53,11 +53,11 @@ class Sea:
         return 0.3 * np.array([np.trapezoid(np.cos(yaw), s), np.trapezoid(np.sin(yaw), s)])
 
     def imu(self, t):
-        noise = SETTINGS.gyro.rate * math.sqrt(RATE) * self.random.standard_normal(3)
+        noise = SETTINGS.imu.gyro.rate * math.sqrt(RATE) * self.random.standard_normal(3)
         r = 0.08 * math.cos(0.1 * t)
         # On a bend the acceleration is r x v: to the left of the way.
         force = np.array([0.0, 0.3 * r, SITE.gravity])
-        force = force + SETTINGS.accel_noise * math.sqrt(RATE) * self.random.standard_normal(3)
+        force = force + SETTINGS.imu.accel_noise * math.sqrt(RATE) * self.random.standard_normal(3)
         return ImuSample(t, tuple(np.array([0.0, 0.0, r]) + self.gyro + noise), tuple(force), (0.0, 0.0))
 
     def doppler(self, t):

@@ -79,7 +79,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         """Return the track before any sample."""
         s = self.settings
         P = np.diag([s.largest_variance] * 3 + [s.speed_std**2] * 3)
-        yaw = YawState(0.0, 0.0, YAW_CAP, 0.0, s.bias_std**2)
+        yaw = YawState(0.0, 0.0, YAW_CAP, 0.0, s.imu.gyro_bias_std**2)
         return PlaneTrack(position=PositionState(np.zeros(6), P), yaw=yaw)
 
     def imu(self, track: PlaneTrack, sample: ImuSample) -> tuple[PlaneTrack, tuple[Outcome, ...]]:
@@ -157,7 +157,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
 
     def turned(self, track: PlaneTrack, angle: float, variance: float) -> PlaneTrack:
         """Start yaw: `angle` [rad] turns it to the measurement, whose variance is `variance` [rad²]."""
-        yaw = attitude.restarted(track.yaw, track.yaw.yaw + angle, variance, self.settings.bias_std)
+        yaw = attitude.restarted(track.yaw, track.yaw.yaw + angle, variance, self.settings.imu.gyro_bias_std)
         return changed(track, yaw=yaw)
 
     def estimate(self, track: PlaneTrack, time: float) -> PoseEstimate:
@@ -219,13 +219,15 @@ class ConstantVelocity(Filter[PlaneTrack]):
             return position
         aided, dived = track.aided, track.seen.get("depth", -math.inf)
         for dt, middle in steps(
-            then, time, (aided + s.coast, aided + s.hold, dived + s.coast, dived + s.hold)
+            then, time, (aided + s.ages.coast, aided + s.ages.hold, dived + s.ages.coast, dived + s.ages.hold)
         ):
             blind, deaf = middle - aided, middle - dived
-            still = ([0, 1] if blind > s.hold else []) + ([2] if deaf > s.hold else [])
+            still = ([0, 1] if blind > s.ages.hold else []) + ([2] if deaf > s.ages.hold else [])
             if still:
                 position = position_filter.frozen(position, still)
-            position = position_filter.predict(position, dt, self._motions[blind > s.coast, deaf > s.coast])
+            position = position_filter.predict(
+                position, dt, self._motions[blind > s.ages.coast, deaf > s.ages.coast]
+            )
         return position_filter.capped(position, s.largest_variance)
 
     def _yaw_at(self, track: PlaneTrack, time: float) -> YawState:
@@ -236,7 +238,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         until = -math.inf if track.imu_time is None or track.rate is None else track.imu_time + GYRO_HOLD
         for dt, middle in steps(then, time, (until,)):
             if track.rate is not None and middle < until:
-                yaw = attitude.predict(yaw, track.rate, dt, s.gyro)
+                yaw = attitude.predict(yaw, track.rate, dt, s.imu.gyro)
             else:
-                yaw = attitude.predict(yaw, yaw.bias, dt, replace(s.gyro, rate=s.blind_rate))
+                yaw = attitude.predict(yaw, yaw.bias, dt, replace(s.imu.gyro, rate=s.imu.blind_rate))
         return attitude.capped(yaw, YAW_CAP) if yaw.variance > YAW_CAP else yaw

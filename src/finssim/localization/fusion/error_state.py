@@ -265,10 +265,10 @@ class ErrorState(Filter[InertialTrack]):
         imu = np.array(site.imu)
         self._body, self._port, self._log = -imu, np.array(site.depth_port) - imu, np.array(site.dvl) - imu
         self._noise = ErrorStateNoise(
-            settings.gyro.rate,
-            settings.accel_noise,
-            settings.gyro.bias_walk,
-            settings.accel_bias_walk,
+            settings.imu.gyro.rate,
+            settings.imu.accel_noise,
+            settings.imu.gyro.bias_walk,
+            settings.imu.accel_bias_walk,
             settings.aids.velocity_walk if settings.aids else 0.0,
         )
         self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
@@ -350,7 +350,7 @@ class ErrorState(Filter[InertialTrack]):
         point, H, *_ = position_model(state, self._body)
         R, rates = quat_to_matrix(state.q), np.array(track.omega) - state.gyro_bias
         x = np.concatenate([point, state.x[V] + R @ cross(rates, self._body)])
-        if time - track.aided > self.settings.hold:
+        if time - track.aided > self.settings.ages.hold:
             x[3:5] = 0.0
         T = np.vstack([H, np.eye(n)[V]])
         yaw, H, *_ = yaw_model(state)
@@ -378,8 +378,8 @@ class ErrorState(Filter[InertialTrack]):
         x = prior.x.copy()
         x[P] -= from_level @ quat_to_matrix(level) @ self._body
         q = quat_multiply(matrix_to_quat(from_level), level)
-        variances = [s.tilt_std**2, s.tilt_std**2, prior.yaw_variance]
-        variances += [s.bias_std**2] * 3 + [s.accel_bias_std**2] * 3
+        variances = [s.imu.tilt_std**2, s.imu.tilt_std**2, prior.yaw_variance]
+        variances += [s.imu.gyro_bias_std**2] * 3 + [s.imu.accel_bias_std**2] * 3
         if s.aids is not None:
             a = s.aids
             variances += [a.heading_bias**2, a.velocity_scale**2, *[a.velocity_bias**2] * 3]
@@ -398,7 +398,7 @@ class ErrorState(Filter[InertialTrack]):
             return track
         aided = track.aided
         heard = -math.inf if track.imu_time is None else track.imu_time + GYRO_HOLD
-        for dt, middle in steps(track.time, time, (aided + s.coast, aided + s.hold, heard)):
+        for dt, middle in steps(track.time, time, (aided + s.ages.coast, aided + s.ages.hold, heard)):
             state = self._step(state, track, dt, blind=middle > heard, age=middle - aided)
         P = bounded(state.P, limits(s.largest_variance, state.P.shape[-1]))
         return changed(track, state=changed(state, P=P), time=time)
@@ -407,17 +407,17 @@ class ErrorState(Filter[InertialTrack]):
         self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
     ) -> InertialState:
         """Return the state after a step [s], without the IMU if `blind`; `age` is that of position and velocity [s]."""
-        s, lost = self.settings, age > self.settings.hold
+        s, lost = self.settings, age > self.settings.ages.hold
         if lost:
             state = frozen(state, [0, 1])
         if blind or track.force is None:
-            after = position_filter.predict(state, dt, self._drifts[age > s.coast])
+            after = position_filter.predict(state, dt, self._drifts[age > s.ages.coast])
             P = after.P.copy()
-            P[A, A] += s.blind_rate**2 * dt * _I3
+            P[A, A] += s.imu.blind_rate**2 * dt * _I3
             return changed(after, P=P)
         omega, force = np.array(track.omega), np.array(track.force)
         after = predict(state, omega, force, dt, self._noise, self._gravity)
-        if age <= s.coast:
+        if age <= s.ages.coast:
             return after
         if lost:  # the accelerometer no longer gives the position; the vehicle may be anywhere near
             x, xy = after.x.copy(), [0, 1]

@@ -224,7 +224,11 @@ def mode_of(age: float, settings: Settings) -> str:
     """The vision state at that age of vision [s]; NaN: there was none."""
     if math.isnan(age):
         return "uninitialized"
-    for mode, limit in (("fresh", settings.fresh), ("coast", settings.coast), ("hold", settings.hold)):
+    for mode, limit in (
+        ("fresh", settings.ages.fresh),
+        ("coast", settings.ages.coast),
+        ("hold", settings.ages.hold),
+    ):
         if age <= limit + 1e-9:
             return mode
     return "lost"
@@ -258,7 +262,7 @@ def health_of(
     )
     variances = estimate.P.diagonal().tolist()
     vx, vy, vz = estimate.x[3:].tolist()
-    imu_fresh, depth_fresh = imu <= settings.imu_fresh + 1e-9, depth <= settings.depth_fresh + 1e-9
+    imu_fresh, depth_fresh = imu <= settings.ages.imu_fresh + 1e-9, depth <= settings.ages.depth_fresh + 1e-9
     finite = all(map(math.isfinite, (*variances[:3], estimate.yaw_variance)))
     sure = finite and max(variances[:3]) <= settings.ready_position
     return Health(
@@ -338,7 +342,7 @@ class Estimator:
         """Sensor -> sum of squared Mahalanobis distances of accepted measurements, and of their dimensions."""
         self._arrived = -math.inf
         self._other: list[float] = []
-        self._timeline: Timeline[Any] = Timeline(self._model.start(), self.settings.horizon)
+        self._timeline: Timeline[Any] = Timeline(self._model.start(), self.settings.ages.horizon)
 
     def add(self, sample: Sample) -> str:
         """Take in a sample and apply it.
@@ -407,8 +411,8 @@ class Estimator:
         """
         self._settle()
         s = self.settings
-        roll, pitch = self._timeline.tilt_at(time, s.imu_fresh, self._model.tilt)
-        return OtherReadings(roll, pitch, self._timeline.depth_at(time, s.depth_fresh))
+        roll, pitch = self._timeline.tilt_at(time, s.ages.imu_fresh, self._model.tilt)
+        return OtherReadings(roll, pitch, self._timeline.depth_at(time, s.ages.depth_fresh))
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
@@ -418,7 +422,7 @@ class Estimator:
 
     def _restart(self) -> None:
         self._settle()
-        self._timeline = Timeline(self._model.start(), self.settings.horizon)
+        self._timeline = Timeline(self._model.start(), self.settings.ages.horizon)
         self._arrived = -math.inf
 
     def _clock(self, sample: Sample) -> str | None:
@@ -432,11 +436,11 @@ class Estimator:
             return None
         # Without arrivals a silence and a jump cannot be distinguished, and silences are more frequent.
         waited = UNHEARD if sample.arrival is None else max(0.0, sample.arrival - self._arrived)
-        forward = sample.time - head > waited + self.settings.jump
-        if not forward and sample.time >= head - max(self.settings.horizon, self.settings.jump):
+        forward = sample.time - head > waited + self.settings.ages.jump
+        if not forward and sample.time >= head - max(self.settings.ages.horizon, self.settings.ages.jump):
             self._other = []
             return None
-        if self._other and abs(sample.time - self._other[-1]) > self.settings.jump:
+        if self._other and abs(sample.time - self._other[-1]) > self.settings.ages.jump:
             self._other = []
         self._other.append(sample.time)
         if len(self._other) < AGREED:

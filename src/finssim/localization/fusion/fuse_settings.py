@@ -37,8 +37,8 @@ class Aids:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of the estimator. Times in seconds."""
+class AgeLimits:
+    """Ages and delays of samples up to which they count [s]."""
 
     fresh: float = 0.25
     """Age of vision up to which the state is called fresh [s]."""
@@ -47,11 +47,39 @@ class Settings:
     hold: float = 3.0
     """Time [s] up to which velocity decays; beyond it the position is constant and its covariance grows."""
     imu_fresh: float = 0.10
+    """Age of an IMU's sample up to which it is called fresh [s]."""
     depth_fresh: float = 0.30
+    """Age of a depth up to which it is called fresh [s]."""
     horizon: float = 1.0
     """Greatest delay of a sample that is still inserted at its time [s]."""
     jump: float = 1.0
     """Greatest lead of a stamp over its arrival before the clock is doubted [s]."""
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """Errors of gyro and accelerometer."""
+
+    gyro: YawNoise = YawNoise()
+    gyro_bias_std: float = 0.01
+    """Bias of the gyro at power-on [rad/s]."""
+    blind_rate: float = 0.3
+    """Noise density of the yaw rate where the gyro is silent [rad/s/√Hz]."""
+    accel_noise: float = 0.02
+    """Noise density of the accelerometer [m/s²/√Hz], vibration included."""
+    accel_bias_walk: float = 1e-3
+    """Random walk of the accelerometer's bias [m/s³/√Hz]."""
+    accel_bias_std: float = 0.05
+    """Bias of the accelerometer at power-on [m/s²]."""
+    tilt_std: float = 0.03
+    """Standard deviation of roll and pitch at the start of the error-state filter [rad]."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the estimator. Times in seconds."""
+
+    ages: AgeLimits = AgeLimits()
     gate: OutlierGate = OutlierGate()
     motion: MotionModel = MotionModel()
     half_life: float = 1.0
@@ -66,19 +94,7 @@ class Settings:
     """Added to a measurement's own standard deviations, in squares [m, rad]: errors that its covariance leaves out."""
     depth_std: float = 0.01
     """[m]"""
-    gyro: YawNoise = YawNoise()
-    bias_std: float = 0.01
-    """Bias of the gyro at power-on [rad/s]."""
-    blind_rate: float = 0.3
-    """Noise density of the yaw rate where the gyro is silent [rad/s/√Hz]."""
-    accel_noise: float = 0.02
-    """Noise density of the accelerometer [m/s²/√Hz], vibration included."""
-    accel_bias_walk: float = 1e-3
-    """[m/s³/√Hz]"""
-    accel_bias_std: float = 0.05
-    """Bias of the accelerometer at power-on [m/s²]."""
-    tilt_std: float = 0.03
-    """Standard deviation of roll and pitch at the start of the error-state filter [rad]."""
+    imu: ImuErrors = ImuErrors()
     ready_position: float = 0.04
     """Largest variance of a position with which the state is ready [m²]."""
     ready_yaw: float = 0.03
@@ -154,13 +170,15 @@ def settings_of(vehicle: Vehicle) -> Settings:
     """Settings with the vehicle file's sensor noises, never below what mounting and sampling leave besides them."""
     settings, imu, depth = Settings(), vehicle.sensors.imu, vehicle.sensors.depth
     if imu is not None:
-        settings = replace(
-            settings,
-            gyro=YawNoise(max(imu.gyro_noise_density, settings.gyro.rate), max(imu.gyro_bias_walk, 2e-5)),
-            bias_std=max(imu.gyro_bias_initial, settings.bias_std),
-            accel_noise=max(imu.accel_noise_density, settings.accel_noise),
-            accel_bias_std=max(imu.accel_bias_initial, settings.accel_bias_std),
+        least = settings.imu
+        errors = replace(
+            least,
+            gyro=YawNoise(max(imu.gyro_noise_density, least.gyro.rate), max(imu.gyro_bias_walk, 2e-5)),
+            gyro_bias_std=max(imu.gyro_bias_initial, least.gyro_bias_std),
+            accel_noise=max(imu.accel_noise_density, least.accel_noise),
+            accel_bias_std=max(imu.accel_bias_initial, least.accel_bias_std),
         )
+        settings = replace(settings, imu=errors)
     if depth is not None:
         settings = replace(settings, depth_std=max(depth.noise_std, settings.depth_std))
     dvl, compass = vehicle.sensors.dvl, vehicle.sensors.compass
