@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from finssim.core.rotations import quat_to_matrix
 from finssim.sim.overhead_camera import ObjectPose, Rectangle, Scene, TagInScene
 from finssim.sim.overhead_camera.photometry import digitise, noise_key
+from finssim.sim.overhead_camera.render import sensor_levels
 from finssim.sim.overhead_camera.scene import SurfaceFrame, surface_frame
 from finssim.sim.overhead_camera.surface import waves_of
 from finssim.sim.sensors.batch import SensorError
@@ -51,13 +52,13 @@ def render_with_mitsuba(
     """
     sensor, lens = scene.sensor, scene.camera.lens
     image = wp.zeros((lens.height, lens.width, 3 if sensor.colour else 1), dtype=wp.uint8, device="cpu")
-    levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
+    levels = sensor_levels(sensor)
     whole = (0, 0, lens.width, lens.height)
     for rectangle in np.atleast_2d(whole if region is None else region).tolist():
         r = Rectangle(*rectangle).clipped(lens.width, lens.height)
         radiance = radiance_by_mitsuba(scene, r, time=time, seed=seed, rays=rays)
         light: wp.array[Any] = wp.array(radiance, dtype=wp.vec3, device="cpu")
-        inputs = [light, r.top, r.left, *levels, noise_key(seed, time), image]
+        inputs = [light, r.top, r.left, levels, noise_key(seed, time), image]
         wp.launch(digitise, dim=light.shape, inputs=inputs, device="cpu")
     return np.asarray(image.numpy() if sensor.colour else image.numpy()[..., 0])
 

@@ -403,21 +403,32 @@ VEHICLE = wp.constant(122949823)
 
 
 @wp.struct
-class DrawnArrays:
-    """Drawn numbers, and the arrays that they are written to."""
+class PrivilegedNumbers:
+    """Drawn numbers that agents, the first vehicles, are told, scaled."""
 
+    agents: int  # how many are told; 0: none
+    told: wp.array(dtype=int)  # columns of these numbers
+    nominal: wp.array(dtype=float)  # nominal value in the unit of the entry
+    scale: wp.array(dtype=float)  # one over the unit that they are counted in
+    now: wp.array2d(dtype=float)  # (worlds, agents * told), (value - nominal) * scale
+    before: wp.array2d(dtype=float)  # the same of the episode before [-]
+
+
+@wp.struct
+class DrawnArrays:
+    """Drawn numbers, and the arrays that they are written to; the water's are separate."""
+
+    plant: wp.array2d(dtype=VehicleParameters)
+    extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units
+    lines: wp.array2d(dtype=Tether)
+    measurement: wp.array2d(dtype=MeasurementErrors)
     values: wp.array3d(dtype=float)  # in the unit of each entry, (worlds, vehicles, entries)
     volume_with_mass: int
     water: int  # 1: write the water's numbers
     drift: int
     tether: int
     sensors: int
-    agents: int  # vehicles whose privileged numbers are observed
-    told: wp.array(dtype=int)  # columns of these numbers
-    told_nominal: wp.array(dtype=float)  # nominal value in the unit of the entry
-    told_scale: wp.array(dtype=float)  # one over the unit that observed numbers are counted in
-    privileged: wp.array2d(dtype=float)  # (worlds, agents * observed), (value - nominal) * scale
-    final_privileged: wp.array2d(dtype=float)  # the same of the episode before [-]
+    privileged: PrivilegedNumbers
 
 
 @wp.func
@@ -460,19 +471,16 @@ def finish_values(d: DrawnArrays, w: int, v: int):
 @wp.func
 def write_privileged(d: DrawnArrays, w: int, v: int):
     """The privileged numbers of an agent; those of the episode that ended move aside."""
-    size = d.told.shape[0]
+    p = d.privileged
+    size = p.told.shape[0]
     for i in range(size):
         column = v * size + i
-        d.final_privileged[w, column] = d.privileged[w, column]
-        d.privileged[w, column] = (d.values[w, v, d.told[i]] - d.told_nominal[i]) * d.told_scale[i]
+        p.before[w, column] = p.now[w, column]
+        p.now[w, column] = (d.values[w, v, p.told[i]] - p.nominal[i]) * p.scale[i]
 
 
 @wp.kernel(enable_backward=False)
 def draw_episode(
-    plant: wp.array2d(dtype=VehicleParameters),
-    extra: wp.array3d(dtype=float),
-    tether: wp.array2d(dtype=Tether),
-    measurement: wp.array2d(dtype=MeasurementErrors),
     water: WaterArrays,
     nominal: Nominal,
     table: DrawTable,
@@ -500,16 +508,16 @@ def draw_episode(
         stream(seed + 49979687 * episode - 1, w),
     )
     finish_values(d, w, v)
-    write_body(plant, nominal, d.values, w, v)
-    write_terms(extra, nominal, d.values, w, v)
-    write_thrusters(plant, nominal, d.values, w, v)
+    write_body(d.plant, nominal, d.values, w, v)
+    write_terms(d.extra, nominal, d.values, w, v)
+    write_thrusters(d.plant, nominal, d.values, w, v)
     if d.tether != 0:
-        write_tether(tether, d.values, w, v)
+        write_tether(d.lines, d.values, w, v)
     if d.sensors != 0:
-        write_sensors(measurement, d.values, w, v)
+        write_sensors(d.measurement, d.values, w, v)
     if d.water != 0 and v == 0:
         write_water(water, nominal, d.values, w, d.drift)
-    if v < d.agents:
+    if v < d.privileged.agents:
         write_privileged(d, w, v)
 
 
@@ -667,22 +675,25 @@ class Draws:
 
     def _drawn_arrays(self, agents: int, privileged: tuple[wp.array, wp.array] | None) -> DrawnArrays:
         randomization, device = self.randomization, self.simulator.device
-        d = DrawnArrays()
+        d, s = DrawnArrays(), self.simulator
+        d.plant, d.extra, d.lines, d.measurement = s.plant.array, s.plant.extra, s.tether.array, self._seen
         d.values = self.values
         d.volume_with_mass = int(randomization.ranges.volume == "with_mass")
         d.water, d.sensors = int(randomization.moves_water), int(randomization.changes_sensors)
         d.drift, d.tether = (int(randomization._draws(f"{name}.")) for name in ("current_drift", "tether"))
-        d.agents = agents if privileged else 0
         names = self.told if privileged else []
         columns = [INDEX[name] for name in names]
-        d.told = wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device)
+        p = PrivilegedNumbers()
+        p.agents = agents if privileged else 0
+        p.told = wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device)
         for field, values in (
-            ("told_nominal", self.nominal[columns]),
-            ("told_scale", [self._scale(n) for n in names]),
+            ("nominal", self.nominal[columns]),
+            ("scale", [self._scale(n) for n in names]),
         ):
-            setattr(d, field, wp.array(np.asarray(values, np.float32), dtype=wp.float32, device=device))
+            setattr(p, field, wp.array(np.asarray(values, np.float32), dtype=wp.float32, device=device))
         none = wp.zeros((self.simulator.worlds, 0), dtype=wp.float32, device=device)
-        d.privileged, d.final_privileged = privileged or (none, none)
+        p.now, p.before = privileged or (none, none)
+        d.privileged = p
         return d
 
     @property
@@ -708,8 +719,7 @@ class Draws:
     def add(self, pipeline: KernelSequence, mask: wp.array, seed: int) -> None:
         """Append the draw for the worlds where mask (by world, int32) is not 0; refresh the plant afterwards."""
         s = self.simulator
-        places = [s.plant.array, s.plant.extra, s.tether.array, self._seen, s.water]
-        inputs = [*places, self._nominal, self.table, self._arrays, s.state, seed, mask]
+        inputs = [s.water, self._nominal, self.table, self._arrays, s.state, seed, mask]
         pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
 
     def add_step(self, pipeline: KernelSequence, seed: int) -> None:

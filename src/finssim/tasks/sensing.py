@@ -167,8 +167,11 @@ class Estimates:
 
 @wp.struct
 class InstrumentReadings:
-    """Readings of the instruments; arrays of a kind that no vehicle has are empty."""
+    """Readings of the instruments; arrays of a kind that no vehicle has are empty. Fixes are drawn when they arrive."""
 
+    control_step: float  # [s]
+    fix_errors: wp.array2d(dtype=MeasurementErrors)  # by (world, vehicle)
+    fixes_per_step: wp.float64  # fixes in a control step [-]; 0: none
     imu_errors: wp.array2d(dtype=ImuParameters)
     imu: ImuArrays
     imu_samples: Sampling
@@ -261,7 +264,6 @@ def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
 @wp.func
 def begin(
     state: State,
-    m: MeasurementErrors,
     r: InstrumentReadings,
     e: Estimates,
     has_fixes: bool,
@@ -282,6 +284,7 @@ def begin(
     turn = doubted(aboard.yaw, normal(key, WHITE_2), normal(key, WALK_2))
     lasting = wp.vec3()
     if has_fixes:
+        m = r.fix_errors[w, v]
         lasting = m.position_bias * normal3(key, TURN_ON)
         turn[0] = turn[0] + m.yaw_bias * normal(key, TURN_ON_2)
     if aboard.gauge:
@@ -338,40 +341,53 @@ def measured_at(e: Estimates, latency: int, step: int) -> int:
     return step - wp.min(wp.min(latency, e.position.shape[2] - 1), step)
 
 
+@wp.struct
+class Correction:
+    """Correction of an estimate by a measurement."""
+
+    position: wp.vec3  # world frame [m]
+    velocity: wp.vec3  # world frame [m/s]
+    turn: wp.vec2  # about the vertical, and of the gyro's bias about it [rad, rad/s]
+
+
 @wp.func
-def shift(
-    e: Estimates, w: int, v: int, at: int, step: int, dt: float, dx: wp.vec3, dv: wp.vec3, turn: wp.vec2
-):
+def moved(position: wp.vec3, velocity: wp.vec3) -> Correction:
+    """Correction of position [m] and velocity [m/s] alone, world frame."""
+    c = Correction()
+    c.position = position
+    c.velocity = velocity
+    return c
+
+
+@wp.func
+def correct(e: Estimates, w: int, v: int, at: int, step: int, dt: float, c: Correction):
     """Apply a correction of control step `at`: offsets, which have grown since then, and the gyro's bias.
 
-    `dt` is in [s], `dx` in [m], `dv` in [m/s], `turn` in [rad, rad/s].
+    `dt` is in [s].
     """
     up = wp.quat_rotate_inv(e.quaternion[w, v, step % e.position.shape[2]], wp.vec3(0.0, 0.0, 1.0))
-    e.bias[w, v] = e.bias[w, v] - turn[1] * up
-    e.rate[w, v] = e.rate[w, v] + turn[1] * up
+    e.bias[w, v] = e.bias[w, v] - c.turn[1] * up
+    e.rate[w, v] = e.rate[w, v] + c.turn[1] * up
     for j in range(at, step + 1):
         k = j % e.position.shape[2]
         t = float(j - at) * dt
-        e.position[w, v, k] = e.position[w, v, k] + dx + t * dv
-        e.velocity[w, v, k] = e.velocity[w, v, k] + dv
-        e.quaternion[w, v, k] = about_z(turn[0] + t * turn[1]) * e.quaternion[w, v, k]
+        e.position[w, v, k] = e.position[w, v, k] + c.position + t * c.velocity
+        e.velocity[w, v, k] = e.velocity[w, v, k] + c.velocity
+        e.quaternion[w, v, k] = about_z(c.turn[0] + t * c.turn[1]) * e.quaternion[w, v, k]
 
 
 @wp.func
-def take_fix(
-    state: State, m: MeasurementErrors, e: Estimates, rate: wp.float64, dt: float, seed: int, w: int, v: int
-):
-    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean.
-
-    Fixes come at `rate` [1/s]; a control step takes `dt` [s].
-    """
+def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: int, v: int):
+    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean."""
+    m = r.fix_errors[w, v]
+    dt = r.control_step
     step = state.steps[w]
     at = measured_at(e, int(wp.rint(m.delay / dt)), step)
     if at < 1:
         return
     key = sample_key(seed, FIX, w, v, state.episode[w], at)
     came = float(0.0)
-    for i in range(samples_until(rate, at) - samples_until(rate, at - 1)):
+    for i in range(samples_until(r.fixes_per_step, at) - samples_until(r.fixes_per_step, at - 1)):
         if wp.randf(wp.rand_init(int(key), DROPOUT + i)) >= m.dropout:
             came += 1.0
     if came == 0.0:
@@ -397,10 +413,10 @@ def take_fix(
         B = value_gain(e.height[w, v], R)
         e.height[w, v] = value_known(e.height[w, v], R)
     R_yaw = counted(fewer * m.yaw_std, 0.0)
-    turn = value_gain(e.yaw[w, v], R_yaw) * turn_off
+    c = moved(wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off), wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off))
+    c.turn = value_gain(e.yaw[w, v], R_yaw) * turn_off
     e.yaw[w, v] = value_known(e.yaw[w, v], R_yaw)
-    dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
-    shift(e, w, v, at, step, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), turn)
+    correct(e, w, v, at, step, dt, c)
 
 
 @wp.func
@@ -414,8 +430,7 @@ def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int
     R = counted(gauge.noise_std, gauge.quantisation)
     K = value_gain(e.height[w, v], R) * off
     e.height[w, v] = value_known(e.height[w, v], R)
-    dx = wp.vec3(0.0, 0.0, K[0])
-    shift(e, w, v, at, step, dt, dx, wp.vec3(0.0, 0.0, K[1]), wp.vec2(0.0, 0.0))
+    correct(e, w, v, at, step, dt, moved(wp.vec3(0.0, 0.0, K[0]), wp.vec3(0.0, 0.0, K[1])))
 
 
 @wp.func
@@ -437,30 +452,28 @@ def take_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: 
     e.plane[w, v] = rate_known(e.plane[w, v], R)
     e.height[w, v] = rate_known(e.height[w, v], R)
     dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
-    shift(e, w, v, at, step, dt, dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off), wp.vec2(0.0, 0.0))
+    correct(e, w, v, at, step, dt, moved(dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off)))
 
 
 @wp.kernel(enable_backward=False)
 def estimate(
-    state: State, arrays: TaskArrays, noise: wp.array2d(dtype=MeasurementErrors), r: InstrumentReadings, e: Estimates,
-    rate: wp.float64, dt: float, seed: int, mask: wp.array(dtype=int), starting: bool, world_offset: int,
+    state: State, arrays: TaskArrays, r: InstrumentReadings, e: Estimates, seed: int, mask: wp.array(dtype=int),
+    starting: bool, world_offset: int,
 ):  # fmt: skip
-    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0.
-
-    Fixes come at `rate` [1/s], 0 for none; a control step takes `dt` [s].
-    """
+    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0."""
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0 or state.frozen[w] != 0:
         return
     step = state.steps[w]
-    has_fixes = rate > wp.float64(0.0)
+    dt = r.control_step
+    has_fixes = r.fixes_per_step > wp.float64(0.0)
     if starting:
-        begin(state, noise[w, v], r, e, has_fixes, seed, w, v)
+        begin(state, r, e, has_fixes, seed, w, v)
     else:
         go_on(r, e, step, dt, w, v)
         if has_fixes:
-            take_fix(state, noise[w, v], e, rate, dt, seed, w, v)
+            take_fix(state, r, e, seed, w, v)
         if r.gauge_errors.shape[0] > 0 and r.gauge_samples.fresh[w, v]:
             take_depth(r, e, step, dt, w, v)
         if r.dvl_errors.shape[0] > 0 and r.dvl_samples.fresh[w, v]:
@@ -504,14 +517,15 @@ class SensingBatch:
                     f"vehicle {vehicle.name} has no IMU for its attitude: give sensors.imu in its "
                     "file, or use another observation"
                 )
-        self._simulator, self._arrays, self._seen = simulator, arrays, measurement
+        self._simulator, self._arrays = simulator, arrays
         dt = simulator.control_step
         self.suite = SensorSuite(
             simulator.vehicles, worlds=simulator.worlds, control_step=dt, seed=seed, device=simulator.device,
             floor_depth=floor_depth,
         )  # fmt: skip
-        self._rate = sensing.rate * dt
         self.readings, slow = InstrumentReadings(), [0]
+        self.readings.fix_errors, self.readings.fixes_per_step = measurement.array, sensing.rate * dt
+        self.readings.control_step = dt
         for name, batch in (("imu", self.suite.imu), ("gauge", self.suite.depth), ("dvl", self.suite.dvl)):
             if batch is not None:
                 setattr(self.readings, name, batch.arrays)
@@ -541,12 +555,9 @@ class SensingBatch:
         worlds_mask = mask if starting else self._simulator._all
         pipeline.add(
             estimate,
-            [
-                state, self._arrays, self._seen.array, self.readings, self.estimates, self._rate,
-                self._simulator.control_step, seed, worlds_mask, starting,
-            ],
+            [state, self._arrays, self.readings, self.estimates, seed, worlds_mask, starting],
             vehicles=count,
-        )  # fmt: skip
+        )
 
     def structs(self) -> dict[str, Any]:
         """All that decides what is seen next, by name; parameters that `suite` was given are not in it."""

@@ -29,49 +29,55 @@ STREAM = wp.constant(1000)
 """Stream of the keys of lost readings, separate from those of the sensors of `finssim.sim.sensors`."""
 
 
+@wp.struct
+class DeliverySchedule:
+    """Work of the sensors in a step, by view, and what remains of the steps before it."""
+
+    begun: wp.array2d(dtype=int)  # episode that the sensor of (world, vehicle) has begun
+    due: wp.array(dtype=int)  # 1: measures in this step
+    stored: wp.array(dtype=int)  # slot of the ring that takes the reading; -1: none
+    arrived: wp.array(dtype=int)  # slot of the ring whose reading arrives; -1: none
+    age: wp.array2d(dtype=float)  # time since the reading on display was measured [s], by (world, vehicle)
+
+
 @wp.kernel(enable_backward=False)
 def _schedule(
     steps: wp.array(dtype=int),
     episode: wp.array(dtype=int),
-    begun: wp.array2d(dtype=int),
     sampling: Sampling,
     loss: float,
     seed: int,
-    due: wp.array(dtype=int),
-    stored: wp.array(dtype=int),
-    arrived: wp.array(dtype=int),
-    age: wp.array2d(dtype=float),
+    schedule: DeliverySchedule,
 ):
     """Write which sensors measure in this step, into which slot of their ring, and which slot's reading arrives; -1:
     none."""
     w, v = wp.tid()
     step = steps[w]
-    view = w * age.shape[1] + v
-    due[view] = 0
-    stored[view] = -1
-    arrived[view] = -1
-    restarting = bool(episode[w] != begun[w, v])
+    view = w * schedule.age.shape[1] + v
+    schedule.due[view] = 0
+    schedule.stored[view] = -1
+    schedule.arrived[view] = -1
+    restarting = bool(episode[w] != schedule.begun[w, v])
     if restarting:
-        begun[w, v] = episode[w]
+        schedule.begun[w, v] = episode[w]
         restart(sampling, w, v, step)
     if begin_update(sampling, w, v, step):
         if restarting or sample_due(sampling, w, v, step):
             key = sample_key(seed, STREAM, w, v, episode[w], step)
             slot = slot_of(sampling, step)
-            due[view] = 1
-            stored[view] = slot
+            schedule.due[view] = 1
+            schedule.stored[view] = slot
             sampling.sent[w, v, slot] = restarting or not lost(key, loss)
             sampling.last[w, v] = step
-        arrived[view] = arrival(sampling, w, v, step, restarting)
+        schedule.arrived[view] = arrival(sampling, w, v, step, restarting)
     stamp = sampling.stamp[w, v]
-    age[w, v] = wp.where(stamp < 0.0, float(wp.inf), float(step) * sampling.control_step - stamp)
+    schedule.age[w, v] = wp.where(stamp < 0.0, float(wp.inf), float(step) * sampling.control_step - stamp)
 
 
 @wp.kernel(enable_backward=False)
 def _pass_on(
     measured: wp.array2d(dtype=wp.uint8),
-    stored: wp.array(dtype=int),
-    arrived: wp.array(dtype=int),
+    schedule: DeliverySchedule,
     span: int,
     ring: wp.array3d(dtype=wp.uint8),
     reading: wp.array2d(dtype=wp.uint8),
@@ -79,11 +85,11 @@ def _pass_on(
     """Put what was measured on its way, and on display what arrives; a thread moves `span` bytes."""
     view, block = wp.tid()
     last = wp.min(block * span + span, measured.shape[1])
-    slot = stored[view]
+    slot = schedule.stored[view]
     if slot >= 0:
         for k in range(block * span, last):
             ring[view, slot, k] = measured[view, k]
-    slot = arrived[view]
+    slot = schedule.arrived[view]
     if slot >= 0:
         for k in range(block * span, last):
             reading[view, k] = ring[view, slot, k]
@@ -145,8 +151,11 @@ class DelayedSensor:
         self.reading = wp.zeros_like(source)
         with wp.ScopedDevice(self.device):
             self.age = wp.full((worlds, vehicles), math.inf, dtype=float)
-            self._begun = wp.full((worlds, vehicles), -1, dtype=int)
-            self._due, self._stored, self._arrived = (wp.zeros(sensor.count, dtype=int) for _ in range(3))
+            self._schedule = DeliverySchedule()
+            self._schedule.age = self.age
+            self._schedule.begun = wp.full((worlds, vehicles), -1, dtype=int)
+            for name in ("due", "stored", "arrived"):
+                setattr(self._schedule, name, wp.zeros(sensor.count, dtype=int))
             self._ring = wp.zeros((sensor.count, slots, width), dtype=wp.uint8)
         self._bytes = [
             wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(sensor.count, width), device=self.device)
@@ -164,21 +173,20 @@ class DelayedSensor:
         Returns:
             `reading` in the unit of the sensor, which the next update overwrites.
         """
-        inputs = [steps, episode, self._begun, self.sampling, self.loss, self.seed]
-        inputs += [self._due, self._stored, self._arrived, self.age]
+        inputs = [steps, episode, self.sampling, self.loss, self.seed, self._schedule]
         wp.launch(_schedule, self.age.shape, inputs, device=self.device)
         self.updates += 1
-        self.sensor.update(poses, seed=self.seed, time=float(self.updates), mask=self._due)
+        self.sensor.update(poses, seed=self.seed, time=float(self.updates), mask=self._schedule.due)
         source, reading = self._bytes
         span = 16 if self.device.is_cuda else source.shape[1]
-        inputs = [source, self._stored, self._arrived, span, self._ring, reading]
+        inputs = [source, self._schedule, span, self._ring, reading]
         wp.launch(_pass_on, (len(source), -(-source.shape[1] // span)), inputs, device=self.device)
         return self.reading
 
     def restart(self, seed: int) -> None:
         """Start noise and losses over with a seed; the next update is the first of an episode in every world."""
         self.seed, self.updates = seed, 0
-        self._begun.fill_(-1)
+        self._schedule.begun.fill_(-1)
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
         """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all.
@@ -186,7 +194,7 @@ class DelayedSensor:
         Each has the unit of its attribute.
         """
         yield from (("measured", self.sensor.reading), ("reading", self.reading), ("age", self.age))
-        yield from (("begun", self._begun), ("ring", self._ring))
+        yield from (("begun", self._schedule.begun), ("ring", self._ring))
         fields = ((name, getattr(self.sampling, name)) for name in self.sampling._cls.vars)
         yield from ((name, x) for name, x in fields if isinstance(x, wp.array) and name != "timing")
 

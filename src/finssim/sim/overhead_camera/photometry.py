@@ -58,26 +58,33 @@ def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: 
     return out
 
 
+@wp.struct
+class SensorLevels:
+    """How an image sensor makes numbers of radiance."""
+
+    gain: float  # share of the full scale of radiance 1 [-]
+    full_well: float  # charge at full scale [electrons]
+    read_noise: float  # standard deviation of reading out [electrons]
+    gamma: float  # exponent of the encoding [-]
+    noisy: wp.bool  # whether there is noise
+
+
 @wp.func
-def digitised_charge(
-    charge: float, noise: float, read_noise: float, full_well: float, gamma: float
-) -> wp.uint8:
+def digitised_charge(charge: float, noise: float, sensor: SensorLevels) -> wp.uint8:
     """The number a pixel reports, 0 to 255.
 
     Args:
         charge: Mean charge [electrons].
         noise: A standard normal number, or zero.
-        read_noise: Standard deviation of reading out [electrons].
-        full_well: Charge at full scale [electrons].
-        gamma: Exponent of the encoding.
+        sensor: Its full scale, noise and encoding.
 
     Note:
         Shot noise, of variance `charge` (photon transfer), is normal here instead of Poisson: alike above 20 electrons.
     """
-    measured = charge + noise * wp.sqrt(charge + read_noise * read_noise)
-    level = wp.clamp(measured / full_well, 0.0, 1.0)
-    if gamma != 1.0:
-        level = wp.pow(level, 1.0 / gamma)
+    measured = charge + noise * wp.sqrt(charge + sensor.read_noise * sensor.read_noise)
+    level = wp.clamp(measured / sensor.full_well, 0.0, 1.0)
+    if sensor.gamma != 1.0:
+        level = wp.pow(level, 1.0 / sensor.gamma)
     return wp.uint8(wp.floor(255.0 * level + 0.5))
 
 
@@ -86,11 +93,7 @@ def digitise(
     radiance: wp.array2d(dtype=wp.vec3),
     first_row: int,
     first_column: int,
-    gain: float,
-    full_well: float,
-    read_noise: float,
-    gamma: float,
-    noisy: bool,
+    sensor: SensorLevels,
     key: int,
     image: wp.array3d(dtype=wp.uint8),
 ):
@@ -105,10 +108,10 @@ def digitise(
     state = wp.rand_init(key, row * image.shape[1] + column)
     for c in range(image.shape[2]):
         noise = float(0.0)
-        if noisy:
+        if sensor.noisy:
             noise = wp.randn(state)
-        charge = wp.max(gain * colour[c], 0.0) * full_well
-        image[row, column, c] = digitised_charge(charge, noise, read_noise, full_well, gamma)
+        charge = wp.max(sensor.gain * colour[c], 0.0) * sensor.full_well
+        image[row, column, c] = digitised_charge(charge, noise, sensor)
 
 
 def noise_key(seed: int, time: float) -> int:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from finssim.core.optics import Status, project
 from finssim.core.rotations import quat_rotate, quat_to_matrix
-from finssim.sim.overhead_camera.photometry import digitise, noise_key
+from finssim.sim.overhead_camera.photometry import SensorLevels, digitise, noise_key
 from finssim.sim.overhead_camera.raycast import BasinData, SceneData, TagData, cast
 from finssim.sim.overhead_camera.scene import (
+    ImageSensor,
     Scene,
     SurfaceFrame,
     TagInScene,
@@ -198,6 +199,14 @@ Image = NDArray[np.uint8]
 Region = Rectangle | tuple[int, int, int, int]
 
 
+def sensor_levels(sensor: ImageSensor) -> SensorLevels:
+    """Return the numbers of an image sensor for the kernel that makes its pixel values."""
+    levels = SensorLevels()
+    levels.gain, levels.full_well, levels.read_noise = sensor.gain, sensor.full_well, sensor.read_noise
+    levels.gamma, levels.noisy = sensor.gamma, sensor.noise
+    return levels
+
+
 class OverheadCamera:
     """A fixed camera above a pool.
 
@@ -257,10 +266,10 @@ class OverheadCamera:
             start = self._background.reshape(shape).copy()
         image = on_device(start, wp.uint8, self.device)
         samples = self._prepare((*self.scene.tags, *tags), time)
-        levels = [sensor.gain, sensor.full_well, sensor.read_noise, sensor.gamma, sensor.noise]
+        levels = sensor_levels(sensor)
         for r in chosen:
             radiance = self._cast(r, samples)
-            inputs = [radiance, r.top, r.left, *levels, noise_key(seed, time), image]
+            inputs = [radiance, r.top, r.left, levels, noise_key(seed, time), image]
             wp.launch(digitise, dim=radiance.shape, inputs=inputs, device=self.device)
         return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2])
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import warp as wp
 from numpy.typing import NDArray
 
-from finssim.sim.sensors.sampling import SensedState, new_sampling
+from finssim.sim.sensors.sampling import SensedArrays, SensedState, new_sampling
 from finssim.vehicles.equipment import Sensor
 
 
@@ -70,7 +70,6 @@ class SensorBatch:
         """Struct of readings, by (world, vehicle), and of rings, which have one more index."""
         self.device = device
         self.seed = seed
-        self.number = NUMBERS.get(name) or zlib.crc32(name.encode()) >> 1
         self.shape = (worlds, len(entries))
         self.sampling = new_sampling(
             [0.0 if entry is None else entry.rate for entry in entries],
@@ -79,6 +78,7 @@ class SensorBatch:
             control_step,
             device,
         )
+        self.sampling.number = NUMBERS.get(name) or zlib.crc32(name.encode()) >> 1
         self.stamp: wp.array[Any] = self.sampling.stamp
         """Time since reset at which the reading on display was taken [s], -1 before the first; float (W, V)."""
         self.fresh: wp.array[Any] = self.sampling.fresh
@@ -106,9 +106,12 @@ class SensorBatch:
             mask: Worlds to look at, int (W,).
             restarting: Whether these worlds have just been reset.
         """
-        truth = [state.position, state.quaternion, state.velocity, state.acceleration, water_velocity]
-        memory = [self.parameters, self.arrays, self.sampling]
-        return [*truth, state.steps, state.episode, *memory, mask, restarting, self.seed, self.number]
+        truth = SensedArrays()
+        for name in ("position", "quaternion", "velocity", "acceleration", "steps", "episode"):
+            setattr(truth, name, getattr(state, name))
+        if water_velocity is not None:
+            truth.water_velocity = water_velocity
+        return [truth, self.parameters, self.arrays, self.sampling, mask, restarting, self.seed]
 
     def use(self, vehicle: int, entry: Any, site: Surroundings) -> None:
         """Take one vehicle's parameters from its file.

@@ -108,6 +108,19 @@ class SensedState(Protocol):
 
 
 @wp.struct
+class SensedArrays:
+    """The arrays of a `SensedState` and of the water at the vehicles, for a kernel."""
+
+    position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
+    quaternion: wp.array2d(dtype=wp.quat)  # attitude, body to world, xyzw
+    velocity: wp.array2d(dtype=vec6)  # nu at the body origin, body frame [m/s, rad/s]
+    acceleration: wp.array2d(dtype=vec6)  # nu_dot, body frame [m/s², rad/s²]
+    water_velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]; empty if it is not given
+    steps: wp.array(dtype=int)  # control steps since the world's reset
+    episode: wp.array(dtype=int)  # resets of the world so far
+
+
+@wp.struct
 class Timing:
     """When one sensor of one vehicle samples."""
 
@@ -119,6 +132,7 @@ class Timing:
 class Sampling:
     """State of the samples of one kind of sensor, by (world, vehicle)."""
 
+    number: int  # of the sensor, in the key of its random numbers
     timing: wp.array(dtype=Timing)  # by vehicle
     control_step: float  # [s]
     seen: wp.array2d(dtype=int)  # step of the last update
@@ -273,20 +287,13 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
 
     @wp.kernel(enable_backward=False, module="unique")
     def sample(
-        position: wp.array2d(dtype=wp.vec3),
-        quaternion: wp.array2d(dtype=wp.quat),
-        velocity: wp.array2d(dtype=vec6),
-        acceleration: wp.array2d(dtype=vec6),
-        water_velocity: wp.array2d(dtype=wp.vec3),
-        steps: wp.array(dtype=int),
-        episode: wp.array(dtype=int),
+        state: SensedArrays,
         errors: wp.array2d(dtype=parameters),
         sensor: arrays,
         sampling: Sampling,
         mask: wp.array(dtype=int),
         restarting: bool,
         seed: int,
-        number: int,
         world_offset: int,
     ):
         i, v = wp.tid()
@@ -294,20 +301,20 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
         if mask[w] == 0:
             return
         p = errors[w, v]
-        step = steps[w]
+        step = state.steps[w]
         if restarting:
             restart(sampling, w, v, step)
         if not begin_update(sampling, w, v, step):
             return
         if restarting or sample_due(sampling, w, v, step):
-            key = sample_key(seed, number, w, v, episode[w], step)
+            key = sample_key(seed, sampling.number, w, v, state.episode[w], step)
             truth = SampledState()
-            truth.position = position[w, v]
-            truth.quaternion = quaternion[w, v]
-            truth.velocity = velocity[w, v]
-            truth.acceleration = acceleration[w, v]
-            if water_velocity.shape[0] > 0:
-                truth.water = water_velocity[w, v]
+            truth.position = state.position[w, v]
+            truth.quaternion = state.quaternion[w, v]
+            truth.velocity = state.velocity[w, v]
+            truth.acceleration = state.acceleration[w, v]
+            if state.water_velocity.shape[0] > 0:
+                truth.water = state.water_velocity[w, v]
                 truth.water_known = True
             truth.key = key
             truth.root = root_of_wait(sampling, w, v, step)
