@@ -85,6 +85,17 @@ class DeviceMount(Part):
         return quat_from_euler(0.0, self.pitch, self.yaw)
 
 
+class SiteDevice(Part):
+    """A device on a vehicle that senses the site around it."""
+
+    about: str
+    source: str
+    """Source of the figures."""
+    rate: Positive
+    """[Hz]"""
+    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
+
+
 class Port(Part):
     """A flat window between a lens in air and the water, square to the view."""
 
@@ -96,12 +107,9 @@ class Port(Part):
     """Refractive index; acrylic has 1.49."""
 
 
-class CameraDevice(Part):
+class CameraDevice(SiteDevice):
     """A camera on a vehicle. Pixels and coefficients as OpenCV's; a dome port centred on the lens needs nothing."""
 
-    about: str
-    source: str
-    """Source of the figures."""
     width: Pixels
     height: Pixels
     focal_length: Positive
@@ -121,9 +129,6 @@ class CameraDevice(Part):
     """Numbers are (charge)^(1/gamma) [-]."""
     exposure_time: NonNegative = 0.0
     """During which a picture that knows the vehicle's motion blurs [s]."""
-    rate: Positive
-    """[Hz]"""
-    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
     @model_validator(mode="after")
     def _optics(self) -> CameraDevice:
@@ -154,12 +159,9 @@ class CameraDevice(Part):
         return 1.0 if self.exposure == "auto" else float(self.exposure)
 
 
-class SonarDevice(Part):
+class SonarDevice(SiteDevice):
     """A sonar whose picture is echo strength by beam and range: imaging, profiling or side-scan."""
 
-    about: str
-    source: str
-    """Source of the figures."""
     mode: Literal["imaging", "profiling", "side_scan"] = "imaging"
     """Profiling: ranges of the first strong returns too. Side-scan: two beams square to the sensor's x axis."""
     frequency: Positive
@@ -190,9 +192,6 @@ class SonarDevice(Part):
     """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
     detection_db: Number = -60.0
     """Level after gain that a profiling sonar takes for a return [dB]."""
-    rate: Positive
-    """[Hz]"""
-    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
     @model_validator(mode="after")
     def _computable(self) -> SonarDevice:
@@ -214,12 +213,9 @@ class SonarDevice(Part):
         return self
 
 
-class RangeDevice(Part):
+class RangeDevice(SiteDevice):
     """An altimeter, a rangefinder, or the beams of a DVL: the distance along each beam."""
 
-    about: str
-    source: str
-    """Source of the figures."""
     beams: Annotated[int, Field(strict=True, ge=1, le=16)] = 1
     """One along the sensor's x axis, or several evenly around it."""
     beam_angle: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
@@ -238,9 +234,6 @@ class RangeDevice(Part):
     """Standard deviation, as a share of the range."""
     velocity_noise: NonNegative = 0.0
     """Standard deviation of a DVL's velocity along a beam [m/s]."""
-    rate: Positive
-    """[Hz]"""
-    mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
 
 Device = CameraDevice | SonarDevice | RangeDevice

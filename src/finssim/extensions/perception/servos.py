@@ -338,6 +338,17 @@ class NetSide(NamedTuple):
         return (np.abs(turn) > 0.05) & (np.abs(turn) < 0.7) & (beyond < reach)
 
 
+class SonarNumbers(NamedTuple):
+    """Sonar of a vehicle."""
+
+    sector: float
+    """Its field of view [rad]."""
+    bin_length: float
+    """[m]"""
+    position: tuple[float, float, float]
+    """Body axes [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class WallFollower(DriveBaseline):
     """Finds the net's sides among the two loudest echoes of each beam, faces its nearest point and goes to the left.
@@ -354,12 +365,7 @@ class WallFollower(DriveBaseline):
     """Distance from the net [m]."""
     height: float
     """Above its foot [m]."""
-    sector: float
-    """Sector of the sonar [rad]."""
-    bin_length: float
-    """[m]"""
-    eye: tuple[float, float, float]
-    """Position of the sonar, body axes [m]."""
+    sonar: SonarNumbers
     under: float
     """Distance of the altimeter below the body origin [m]."""
     least: float = 60.0
@@ -389,7 +395,7 @@ class WallFollower(DriveBaseline):
         altimeter = device_of(vehicle, task.ranges[0])
         return cls(
             drive=DriveNumbers.of(vehicle), speed=task.speed, distance=task.distance, height=task.height,
-            sector=sonar.sector, bin_length=sonar.range / sonar.bins, eye=tuple(sonar.mount.position.tolist()),
+            sonar=SonarNumbers(sonar.sector, sonar.range / sonar.bins, tuple(sonar.mount.position.tolist())),
             under=-float(altimeter.mount.position[2]),
         )  # fmt: skip
 
@@ -433,15 +439,15 @@ class WallFollower(DriveBaseline):
         """
         levels = picture[..., 0].astype(float)
         count, cells = levels.shape[1:]
-        azimuth = self.sector * (0.5 - (np.arange(count) + 0.5) / count)
+        azimuth = self.sonar.sector * (0.5 - (np.arange(count) + 0.5) / count)
         rows = []
         for _ in range(2):
             cell = levels.argmax(2)
-            r = (cell + 0.5) * self.bin_length - self.behind
+            r = (cell + 0.5) * self.sonar.bin_length - self.behind
             weight = r * (
                 levels.max(2) >= self.least
             )  # the way along a side from beam to beam grows with the range
-            rows.append((r * np.cos(azimuth) + self.eye[0], r * np.sin(azimuth), weight))
+            rows.append((r * np.cos(azimuth) + self.sonar.position[0], r * np.sin(azimuth), weight))
             levels = np.where(np.abs(np.arange(cells) - cell[..., None]) <= 3, 0.0, levels)
         x, y, weight = (np.concatenate(parts, 1) for parts in zip(*rows, strict=True))
         first, on = self.side(x, y, weight)
