@@ -69,7 +69,9 @@ def steady_ratio(spec: PlantSpec, axis: int, power: float) -> float:
     hydro = FINSROV.hydrodynamics["calibrated"]
     d1, d2 = hydro.linear_damping[axis, axis], hydro.quadratic_damping[axis, axis]
     wrench = power * FINSROV.wrench_limits[axis]
-    plant = Plant(FINSROV, spec.model_copy(update=OPEN_WATER), position=(0.0, 0.0, -100.0))
+    plant = Plant(
+        FINSROV, spec.model_copy(update=OPEN_WATER), start=((0.0, 0.0, -100.0), (0.0, 0.0, 0.0, 1.0))
+    )
     force = np.linalg.pinv(FINSROV.control_matrix) @ (wrench * np.eye(6)[axis])
     pairs = zip(FINSROV.thrusters.values(), force, strict=True)
     plant.target[:] = [float(t.speed(f)) if abs(f) > 0.1 else 0.0 for t, f in pairs]

@@ -225,6 +225,11 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
     return begin
 
 
+def autopilot_fault(**fields: Any) -> Touch:
+    """Return a fault that sets fields of `pool.faults.autopilot`."""
+    return lambda bench: vars(bench.pool.faults.autopilot).update(fields)
+
+
 def stuck_sensors(*names: str) -> Touch:
     """Return a fault in which fields of the telemetry keep their values, while sequence and clock advance."""
 
@@ -379,12 +384,12 @@ def leap(bench: Bench) -> None:
 
 def turning_north(bench: Bench) -> None:
     """Turn the autopilot's north on by one step of 15° in 20 s."""
-    bench.pool.faults.north += math.radians(15.0) / 20.0 / RATE
+    bench.pool.faults.autopilot.north += math.radians(15.0) / 20.0 / RATE
 
 
 def lagging_leap(bench: Bench) -> None:
     """Let the autopilot's position be late, and then be reset."""
-    bench.pool.faults.position_lag = 0.25
+    bench.pool.faults.autopilot.position_lag = 0.25
     leap(bench)
 
 
@@ -403,7 +408,7 @@ def low_battery(bench: Bench) -> None:
     """Let the battery fall below the voltage at which the autopilot, as its user set it, disarms."""
     autopilot: Any = bench.pool.firmware
     autopilot.parameters |= {"BATT_LOW_VOLT": 12.8, "BATT_FS_LOW_ACT": 2.0}
-    bench.pool.faults.battery_voltage = 9.0
+    bench.pool.faults.autopilot.battery_voltage = 9.0
 
 
 SILENT, WAITS = "no fresh telemetry", "held longer than"
@@ -411,9 +416,9 @@ UNARMED = "failsafe|was disarmed"
 AUTOPILOT: Mapping[str, Scenario] = {
     "ap-none": _autopilot("no fault", "", math.inf, pool_fault()),
     "ap-heartbeat": _autopilot(
-        "its heartbeat is lost", "no heartbeat from the autopilot", 3.5, pool_fault(no_heartbeat=True)
+        "its heartbeat is lost", "no heartbeat from the autopilot", 3.5, autopilot_fault(no_heartbeat=True)
     ),
-    "ap-our-heartbeat": _autopilot("ours is lost", "", math.inf, pool_fault(no_ground_heartbeat=True)),
+    "ap-our-heartbeat": _autopilot("ours is lost", "", math.inf, autopilot_fault(no_ground_heartbeat=True)),
     "ap-silence": _autopilot("telemetry is lost", SILENT, 1.0, pool_fault(drop=1.0)),
     "ap-deaf": _autopilot(
         "what is sent is lost", "our frames are lost|was disarmed|in failsafe", 3.5, pool_fault(drop_commands=1.0)
@@ -430,7 +435,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     }),
     "ap-dvl": _autopilot(
         "Doppler log lost for 10 s", WAITS, 4.0,
-        Fault(begin=pool_fault(dvl_silent=True), end=pool_fault(dvl_silent=False), lasts=10.0),
+        Fault(begin=autopilot_fault(dvl_silent=True), end=autopilot_fault(dvl_silent=False), lasts=10.0),
     ),
     "ap-origin": _autopilot(
         "an origin is set, its north turns by 11.4°", "", 0.5,
@@ -442,11 +447,11 @@ AUTOPILOT: Mapping[str, Scenario] = {
         Fault(begin=turning_north, during=turning_north, lasts=20.0), **TURNED,
     ),
     "ap-leap": _autopilot("its own position is reset by 0.7 m", "", math.inf, leap, **OWN),
-    "ap-lag": _autopilot("its own position lags by 0.25 s", "", math.inf, pool_fault(position_lag=0.25), **OWN),
+    "ap-lag": _autopilot("its own position lags by 0.25 s", "", math.inf, autopilot_fault(position_lag=0.25), **OWN),
     "ap-lag-leap": _autopilot("it lags and is reset", "", math.inf, lagging_leap, **OWN),
     "ap-own-dvl": _autopilot(
-        "its Doppler log is lost, by its own position", WAITS, 7.5, pool_fault(dvl_silent=True), firmware="ardusub-own",
-        watched=15.0,
+        "its Doppler log is lost, by its own position", WAITS, 7.5, autopilot_fault(dvl_silent=True),
+        firmware="ardusub-own", watched=15.0,
     ),
     "ap-depth": _autopilot("depth frozen", WAITS, 4.0, pool_fault(freeze_depth=True)),
     "ap-battery": _autopilot(

@@ -17,12 +17,12 @@ from finssim.control.trajectories import TRAJECTORIES
 from finssim.evaluation.campaign import keep_result, load_result
 from finssim.evaluation.plants import load_plant
 from finssim.evaluation.tables import Table, figure_text
-from finssim.evaluation.trials import EpisodeError, follows, run_episodes, summarize_episodes
+from finssim.evaluation.trials import EpisodeError, TrialSettings, follows, run_episodes, summarize_episodes
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.drawn_plant import site_of as plant_at
 from finssim.pool.plant_spec import Severity
-from finssim.pool.task_site import TaskSite
+from finssim.pool.task_site import PositionSources, TaskSite
 from finssim.robot.pilots import make_pilot
 from finssim.tasks import Task
 from finssim.tasks.observer import fitted_task
@@ -70,24 +70,27 @@ def site_of(
             "heading of a trajectory are its command, so that an episode of it cannot be played here"
         )
     pool = fitted.arena() is not None and fitted.dock() is None
+    site = "pool" if pool else "open-water"
     vehicle = vehicles[0]
-    site, state_sources, settings = camera_of(vehicle, plant, severity)
+    true_camera, known, settings = camera_of(vehicle, plant, severity)
+    if pool:
+        positions = PositionSources(
+            pool=known,
+            camera=lambda v: PoolCamera(v, true_camera, mode="corners", settings=settings, seed=seed),
+        )
+    else:
+        positions = PositionSources(positioning="motion-capture")
     task_argument: Any = task if isinstance(task, str) else fitted.name
     return TaskSite(
         task,
         vehicles,
-        lambda v: plant_at("pool" if pool else "open-water", draw_plant(v, plant, severity)),
+        [(v, plant_at(site, draw_plant(v, plant, severity))) for v in vehicles],
         lambda name: make_pilot(
             controller, vehicles[fitted.vehicles.index(name)], task=task_argument, agent=name
         ),
-        state_sources if pool else None,
+        positions,
         seed=seed,
         guide=guide,
-        communication=getattr(fitted, "communication", None),
-        camera=(lambda v: PoolCamera(v, site, mode="corners", settings=settings, seed=seed))
-        if pool
-        else None,
-        positioning="none" if pool else "motion-capture",
         record=record,
     )
 
@@ -158,7 +161,9 @@ def play(
             keep_result(file, {**about, "episodes": rows})
         show(f"episode {k + 1} of {episodes}: success {measured.get('success', float('nan')):g}")
     agent, nominal = make_pilot(policy, body, task=task).agent, load_plant("nominal")
-    batch = run_episodes(agent, fitted_task(task, vehicles), body, nominal, trials=BATCH, seed=seed)
+    batch = run_episodes(
+        agent, fitted_task(task, vehicles), body, nominal, TrialSettings(trials=BATCH, seed=seed)
+    )
     return {**about, "stack": summarize_episodes(rows[:episodes]), "batch": summarize_episodes(batch)}
 
 

@@ -30,7 +30,7 @@ COMMAND = np.array([0.2, -0.15, 6e-4, 0.03])
 @pytest.mark.slow
 def test_a_nominal_torpedo_moves_as_the_engine_does():
     """All actuators and the terms of its hull: the simulation that gets its thrust follows it for five seconds."""
-    plant = Plant(TORPEDO, NOMINAL, position=(0.0, 0.0, -8.0))
+    plant = Plant(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
     engine = Simulator(TORPEDO, control_step=plant.step, substeps=1)
     engine.plant.time_constant.numpy()[..., 0] = 0.0
     engine.plant.dead_plus.zero_()
@@ -54,7 +54,7 @@ def test_a_drawn_actuator_is_not_quite_that_of_the_file():
     assert spec == draw_plant(TORPEDO, 3, "hard") and set(spec.actuators) == set(TORPEDO.actuators)
     assert spec.terms["surge_damping"] != 1.0
     assert spec.thrusters == draw_plant(load_vehicle("remus100"), 3, "hard").thrusters
-    plant = Plant(TORPEDO, spec, position=(0.0, 0.0, -8.0))
+    plant = Plant(TORPEDO, spec, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
     plant.set_points(COMMAND)
     plant.advance(1000)
     elevator = spec.actuators["elevator"]

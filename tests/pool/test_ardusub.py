@@ -221,7 +221,7 @@ def test_a_low_battery_disarms_after_its_timer():
     """BATT_LOW_TIMER 10 s below BATT_LOW_VOLT; both are off in the defaults."""
     ground = Ground().armed()
     ground.set(BATT_LOW_VOLT=12.8, BATT_FS_LOW_ACT=2)
-    ground.pool.faults.battery_voltage = 11.0
+    ground.pool.faults.autopilot.battery_voltage = 11.0
     ground.run(9.8)
     assert ground.firmware.armed
     assert any("Battery 1 is low" in text for text in ground.texts(ground.run(0.5)))
@@ -232,11 +232,11 @@ def test_a_leak_is_reported_and_with_two_it_surfaces():
     """FS_LEAK_ENABLE 1 warns and drives on, 2 goes up where it has a position, to SURFACE_DEPTH, and holds there."""
     ground = Ground().armed()
     ground.run(0.5, mavlink.MAVLink_set_gps_global_origin_message(1, 338103130, -1183938670, 0))
-    ground.pool.faults.leak = True
+    ground.pool.faults.autopilot.leak = True
     assert ground.texts(ground.run(0.5)) == ["Leak Detected"] and ground.firmware.mode == MANUAL
-    ground.pool.faults.leak = False
+    ground.pool.faults.autopilot.leak = False
     ground.set(FS_LEAK_ENABLE=2)
-    ground.pool.faults.leak = True
+    ground.pool.faults.autopilot.leak = True
     ground.run(1.5)
     assert ground.firmware.mode == SURFACE and ground.pool.plant.position[2] > -1.9
     ground.run(8.0)
@@ -407,7 +407,7 @@ def test_its_own_position_comes_with_the_doppler_log_and_an_origin():
     assert decode_line(ground.lines[-1]).altitude == pytest.approx(
         5.0 + ground.pool.plant.position[2], rel=0.05
     )
-    ground.pool.faults.dvl_silent = True
+    ground.pool.faults.autopilot.dvl_silent = True
     ground.run(0.2)
     ground.lines.clear()
     ground.run(1.0)
@@ -439,7 +439,7 @@ def test_a_fault_of_depth_or_heartbeat_is_that_alone():
     ground = Ground().armed(ALT_HOLD)
     ground.run(0.5, mavlink.MAVLink_request_data_stream_message(1, 1, 0, 10, 1))
     ground.pool.faults.freeze_depth = True
-    ground.pool.faults.no_heartbeat = True
+    ground.pool.faults.autopilot.no_heartbeat = True
     ground.axes = (0, 0, 700, 0)
     out = ground.run(2.0)
     pressures = {m.press_abs for m in out if m.get_type() == "SCALED_PRESSURE2"}

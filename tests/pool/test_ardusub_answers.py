@@ -392,9 +392,9 @@ def test_what_refuses_to_arm(ground):
 
 def test_a_leak_is_a_word_and_no_more(armed):
     """Armed, active and in its mode; later the vehicle is disarmed and in standby."""
-    armed.pool.faults.leak = True
+    armed.pool.faults.autopilot.leak = True
     out = armed.run(1.2)
-    armed.pool.faults.leak = False
+    armed.pool.faults.autopilot.leak = False
     beat = [m for m in out if m.get_type() == "HEARTBEAT"][-1]
     still, status, mode, texts = SECOND["leak"]
     assert [armed.firmware.armed, beat.system_status, beat.custom_mode] == [still, status, mode]

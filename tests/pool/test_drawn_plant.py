@@ -82,7 +82,9 @@ def test_the_mean_plant_is_the_vehicle():
 
 def steady_speed(spec, axis, wrench):
     """Speed at which a plant settles when it can move along one axis only [m/s, rad/s]."""
-    plant = Plant(FINSROV, spec.model_copy(update=OPEN_WATER), position=(0.0, 0.0, -100.0))
+    plant = Plant(
+        FINSROV, spec.model_copy(update=OPEN_WATER), start=((0.0, 0.0, -100.0), (0.0, 0.0, 0.0, 1.0))
+    )
     force = np.linalg.pinv(FINSROV.control_matrix) @ (wrench * np.eye(6)[axis])
     plant.target[:] = [
         float(t.speed(f)) if abs(f) > 0.1 else 0.0

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import GroundLinks, serve_realtime, whole_frames
+from finssim.pool.run import GroundLinks, SiteWires, serve_realtime, whole_frames
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.water_linked import DvlClient, decode_line
 from finssim.vehicles import load_vehicle
@@ -102,7 +102,7 @@ def test_pymavlink_drives_it_in_real_time_and_its_log_reports(links):
     stop = threading.Event()
     site = threading.Thread(
         target=serve_realtime,
-        args=(Fleet({"it": world}), {"it": links}),
+        args=(Fleet({"it": world}), SiteWires({"it": links})),
         kwargs={"until": stop.is_set, "duration": 60.0},
     )
     site.start()

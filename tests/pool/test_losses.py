@@ -8,6 +8,7 @@ from finssim.pool.plant import Plant, induced_shares
 from finssim.pool.plant_spec import Basin, Circulation, Propellers
 from finssim.vehicles import load_vehicle
 
+LEVEL = (0.0, 0.0, 0.0, 1.0)
 FINSROV = load_vehicle("finsrov")
 NOMINAL = draw_plant(FINSROV, 0, "nominal").model_copy(
     update={"circulation": Circulation(), "basin": Basin(length=100.0, width=100.0, depth=50.0)}
@@ -16,7 +17,11 @@ NOMINAL = draw_plant(FINSROV, 0, "nominal").model_copy(
 
 def thrust(propellers, speed, surge=0.0, names=("H_LF",)):
     """Thrust of one thruster at a shaft speed while the vehicle moves [N]."""
-    plant = Plant(FINSROV, NOMINAL.model_copy(update={"propellers": propellers}), position=(0.0, 0.0, -25.0))
+    plant = Plant(
+        FINSROV,
+        NOMINAL.model_copy(update={"propellers": propellers}),
+        start=((0.0, 0.0, -25.0), LEVEL),
+    )
     index = [FINSROV.thruster_names.index(name) for name in names]
     plant.target[index] = speed
     for _ in range(400):
@@ -54,7 +59,7 @@ def test_the_deduction_and_the_gain_scale_the_thrust():
     """As built, less what the jet takes back from the hull."""
     built = NOMINAL.thrusters["H_LF"].model_copy(update={"gain_plus": 1.2, "deduction": 0.1})
     spec = NOMINAL.model_copy(update={"thrusters": {**NOMINAL.thrusters, "H_LF": built}})
-    plant = Plant(FINSROV, spec, position=(0.0, 0.0, -25.0))
+    plant = Plant(FINSROV, spec, start=((0.0, 0.0, -25.0), LEVEL))
     plant.target[4] = 150.0
     plant.advance(200)
     expected = 1.2 * 0.9 * FINSROV.thrusters["H_LF"].thrust(plant.shaft_speed[4])

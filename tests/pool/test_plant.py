@@ -10,6 +10,7 @@ from finssim.pool.plant_spec import Basin, Battery, BuoyancyDrift, Circulation
 from finssim.sim import RectangularPool, Simulator
 from finssim.vehicles import load_vehicle
 
+LEVEL = (0.0, 0.0, 0.0, 1.0)
 FINSROV = load_vehicle("finsrov")
 QUIET = {"circulation": Circulation(), "tether": None, "buoyancy": BuoyancyDrift()}
 
@@ -44,7 +45,9 @@ def test_without_thrust_a_moving_plant_only_slows_down(seed):
                                         "center_of_buoyancy": spec.body.center_of_gravity})  # fmt: skip
     basin = Basin(length=400.0, width=400.0, depth=200.0)
     plant = Plant(
-        FINSROV, spec.model_copy(update={**QUIET, "body": body, "basin": basin}), position=(0.0, 0.0, -100.0)
+        FINSROV,
+        spec.model_copy(update={**QUIET, "body": body, "basin": basin}),
+        start=((0.0, 0.0, -100.0), LEVEL),
     )
     M = np.linalg.inv(plant.simulator.plant.M_inv.numpy()[0, 0].astype(float))
     plant.nu[:] = np.random.default_rng(seed).normal(size=6) * (0.4, 0.4, 0.3, 1.0, 1.0, 1.0)
@@ -72,8 +75,8 @@ def test_it_drifts_with_the_circulation():
     spec = spec.model_copy(update={"tether": spec.tether.model_copy(update={"length": 50.0})})
     # Eddies without speed: the same kernel, so nothing is compiled for this test alone.
     calm = Circulation(eddies=[eddy.model_copy(update={"speed": 0.0}) for eddy in spec.circulation.eddies])
-    carried = Plant(FINSROV, spec, position=(0.6, 0.3, -0.5))
-    still = Plant(FINSROV, spec.model_copy(update={"circulation": calm}), position=(0.6, 0.3, -0.5))
+    carried = Plant(FINSROV, spec, start=((0.6, 0.3, -0.5), LEVEL))
+    still = Plant(FINSROV, spec.model_copy(update={"circulation": calm}), start=((0.6, 0.3, -0.5), LEVEL))
     for plant in (carried, still):
         plant.advance(2000)
     assert np.hypot(*(carried.position[:2] - (0.6, 0.3))) > 0.04
@@ -100,7 +103,7 @@ def test_buoyancy_drifts_by_grams():
     plant = Plant(
         FINSROV,
         spec.model_copy(update={"buoyancy": drift, "body": body, "basin": basin}),
-        position=(0.0, 0.0, -5.0),
+        start=((0.0, 0.0, -5.0), LEVEL),
     )
     plant.advance(1600)
     F, d1, d2 = 0.05 * 9.81, 80.09677, 100.0

@@ -16,7 +16,7 @@ from finssim.core import realtime
 from finssim.localization.overhead_camera import load_pool
 from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import LockstepServer, make_plan, serve_realtime
+from finssim.pool.run import LockstepServer, SiteWires, make_plan, serve_realtime
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import Decoder, LinkError
@@ -130,7 +130,7 @@ def telemetry(datagrams):
 def test_a_pool_keeps_real_time():
     """Two seconds of the clock are two seconds of the pool, with 100 telemetry frames a second."""
     clock, (pool, robot) = Clock(), memory_pair()
-    pace = serve_realtime(alone(), {"it": pool}, duration=2.0, clock=clock, wait=clock.wait)
+    pace = serve_realtime(alone(), SiteWires({"it": pool}), duration=2.0, clock=clock, wait=clock.wait)
     assert clock.now == pytest.approx(102.0, abs=0.01) and pace.duration == 2.0 and pace.given_up == 0.0
     assert len(telemetry(robot.receive())) == pytest.approx(200, abs=3)
 
@@ -146,7 +146,9 @@ def test_a_pool_that_was_stopped_does_not_catch_up():
             clock.now += 5.0
         return False
 
-    pace = serve_realtime(alone(), {"it": pool}, duration=1.0, clock=clock, wait=clock.wait, until=pause)
+    pace = serve_realtime(
+        alone(), SiteWires({"it": pool}), duration=1.0, clock=clock, wait=clock.wait, until=pause
+    )
     assert pace.given_up == pytest.approx(5.0, abs=0.02) and "gave up 5.0" in pace.sentence
     assert len(telemetry(robot.receive())) == pytest.approx(100, abs=3)
 
@@ -164,7 +166,7 @@ def test_pictures_carry_the_time_of_the_machine():
     clock, (pool, _) = Clock(), memory_pair()
     eye = plan.camera.camera()
     pace = serve_realtime(
-        alone(camera=eye), {"it": pool}, sinks=[Sink()], duration=1.0, clock=clock, wait=clock.wait
+        alone(camera=eye), SiteWires({"it": pool}, sinks=[Sink()]), duration=1.0, clock=clock, wait=clock.wait
     )
     assert pace.pictures == len(Sink.times) >= 27
     assert all(0.0 <= now - came < 0.01 and 100.0 < came < 101.1 for came, now in Sink.times)

@@ -15,6 +15,7 @@ from finssim.cli.commands import app
 from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import Medium, one_picture
 from finssim.pool.run import MediumServer, SiteChoice, swimming
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record
 from finssim.robot.runtime import Runtime
@@ -57,7 +58,9 @@ def test_one_camera_tells_vehicles_apart_by_their_tags():
         x, y, z = world.plant.position.astype(float)
         station = Station((x, y + 0.3, z), 0.0)
         pilot = make_pilot("pid", finsrov)
-        runtimes[name] = Runtime(numbered(finsrov, i), known, pilot, station, arm=True)
+        runtimes[name] = Runtime(
+            numbered(finsrov, i), Perception(numbered(finsrov, i), known), pilot, station, arm=True
+        )
     for k in range(1, 901):
         arrived = {name: fleet.worlds[name].exchange(k / 60.0, sent[name]) for name in names}
         pictures = one_picture(p for delivery in arrived.values() for p in delivery.pictures)

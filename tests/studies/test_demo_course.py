@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from finssim.studies import demo_course
-from finssim.studies.demo import demo
+from finssim.studies.demo import DemoSettings, demo
 from finssim.vehicles import load_vehicle
 
 pytestmark = pytest.mark.slow
@@ -16,7 +16,8 @@ def test_the_loop_closes_and_an_interrupted_one_continues(tmp_path, monkeypatch,
     monkeypatch.setattr(demo_course, "AXES_FITTED", ("surge", "sway", "yaw"))
     monkeypatch.setattr(demo_course, "DIVES", 1)
     out = tmp_path / "demo"
-    report = demo(out, vehicle="remus100", steps=40_000, console=Console(quiet=True))
+    settings = DemoSettings(vehicle="remus100", steps=40_000)
+    report = demo(out, settings=settings, console=Console(quiet=True))
     first = capsys.readouterr().out
     assert "fin.lift_slope" in first and "line-of-sight" in first and "by DVL, compass and USBL" in first
     identified = load_vehicle(out / "remus100_identified.yaml")
@@ -27,6 +28,6 @@ def test_the_loop_closes_and_an_interrupted_one_continues(tmp_path, monkeypatch,
     assert "finssim train path" in page and page.count("<img") == 1
     changed = {file: file.stat().st_mtime_ns for file in out.rglob("*.mcap")}
     assert len(changed) == 2
-    demo(out, vehicle="remus100", steps=40_000, console=Console(quiet=True))
+    demo(out, settings=settings, console=Console(quiet=True))
     assert capsys.readouterr().out == first
     assert changed == {file: file.stat().st_mtime_ns for file in out.rglob("*.mcap")}

@@ -356,19 +356,22 @@ class ArduSub:
             plant: Battery, and distance to the floor.
             faults: What is wrong.
         """
-        aids = [aid for aid in aids if aid.kind != VELOCITY or not faults.dvl_silent]
-        silent = faults.dvl_silent or self._dvl is None or not self._spec.log_shared
+        aids = [aid for aid in aids if aid.kind != VELOCITY or not faults.autopilot.dvl_silent]
+        silent = faults.autopilot.dvl_silent or self._dvl is None or not self._spec.log_shared
         lines = [] if silent else self._dvl_lines(now, aids, plant)
         if not self.running(now):
             return lines
         self._now, self._faults = max(self._now, now), faults
-        self._battery = (faults.battery_voltage or float(plant.electric[0]), float(plant.electric[1]))
+        self._battery = (
+            faults.autopilot.battery_voltage or float(plant.electric[0]),
+            float(plant.electric[1]),
+        )
         before = self._sampled
         self._used += self._battery[1] * max(now - before, 0.0) / 3.6
         if not faults.freeze_sensors or self._sample is None:
             self._sense(now, sample, aids)
         self._check_battery(now)
-        self._check_leak(faults.leak)
+        self._check_leak(faults.autopilot.leak)
         self._hold(now - before)
         for name, due in self._due.items():
             if now >= due - 1e-9:
@@ -401,7 +404,7 @@ class ArduSub:
         for aid in aids:
             if aid.kind == HEADING and self.parameters["COMPASS_USE"]:
                 # Our angles count to the left; the magnetic heading is short of the true one by the declination.
-                disturbed = self._faults.north if self._faults else 0.0
+                disturbed = self._faults.autopilot.north if self._faults else 0.0
                 missing = self._spec.declination * (1.0 - self._true_north(now)) + disturbed
                 # A turn of the north is no offset of the gyroscope.
                 turning = disturbed or (self._spec.declination and 0.0 < self._true_north(now) < 1.0)
@@ -601,7 +604,7 @@ class ArduSub:
         return RENAMED.get(name, name) if self._version >= (4, 7) else name
 
     def _on_heartbeat(self, message: Any) -> None:
-        if self._from_ground() and not (self._faults and self._faults.no_ground_heartbeat):
+        if self._from_ground() and not (self._faults and self._faults.autopilot.no_ground_heartbeat):
             self._ground_seen = self._now
 
     def _on_manual_control(self, message: Any) -> None:
@@ -1031,7 +1034,7 @@ class ArduSub:
         return [math.nan if field in fields else float(value) for value in values]
 
     def _report_heartbeat(self) -> tuple[Any, ...]:
-        if self._faults and self._faults.no_heartbeat:
+        if self._faults and self._faults.autopilot.no_heartbeat:
             return ()
         state = mavlink.MAV_STATE_ACTIVE if self.armed else mavlink.MAV_STATE_STANDBY
         kind = mavlink.MAV_TYPE_SUBMARINE, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -1118,7 +1121,7 @@ class ArduSub:
     def _report_local_position_ned(self) -> tuple[Any, ...]:
         if not self._has_position:
             return ()
-        lag = self._faults.position_lag if self._faults else 0.0
+        lag = self._faults.autopilot.position_lag if self._faults else 0.0
         _, position, velocity = next(
             place for place in self._places if place[0] >= self._sampled - lag - 1e-9
         )

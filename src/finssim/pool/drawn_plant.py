@@ -38,10 +38,10 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Distance of a plant of one severity from the vehicle file: ±, uniform, unless a name says otherwise."""
+class HydrodynamicSpread:
+    """Distance of added mass, damping and the hull's drag from the vehicle file: ±, uniform."""
 
-    hydrodynamics: float
+    entries: float
     """Spread of every diagonal entry of added mass and damping, and of the forces of each term [-]."""
     center: float
     """Spread of the points where they are diagonal, per axis [m]."""
@@ -49,6 +49,12 @@ class Spread:
     """Spread of the axes in which they are diagonal [deg]."""
     hull_share: float
     """Part of the drag, on the axis where it is largest, that the hull's panels make [-]."""
+
+
+@dataclass(frozen=True)
+class PropulsionSpread:
+    """Distance of thrusters, other actuators and battery from the vehicle file: ±, uniform, unless stated otherwise."""
+
     own_share: float
     """Share of the vehicle's speed that enters its propellers [-]."""
     induced_share: float
@@ -65,6 +71,14 @@ class Spread:
     """Discharge of the battery in a quarter of an hour [-]."""
     resistance: float
     """Resistance of the battery [ohm]."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Distance of a plant of one severity from the vehicle file: ±, uniform, unless a name says otherwise."""
+
+    hydrodynamics: HydrodynamicSpread
+    propulsion: PropulsionSpread
     mass: float
     """[kg]"""
     gravity_offset: tuple[float, float]
@@ -90,20 +104,20 @@ class Spread:
         Added mass about axes that are tilted by 3° would turn a torpedo harder than its rudder (Munk).
         """
         least, most = self.gravity_offset
-        return replace(
-            self,
-            center=share * self.center,
-            tilt_deg=share * self.tilt_deg,
-            gravity_offset=(share * least, share * most),
-        )
+        hydro = self.hydrodynamics
+        hydro = replace(hydro, center=share * hydro.center, tilt_deg=share * hydro.tilt_deg)
+        return replace(self, hydrodynamics=hydro, gravity_offset=(share * least, share * most))
 
 
-SPREADS: dict[Severity, Spread] = by_severity(
-    Spread,
-    hydrodynamics=(0.0, 0.1, 0.2),
+HYDRODYNAMICS = by_severity(
+    HydrodynamicSpread,
+    entries=(0.0, 0.1, 0.2),
     center=(0.0, 0.012, 0.025),
     tilt_deg=(0.0, 3.0, 6.0),
     hull_share=(0.0, 0.1, 0.2),
+)
+PROPULSION = by_severity(
+    PropulsionSpread,
     own_share=(0.0, 0.4, 0.7),
     induced_share=(0.0, 0.05, 0.1),
     deduction=((0.0, 0.0), (0.02, 0.06), (0.04, 0.12)),
@@ -112,6 +126,11 @@ SPREADS: dict[Severity, Spread] = by_severity(
     offset=(0.0, 0.02, 0.04),
     fade=(0.0, 0.04, 0.08),
     resistance=(0.0, 0.03, 0.06),
+)
+SPREADS: dict[Severity, Spread] = by_severity(
+    Spread,
+    hydrodynamics=tuple(HYDRODYNAMICS.values()),
+    propulsion=tuple(PROPULSION.values()),
     mass=(0.0, 0.012, 0.025),
     gravity_offset=((0.0, 0.0), (0.003, 0.006), (0.006, 0.012)),
     buoyancy=(0.0, 4.0, 8.0),
@@ -274,6 +293,7 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
     spread = SPREADS[severity]
     if hydro.terms or vehicle.actuators:
         spread = spread.slender(float(vehicle.body.size[1] / vehicle.body.size[0]))
+    propulsion = spread.propulsion
     draw = _Draw(np.random.default_rng([seed, DRAWN]))
     sections: dict[str, Any] = {
         "title": f"{vehicle.name}, {severity} plant {seed}",
@@ -282,9 +302,9 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
         "vehicle": vehicle.name,
         "basin": basin_of(vehicle),
         "body": _body(vehicle, spread, draw),
-        "thrusters": _thrusters(vehicle, spread, draw),
-        "propellers": {"own_share": spread.own_share, "induced_share": spread.induced_share},
-        "battery": {"fade": spread.fade * draw.within(0.6, 1.0), "resistance": spread.resistance},
+        "thrusters": _thrusters(vehicle, propulsion, draw),
+        "propellers": {"own_share": propulsion.own_share, "induced_share": propulsion.induced_share},
+        "battery": {"fade": propulsion.fade * draw.within(0.6, 1.0), "resistance": propulsion.resistance},
         "buoyancy": _buoyancy(spread, draw),
         "circulation": _circulation(spread, draw),
         "tether": _tether(vehicle, spread, draw),
@@ -295,8 +315,8 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
         },
     }
     further = _Draw(np.random.default_rng([seed, DRAWN, 1]))
-    sections["actuators"] = _actuators(vehicle, spread, further)
-    sections["terms"] = {name: 1.0 + further.around(spread.hydrodynamics) for name in hydro.terms}
+    sections["actuators"] = _actuators(vehicle, propulsion, further)
+    sections["terms"] = {name: 1.0 + further.around(spread.hydrodynamics.entries) for name in hydro.terms}
     return PlantSpec.model_validate({**sections, **_water(vehicle, hydro, spread, draw, sections)})
 
 
@@ -326,20 +346,20 @@ def _water(
     vehicle: Vehicle, hydro: HydrodynamicSet, spread: Spread, draw: _Draw, sections: dict[str, Any]
 ) -> dict[str, Any]:
     """Added mass, damping and hull drag, so that the sum of all losses of speed is about the file's damping."""
-    half = spread.hydrodynamics
+    half, about = spread.hydrodynamics.entries, spread.hydrodynamics
     M_A = _congruent(hydro.added_mass, draw.around(half, 6))
     factor = draw.around(half, 6)
     D1, D2 = _congruent(hydro.linear_damping, factor), _congruent(hydro.quadratic_damping, factor)
     # Terms describe the flow around the hull already.
     drag = np.zeros(6) if hydro.terms else panel_drag(vehicle)
-    hull = hull_share(vehicle, spread.hull_share, drag)
+    hull = hull_share(vehicle, about.hull_share, drag)
     panels = hull["form_drag"] * drag
-    outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.deduction) / 2.0)
+    outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.propulsion.deduction) / 2.0)
     D1, D2 = _dissipative(*less_share(vehicle, D1, D2, outer_drag))
     axes = [
         {
-            "center": tuple((np.asarray(hydro.reference_point) + draw.around(spread.center, 3)).tolist()),
-            "tilt_deg": tuple(np.asarray(draw.around(spread.tilt_deg, 3)).tolist()),
+            "center": tuple((np.asarray(hydro.reference_point) + draw.around(about.center, 3)).tolist()),
+            "tilt_deg": tuple(np.asarray(draw.around(about.tilt_deg, 3)).tolist()),
         }
         for _ in range(2)
     ]
@@ -381,7 +401,7 @@ def _body(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
     }
 
 
-def _thrusters(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
+def _thrusters(vehicle: Vehicle, spread: PropulsionSpread, draw: _Draw) -> dict[str, Any]:
     built = {}
     for name, t in vehicle.thrusters.items():
         built[name] = {
@@ -397,7 +417,7 @@ def _thrusters(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
     return built
 
 
-def _actuators(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any]:
+def _actuators(vehicle: Vehicle, spread: PropulsionSpread, draw: _Draw) -> dict[str, Any]:
     return {
         name: {
             "gain": 1.0 + draw.around(spread.thrust),

@@ -17,7 +17,15 @@ from finssim.physics.plant import VehicleCommand
 from finssim.physics.terms.composed import layout
 from finssim.physics.types import MAX_THRUSTERS, angular, join, linear, mat66, vec6, vec8
 from finssim.physics.water import WaterArrays, profile_at
-from finssim.pool.plant_spec import HEADROOM, Basin, Circulation, PlantSpec, PlantSpecError, SlackTether
+from finssim.pool.plant_spec import (
+    HEADROOM,
+    Basin,
+    Circulation,
+    FirmwareSpec,
+    PlantSpec,
+    PlantSpecError,
+    SlackTether,
+)
 from finssim.sim import Dock, RectangularPool, Simulator, TetherLine, Water, Wave
 from finssim.sim.plant_arrays import NO_LIMIT
 from finssim.sim.state import State
@@ -273,6 +281,40 @@ FILTER = 0.02
 
 
 @wp.struct
+class PowerSupply:
+    """Battery and wiring that feed all motors."""
+
+    full_voltage: float  # [V]
+    fade: float  # share of the voltage that is lost after fade_time
+    fade_time: float  # [s]
+    resistance: float  # [ohm]
+    motor_power: float  # of one motor at full speed [W]
+    idle_current: float  # [A]
+    electric: wp.array(dtype=float)  # present voltage [V] and current [A]
+
+
+@wp.struct
+class SpeedLoop:
+    """The firmware's speed loop: its parameters, and its memory of every motor."""
+
+    on: int  # 0: no speed loop, the target is a throttle
+    steps: int  # motor steps between two runs
+    period: float  # [s]
+    rated: wp.array(dtype=float)  # speed of a motor as described at full throttle on a full battery [rad/s]
+    scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
+    model_alpha: wp.array(dtype=float)  # share of the way in one run, in the response of the firmware
+    kp: float  # gain of the relative deviation [-]
+    ki: float  # [1/s]
+    kd: float  # [s]
+    noise: float  # of one speed measurement [rad/s]
+    quantum: float  # of one speed measurement [rad/s]
+    measured: wp.array(dtype=float)  # newest measurement [rad/s]
+    smooth: wp.array(dtype=float)  # smoothed measurement for the derivative [rad/s]
+    expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
+    integral: wp.array(dtype=float)  # integral part of the throttle [-]
+
+
+@wp.struct
 class MotorBank:
     """Parameters and memory of all motors, in canonical order; speeds are canonical too (positive pushes forward)."""
 
@@ -282,39 +324,12 @@ class MotorBank:
     full: wp.array(dtype=float)  # steady speed at full throttle on a full battery [rad/s]
     dead_plus: wp.array(dtype=float)  # slowest speed that turns the shaft [rad/s]
     dead_minus: wp.array(dtype=float)  # the same in reverse, as a magnitude [rad/s]
-
-    full_voltage: float  # [V]
-    fade: float  # share of the voltage that is lost after fade_time
-    fade_time: float  # [s]
-    resistance: float  # [ohm]
-    motor_power: float  # at full speed [W]
-    idle_current: float  # [A]
-
-    loop: int  # 0: no speed loop, the target is a throttle
-    loop_steps: int  # motor steps between runs of the loop
-    loop_period: float  # [s]
-    rated: wp.array(
-        dtype=float
-    )  # speed that a motor as described has at full throttle on a full battery [rad/s]
-    scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
-    model_alpha: wp.array(
-        dtype=float
-    )  # share of the way in one run of the loop, in the response of the firmware
-    kp: float  # gain of the relative deviation [-]
-    ki: float  # [1/s]
-    kd: float  # [s]
-    noise: float  # of one speed measurement [rad/s]
-    quantum: float  # [rad/s]
-
     target: wp.array(dtype=float)  # [rad/s]
     speed: wp.array(dtype=float)  # true shaft speed [rad/s]
-    measured: wp.array(dtype=float)  # newest measurement [rad/s]
-    smooth: wp.array(dtype=float)  # smoothed measurement for the derivative [rad/s]
-    expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
-    integral: wp.array(dtype=float)  # integral part of the throttle [-]
     throttle: wp.array(dtype=float)  # newest [-1, 1]
     line: wp.array2d(dtype=float)  # throttles on their way [-1, 1]
-    electric: wp.array(dtype=float)  # battery voltage [V], current [A]
+    supply: PowerSupply
+    loop: SpeedLoop
 
 
 @wp.func
@@ -332,30 +347,30 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     Returns:
         Throttle [-1, 1].
     """
-    measured = motors.speed[k] + motors.noise * noise
+    measured = motors.speed[k] + motors.loop.noise * noise
     if motors.speed[k] == 0.0:
         measured = 0.0  # a shaft at rest gives no pulses to count
-    if motors.quantum > 0.0:
-        measured = motors.quantum * wp.round(measured / motors.quantum)
-    motors.measured[k] = measured
-    before = motors.smooth[k]
-    motors.smooth[k] = before + (motors.loop_period / wp.static(FILTER)) * (measured - before)
+    if motors.loop.quantum > 0.0:
+        measured = motors.loop.quantum * wp.round(measured / motors.loop.quantum)
+    motors.loop.measured[k] = measured
+    before = motors.loop.smooth[k]
+    motors.loop.smooth[k] = before + (motors.loop.period / wp.static(FILTER)) * (measured - before)
     target = motors.target[k]
-    if motors.loop == 0:
-        return wp.clamp(target / motors.rated[k], -1.0, 1.0)
+    if motors.loop.on == 0:
+        return wp.clamp(target / motors.loop.rated[k], -1.0, 1.0)
     if target == 0.0:
-        motors.integral[k] = 0.0
-        motors.expected[k] = measured
+        motors.loop.integral[k] = 0.0
+        motors.loop.expected[k] = measured
         return 0.0
-    scale = motors.scale[k]
-    expected = motors.expected[k] + motors.model_alpha[k] * (target - motors.expected[k])
-    motors.expected[k] = expected
+    scale = motors.loop.scale[k]
+    expected = motors.loop.expected[k] + motors.loop.model_alpha[k] * (target - motors.loop.expected[k])
+    motors.loop.expected[k] = expected
     error = (expected - measured) / scale
-    rate = (motors.smooth[k] - before) / (motors.loop_period * scale)
-    u = target / scale + motors.kp * error + motors.integral[k] - motors.kd * rate
+    rate = (motors.loop.smooth[k] - before) / (motors.loop.period * scale)
+    u = target / scale + motors.loop.kp * error + motors.loop.integral[k] - motors.loop.kd * rate
     # Integrate only while the throttle is free to follow.
     if wp.abs(u) < 1.0 or u * error < 0.0:
-        motors.integral[k] = motors.integral[k] + motors.ki * motors.loop_period * error
+        motors.loop.integral[k] = motors.loop.integral[k] + motors.loop.ki * motors.loop.period * error
     # A motor with a target in one direction is never driven the other way: only the target can reverse it.
     return wp.clamp(u, wp.where(target > 0.0, 0.0, -1.0), wp.where(target > 0.0, 1.0, 0.0))
 
@@ -363,7 +378,7 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
 @wp.func
 def steady_speed(motors: MotorBank, k: int, throttle: float, voltage: float) -> float:
     """Speed at which motor k settles [rad/s]: throttle times voltage, and none below the slowest that turns."""
-    speed = throttle * motors.full[k] * voltage / motors.full_voltage
+    speed = throttle * motors.full[k] * voltage / motors.supply.full_voltage
     if speed < motors.dead_plus[k] and speed > -motors.dead_minus[k]:
         return 0.0
     return speed
@@ -381,11 +396,11 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
     """
     power = float(0.0)
     slots = motors.line.shape[1]
-    age = wp.min(float(tick) * dt / motors.fade_time, 1.0)
-    rest = motors.full_voltage * (1.0 - motors.fade * age)
-    voltage = rest - motors.resistance * motors.electric[1]
+    age = wp.min(float(tick) * dt / motors.supply.fade_time, 1.0)
+    rest = motors.supply.full_voltage * (1.0 - motors.supply.fade * age)
+    voltage = rest - motors.supply.resistance * motors.supply.electric[1]
     for k in range(motors.count):
-        if tick % motors.loop_steps == 0:
+        if tick % motors.loop.steps == 0:
             motors.throttle[k] = throttle_of(motors, k, wp.randn(noise))
         motors.line[k, tick % slots] = motors.throttle[k]
         late = motors.line[k, (tick + slots - motors.delay[k]) % slots]
@@ -395,9 +410,9 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
             speed = 0.0  # friction stops a shaft permanently
         motors.speed[k] = speed
         part = wp.abs(speed) / motors.full[k]
-        power += motors.motor_power * part * part * part
-    motors.electric[0] = voltage
-    motors.electric[1] = motors.idle_current + power / voltage
+        power += motors.supply.motor_power * part * part * part
+    motors.supply.electric[0] = voltage
+    motors.supply.electric[1] = motors.supply.idle_current + power / voltage
 
 
 def motor_bank(
@@ -413,35 +428,44 @@ def motor_bank(
         speed_loop: Whether the firmware holds speeds; if not, a target is what it expects at full voltage.
     """
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
-    nominal = list(vehicle.thrusters.values())
-    firmware = spec.firmware
     bank = MotorBank()
     n = bank.count = len(true)
-    bank.loop = int(speed_loop)
-    bank.loop_steps = max(1, round(firmware.loop_period / dt))
-    bank.loop_period = bank.loop_steps * dt
     delay = [round(t.delay / dt) for t in true]
-    lag = np.array([t.time_constant + t.delay for t in nominal])
     arrays = {
         "alpha": 1.0 - np.exp(-dt / np.array([t.time_constant for t in true])),
         "full": [t.full_rpm * RPM for t in true],
         "dead_plus": [t.dead_rpm_plus * RPM for t in true],
         "dead_minus": [t.dead_rpm_minus * RPM for t in true],
-        "rated": [HEADROOM * max(t.rpm_max, -t.rpm_min) * RPM for t in nominal],
-        "scale": [max(t.rpm_max, -t.rpm_min) * RPM / firmware.feed_forward for t in nominal],
-        "model_alpha": 1.0 - np.exp(-bank.loop_period / lag),
-        **{name: np.zeros(n) for name in ("target", "speed", "measured", "smooth", "expected")},
-        **{name: np.zeros(n) for name in ("integral", "throttle")},
-        "electric": [spec.battery.full_voltage, spec.battery.idle_current],
+        **{name: np.zeros(n) for name in ("target", "speed", "throttle")},
     }
     with_arrays(bank, device, **arrays)
     bank.delay = wp.array(delay, dtype=int, device=device)
     bank.line = wp.zeros((n, max(delay) + 1), dtype=float, device=device)
+    supply = PowerSupply()
     for name in ("full_voltage", "fade", "fade_time", "resistance", "motor_power", "idle_current"):
-        setattr(bank, name, getattr(spec.battery, name))
-    bank.kp, bank.ki, bank.kd = firmware.gain, firmware.integral_gain, firmware.derivative_gain
-    bank.noise, bank.quantum = firmware.rpm_noise * RPM, firmware.rpm_quantum * RPM
+        setattr(supply, name, getattr(spec.battery, name))
+    with_arrays(supply, device, electric=[spec.battery.full_voltage, spec.battery.idle_current])
+    bank.supply = supply  # a copy, which has the same arrays
+    bank.loop = _speed_loop(vehicle, spec.firmware, dt, device, speed_loop)
     return bank
+
+
+def _speed_loop(vehicle: Vehicle, firmware: FirmwareSpec, dt: float, device: Any, on: bool) -> SpeedLoop:
+    """The speed loop of a firmware that believes the vehicle file; arguments as of `motor_bank`."""
+    nominal, loop = list(vehicle.thrusters.values()), SpeedLoop()
+    fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in nominal])
+    lag = np.array([t.time_constant + t.delay for t in nominal])
+    loop.on, loop.steps = int(on), max(1, round(firmware.loop_period / dt))
+    loop.period = loop.steps * dt
+    loop.kp, loop.ki, loop.kd = firmware.gain, firmware.integral_gain, firmware.derivative_gain
+    loop.noise, loop.quantum = firmware.rpm_noise * RPM, firmware.rpm_quantum * RPM
+    arrays = {
+        "rated": HEADROOM * fastest * RPM,
+        "scale": fastest * RPM / firmware.feed_forward,
+        "model_alpha": 1.0 - np.exp(-loop.period / lag),
+        **{name: np.zeros(len(nominal)) for name in ("measured", "smooth", "expected", "integral")},
+    }
+    return with_arrays(loop, device, **arrays)  # type: ignore[no-any-return]
 
 
 LONGEST_STEP = 0.005
@@ -551,8 +575,7 @@ class Plant:
         *,
         seed: int = 0,
         period: float = 0.01,
-        position: ArrayLike = (0.0, 0.0, -0.5),
-        quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+        start: tuple[ArrayLike, ArrayLike] = ((0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)),
         speed_loop: bool = True,
         world: Any | None = None,
         dock: Dock | None = None,
@@ -564,8 +587,7 @@ class Plant:
             spec: What is hidden.
             seed: Of the speed measurements' noise.
             period: Time that the physics step must divide [s], such as the sensors' period.
-            position: Body origin at the start, world frame [m], (3,).
-            quaternion: Attitude at the start, body to world, xyzw, (4,).
+            start: Position of the body origin, world frame [m], (3,), and attitude, body to world, xyzw, (4,).
             speed_loop: Whether the firmware holds shaft speeds; if not, `target` is what it expects at full voltage.
             world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
             dock: A funnel in the water, at `simulator.funnel`.
@@ -593,7 +615,7 @@ class Plant:
         self.step = period / self.steps_per_period
         """Physics step [s]."""
         motor_steps = math.ceil(self.step / MOTOR_STEP - 1e-9)
-        self.simulator = self._simulator(position, quaternion, world, dock)
+        self.simulator = self._simulator(start, world, dock)
         self.motors = motor_bank(vehicle, spec, self.step / motor_steps, speed_loop=speed_loop)
         self._views()
         s = self.simulator
@@ -621,7 +643,7 @@ class Plant:
         self._offset = np.array([a.offset for a in built])
 
     def _simulator(
-        self, position: ArrayLike, quaternion: ArrayLike, world: Any | None, dock: Dock | None
+        self, start: tuple[ArrayLike, ArrayLike], world: Any | None, dock: Dock | None
     ) -> Simulator:
         spec, hull = self.spec, self.spec.hull
         water = replace(spec.circulation.water or Water(), depth=spec.basin.depth)
@@ -662,7 +684,7 @@ class Plant:
         for k, actuator in enumerate((spec.actuators[name] for name in vehicle.actuators), start=n):
             fields["time_constant"].numpy()[..., k] = actuator.time_constant
             fields["gain"].numpy()[..., k] = actuator.gain
-        simulator.place(position=position, quaternion=quaternion)
+        simulator.place(*start)
         simulator.refresh()
         return simulator
 
@@ -684,11 +706,11 @@ class Plant:
         """Shaft speeds that the firmware asks for, canonical [rad/s]; written by it, a view, (n,)."""
         self.shaft_speed = self.motors.speed.numpy()
         """True, canonical [rad/s]; a view, (n,)."""
-        self.measured_speed = self.motors.measured.numpy()
+        self.measured_speed = self.motors.loop.measured.numpy()
         """As the firmware measures it, canonical [rad/s]; a view, (n,)."""
         self.throttle = self.motors.throttle.numpy()
         """-1 to 1; a view, (n,)."""
-        self.electric = self.motors.electric.numpy()
+        self.electric = self.motors.supply.electric.numpy()
         """Battery voltage [V] and current [A]; a view, (2,)."""
 
     def set_points(self, values: ArrayLike) -> None:

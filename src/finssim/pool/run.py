@@ -26,7 +26,7 @@ from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of, site_o
 from finssim.pool.fleet import Fleet, Medium, one_picture
 from finssim.pool.pictures import CameraPlan, Cameras, PictureProcess, PictureSourcePlan, UdpSender
 from finssim.pool.plant_spec import Basin, PlantSpec, PlantSpecError, Severity, load_plant_spec
-from finssim.pool.task_site import TaskSite
+from finssim.pool.task_site import PositionSources, TaskSite
 from finssim.pool.virtual_pool import PoolClockError, VirtualPool
 from finssim.robot.goals import station_of
 from finssim.robot.interrupt import interruptible, interrupting
@@ -376,13 +376,24 @@ class MediumServer:
         self._socket.close()
 
 
+@dataclass(frozen=True)
+class SiteWires:
+    """Open wires of a site, to robots in other processes."""
+
+    transports: Mapping[str, Transport]
+    """Vehicle -> wire to its robot, from the motor controller's end."""
+    messages: MessageEnd | None = None
+    """Messages between the robots; None: they tell each other nothing."""
+    sinks: Sequence[UdpSender] = ()
+    """Take the one camera's pictures, one for each robot."""
+    camera: Clocked | None = None
+    """Camera that sends its pictures itself."""
+
+
 def serve_realtime(
     site: Fleet,
-    transports: Mapping[str, Transport],
-    messages: MessageEnd | None = None,
+    wires: SiteWires,
     *,
-    sinks: Sequence[UdpSender] = (),
-    camera: Clocked | None = None,
     duration: float = math.inf,
     until: Callable[[], bool] = lambda: False,
     over: Callable[[], None] = lambda: None,
@@ -393,10 +404,7 @@ def serve_realtime(
 
     Args:
         site: With robots in other processes, at time 0.
-        transports: To the robot of each of these vehicles, by name, from the motor controllers' end.
-        messages: Between the robots; None: they tell each other nothing.
-        sinks: Take the one camera's pictures, one for each robot.
-        camera: One that sends its pictures itself.
+        wires: Its open wires.
         duration: How long [s].
         until: Ends it where it says so; asked at every tick.
         over: Called once, when the site says that it is over; it lives on.
@@ -412,11 +420,11 @@ def serve_realtime(
         if behind > MOST_BEHIND:
             pace.given_up += behind - TICK
             start += behind - TICK
-        if camera is not None:
-            camera.start = start
+        if wires.camera is not None:
+            wires.camera.start = start
         now = min(max(clock() - start, now), duration)
         pictures: list[Picture] = []
-        for name, transport in transports.items():
+        for name, transport in wires.transports.items():
             received = transport.receive()
             delivery = site.worlds[name].exchange(now, received)
             pictures += delivery.pictures
@@ -424,7 +432,7 @@ def serve_realtime(
                 transport.send(frame)
             pace.received, pace.sent = pace.received + len(received), pace.sent + len(delivery.frames)
         for picture in one_picture(pictures):
-            for sink in sinks:
+            for sink in wires.sinks:
                 sink.send(replace(picture, time=start + picture.time), clock())
                 pace.pictures += 1
         due = now * RATE >= steps + 1
@@ -437,8 +445,8 @@ def serve_realtime(
                 for datagram in runtime.told:
                     site.medium.send(now, name, datagram)
         steps = math.floor(now * RATE)
-        if messages is not None:
-            messages.poll(now)
+        if wires.messages is not None:
+            wires.messages.poll(now)
         site.turn(now, due)
         if site.over and not announced:
             announced = True
@@ -682,6 +690,16 @@ class Ends:
         return partial(GroundLinks, self.ours, stations, tcp, dvl, page)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PoolFiles:
+    """Files that a pool writes."""
+
+    pool_file: Path | None = None
+    """(FILE) Pool file to write, with the calibrated camera (.yaml)."""
+    truth: Path | None = None
+    """(FILE) File for the true states, for scoring; for a team a folder."""
+
+
 def run(
     choice: Annotated[SiteChoice, "options"],
     ends: Annotated[Ends, "options"],
@@ -689,8 +707,7 @@ def run(
     task: str | None = None,
     team: str | None = None,
     lockstep: bool = False,
-    pool_file: Path | None = None,
-    truth: Path | None = None,
+    files: Annotated[PoolFiles, "options"] = PoolFiles(),
     duration: Annotated[float | None, (0.0, None)] = None,
     timing: Annotated[PoolTiming | None, "python"] = None,
 ) -> None:
@@ -708,8 +725,7 @@ def run(
             of --task or without a task. The ports of each further motor controller and robot are higher by ten than
             --port and --robot. A camera sees all of them, with different tag ids.
         lockstep: Advance time as fast as one robot requests, instead of in real time.
-        pool_file (FILE): Pool file to write, with the calibrated camera (.yaml).
-        truth (FILE): File for the true states, for scoring; for a team a folder.
+        files: Files that are written.
         duration: Duration, pool's clock [s]; until Ctrl-C if not given.
         timing: Clock of the pool; that of this machine if not given.
 
@@ -723,32 +739,32 @@ def run(
     if task is not None or team is not None:
         if choice.firmware == "ardusub":
             raise PlantSpecError("--firmware ardusub is for one vehicle: leave --team and --task out")
-        files = task is not None and (pool_file is not None or truth is not None)
+        written = task is not None and files != PoolFiles()
         single = lockstep or choice.start is not None or choice.world is not None
-        if not choice.plant.isdecimal() or single or files:
+        if not choice.plant.isdecimal() or single or written:
             raise PlantSpecError(
                 "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
                 "for --plant, leave --lockstep, --start and --world out, and of a task --pool-file and --truth"
             )
         bodies = [load_vehicle(name.strip()) for name in (team or choice.vehicle).split(",")]
         fleet, calibrated = (
-            _playing(task, bodies, choice) if task is not None else swimming(bodies, choice, truth)
+            _playing(task, bodies, choice) if task is not None else swimming(bodies, choice, files.truth)
         )
-        _serve_team(fleet, calibrated, ends, pool_file, longest, timing)
+        _serve_team(fleet, calibrated, ends, files.pool_file, longest, timing)
         return
     plan, begin = choice.plan()
     port, ardusub = ends.port, choice.firmware == "ardusub"
     if not (0 < port or (ardusub and not lockstep and plan.camera is None)) or port > 65533:
         raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
-    if pool_file is not None and plan.calibrated is None:
+    if files.pool_file is not None and plan.calibrated is None:
         raise PlantSpecError("--pool-file describes the camera, and --camera none has none: omit one")
 
     def make_world(eye: Any) -> VirtualPool:
         """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""
-        world = plan.world(eye, start=begin, seed=choice.seed, truth=truth)
-        if pool_file is not None and plan.calibrated is not None:
-            write_pool(plan.calibrated, pool_file)
-        _tell_plant(plan, pool_file, truth)
+        world = plan.world(eye, start=begin, seed=choice.seed, truth=files.truth)
+        if files.pool_file is not None and plan.calibrated is not None:
+            write_pool(plan.calibrated, files.pool_file)
+        _tell_plant(plan, files)
         return world
 
     if lockstep:
@@ -795,9 +811,7 @@ def _serve_team(
         notify = partial(_tell_episode, fleet)
         pace = serve_realtime(
             fleet,
-            transports,
-            messages,
-            sinks=sinks,
+            SiteWires(transports, messages, sinks),
             duration=duration,
             until=interrupted,
             over=notify,
@@ -818,16 +832,15 @@ def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[
             f"{', '.join(fitted.agents)}"
         )
     agents = list(bodies) * (len(fitted.agents) // len(bodies))
-    site = TaskSite(
-        task,
+    vehicles, positions = (
         [*agents, *[bodies[0]] * len(fitted.others)],
-        lambda v: choice.wet(site_of("open-water", draw_plant(v, int(choice.plant), choice.severity))),
-        None,
-        None,
-        seed=choice.seed,
-        communication=getattr(fitted, "communication", None),
-        positioning=choice.positioning,
+        PositionSources(positioning=choice.positioning),
     )
+    plants = [
+        (v, choice.wet(site_of("open-water", draw_plant(v, int(choice.plant), choice.severity))))
+        for v in vehicles
+    ]
+    site = TaskSite(task, vehicles, plants, None, positions, seed=choice.seed)
     return site, None
 
 
@@ -958,9 +971,7 @@ def _realtime(
         transports = {plan.vehicle.name: transport}
         pace = serve_realtime(
             site,
-            transports,
-            sinks=sinks,
-            camera=drawn,
+            SiteWires(transports, sinks=sinks, camera=drawn),
             duration=duration,
             until=interrupted,
             clock=timing.now,
@@ -991,7 +1002,7 @@ def _next(address: tuple[str, int]) -> tuple[str, int]:
     return address[0], address[1] + 1
 
 
-def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> None:
+def _tell_plant(plan: PoolPlan, files: PoolFiles) -> None:
     spec = plan.spec
     _say(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
     if plan.camera is not None:
@@ -1003,7 +1014,7 @@ def _tell_plant(plan: PoolPlan, pool_file: Path | None, truth: Path | None) -> N
     if plan.onboard is not None:
         rates = (f"{name} {sensor.rate:g} Hz" for name, sensor in plan.vehicle.perception.items())
         _say(f"world: {plan.onboard.name}, seed {plan.onboard.seed}; {', '.join(rates)}")
-    for name, path in (("pool file", pool_file), ("truth", truth)):
+    for name, path in (("pool file", files.pool_file), ("truth", files.truth)):
         if path is not None:
             _say(f"{name}: {path}")
 

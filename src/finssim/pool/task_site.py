@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -331,6 +331,20 @@ def _goal(referee: Referee) -> Guide:
     return _Goal(referee) if points is None else PathGuide(points.numpy()[0].astype(float))
 
 
+@dataclass(frozen=True, kw_only=True)
+class PositionSources:
+    """Sources of the robots' positions."""
+
+    pool: Pool | None = None
+    """Camera, water and frames, as the robots know them; None: no camera looks."""
+    camera: Callable[[Vehicle], Any] | None = None
+    """Makes the overhead camera of a vehicle; None: there is none."""
+    positioning: str = "none"
+    """Fixes on every robot's wire: none, motion-capture or usbl."""
+    let_in: bool = False
+    """True if robots know their position at the start, for dead reckoning."""
+
+
 class TaskSite(Fleet):
     """One episode of a task in the virtual site, with everybody by place.
 
@@ -345,35 +359,25 @@ class TaskSite(Fleet):
         self,
         task: str | Task,
         vehicles: Sequence[Vehicle],
-        spec: Callable[[Vehicle], PlantSpec],
+        plants: Sequence[tuple[Vehicle, PlantSpec]],
         pilots: Callable[[str], Pilot] | None,
-        pool: Pool | None,
+        positions: PositionSources = PositionSources(),
         *,
         seed: int = 0,
         guide: Guide | None = None,
-        communication: Communication | None = None,
-        camera: Callable[[Vehicle], Any] | None = None,
-        positioning: str = "none",
         record: Path | None = None,
-        bodies: Sequence[Vehicle] | None = None,
-        let_in: bool = False,
     ) -> None:
         """Put everybody where the task starts.
 
         Args:
             task: A task, its name, or FILE.py:CLASS of one's own.
-            vehicles: One for each of its places.
-            spec: Makes the plant of a vehicle.
+            vehicles: One for each of its places, as its robot knows it.
+            plants: True vehicle and its plant, for each place.
             pilots: Who steers an agent, by its place; None: they are elsewhere, and `runtimes` holds the others alone.
-            pool: Camera, water and frames, as the robots know them; None: no camera looks.
+            positions: Sources of the robots' positions.
             seed: Of the episode, of instruments and of what is lost.
             guide: The reference, of a task that follows one; drawn as in training if None.
-            communication: Of what the vehicles tell each other; None: everything arrives at once.
-            camera: Makes the overhead camera of a vehicle; None: there is none.
-            positioning: Fixes on every robot's wire: none, motion-capture or usbl.
             record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
-            bodies: Vehicles around which the plants are drawn, where they are others than the robots know.
-            let_in: Whether robots know their position at the start, for dead reckoning.
 
         Raises:
             ControlError, PlantSpecError: Task, vehicles and guide do not fit, or there is no such positioning.
@@ -391,23 +395,26 @@ class TaskSite(Fleet):
             )
         self.task, self._guide = referee.task, guide or _goal(referee)
         names, kept = self.task.vehicles, {name: record for name in self.task.agents if record is not None}
-        places = list(zip(names, vehicles, bodies or vehicles, referee.places(), strict=True))
+        places = list(zip(names, vehicles, plants, referee.places(), strict=True))
         worlds = {
             name: VirtualPool(
                 body,
-                _deep_enough(spec(body), referee.arrays),
-                camera=camera(vehicle) if camera else self._eyes(vehicle, seed),
-                positioning=positioning_of(positioning, seed + i) if name in self.task.agents else None,
+                _deep_enough(spec, referee.arrays),
+                camera=positions.camera(vehicle) if positions.camera else self._eyes(vehicle, seed),
+                positioning=positioning_of(positions.positioning, seed + i)
+                if name in self.task.agents
+                else None,
                 start=start,
                 seed=seed + i,
                 truth=kept[name] / f"{name}.truth" if name in kept and name in steering else None,
                 dock=self.task.dock(),
             )
-            for i, (name, vehicle, body, start) in enumerate(places)
+            for i, (name, vehicle, (body, spec), start) in enumerate(places)
         }
         self._place_dock(worlds)
         self._goal_is_told = pilots is None and self.task.moving and len(names) == 1
         super().__init__(worlds)
+        communication: Communication | None = getattr(self.task, "communication", None)
         self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
         self._actions: dict[str, Array] = {}
@@ -423,10 +430,9 @@ class TaskSite(Fleet):
                 vehicle,
                 steering.get(name)
                 or ScriptedPilot(self.task, vehicles, lambda: truth_of(self.worlds), seed=seed),
-                Perception(vehicle, pool, let_in=start[0][:2] if let_in else None)
+                Perception(vehicle, positions.pool, let_in=start[0][:2] if positions.let_in else None)
                 if agent
                 else TrueState(self.worlds[name]),
-                pool=pool,
                 team=Team(name, others, period=period, turn=period * i / len(names)) if names[1:] else None,
                 record=kept.get(name),
             )
@@ -445,7 +451,6 @@ class TaskSite(Fleet):
         pilot: Pilot,
         perception: Any,
         *,
-        pool: Pool | None,
         team: Team | None,
         record: Path | None,
     ) -> Runtime:
@@ -453,11 +458,10 @@ class TaskSite(Fleet):
         about = {"command": "python -m studies.stack", "guide": self._guide.name, "armed": True}
         return Runtime(
             vehicle,
-            pool,
+            perception,
             pilot,
             self._guide,
             arm=True,
-            perception=perception,
             bridge=Bridge(vehicle, _limits(vehicle, self.worlds[name].spec.basin)),
             team=team,
             recorder=None

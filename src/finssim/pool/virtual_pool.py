@@ -10,7 +10,7 @@ import struct
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, Protocol
@@ -188,6 +188,26 @@ class FaultError(ValueError):
 
 
 @dataclass
+class AutopilotFaults:
+    """Active faults of an `ArduSub` and of what is connected to it."""
+
+    dvl_silent: bool = False
+    """True if the Doppler log sends nothing, to nobody."""
+    north: float = 0.0
+    """Turn of its north, east positive, as by a disturbed compass [rad]."""
+    no_heartbeat: bool = False
+    """True if its HEARTBEAT is lost, and nothing else."""
+    no_ground_heartbeat: bool = False
+    """True if HEARTBEAT of the ground station is lost on its way to it."""
+    position_lag: float = 0.0
+    """Age of the own position that it sends as the present one [s]."""
+    leak: bool = False
+    """True if there is water at its leak sensor."""
+    battery_voltage: float = 0.0
+    """Reading of its battery monitor [V]; the true voltage if 0."""
+
+
+@dataclass
 class Faults:
     """Active faults; every field may be changed at any time, all draws come from the seed."""
 
@@ -208,20 +228,7 @@ class Faults:
     """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
     freeze_depth: bool = False
     """True if the pressure gauge is frozen."""
-    dvl_silent: bool = False
-    """The Doppler log of an `ArduSub` sends nothing, to nobody."""
-    north: float = 0.0
-    """Turn of the north of an `ArduSub`, east positive, as by a disturbed compass [rad]."""
-    no_heartbeat: bool = False
-    """HEARTBEAT of an `ArduSub` is lost, and nothing else."""
-    no_ground_heartbeat: bool = False
-    """HEARTBEAT of the ground station is lost on its way to an `ArduSub`."""
-    position_lag: float = 0.0
-    """Age of the own position that an `ArduSub` sends as the present one [s]."""
-    leak: bool = False
-    """Water at the leak sensor of an `ArduSub`."""
-    battery_voltage: float = 0.0
-    """Reading of an `ArduSub`'s battery monitor [V]; the true voltage if 0."""
+    autopilot: AutopilotFaults = field(default_factory=AutopilotFaults)
     _frozen: Telemetry | None = None
     _frozen_depth: tuple[float, float] | None = None
 
@@ -371,11 +378,10 @@ class VirtualPool:
         imu = vehicle.sensors.imu
         period = 1.0 / imu.rate if imu is not None else 0.01
         self.vehicle, self.spec, self.camera, self.positioning = vehicle, spec, camera, positioning
-        position, quaternion = start
         self.firmware = self._firmware(firmware)
         self.plant = Plant(
-            vehicle, spec, seed=seed, period=period, position=position, quaternion=quaternion,
-            speed_loop=firmware == "mcu", world=world, dock=dock,
+            vehicle, spec, seed=seed, period=period, start=start, speed_loop=firmware == "mcu", world=world,
+            dock=dock,
         )  # fmt: skip
         self.sensors = PoolSensors(self.plant, seed)
         self.faults = Faults(seed)

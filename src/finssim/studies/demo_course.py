@@ -26,7 +26,7 @@ from finssim.identification.vehicle_file import calibrated, write_vehicle
 from finssim.learning.train import TrainingSettings, train
 from finssim.pool import draw_plant
 from finssim.pool.drawn_plant import site_of
-from finssim.pool.task_site import TaskSite
+from finssim.pool.task_site import PositionSources, TaskSite
 from finssim.pool.virtual_pool import Truth, read_truth
 from finssim.robot.pilots import make_pilot
 from finssim.tasks.catalogue import task_named
@@ -180,17 +180,15 @@ def _dive(
     policy = str(out / "policy") if controller == "policy" else controller
     episode, known = 1000 * seed + number, vehicle_at(SITE, vehicle)
     shutil.rmtree(folder, ignore_errors=True)  # of a dive that was interrupted
+    true = vehicle_at(SITE, body)
     site = TaskSite(
         replace(task_named(TASK), **GENTLE),
         [known],
-        lambda one: site_of(SITE, draw_plant(one, episode, SEVERITY)),
+        [(true, site_of(SITE, draw_plant(true, episode, SEVERITY)))],
         lambda name: make_pilot(policy, vehicle, task=TASK),
-        None,
+        PositionSources(positioning=POSITIONING, let_in=True),
         seed=episode,
-        positioning=POSITIONING,
         record=folder,
-        bodies=[vehicle_at(SITE, body)],
-        let_in=True,
     )
     path = site.referee.arrays.path.points.numpy()[0].astype(float).tolist()
     measured = {key: float(x) if np.isfinite(x) else None for key, x in site.run().items()}

@@ -212,7 +212,7 @@ def test_a_reset_of_the_autopilots_position_moves_nothing(lag):
     """Its filter leaps by 0.7 m at 14 s, with a position that is late or not: noted, and the station is kept."""
 
     def leap(pool):
-        pool.faults.position_lag = lag
+        pool.faults.autopilot.position_lag = lag
         if 14.0 <= pool.time < 14.01:
             pool.firmware.leap(0.5, -0.5)
         return send(pool)

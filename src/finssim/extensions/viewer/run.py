@@ -6,7 +6,7 @@ import math
 import time
 import webbrowser
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -183,6 +183,8 @@ def _check(choice: SourceChoice) -> str:
 def _pool(choice: SourceChoice) -> Source:
     from finssim.extensions.perception import load_world
     from finssim.extensions.viewer.sources import PoolSource, guide_for
+    from finssim.pool.plant_spec import PlantSpecError
+    from finssim.pool.run import make_plan
     from finssim.vehicles.defaults import vehicle_at
 
     name = choice.vehicle or "finsrov"
@@ -192,17 +194,14 @@ def _pool(choice: SourceChoice) -> Source:
         goal = ",".join(f"{x:g}" for x in (*view.position, math.degrees(view.yaw)))
     room = load_vehicle(name) if choice.world is None else vehicle_at("open-water", load_vehicle(name))
     guide = guide_for(goal, choice.trajectory, choice.task, room)
-    kinds: Any = {"severity": choice.severity, "camera": choice.camera}  # checked where they are used
-    return PoolSource(
-        guide,
-        vehicle=name,
-        policy=choice.policy,
-        task=choice.task,
-        plant=choice.plant,
-        seed=choice.seed,
-        world=choice.world,
-        **kinds,
-    )
+    severity: Any = choice.severity  # checked where it is used, as is the camera
+    camera: Any = "none" if choice.world else choice.camera
+    plan = make_plan(name, choice.plant, severity, camera=camera, seed=choice.seed, world=choice.world)
+    if choice.world is not None:
+        plan = replace(plan, positioning="motion-capture")
+    elif plan.camera is None or plan.calibrated is None:
+        raise PlantSpecError("a robot in the pool needs a camera: give corners or pictures")
+    return PoolSource(guide, plan, policy=choice.policy, task=choice.task, seed=choice.seed)
 
 
 def _simulator(choice: SourceChoice) -> Source:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,13 +41,13 @@ from finssim.extensions.viewer.series import (
 )
 from finssim.extensions.viewer.shapes import shown_of, world_bodies
 from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.pool.plant_spec import PlantSpecError, Severity
-from finssim.pool.run import make_plan
+from finssim.pool.run import PoolPlan
 from finssim.pool.virtual_pool import Truth, read_truth
 from finssim.robot.bridge import Bridge
 from finssim.robot.goals import check_reachable, guide_of
 from finssim.robot.messages import Picture as Seen
 from finssim.robot.messages import TagCorners
+from finssim.robot.perception import Perception
 from finssim.robot.pictures import picture_of
 from finssim.robot.pilots import make_pilot
 from finssim.robot.reading import Reading
@@ -78,36 +78,23 @@ class PoolSource:
     def __init__(
         self,
         guide: Guide,
+        plan: PoolPlan,
         *,
-        vehicle: str = "finsrov",
         policy: str = "pid",
         task: str | None = None,
-        plant: str = "1",
-        severity: Severity = "realistic",
-        camera: Literal["pictures", "corners"] = "corners",
         seed: int = 0,
-        world: str | None = None,
     ) -> None:
         """
         Args:
             guide: Where the vehicle shall go.
-            vehicle: Name or file.
+            plan: The pool; a vehicle with its own cameras and sonars begins at the viewpoint of their world.
             policy: Name of a PID, or a policy's directory.
             task: That the policy must have been trained for.
-            plant: Seed or file.
-            severity: Of a drawn plant.
-            camera: What it sends; pictures cost more.
-            seed: Of noises, and of the world.
-            world: That the vehicle's own cameras and sonars see; it begins at its viewpoint, located by motion capture.
+            seed: Of noises.
 
         Raises:
             PlantSpecError, PolicyError, ControlError, VehicleError: What cannot be made.
         """
-        plan = make_plan(vehicle, plant, severity, camera="none" if world else camera, seed=seed, world=world)
-        if world is not None:
-            plan = replace(plan, positioning="motion-capture")
-        elif plan.camera is None or plan.calibrated is None:
-            raise PlantSpecError("a robot in the pool needs a camera: give corners or pictures")
         ours, basin, eye = plan.vehicle, plan.spec.basin, plan.eye()
         begin, self._own = start_of(guide), dict[str, Any]()
         if isinstance(eye, OnboardSensors):
@@ -115,7 +102,9 @@ class PoolSource:
             begin = Station(tuple(view.position.tolist()), view.yaw)
         self._world = plan.world(eye, start=begin, seed=seed, truth=None)
         pilot = make_pilot(policy, ours, task=task)
-        self._runtime = Runtime(ours, plan.calibrated, pilot, guide, arm=True, bridge=Bridge(ours))
+        self._runtime = Runtime(
+            ours, Perception(ours, plan.calibrated), pilot, guide, arm=True, bridge=Bridge(ours)
+        )
         self._guide, self._look = guide, TagLook(ours)
         self._errors, self._sent, self._steps = Errors(), list[bytes](), 0
         self._picture: LatestPicture | None = None

@@ -16,7 +16,7 @@ from finssim.extensions.ros2.topics import TOPICS, quality_profile
 from finssim.extensions.ros2.up import DVL_AFTER, STATIONS_AFTER
 from finssim.extensions.ros2.worlds.clock import PacedClock
 from finssim.pool.fleet import Fleet, Medium
-from finssim.pool.run import MCU_PORT, Ends, PoolTiming, SiteChoice
+from finssim.pool.run import MCU_PORT, Ends, PoolFiles, PoolTiming, SiteChoice
 from finssim.pool.run import run as serve
 from finssim.robot.links.transports import DEFAULT_BIND
 from finssim.tasks.communication import Communication
@@ -97,8 +97,8 @@ class VirtualPoolNode(RobotNode):
 
     def spin(self) -> None:
         """Be the pool until SIGINT or SIGTERM."""
-        files = {"pool_file": self._pool_file, "truth": self._truth}
-        serve(self.choice, self._addresses, team=self.team, timing=_NodeTiming(self), **files)
+        files = PoolFiles(pool_file=self._pool_file, truth=self._truth)
+        serve(self.choice, self._addresses, team=self.team, files=files, timing=_NodeTiming(self))
 
 
 class _NodeTiming(PoolTiming):
