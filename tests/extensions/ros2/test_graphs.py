@@ -9,7 +9,16 @@ import yaml
 
 from finssim.control import ControlError
 from finssim.extensions.ros2 import Ros2Error
-from finssim.extensions.ros2.up import EVERYWHERE, GRAPHS, NODES, TAKES, Options, plan_of, topics_of
+from finssim.extensions.ros2.up import (
+    EVERYWHERE,
+    GRAPHS,
+    NODES,
+    TAKES,
+    Options,
+    VehicleNames,
+    plan_of,
+    topics_of,
+)
 from finssim.robot.goals import GoalError
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "ros2_nodes.md").read_text()
@@ -41,7 +50,7 @@ AUTOPILOT = {"firmware": "ardusub", "vehicle": "bluerov2_heavy", "port": 6000}
 
 def told(graph, tmp_path, **choices):
     """Parameters of the file that nodes are started with: node -> parameters; ** what all have."""
-    plan = plan_of(graph, Options(**choices), FILE)
+    plan = plan_of(graph, Options.of(choices), FILE)
     plan.write(tmp_path / "p.yaml")
     tree = yaml.safe_load((tmp_path / "p.yaml").read_text())
     found = {key.rsplit("/", 1)[-1]: value["ros__parameters"] for key, value in tree.items()}
@@ -97,7 +106,7 @@ def test_extra_nodes_are_started_where_asked_for():
     """Recorder and teleoperation."""
 
     def nodes(graph, **choices):
-        return tuple(one.node for one in plan_of(graph, Options(**choices), FILE).nodes)
+        return tuple(one.node for one in plan_of(graph, Options.of(choices), FILE).nodes)
 
     assert nodes("sim") == GRAPHS["sim"]
     assert nodes("robot", site="open-water") == ("hardware_bridge", "state_estimation", "controller")
@@ -108,7 +117,7 @@ def test_each_vehicle_of_a_team_has_its_own_names_ports_and_share():
     """One world for all; namespaces, frames, tag ids, ports ten apart, goals and records by vehicle."""
     goals = "0,0,-1,0; 2,0,-1,0; 4,0,-1,0"
     choices = {"team": "finsrov,finsrov,lauv", "site": "open-water", "goal": goals, "record": Path("r")}
-    plan = plan_of("pool", Options(**choices, lockstep=True), FILE)
+    plan = plan_of("pool", Options.of({**choices, "lockstep": True}), FILE)
     assert plan.namespaces == ("robot_1", "robot_2", "robot_3")
     found = {one.full_name: one.parameters for one in plan.nodes}
     assert [name for name in found if "virtual_pool" in name] == ["/team/virtual_pool"]
@@ -128,7 +137,7 @@ def test_time_of_a_graph_is_that_of_its_world(graph):
 
     def lives(**choices):
         file = {} if graph != "robot" else {"pool_file": FILE}
-        nodes = plan_of(graph, Options(**file, **choices), FILE).nodes
+        nodes = plan_of(graph, Options.of({**file, **choices}), FILE).nodes
         return {
             bool(one.parameters.get("use_sim_time"))
             for one in nodes
@@ -183,12 +192,14 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
 def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, words):
     """Before any process."""
     with pytest.raises(error, match=re.escape(words)):
-        plan_of(graph, Options(**choices), FILE)
+        plan_of(graph, Options.of(choices), FILE)
 
 
 def test_topics_are_those_of_the_nodes():
     """Full names; a simulator has no camera."""
-    names = {name for name, _ in topics_of(plan_of("sim", Options(namespace="rov"), None))}
+    names = {
+        name for name, _ in topics_of(plan_of("sim", Options(names=VehicleNames(namespace="rov")), None))
+    }
     assert {"/rov/odom", "/clock", "/rov/arm", "/rov/thruster_cmd"} <= names
     assert "/rov/camera/image" not in names and "/rov/telemetry" not in names
 

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import types
 import xml.etree.ElementTree as ElementTree
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ from finssim.extensions.ros2.codec import INTERFACES
 from finssim.extensions.ros2.shim.arguments import overrides_for, parse_arguments
 from finssim.extensions.ros2.topics import OWN_TOPICS, SERVICES, TOPICS
 from finssim.extensions.ros2.up import NODES as GRAPH_NODES
-from finssim.extensions.ros2.up import Options, plan_of
+from finssim.extensions.ros2.up import Options, each_option, plan_of
 from finssim.extensions.ros2.up import launched as graph_launched
 from finssim.robot.wiring import POOL_ADDRESS
 from finssim.vehicles.loader import catalogue
@@ -275,7 +274,7 @@ def test_launch_files_start_what_up_starts(launched, graph, given):
     activate(announce=False)
     convert = {"seed": int, "port": int, "real_time_factor": float, "record": Path, "lockstep": bool}
     typed = {name: convert.get(name, str)(text) for name, text in given.items()}
-    plan = plan_of(graph, Options(**typed), given.get("pool_file", "pool.yaml"))
+    plan = plan_of(graph, Options.of(typed), given.get("pool_file", "pool.yaml"))
     lines = launched(graph, **given)
     assert launched.named == [one.full_name for one in plan.nodes]
     for one in plan.nodes:
@@ -308,7 +307,7 @@ def test_every_launch_file_takes_the_options_of_up(launched):
         *declared, _ = runpy.run_path(str(NODES / f"launch/{graph}.launch.py"))[
             "generate_launch_description"
         ]()
-        options = {field.name for field in fields(Options)} - {"arm", "duration"}
+        options = {option.name for _, option in each_option()} - {"arm", "duration"}
         assert {name for name, _ in declared} == options | {"params_file"}
 
 

@@ -11,8 +11,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import Field, dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -145,25 +145,9 @@ APART = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
-    """Options of the command."""
+class SimulatedWorld:
+    """World of a virtual pool or of a simulated vehicle."""
 
-    policy: str = "pid"
-    """(DIR|pid|pid-paper|none) A policy's directory, or pid, or pid-paper; none for a controller of your own."""
-    task: str | None = None
-    """Task that the policy must have been trained for; its own if not given."""
-    vehicle: str = "finsrov"
-    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
-    team: str | None = None
-    """(NAME,NAME) Several vehicles of one virtual pool instead: robot_1 and so on, which are their namespaces. Of goal,
-    trajectory and let-in give one for each, separated by semicolons; record and truth are folders."""
-    namespace: str | None = None
-    """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
-    vehicles. The vehicle's name, without prefix, if not given."""
-    frame_prefix: str | None = None
-    """(PREFIX/) Prefix of the vehicle's frames in /tf, if not the namespace's."""
-    site: str = "pool"
-    """(NAME) Site: pool, tank or open-water (DVL and compass instead of a camera)."""
     world: str | None = None
     """(SITE|FILE) World for the own cameras, sonars and altimeters of a vehicle in a virtual pool; in open water
     also its water. The node camera publishes them."""
@@ -171,26 +155,6 @@ class Options:
     """(FILE) Water file of a virtual pool (.yaml): currents and waves, which add to the site's own."""
     positioning: str = "none"
     """(NAME) Position fixes of a virtual pool: none, motion-capture or usbl."""
-    let_in: str | None = None
-    """(X,Y) Position at the start, in the map [m], for dead reckoning by DVL and compass, without camera and
-    position fixes."""
-    goal: str | None = None
-    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 at the surface) and heading [deg], or a file;
-    the
-    position at arming if not given. The topic goal changes it."""
-    trajectory: str | None = None
-    """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
-    arm: bool = False
-    """Arm once, as soon as the state is known; otherwise the topic arm does."""
-    robot: str = "pool"
-    """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, or pool for a finssim pool on
-    this machine; or its autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
-    bind: str = "127.0.0.1:54321"
-    """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port."""
-    pictures: str | None = None
-    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
-    pool_file: Path | None = None
-    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without an overhead camera."""
     plant: str = "1"
     """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
@@ -209,24 +173,138 @@ class Options:
     """(X,Y,Z,YAW) Where the vehicle starts in sim and pool: x,y,z [m], yaw [deg]."""
     hydrodynamics: str | None = None
     """(MODEL) Model of sim: calibrated, mesh or simplified."""
-    record: Path | None = None
-    """(FILE) Record all topics to this file (.mcap)."""
-    teleop: str | None = None
-    """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphWiring:
+    """Connection of a robot and its camera."""
+
+    robot: str = "pool"
+    """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, or pool for a finssim pool on
+    this machine; or its autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
+    bind: str = "127.0.0.1:54321"
+    """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port."""
+    pictures: str | None = None
+    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
+    pool_file: Path | None = None
+    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without an overhead camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphPace:
+    """Pace of the graph's time."""
+
     lockstep: bool = False
     """Let /clock advance when every node has done its work of the last step, however long it takes: for a slow machine
     or CI. As fast as possible, unless --real-time-factor limits it."""
     real_time_factor: Annotated[float | None, (0.0, None)] = None
     """Time of /clock per real time [-]; 0: without limit, for sim and in lock-step. A virtual pool publishes /clock
     where this or --lockstep is given; otherwise it runs in real time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamMessages:
+    """Messages between the vehicles of a team."""
+
     message_loss: Annotated[float | None, (0.0, 1.0)] = None
     """Probability that a vehicle of a team misses a message of another; as of training, 0.1, if not given."""
     message_delay: Annotated[float | None, (0.0, None)] = None
     """Time to process such a message, besides its way at the speed of sound [s]; 0.1 if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphMission:
+    """Controller and where it steers to."""
+
+    policy: str = "pid"
+    """(DIR|pid|pid-paper|none) A policy's directory, or pid, or pid-paper; none for a controller of your own."""
+    task: str | None = None
+    """Task that the policy must have been trained for; its own if not given."""
+    let_in: str | None = None
+    """(X,Y) Position at the start, in the map [m], for dead reckoning by DVL and compass, without camera and
+    position fixes."""
+    goal: str | None = None
+    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 at the surface) and heading [deg], or a file;
+    the position at arming if not given. The topic goal changes it."""
+    trajectory: str | None = None
+    """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleNames:
+    """Vehicles of the graph, and the names of their topics and frames."""
+
+    vehicle: str = "finsrov"
+    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    team: str | None = None
+    """(NAME,NAME) Several vehicles of one virtual pool instead: robot_1 and so on, which are their namespaces. Of goal,
+    trajectory and let-in give one for each, separated by semicolons; record and truth are folders."""
+    namespace: str | None = None
+    """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
+    vehicles. The vehicle's name, without prefix, if not given."""
+    frame_prefix: str | None = None
+    """(PREFIX/) Prefix of the vehicle's frames in /tf, if not the namespace's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of the command."""
+
+    mission: Annotated[GraphMission, "options"] = GraphMission()
+    names: Annotated[VehicleNames, "options"] = VehicleNames()
+    site: str = "pool"
+    """(NAME) Site: pool, tank or open-water (DVL and compass instead of a camera)."""
+    arm: bool = False
+    """Arm once, as soon as the state is known; otherwise the topic arm does."""
+    wiring: Annotated[GraphWiring, "options"] = GraphWiring()
+    simulated: Annotated[SimulatedWorld, "options"] = SimulatedWorld()
+    record: Path | None = None
+    """(FILE) Record all topics to this file (.mcap)."""
+    teleop: str | None = None
+    """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
+    pace: Annotated[GraphPace, "options"] = GraphPace()
+    messages: Annotated[TeamMessages, "options"] = TeamMessages()
     duration: Annotated[float | None, (0.0, None)] = None
     """Duration from the bridge's first word [s], of /clock where nodes live by it; until Ctrl-C if not given."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Options:
+        """Return the options of values by name; what is left out has its default."""
+        by_group: dict[str | None, dict[str, Any]] = {}
+        for group, option in each_option():
+            if option.name in values:
+                by_group.setdefault(group, {})[option.name] = values[option.name]
+        direct = by_group.pop(None, {})
+        return cls(**direct, **{group: GROUPS[group](**own) for group, own in by_group.items() if group})
+
+    def values(self) -> dict[str, Any]:
+        """Return the value of each option by name."""
+        return {
+            option.name: getattr(getattr(self, group) if group else self, option.name)
+            for group, option in each_option()
+        }
+
+
+GROUPS = {
+    "mission": GraphMission,
+    "names": VehicleNames,
+    "wiring": GraphWiring,
+    "simulated": SimulatedWorld,
+    "pace": GraphPace,
+    "messages": TeamMessages,
+}
+"""Field of `Options` -> group of options."""
+
+
+def each_option() -> Iterator[tuple[str | None, Field[Any]]]:
+    """Yield all options, each with the group that it is in, if any."""
+    for field in fields(Options):
+        if field.name in GROUPS:
+            yield from ((field.name, option) for option in fields(GROUPS[field.name]))
+        else:
+            yield None, field
 
 
 NOT_LAUNCHED = ("arm", "duration")
@@ -235,7 +313,7 @@ NOT_LAUNCHED = ("arm", "duration")
 
 def launch_arguments() -> list[str]:
     """Return the options that every launch file takes as arguments."""
-    return [option.name for option in fields(Options) if option.name not in NOT_LAUNCHED]
+    return [option.name for _, option in each_option() if option.name not in NOT_LAUNCHED]
 
 
 def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
@@ -249,7 +327,7 @@ def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
         Ros2Error, VehicleError, GoalError, ControlError: As of `plan_of`, or a text that is no number or no flag.
     """
     values: dict[str, Any] = {**given}
-    for option in fields(Options):
+    for _, option in each_option():
         name, kind = option.name, str(option.type)
         if name in given and any(word in kind for word in MEANT):
             convert, expected = MEANT[next(word for word in MEANT if word in kind)]
@@ -257,11 +335,11 @@ def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
                 values[name] = convert(given[name])
             except (KeyError, ValueError):
                 raise Ros2Error(f"{name}:={given[name]}: expected {expected}") from None
-    nothing = dict.fromkeys((option.name for option in fields(Options)), None)
+    nothing = dict.fromkeys(option.name for _, option in each_option())
     pool_file = given.get("pool_file")
     if graph == "pool" and pool_file is None:
         pool_file = str(Path(mkdtemp(prefix="finssim-ros2-")) / "pool.yaml")
-    return plan_of(graph, Options(**{**nothing, **values}), pool_file, since=time.time())
+    return plan_of(graph, Options.of({**nothing, **values}), pool_file, since=time.time())
 
 
 MEANT: dict[str, tuple[Callable[[str], Any], str]] = {
@@ -289,42 +367,53 @@ def plan_of(
     """
     if graph not in GRAPHS:
         raise Ros2Error(f"unknown graph '{graph}'; available: {', '.join(GRAPHS)}")
-    o, several = options, options.team is not None
-    names = [name.strip() for name in o.team.split(",")] if o.team is not None else [o.vehicle]
+    o, several = options, options.names.team is not None
+    world, wiring, pace, stated = o.simulated, o.wiring, o.pace, o.values()
+    names = (
+        [name.strip() for name in o.names.team.split(",")] if o.names.team is not None else [o.names.vehicle]
+    )
     _check(graph, o)
-    blind = o.site == "open-water" or o.firmware == "ardusub" or "none" in (str(o.pool_file), o.camera)
-    if graph == "robot" and not blind and o.pool_file is None and pool_file is not None:  # our own, unwritten
+    blind = (
+        o.site == "open-water"
+        or world.firmware == "ardusub"
+        or "none" in (str(wiring.pool_file), world.camera)
+    )
+    if (
+        graph == "robot" and not blind and wiring.pool_file is None and pool_file is not None
+    ):  # our own, unwritten
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
-    simulated = graph == "sim" or o.lockstep or o.real_time_factor is not None
-    camera = o.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
+    simulated = graph == "sim" or pace.lockstep or pace.real_time_factor is not None
+    camera = world.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
     file = None if pool_file is None else str(pool_file)
-    factor = 0.0 if o.lockstep and o.real_time_factor is None else o.real_time_factor
+    factor = 0.0 if pace.lockstep and pace.real_time_factor is None else pace.real_time_factor
     common: dict[str, Any] = {
-        **{option.name: getattr(o, option.name) for option in fields(Options)},
+        **stated,
         "use_sim_time": simulated or None,
-        "lockstep": o.lockstep or None,
+        "lockstep": pace.lockstep or None,
         "pool_since": since if graph == "pool" and not blind else None,
         "real_time_factor": factor,
         "pool_file": "none" if blind else file,
         "need_reading": False if o.teleop else None,
         "device": o.teleop,
-        "other": o.policy if o.policy is None or o.policy.startswith("pid") else "policy",
+        "other": o.mission.policy
+        if o.mission.policy is None or o.mission.policy.startswith("pid")
+        else "policy",
     }
     nodes: list[GraphNode] = []
     namespaces: list[str] = []
-    shares = {name: _share(name, getattr(o, name), len(names)) for name in SHARED}
+    shares = {name: _share(name, stated[name], len(names)) for name in SHARED}
     for i, name in enumerate(names):
         vehicle = vehicle_at(o.site or "pool", load_vehicle(name or "finsrov"))
-        if o.firmware == "ardusub":
+        if world.firmware == "ardusub":
             Mixer.of(vehicle)  # refuses a vehicle without an autopilot
         own = {key: texts[i] for key, texts in shares.items()}
         if name is not None and (own["goal"] is not None or own["trajectory"] is not None):
             check_reachable(guide_of(own["goal"], own["trajectory"]), vehicle)
         if own["let_in"] is not None:
             place_of(own["let_in"])  # refuses what is none
-        namespace = f"robot_{i + 1}" if several else o.namespace or vehicle.name.replace("-", "_")
+        namespace = f"robot_{i + 1}" if several else o.names.namespace or vehicle.name.replace("-", "_")
         namespaces.append(namespace)
-        prefix = f"{namespace}/" if several or o.namespace else None
+        prefix = f"{namespace}/" if several or o.names.namespace else None
         record = o.record and str(Path(o.record) / f"{namespace}.mcap" if several else o.record)
         values = {
             **common,
@@ -332,7 +421,7 @@ def plan_of(
             **_wire(graph, o, APART * i),
             "vehicle": name,
             "number": i or None,
-            "frame_prefix": o.frame_prefix or prefix,
+            "frame_prefix": o.names.frame_prefix or prefix,
             "record": record,
             "mode": "error-state" if own["let_in"] is not None else None,
         }
@@ -344,12 +433,12 @@ def plan_of(
                 given = {
                     **values,
                     "use_sim_time": None,
-                    "bind": o.bind,
+                    "bind": wiring.bind,
                     "camera": "none" if blind else camera,
                 }
                 given |= {"pool_file": None if blind else file, "frame_prefix": None if several else prefix}
-                given["truth"] = None if o.truth is None else str(o.truth)
-                given["water"] = None if o.water is None else str(o.water)
+                given["truth"] = None if world.truth is None else str(world.truth)
+                given["water"] = None if world.water is None else str(world.water)
             elif node == "recorder" and (graph == "sim" or blind):
                 given = {**values, "pool_file": None}
             below = "team" if several and node in WORLDS else namespace
@@ -357,7 +446,7 @@ def plan_of(
             nodes.append(
                 GraphNode(node, below, {key: given[key] for key in takes if given.get(key) is not None})
             )
-    if o.lockstep:
+    if pace.lockstep:
         waits = " ".join(one.full_name for one in nodes if one.node not in WORLDS)
         for one in nodes:
             one.parameters.update({"waits_for": waits} if one.node in WORLDS else {})
@@ -366,8 +455,8 @@ def plan_of(
 
 def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
     """Return the nodes of one vehicle in the order of their start."""
-    sees = o.world is not None or o.pictures not in (None, "none")
-    excluded = [*(["controller"] if o.policy == "none" else [])]
+    sees = o.simulated.world is not None or o.wiring.pictures not in (None, "none")
+    excluded = [*(["controller"] if o.mission.policy == "none" else [])]
     excluded += (["localizer"] if sees else ["camera", "localizer"]) if blind else []
     extra = (*(("recorder",) if o.record else ()), *(("teleop",) if o.teleop else ()))
     return (*(name for name in GRAPHS[graph] if name not in excluded), *extra)
@@ -375,32 +464,36 @@ def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
 
 def _check(graph: str, o: Options) -> None:
     """Refuse options that have no effect in a graph."""
-    single = o.namespace or o.frame_prefix or o.teleop or o.start or o.firmware == "ardusub"
-    if o.team is not None and (graph != "pool" or single):
+    world, wiring, pace = o.simulated, o.wiring, o.pace
+    single = (
+        o.names.namespace or o.names.frame_prefix or o.teleop or world.start or world.firmware == "ardusub"
+    )
+    if o.names.team is not None and (graph != "pool" or single):
         raise Ros2Error(
             "--team is for the graph pool, which places and names its vehicles: leave --namespace, --frame-prefix, "
             "--start, --firmware and --teleop out"
         )
-    if o.firmware == "ardusub" and o.camera not in (None, "none"):
+    if world.firmware == "ardusub" and world.camera not in (None, "none"):
         raise Ros2Error("--firmware ardusub has no camera, but DVL and compass: leave --camera out")
-    if o.team is not None and o.vehicle not in (None, "finsrov"):
+    if o.names.team is not None and o.names.vehicle not in (None, "finsrov"):
         raise Ros2Error("--team names its vehicles: leave --vehicle out")
-    if o.team is None and (o.message_loss is not None or o.message_delay is not None):
+    if o.names.team is None and (o.messages.message_loss is not None or o.messages.message_delay is not None):
         raise Ros2Error("--message-loss and --message-delay are for the messages of a team: give --team")
-    if graph == "robot" and (o.lockstep or o.real_time_factor is not None):
-        host = "" if o.robot is None else o.robot.rpartition("//")[2]
-        if o.robot not in (None, "pool") and not host.startswith(("127.", "localhost")):
+    if graph == "robot" and (pace.lockstep or pace.real_time_factor is not None):
+        host = "" if wiring.robot is None else wiring.robot.rpartition("//")[2]
+        if wiring.robot not in (None, "pool") and not host.startswith(("127.", "localhost")):
             raise Ros2Error(
-                f"--robot {o.robot} lives in real time: leave --lockstep and --real-time-factor out"
+                f"--robot {wiring.robot} lives in real time: leave --lockstep and --real-time-factor out"
             )
-    if graph == "pool" and o.real_time_factor == 0.0 and not o.lockstep:
+    if graph == "pool" and pace.real_time_factor == 0.0 and not pace.lockstep:
         raise Ros2Error(
             "--real-time-factor 0: expected more than 0, or --lockstep, in which 0 means without limit"
         )
     takes = {word for node in GRAPHS[graph] for word in TAKES[node].split()} | set(ALWAYS.split())
     takes |= set(BESIDES[graph].split())
-    for option in fields(Options):
-        value = getattr(o, option.name)
+    stated = o.values()
+    for _, option in each_option():
+        value = stated[option.name]
         if value not in (None, option.default) and option.name not in takes:
             raise Ros2Error(
                 f"--{option.name.replace('_', '-')} has no effect in the graph {graph}: leave it out"
@@ -429,24 +522,24 @@ def _wire(graph: str, o: Options, further: int) -> dict[str, Any]:
     """
     if graph == "sim":
         return {"robot": None}
-    if o.firmware == "ardusub":
-        port = o.port or MCU_PORT
+    if o.simulated.firmware == "ardusub":
+        port = o.simulated.port or MCU_PORT
         return {"robot": f"mavlink://udpout:127.0.0.1:{port}?dvl=127.0.0.1:{port + DVL_AFTER}"}
     bind = camera_bind = None
-    ours = DEFAULT_BIND if o.bind is None and further else o.bind
+    ours = DEFAULT_BIND if o.wiring.bind is None and further else o.wiring.bind
     if ours is not None:
         host, _, port = ours.rpartition(":")
         if not port.isdecimal():
             raise Ros2Error(f"--bind {ours}: expected ADDRESS:PORT")
         bind, camera_bind = f"{host}:{int(port) + further}", f"{host}:{int(port) + further + 1}"
-    pool = graph == "pool" or o.robot in (None, "pool")
-    first = MCU_PORT if o.port is None and further else o.port
+    pool = graph == "pool" or o.wiring.robot in (None, "pool")
+    first = MCU_PORT if o.simulated.port is None and further else o.simulated.port
     here = f"udp://127.0.0.1:{first + further}" if pool and first is not None else None
     eye = f"udp://127.0.0.1:{first + further + 1}" if here else None if pool else "none"
     return {
-        "robot": here or o.robot,
+        "robot": here or o.wiring.robot,
         "bind": bind,
-        "pictures": o.pictures or eye,
+        "pictures": o.wiring.pictures or eye,
         "pictures_bind": camera_bind,
     }
 
@@ -476,7 +569,7 @@ def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[
     from finssim.extensions.ros2.nodes.remote import Watcher
 
     with TemporaryDirectory(prefix="finssim-ros2-") as folder:
-        pool_file = (options.pool_file or Path(folder) / "pool.yaml").resolve()
+        pool_file = (options.wiring.pool_file or Path(folder) / "pool.yaml").resolve()
         plan, parameters = (
             plan_of(graph, options, pool_file, since=time.time()),
             Path(folder) / "parameters.yaml",

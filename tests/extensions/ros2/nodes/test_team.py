@@ -21,7 +21,16 @@ from finssim.extensions.ros2.nodes.conversions import RosMessages, nanoseconds, 
 from finssim.extensions.ros2.nodes.robot_node import STEP
 from finssim.extensions.ros2.shim.arguments import parse_arguments
 from finssim.extensions.ros2.topics import TOPICS, quality_profile
-from finssim.extensions.ros2.up import NODES, Options, plan_of
+from finssim.extensions.ros2.up import (
+    NODES,
+    GraphPace,
+    GraphWiring,
+    Options,
+    SimulatedWorld,
+    TeamMessages,
+    VehicleNames,
+    plan_of,
+)
 from finssim.pool.virtual_pool import read_truth
 from finssim.vehicles import load_vehicle
 
@@ -56,10 +65,15 @@ class Team:
     def __init__(self, folder):
         self.truth = folder / "truth"
         options = Options(
-            team="finsrov,finsrov,finsrov", site="open-water", positioning="motion-capture", severity="nominal",
-            port=free_port(), bind=f"127.0.0.1:{free_port()}", truth=self.truth, lockstep=True,
-            message_loss=LOSS, message_delay=DELAY,
-        )  # fmt: skip
+            names=VehicleNames(team="finsrov,finsrov,finsrov"),
+            site="open-water",
+            wiring=GraphWiring(bind=f"127.0.0.1:{free_port()}"),
+            simulated=SimulatedWorld(
+                positioning="motion-capture", severity="nominal", port=free_port(), truth=self.truth
+            ),
+            pace=GraphPace(lockstep=True),
+            messages=TeamMessages(message_loss=LOSS, message_delay=DELAY),
+        )
         plan = plan_of("pool", options, folder / "pool.yaml")
         plan.write(folder / "parameters.yaml")
         rclpy.init(args=[])
