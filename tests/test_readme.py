@@ -13,6 +13,8 @@ import pytest
 from finssim import __version__
 from finssim.cli import boundary
 from finssim.cli.commands import app
+from finssim.control import TRAJECTORIES
+from finssim.evaluation.plants import available_plants
 from finssim.vehicles import load_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,13 +29,14 @@ EXAMPLES.append(ROOT / "examples" / "bluerov2" / "loop.py")
 """What `finssim new` copies is below `examples/own`, with tests of its own."""
 
 SHORT = {
+    "loop.py": ("if status := finssim(line).wait():", "if status := boundary.run(app, line.split()):"),
     "learn_with_pettingzoo.py": ("TURNS, TRIES = 30, 4", "TURNS, TRIES = 2, 2"),
     "learn_with_rsl_rl.py": ("60", "2"),
     "learn_with_sb3.py": ("500_000", "16_384"),
     "learn_with_torchrl.py": ("ROLLOUTS, STEPS, WORLDS, BATCH = 60,", "ROLLOUTS, STEPS, WORLDS, BATCH = 2,"),
     "train_and_evaluate.py": ("600_000", "16_384"),
 }
-"""What makes an example's training short: the words that say how long it is, and others."""
+"""What makes an example short: words that say how long it is or that start a process, and others."""
 
 
 def blocks(language: str) -> list[str]:
@@ -45,6 +48,16 @@ def commands() -> list[list[str]]:
     """Command lines of the README's bash blocks, as words."""
     lines = "\n".join(blocks("bash")).splitlines()
     return [words for words in (shlex.split(line, comments=True) for line in lines) if words]
+
+
+def shortened(line: str) -> list[str]:
+    """Words of a recipe without its third and further plants and trajectories, whose names are known too."""
+    for option, known in (("--plant", available_plants()), ("--trajectory", TRAJECTORIES)):
+        named = re.findall(rf" {option} (\S+)", line)
+        assert set(named) <= set(known), line
+        for name in named[2:]:
+            line = line.replace(f" {option} {name}", "")
+    return shlex.split(line, comments=True)
 
 
 def run(words: list[str], folder: Path) -> str:
@@ -106,7 +119,7 @@ def test_the_recipes_that_need_no_file_of_the_reader_run_in_order(tmp_path, monk
     lines = re.findall(r"^finssim (?:train|evaluate|worlds)\b.*$", page, flags=re.MULTILINE)
     assert len(lines) > 8
     for line in lines:
-        words = shlex.split(line, comments=True)
+        words = shortened(line)
         status = boundary.run(app, [*words[1:], *SMALL.get(words[1], [])])
         assert status == 0, f"{line}\n{''.join(capfd.readouterr())}"
 
@@ -129,7 +142,7 @@ def test_python_blocks_run(code, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_examples_run(path, tmp_path, monkeypatch, capsys):
-    """Every example runs from any folder and prints what it found; as it stands, but for trainings, which are short."""
+    """Every example runs from any folder and prints what it found; as it stands, but for what `SHORT` says."""
     code = path.read_text(encoding="utf-8")
     if path.name in SHORT:
         words, fewer = SHORT[path.name]
@@ -139,6 +152,7 @@ def test_examples_run(path, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(path)])
     module = types.ModuleType("__main__")
     module.__file__ = str(path)
+    vars(module).update(boundary=boundary, app=app)
     monkeypatch.setitem(sys.modules, "__main__", module)
     exec(compile(code, path, "exec"), vars(module))
     assert capsys.readouterr().out
