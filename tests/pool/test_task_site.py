@@ -30,6 +30,8 @@ FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHORT = {"t1": 14.0, "t2": 14.0, "t3": 12.0, "docking": 25.0}
 """Time limits that are long enough for a success of the baseline [s]."""
+SMALL = {"path": {"legs": 30}, "waypoints": {"legs": 2}, "terrain": {"line": 40.0}}
+"""A third, half and less of the way."""
 SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 """Of an episode in which the baseline succeeds; that of a task that sees does not in all."""
 
@@ -43,9 +45,7 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     (who, *_), task = baselines_of(name), task_named(name)
     if task.pictures or task.ranges:
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
-    if name == "terrain":
-        task = replace(task, line=40.0)
-    task = replace(task, time_limit=SHORT.get(name, task.time_limit))
+    task = replace(task, time_limit=SHORT.get(name, task.time_limit), **SMALL.get(name, {}))
     guide = TRAJECTORIES["lemniscate"] if name == "t2" else None
     vehicle = load_vehicle("eca_a9") if name in ("path", "waypoints", "homing", "terrain") else FINSROV
     site = site_of(task, who, [vehicle] * len(task.vehicles), seed=SEEDS.get(name, 1), guide=guide)
