@@ -457,7 +457,7 @@ AUTOPILOT: Mapping[str, Scenario] = {
     "ap-battery": _autopilot(
         "battery low, with its failsafe set to disarm", UNARMED, 10.5, low_battery,
     ),
-    "ap-leak": _autopilot("leak", "autopilot reports: Leak", 1.0, pool_fault(leak=True)),
+    "ap-leak": _autopilot("leak", "autopilot reports: Leak", 1.0, autopilot_fault(leak=True)),
     "ap-spoiled": _autopilot(
         "a tenth lost and spoiled", "", math.inf, pool_fault(drop=0.1, corrupt=0.1, drop_commands=0.1)
     ),
