@@ -66,34 +66,35 @@ def check(fit, vehicle, axes, within):
 
 
 CASES = {
-    "finsrov, sensors at 50 Hz": ("finsrov", ("surge", "yaw"), {}, 0.05),
+    "finsrov, sensors at 50 Hz": ("finsrov", ("surge", "yaw"), 4, {}, 0.05),
     "finsrov, wrench and velocity at 5 Hz": (
         "finsrov",
         ("surge", "sway", "yaw"),
+        2,
         {"rate": 5.0, "columns": ("u", "v", "w", "p", "q", "r"), "inputs": ("wrench",)},
         0.10,
     ),
-    "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), {"inputs": ("command",)}, 0.08),
-    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("surge", "heave", "pitch"), {}, 0.05),
+    "bluerov2, commanded thrusters": ("bluerov2", ("sway", "yaw"), 2, {"inputs": ("command",)}, 0.08),
+    "bluerov2_heavy, sensors at 50 Hz": ("bluerov2_heavy", ("surge", "heave", "pitch"), 3, {}, 0.05),
     "bluerov2_heavy, gyro and attitude": (
         "bluerov2_heavy",
         ("roll",),
+        4,
         {"columns": ("p", "q", "r", "qx", "qy", "qz", "qw")},
         0.10,
     ),
 }
+"""Vehicle, axes, every which step of their programmes is made, options of the simulation, and how near the numbers
+come: with seven seeds of the noise, all came nearer."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_numbers_come_back(name):
     """From coefficients off by factors of two, whatever drives and measures the vehicle."""
-    vehicle, axes, options, within = CASES[name]
+    vehicle, axes, every, options, within = CASES[name]
     vehicle = load_vehicle(vehicle)
-    plan = programmes(axes, vehicle)
-    if options.get("inputs") != ("command",):  # motors that lag need them all
-        plan = plan[::2]
-    some = simulate_programme(plan, vehicle, seed=3, **options)
+    some = simulate_programme(programmes(axes, vehicle)[::every], vehicle, seed=3, **options)
     fit = fit_by_simulation(some, wrong(vehicle))
     assert fit.settings["axes"] == list(axes)
     check(fit, vehicle, axes, within)
@@ -271,7 +272,8 @@ def test_all_axes_moving_at_once():
 def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
     """Only rates and attitude are logged: yaw and roll are fitted, and surge is named as unmeasured."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge", "roll", "yaw")
-    fit = fit_by_simulation(without(some[::3], "u", "v", "w", "x", "y", "z", "depth"), vehicle)
+    some = [next(t for t in some if t.name.startswith(axis)) for axis in ("surge", "roll", "yaw")]
+    fit = fit_by_simulation(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
     assert {n.partition(".")[0] for n in fit.estimates if "." in n} == {"roll", "yaw"}
     assert ("axis_untold", "surge") in {(one.code, one.subject) for one in fit.findings}
 
@@ -362,7 +364,7 @@ def test_a_vehicle_that_turns_over_is_simulated_as_it_turned(axes):
     levels = (("surge", (41.0, 82.0, 123.0)), ("sway", (31.0, 62.0, 93.0)))
     vehicle, some = known_trials.trials("bluerov2", *axes, levels=levels)
     added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
-    found = fit_by_simulation(some, vehicle.replace({f"{SET}.added_mass": added.tolist()})).estimates
+    found = fit_by_simulation(some[::2], vehicle.replace({f"{SET}.added_mass": added.tolist()})).estimates
     for axis in axes:
         expected = known_trials.truth(vehicle)[f"{axis}.m_eff"]
         assert found[f"{axis}.m_eff"].estimate == pytest.approx(expected, rel=0.02), axis
