@@ -215,7 +215,7 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
     """Return a fault that sets fields of `pool.faults`, and loses pictures with a probability."""
 
     def begin(bench: Bench) -> None:
-        vars(bench.pool.faults).update(fields)
+        _set(bench.pool.faults, fields)
         if pictures:
             random = np.random.default_rng([bench.pool.faults.seed, 0xB11D])
             bench.wire.pictures = lambda pictures_taken: [
@@ -227,7 +227,14 @@ def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
 
 def autopilot_fault(**fields: Any) -> Touch:
     """Return a fault that sets fields of `pool.faults.autopilot`."""
-    return lambda bench: vars(bench.pool.faults.autopilot).update(fields)
+    return lambda bench: _set(bench.pool.faults.autopilot, fields)
+
+
+def _set(faults: Any, fields: Mapping[str, Any]) -> None:
+    """Set fields that are there."""
+    for name, value in fields.items():
+        getattr(faults, name)
+        setattr(faults, name, value)
 
 
 def stuck_sensors(*names: str) -> Touch:

@@ -14,6 +14,7 @@ from finssim.control.guidance import Station
 from finssim.pool.run import make_plan
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
+from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import recording
 from finssim.robot.runtime import Runtime
@@ -31,7 +32,8 @@ world = plan.world(plan.eye(), start=station_of("0,0,-0.5,0"), seed=1, truth=Non
 world.exchange(1 / 60, [])  # the pool's own kernels
 with recording(sys.argv[2], vehicle, {}, lockstep=True) as recorder:
     pilot = make_pilot(sys.argv[1], vehicle)
-    runtime = Runtime(vehicle, plan.calibrated, pilot, Station((0.2, 0, -0.5), 0.0), arm=True, recorder=recorder)
+    perception, goal = Perception(vehicle, plan.calibrated), Station((0.2, 0, -0.5), 0.0)
+    runtime = Runtime(vehicle, perception, pilot, goal, arm=True, recorder=recorder)
     before = in_memory()
     run_lockstep(runtime, world, 2.0, start=1 / 60, show=lambda runtime: states.append(runtime.bridge.state))
 print(json.dumps(["armed" in states, runtime.counters.decisions, sorted(in_memory() - before)]))
