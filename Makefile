@@ -26,7 +26,7 @@ demo: $(LIGHT)  ## identify, train, evaluate and report: the whole loop, result 
 # Some tests start processes that keep an appointment with the clock, which a busy machine can miss: what failed runs
 # once more, alone, and what fails twice fails. A third process has work while two wait for such appointments.
 test: check  ## check, then run every test
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --durations 25 || { [ $$? = 1 ] && \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder --durations 25 || { [ $$? = 1 ] && \
 		OMP_NUM_THREADS=1 $(BIN)/python -m pytest --last-failed --last-failed-no-failures none; }
 
 quick: $(STAMP)  ## the tests that take little time and start no process

@@ -13,7 +13,7 @@ import importlib.util
 import multiprocessing.process
 import sys
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -68,6 +68,15 @@ def pytest_terminal_summary(terminalreporter, config):
     )
     for name, seconds in sorted(spent.items(), key=lambda item: -item[1])[: config.option.durations]:
         terminalreporter.write_line(f"{seconds:7.2f}s {name}")
+
+
+# ---- order: files go to processes as a whole, and the last ones should be short
+
+
+def pytest_collection_modifyitems(items):
+    """Files with many slow tests first; by all their tests, as xdist orders them, trainings and sessions come last."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 # ---- garbage: one search of all that the tests import takes a second, and every robot in real time begins with one:
