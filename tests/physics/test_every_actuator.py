@@ -202,7 +202,7 @@ def test_a_current_is_part_of_the_flow():
     """At rest in water that moves aft, a fin steers as it does ahead in still water."""
     found = []
     for water, speed in ((None, 1.0), (Water(current=(-1.0, 0.0, 0.0)), 0.0)):
-        sim = fs.Simulator(fin(), control_step=0.01, substeps=1, water=water)
+        sim = fs.Simulator(fin(), control_step=0.01, substeps=1, water=water, water_moves=True)
         sim.place(position=(0.0, 0.0, -50.0), velocity=(speed, 0.0, 0.0, 0.0, 0.0, 0.0))
         sim.set_actuators([0.0, 0.2])
         for _ in range(20):
@@ -392,12 +392,12 @@ def test_actuators_are_part_of_the_file_and_of_its_digest():
 
 def test_commands_keep_to_channels():
     """Thrust commands leave the other actuators where they are; too many channels are refused."""
-    sim = fs.Simulator(fin(), worlds=2)
-    sim.set_actuators([5.0, 0.1])
+    sim = fs.Simulator("lauv", worlds=2)
+    sim.set_actuators([5.0, *[0.1] * 4])
     sim.set_thrust([10.0])
-    np.testing.assert_allclose(sim.numpy_command()[:, 0, :2], [[10.0, 0.1]] * 2)
+    np.testing.assert_allclose(sim.numpy_command()[:, 0, :5], [[10.0, *[0.1] * 4]] * 2)
     with pytest.raises(SimulatorError, match="expected"):
-        sim.set_actuators([1.0, 2.0, 3.0])
+        sim.set_actuators([1.0] * 6)
     with pytest.raises(SimulatorError, match="1 thrusters and 8 other actuators; at most 8"):
         fs.Simulator(hull({f"fin{i}": FIN for i in range(8)}))
 
@@ -418,10 +418,12 @@ def test_top_speed_counts_the_inflow():
 
 
 def test_ranges_draw_the_parameters_of_all_fins():
-    """`fin: {lift_slope: ...}` scales both fins of a world alike; a scale of thrust leaves angles alone."""
-    two = {"rudder": FIN, "stern": {**FIN, "span": [0.0, 1.0, 0.0], "lift_slope": 2.0}}
+    """`fin: {lift_slope: ...}` scales the fins of a world alike; a scale of thrust leaves angles alone."""
+    vehicle = fs.load_vehicle("lauv").replace(
+        {"actuators.fin_starboard.lift_slope": 2.0}
+    )  # the others have 3
     parts = {"fin": {"lift_slope": [0.5, 1.5]}, "thrust": {"all": [0.5, 0.6]}}
-    sim, _ = draw(parts, vehicles=hull(two), worlds=200, seed=3)
+    sim, _ = draw(parts, vehicles=vehicle, worlds=200, seed=3)
     slopes = np.array([sim.plant.fields[f"actuators.fin_{k}.lift_slope"].numpy()[:, 0] for k in (1, 2)])
     np.testing.assert_allclose(slopes[1] / slopes[0], 2.0 / 3.0, rtol=1e-5)
     assert 1.45 < slopes[0].min() < 1.7 and 4.3 < slopes[0].max() < 4.55

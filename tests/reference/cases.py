@@ -46,17 +46,22 @@ def disturb(simulator, tau):
     simulator.command.disturbance.assign(np.ascontiguousarray(tau))
 
 
-def plain(vehicle):
-    """The hull by its matrices alone: no term but `surge_damping`, no inflow, no actuator but volumes, which are 0."""
+def plain(vehicle, keep=("surge_damping",)):
+    """The hull by its matrices and the terms to keep, whose kernel many share: no inflow, and no actuators.
+
+    Where no thruster would be left, it has that of REMUS 100.
+    """
     values = vehicle.values()
     further = [key for chosen in values["hydrodynamics"].values() for key in chosen if key in TERMS]
-    if "actuators" not in values and set(further) <= {"surge_damping"}:
+    if "actuators" not in values and set(further) <= set(keep):
         return vehicle
-    values["actuators"] = {k: a for k, a in values.get("actuators", {}).items() if a["kind"] == "buoyancy"}
+    values.pop("actuators", None)
+    if not values["thrusters"]:
+        values |= {key: load("remus100").values()[key] for key in ("thrusters", "controlled_axes")}
     for thruster in values["thrusters"].values():
         thruster.pop("inflow", None)
     for chosen in values["hydrodynamics"].values():
-        for key in set(TERMS) & set(chosen) - {"surge_damping"}:
+        for key in set(TERMS) & set(chosen) - set(keep):
             del chosen[key]
     return checked(values, dict(vehicle.provenance), vehicle.name, vehicle.path, vehicle.name)
 
@@ -69,9 +74,9 @@ def damped(vehicle, model):
 
 def undamped(vehicle, model):
     """The vehicle without any damping, and without fins."""
-    vehicle = plain(vehicle)
+    vehicle = plain(vehicle, keep=())
     chosen = vehicle.hydrodynamics[model]
-    names = [x for x in ("linear_damping", "quadratic_damping", "surge_damping") if hasattr(chosen, x)]
+    names = [x for x in ("linear_damping", "quadratic_damping") if hasattr(chosen, x)]
     changes = {f"hydrodynamics.{model}.{x}": np.zeros((6, 6)).tolist() for x in names}
     changes |= {f"hydrodynamics.{model}.{x}": 0.0 for x in ("form_drag", "skin_drag") if hasattr(chosen, x)}
     return vehicle.replace(changes)

@@ -33,7 +33,7 @@ def bare(name, model):
     point = vehicle.body.center_of_buoyancy if model == "mesh" else chosen.reference_point
     changes = {"body.center_of_gravity": list(point), "body.inertia": diagonal(vehicle.body.inertia)}
     for field in ("added_mass", "linear_damping", "quadratic_damping", "surge_damping"):
-        if hasattr(chosen, field):
+        if np.any(getattr(chosen, field, 0.0)):  # a term of zeros would be a kernel more
             changes[f"hydrodynamics.{model}.{field}"] = diagonal(getattr(chosen, field))
     return neutral(vehicle.replace(changes))
 

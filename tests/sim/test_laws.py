@@ -36,6 +36,16 @@ def history(simulator, steps):
     return [np.array(x) for x in zip(*rows, strict=True)]
 
 
+def exactly(name):
+    """Integrator and substeps of a nearly exact motion: RK4, or the midpoint rule in ten times as many.
+
+    These three have a kernel of that for other tests; ECA A9 and REMUS 100 have fins too.
+    """
+    if name in ("lauv", "slocum", "torpedo"):
+        return {"integrator": "midpoint", "substeps": 40}
+    return {"integrator": "rk4", "substeps": 4}
+
+
 def period(vehicle):
     """A time in which a vehicle moves about a tenth of its length [s], for steps that suit a small and a large one."""
     return 0.04 * float(np.sqrt(max(vehicle.body.size)))
@@ -129,10 +139,10 @@ def with_and_without_current(name, model, carried):
             vehicle,
             worlds=20,
             hydrodynamics=model,
-            integrator="rk4",
             control_step=period(vehicle),
-            substeps=4,
             water=water,
+            water_moves=True,
+            **exactly(name),
         )
         simulator.place(position[:, None], q[:, None], start[:, None])
         runs.append(history(simulator, 30))
@@ -272,7 +282,7 @@ def symmetric(name, model):
     inertia = np.asarray(body.inertia)
     changes["body.inertia"] = (0.5 * (inertia + np.outer(MIRROR[3:], MIRROR[3:]) * inertia)).tolist()
     for field in ("added_mass", "linear_damping", "quadratic_damping", "surge_damping"):
-        if hasattr(chosen, field):
+        if np.any(getattr(chosen, field, 0.0)):  # a term of zeros would be a kernel more
             changes[f"hydrodynamics.{model}.{field}"] = symmetrised(getattr(chosen, field))
     return vehicle.replace(changes)
 
@@ -291,8 +301,7 @@ def test_port_and_starboard_are_mirror_images(name, model):
             worlds=20,
             hydrodynamics=model,
             control_step=period(vehicle),
-            substeps=4,
-            integrator="rk4",
+            **exactly(name),
             water=Water(current=(0.1, 0.05 * side, 0.0), waves=(wave,)),
         )
         flip = MIRROR if side < 0 else np.ones(6)
