@@ -105,7 +105,7 @@ def test_a_pitch_is_held():
 def test_course_over_ground_in_a_current():
     """0.4 m/s across: the bow points into it, the course does not."""
     orders = {"speed": 1.6, "course": np.array([0.0, 1.0]), "depth": 10.0}
-    found = sailed(CRUCIFORM, orders, 80.0, water=Water(current=(0.0, 0.4, 0.0), depth=50.0))
+    found = sailed(load_vehicle("remus100"), orders, 80.0, water=Water(current=(0.0, 0.4, 0.0), depth=50.0))
     end = found.time > 50.0
     assert np.abs(found.course[end] - orders["course"]).max() < math.radians(0.5)
     assert found.euler[end, 0, 2] == pytest.approx(-math.asin(0.4 / 1.6), abs=0.04)
