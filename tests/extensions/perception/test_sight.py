@@ -11,7 +11,7 @@ pytest.importorskip("newton")
 
 from finssim.agents.agent import agent_for
 from finssim.evaluation.plants import PlantError, load_plant
-from finssim.extensions.perception import load_world, sight
+from finssim.extensions.perception import load_world
 from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.extensions.perception.gate import Gate, from_bar
 from finssim.extensions.perception.net import Net
@@ -425,14 +425,14 @@ def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
 
 @pytest.mark.parametrize("name", [name for name in TASKS if TASKS[name]().pictures])
 def test_the_kernels_of_tasks_that_see_compile_for_cuda(name, tmp_path):
-    """NVRTC, which needs no device, makes PTX for compute capability 7.5: of the task, of its teacher's, and
-    of what all of them are run, measured and seen with."""
+    """NVRTC, which needs no device, makes PTX for compute capability 7.5: of the task, its teacher's, and of what all
+    of them are run and measured with; `test_cuda` has what they see with."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")
     kind = TASKS[name]
     made = [kernels_of(task).evaluate.module for task in (kind(), kind().for_teacher())]
-    common = [wp.get_module(module.__name__) for module in (sight, environment, measurement)]
+    common = [wp.get_module(module.__name__) for module in (environment, measurement)]
     for i, module in enumerate([*made, *(common if kind is Net else [])]):
         assert module.kernels
         wp.compile_aot_module(module, arch=75, module_dir=tmp_path / str(i), use_ptx=True)
