@@ -22,6 +22,7 @@ PAIRS = [
     for vehicle in catalogue()
     if vehicle in ("finsrov", "bluerov2", "torpedo") or name in ("t1", "path")
 ]
+PAIRS.remove((OWN().name, "torpedo"))  # whose kernel with the walls of a pool no other task has
 """Every task with a vehicle that is pushed every way, one that cannot pitch and one with fins, and every vehicle in the
 pool and in open water: the others repeat the kernels of these, or compile theirs for one case."""
 SHORT = 1.0
