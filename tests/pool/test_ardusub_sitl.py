@@ -560,7 +560,7 @@ def test_both_ends_may_start_again(shared):
 
 
 @pytest.mark.slow
-def test_a_session_by_the_commands_of_the_page(tmp_path):
+def test_a_session_by_the_commands_of_the_page(tmp_path, capsys):
     """A stand-in for ArduSub flies by its own position, which the forwarded log gives it; SIGTERM ends the physics with
     its summary, and the true motion scores the record."""
     with socket.socket() as one, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -577,7 +577,7 @@ def test_a_session_by_the_commands_of_the_page(tmp_path):
                "--exec", "./ardusub", "--dvl", "127.0.0.1:0", "--bind", f"127.0.0.1:{udp}",
                "--mavlink", f"127.0.0.1:{tcp + 2}"]  # fmt: skip
     drive = [*finssim, "run", "--robot", f"mavlink://tcp:127.0.0.1:{tcp}", "--vehicle", "bluerov2_heavy",
-             *"--site tank --pool-file none --let-in 0,0 --policy pid --goal 0.4,0,-0.6,0 --arm --duration 15".split(),
+             *"--site tank --pool-file none --let-in 0,0 --policy pid --goal 0.4,0,-0.6,0 --arm --duration 10".split(),
              "--record", "run.mcap"]  # fmt: skip
     process = subprocess.Popen(physics, cwd=tmp_path, env=slowly, stdout=subprocess.PIPE, text=True)
     try:
@@ -588,12 +588,9 @@ def test_a_session_by_the_commands_of_the_page(tmp_path):
         process.kill()
     assert run.returncode == 0, run.stderr
     assert process.returncode == 0 and "1 origins" in told and " velocities" in told
-    score = [
-        *finssim,
-        *"evaluate run.mcap --task t1 --vehicle bluerov2_heavy --truth truth.mcap --json".split(),
-    ]
-    scored = subprocess.run(score, cwd=tmp_path, capture_output=True, text=True, timeout=120.0)
-    (trial,) = json.loads(scored.stdout)["per_trial"]
+    score = f"evaluate {tmp_path}/run.mcap --task t1 --vehicle bluerov2_heavy --truth {tmp_path}/truth.mcap --json"
+    assert boundary.run(app, score.split()) == 0
+    (trial,) = json.loads(capsys.readouterr().out)["per_trial"]
     assert trial["localization"]["position_m"] < 0.15 and trial["fault"] in ("", "ended early")
 
 
