@@ -14,6 +14,8 @@ CASES = [
 ]
 """Vehicles with the models that a trace can follow, one of them with a mesh; a moving mass is none of it."""
 STEPS = 25
+FIELDS = ("position", "quaternion", "velocity", "acceleration", "actuator", "thrust")
+"""The whole state of a world."""
 
 
 def simulate(
@@ -43,18 +45,23 @@ def simulate(
 
 def numbers(sim, world=slice(None)):
     """All of the state, a row for each world."""
-    fields = ("position", "quaternion", "velocity", "acceleration", "actuator", "thrust")
-    return np.concatenate([sim.numpy(f)[world].reshape(len(sim.numpy(f)[world]), -1) for f in fields], axis=1)
+    return np.concatenate([sim.numpy(f)[world].reshape(len(sim.numpy(f)[world]), -1) for f in FIELDS], axis=1)
 
 
 @pytest.mark.parametrize(("name", "model"), CASES)
 def test_blocks_compute_what_single_worlds_do(monkeypatch, name, model):
-    """To float32 rounding over 25 control steps: a micrometre, and as much of all other numbers' size."""
+    """To float32 rounding over 25 control steps: a micrometre, and as much of all other numbers' size.
+
+    Accelerations are sums of forces that nearly cancel over a small inertia, such as that of a torpedo's roll: their
+    rounding is several times larger, and differs between processors.
+    """
     blocks, single = (
         simulate(monkeypatch, name, lanes=lanes, hydrodynamics=model) for lanes in (True, False)
     )
-    scale = 1.0 + np.abs(numbers(single))
-    np.testing.assert_allclose(numbers(blocks) / scale, numbers(single) / scale, rtol=0, atol=2e-5)
+    for field in FIELDS:
+        a, b = (sim.numpy(field) for sim in (blocks, single))
+        atol = 1e-4 if field == "acceleration" else 2e-5
+        np.testing.assert_allclose(a / (1.0 + np.abs(b)), b / (1.0 + np.abs(b)), rtol=0, atol=atol)
     np.testing.assert_allclose(blocks.numpy("position"), single.numpy("position"), rtol=0, atol=3e-6)
     np.testing.assert_allclose(blocks.state.history.numpy(), single.state.history.numpy(), rtol=0, atol=1e-4)
     assert np.array_equal(blocks.state.commands.numpy(), single.state.commands.numpy())
