@@ -7,7 +7,9 @@ import pytest
 
 from finssim.evaluation.excitation import PlanSettings, excite
 from finssim.identification.manoeuvres import Manoeuvre, Order, manoeuvres, simulate_manoeuvres
-from finssim.identification.parameters import actuator_fields, scaled_actuators
+from finssim.identification.parameters import Parameters, actuator_fields, scaled_actuators
+from finssim.identification.rollout import segments, streams
+from finssim.identification.shooting import Point, Shooting
 from finssim.identification.simulation_error import fit_by_simulation
 from finssim.trials.findings import CalibrationError
 from finssim.vehicles import load_vehicle
@@ -123,3 +125,33 @@ def test_a_fit_finds_what_is_true(monkeypatch):
     np.testing.assert_allclose(found["yaw.m_eff"], 4.0 + TORPEDO.rigid_body_mass_matrix()[5, 5], rtol=0.03)
     np.testing.assert_allclose(found["fin.lift_slope"], 3.0 / 2.2, rtol=0.03)
     np.testing.assert_allclose(fit.changes["actuators.rudder.lift_slope"], 3.0, rtol=0.03)
+
+
+@pytest.mark.slow
+def test_derivatives_of_an_unstable_hull_are_those_of_small_changes():
+    """Over 3 s of a zigzag of REMUS a change of the initial velocity grows a hundredfold.
+
+    Along every direction of the initial state that changes readings by at most 0.02, the derivatives predict what the
+    simulation does, to 0.003.
+    """
+    vehicle, axes = load_vehicle("remus100"), ("sway", "heave", "pitch", "yaw")
+    (zigzag,) = (one for one in manoeuvres(vehicle) if one.name == "zigzag_fast")
+    (trial,) = simulate_manoeuvres([zigzag], vehicle, noise="none", seed=1)
+    problem = Shooting(
+        segments(streams(trial, vehicle), vehicle, length=3.0),
+        Parameters(vehicle, axes=axes, damping=dict.fromkeys(axes, "both")),
+        ("u", "v", "w", "p", "q", "r", "roll", "pitch"),
+    )
+    start = problem.start()
+    growth = problem.growth(start)
+    assert growth.max() > 100.0
+    s, moved = int(growth.argmax()), start._replace(z=start.z + 1e-9)
+    rows, states = slice(*problem.edges[s : s + 2]), len(problem.free)
+    linear = problem.linearise(moved)
+    own = linear.own[rows, :states]
+    for direction in np.linalg.svd(own, full_matrices=False)[2]:
+        step = direction * min(0.005, 0.02 / np.abs(own @ direction).max())
+        z = moved.z.copy()
+        z[s, :states] += step
+        residual = problem.residuals(Point(moved.theta[None], z[None]))[rows, 0]
+        np.testing.assert_allclose(linear.residual[rows] - residual, own @ step, rtol=0, atol=0.003)

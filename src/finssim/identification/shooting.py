@@ -456,7 +456,11 @@ SHOWN_BY = (
 """Channels that show a state, in the order of `STATES`."""
 
 STEPS = np.array([0.002] * 9 + [0.005] * 3)
-"""Steps of the finite differences: small, for instability multiplies them."""
+"""Steps of the finite differences of initial states [m/s, rad/s, rad, m]."""
+
+GENTLE = 8.0
+"""Growth within a segment above which these steps are smaller in proportion, because differences over large responses
+are not derivatives."""
 
 
 RELATIVE_STEP = 0.006
@@ -626,6 +630,7 @@ class Shooting:
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
+        self._grown = np.ones(len(segments))  # by how much changes of the start grew when last linearised
         self._latest: tuple[Point, Linearization, bool] | None = None
         self.repeats, self._correlated = 1.0, correlated
         rows, target = parameters.prior_rows()
@@ -739,16 +744,21 @@ class Shooting:
         late = np.where(self._stream[:, None] == np.arange(len(self.streams)), -np.nan_to_num(rate), 0.0)
         P = len(self.parameters.names)
         one = Point(*(part[:1] for part in points))
-        return Linearization(
+        linear = Linearization(
             self._residual(one, value[:, :1])[:, 0],
             np.concatenate([slopes[:, :P], late], axis=1),
             np.concatenate([slopes[:, P:], self._offset], axis=1),
         )
+        grown = self._growth(linear)
+        self._grown = np.where(np.isfinite(grown), grown, self._grown)
+        return linear
 
     def _neighbours(self, point: Point, one_sided: bool) -> tuple[Point, Array]:
-        """The point, one on one side of it or on either for every unknown that moves the vehicle, and distances."""
+        """The point, one on one side of it or on either for every unknown that moves the vehicle, and the distances of
+        each sample, (N, P + q)."""
         P = len(self.parameters.names)
-        count, steps = P + len(self.free), self._steps[self.free]
+        count, steps = P + len(self.free), np.tile(self._steps[self.free], (len(self.segments), 1))
+        steps *= GENTLE / np.maximum(self._grown, GENTLE)[:, None]
         sides = 1 if one_sided else 2
         theta, z = (np.repeat(part[None], 1 + sides * count, axis=0) for part in point)
         up, i = 1 + sides * np.arange(count), np.arange(P)
@@ -763,18 +773,21 @@ class Shooting:
         else:
             theta[up[:P], i], theta[up[:P] + 1, i] = high, low
             wide = high - low
-        for k, step_k in enumerate(steps):
+        for k, step_k in enumerate(steps.T):
             z[up[P + k], :, k] += step_k
             if not one_sided:
                 z[up[P + k] + 1, :, k] -= step_k
-        return Point(theta, z), np.concatenate([wide, sides * steps])
+        shared = np.broadcast_to(wide, (len(self.measured), P))
+        return Point(theta, z), np.concatenate([shared, sides * steps[self.measured.segment]], axis=1)
 
     def growth(self, point: Point) -> Array:
         """Return the largest factor by which a small change of the initial velocity grows within each segment, (S,).
 
         It is infinite where the simulation diverges.
         """
-        linear = self.linearise(point)
+        return self._growth(self.linearise(point))
+
+    def _growth(self, linear: Linearization) -> Array:
         own = np.abs(linear.own[:, :6])
         speeds = [
             i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]

@@ -100,7 +100,8 @@ GROWTH = 12.0
 
 A fast vehicle without fins turns broadside by itself, and derivatives over a long run of that mean little."""
 
-HALVINGS = 2
+HALVINGS = 3
+"""How often a trial's segments are halved at most for that."""
 
 EXPLAINED = 0.2
 """R² below which the model of an axis explains nothing: at 0 the mean of the measurements does as well."""
