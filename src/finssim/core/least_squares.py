@@ -90,12 +90,12 @@ def huber_weight(size: Array, limit: float) -> Array:
     return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-300)))
 
 
-def huber_cost(size: Array, limit: float) -> float:
-    """Return the sum of squares of sizes within a limit, which grows linearly beyond.
+def huber_loss(size: Array, limit: float) -> Array:
+    """Return the squares of sizes within a limit, which grow linearly beyond.
 
     Sizes and limit have one unit.
     """
-    return float(np.sum(np.where(size <= limit, size**2, limit * (2.0 * size - limit))))
+    return np.asarray(np.where(size <= limit, size**2, limit * (2.0 * size - limit)))
 
 
 def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:

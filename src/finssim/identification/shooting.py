@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.least_squares import Block, arrow_reduced, block_of, boxed, huber_cost, huber_weight
+from finssim.core.least_squares import Block, arrow_reduced, block_of, boxed, huber_loss, huber_weight
 from finssim.core.rotations import (
     quat_conjugate,
     quat_from_rotvec,
@@ -42,6 +42,10 @@ CLOSE = 0.25
 
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
 """Factors on the damping that are tried together."""
+
+PARTS = (1.0, 0.3)
+"""Parts of the step of a segment's own unknowns that are tried: the times of its changes of command, which mean nothing
+beyond the samples before and after, may overshoot while all other segments go on."""
 
 SMALL = 0.05
 """Decrease of half the sum of losses below which iteration ends: an error of a third of a standard error."""
@@ -135,10 +139,37 @@ def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut:
 
     Residuals and `std` have the unit of each sample; losses have none [-].
     """
-    prior = np.square(points.z / problem.prior_std).sum(axis=(1, 2))
-    prior = prior + np.square(problem.prior(points.theta)[0]).sum(axis=-1)
-    loss = np.array([huber_cost(np.abs(column / std), cut) for column in residual.T])
-    return np.asarray(np.where(np.isfinite(loss), 0.5 * (loss + prior), np.inf))
+    own = segment_costs(problem, residual, std, points.z, cut).sum(axis=-1)
+    return np.asarray(own + 0.5 * np.square(problem.prior(points.theta)[0]).sum(axis=-1))
+
+
+def segment_costs(problem: Shooting, residual: Array, std: Array, z: Array, cut: float) -> Array:
+    """Half the losses within each segment of several points, (C, S); infinite where one has no answer.
+
+    Residuals (N, C), `std` (N,) and z (C, S, q) have the unit of each sample and coordinate; losses have none [-].
+    """
+    loss = np.add.reduceat(huber_loss(np.abs(residual.T / std), cut), problem.edges[:-1], axis=-1)
+    loss = loss + np.square(z / problem.prior_std).sum(axis=-1)
+    return np.asarray(np.where(np.isfinite(loss), 0.5 * loss, np.inf))
+
+
+def tried(
+    problem: Shooting, point: Point, steps: Sequence[tuple[Array, Array]], std: Array, cut: float
+) -> tuple[Point, Array]:
+    """Return the points that several steps of theta (P,) and z (S, q) lead to, and half their losses, (C,).
+
+    Each segment goes that part of its own step, of `PARTS`, which suits it best: given theta, segments are independent.
+    Steps have the units of the coordinates, `std` (N,) that of each sample; `cut` is in standard deviations [-].
+    """
+    theta = np.clip(point.theta + np.array([step for step, _ in steps]), problem.low, problem.high)
+    z = point.z + np.multiply.outer(PARTS, [step for _, step in steps])
+    z = np.clip(z, -problem.farthest, problem.farthest)
+    flat = Point(np.tile(theta, (len(PARTS), 1)), z.reshape(-1, *point.z.shape))
+    costs = segment_costs(problem, problem.residuals(flat), std, flat.z, cut).reshape(*z.shape[:3])
+    best = costs.argmin(axis=0)[None]
+    own = np.take_along_axis(costs, best, axis=0)[0].sum(axis=-1)
+    chosen = Point(theta, np.take_along_axis(z, best[..., None], axis=0)[0])
+    return chosen, own + 0.5 * np.square(problem.prior(theta)[0]).sum(axis=-1)
 
 
 def solve(
@@ -194,12 +225,8 @@ def solve(
             if settled and remaining < CLOSE:
                 converged = True
                 break
-            steps = [step_of(problem, reduced, point, damping * factor) for factor in DAMPINGS]
-            points = Point(
-                np.clip(point.theta + np.array([theta for theta, _, _ in steps]), problem.low, problem.high),
-                point.z + np.array([z for _, z, _ in steps]),
-            )
-            costs = costs_of(problem, problem.residuals(points), std, points, cut)
+            steps = [step_of(problem, reduced, point, damping * factor)[:2] for factor in DAMPINGS]
+            points, costs = tried(problem, point, steps, std, cut)
             best = int(np.argmin(costs))
             if costs[best] < cost:
                 damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
@@ -427,6 +454,9 @@ its length as the lever; and the axes that coast."""
 CHANGE_STD = 12.0**-0.5
 """Standard deviation of the time of a change between two samples of a command, as a part of the time between them."""
 
+CHANGE_STEP = 0.05
+"""Step of its finite differences: a longer one would often reach beyond the samples, where nothing changes any more."""
+
 LATEST = 0.3
 """Greatest lag or lead of a stream relative to the inputs [s]."""
 
@@ -509,6 +539,7 @@ class Shooting:
         prior_mean: What is known of theta beforehand, (P,).
         released: Whether nothing drives any segment.
         coasts: Whether, besides, the axes come to rest by drag alone.
+        farthest: Greatest deviations of z, (q,): of the time of a change half the time between its samples.
         judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
         repeats: Samples per independent one.
     """
@@ -577,7 +608,7 @@ class Shooting:
         states_std = np.hstack(
             [states_std, np.where(changes < self.rollouts.changes[:, None], CHANGE_STD, 1e-9)]
         )
-        self._steps = np.append(self._steps, np.full(len(changes), 0.5 * CHANGE_STD))
+        self._steps = np.append(self._steps, np.full(len(changes), CHANGE_STEP))
         self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
         # The initial height already takes up an offset of the depth, unless z is measured too.
         self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
@@ -626,6 +657,8 @@ class Shooting:
             # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
             clocks = np.diag(np.where(np.arange(len(far)) == 0, EXACT_CLOCK, CLOCK_STD) ** 2)
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
+        self.farthest = np.full(self.prior_std.shape[1], np.inf)
+        self.farthest[np.flatnonzero(self.free >= 18)] = 0.5
         self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)

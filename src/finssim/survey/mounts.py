@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.core.least_squares import Block, Step, arrow_step, block_of, descend, huber_cost, huber_weight
+from finssim.core.least_squares import Block, Step, arrow_step, block_of, descend, huber_loss, huber_weight
 from finssim.core.optics import back_project, project, projection_jacobians
 from finssim.core.rotations import (
     matrix_to_quat,
@@ -324,7 +324,7 @@ def minimise(
 
     def cost(state: MountState) -> float:
         corner, _, rest = residuals(rig, state, moments)
-        total = huber_cost(np.linalg.norm(corner, axis=-1) / rig.noise.pixel, HUBER)
+        total = float(huber_loss(np.linalg.norm(corner, axis=-1) / rig.noise.pixel, HUBER).sum())
         total += float(np.sum(np.concatenate(rest) ** 2))
         return total if math.isfinite(total) else math.inf
 
