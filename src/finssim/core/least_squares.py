@@ -189,7 +189,11 @@ def eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
     """Return the damped normal matrix (P, P) and right side (P,) of the shared unknowns alone, and (bb + damping)⁻¹
     [abᵀ b], (Q, P + 1)."""
     diagonal = np.diagonal(block.bb)
-    bb = block.bb + damping * np.diag(diagonal) + 1e-14 * float(diagonal.max()) * np.eye(len(diagonal))
-    inner = np.asarray(np.linalg.solve(bb, np.column_stack([block.ab.T, block.b])), float)
+    scale = np.sqrt(
+        np.where(diagonal > 0.0, diagonal, 1.0)
+    )  # an unknown that is held must not stiffen the others
+    bb = block.bb / np.outer(scale, scale) + np.diag(damping * (diagonal > 0.0) + 1e-14)
+    right = np.column_stack([block.ab.T, block.b]) / scale[:, None]
+    inner = np.asarray(np.linalg.solve(bb, right) / scale[:, None], float)
     aa = block.aa + damping * np.diag(np.diagonal(block.aa))
     return aa - block.ab @ inner[:, :-1], block.a - block.ab @ inner[:, -1], inner

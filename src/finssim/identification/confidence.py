@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.identification.shooting import FitSolution, Shooting, weights_of
+from finssim.identification.shooting import FitSolution, Shooting, curvatures_of, weights_of
 from finssim.identification.uncertainty import (
     Covariance,
     Evidence,
@@ -81,7 +81,7 @@ def shared_slopes(problem: Shooting, solution: FitSolution) -> Array:
 
     They have the units of sample and theta.
     """
-    linear, weight = solution.linear, weights_of(solution.linear.residual, solution.std)
+    linear, weight = solution.linear, curvatures_of(solution.linear.residual, solution.std)
     slopes = linear.shared.copy()
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
         own, weighted = linear.own[a:b], linear.own[a:b].T * weight[a:b]
@@ -99,7 +99,8 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
         group: Of every row, (N,); trials if None, or blocks where fewer than `FEWEST_TRIALS` excite an axis.
     """
     linear = solution.linear
-    weight = weights_of(linear.residual, solution.std)
+    curved = curvatures_of(linear.residual, solution.std)
+    slope = weights_of(linear.residual, solution.std) * linear.residual
     slopes = shared_slopes(problem, solution)
     trial = problem.groups[problem.measured.segment]
     unit = "blocks" if problem.few or len(np.unique(trial)) < FEWEST_TRIALS else "trials"
@@ -107,8 +108,8 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
         group = trial if unit == "trials" else time_blocks(problem, trial)
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
     known = problem.prior(solution.point.theta)[1]
-    normal = [(slopes[rows].T * weight[rows]) @ slopes[rows] for rows in parts]
-    score = [(slopes[rows].T * weight[rows]) @ linear.residual[rows] for rows in parts]
+    normal = [(slopes[rows].T * curved[rows]) @ slopes[rows] for rows in parts]
+    score = [slopes[rows].T @ slope[rows] for rows in parts]
     return Evidence(
         names=problem.names,
         normal=np.array(normal) / problem.repeats,

@@ -37,13 +37,16 @@ Array = NDArray[np.float64]
 CUT = 2.5
 """Whitened residual above which Huber's loss grows linearly."""
 
+BEND = 0.1
+"""Curvature of the loss of a large residual, as a part of its weight."""
+
 CLOSE = 0.25
 """Part of a standard error (of independent noise) that a converged estimate may still be off."""
 
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
 """Factors on the damping that are tried together."""
 
-PARTS = (1.0, 0.3)
+PARTS = (1.0, 0.3, 0.1, 0.03)
 """Parts of the step of a segment's own unknowns that are tried: the times of its changes of command, which mean nothing
 beyond the samples before and after, may overshoot while all other segments go on."""
 
@@ -90,23 +93,35 @@ class FitSolution:
 
 
 def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
-    """Huber's weights over the variance of the samples, (N,)."""
+    """Huber's weights over the variance of the samples, (N,): with the residual, the slope of half the loss."""
     return huber_weight(np.abs(residual / std), cut) / std**2
+
+
+def curvatures_of(residual: Array, std: Array, cut: float = CUT) -> Array:
+    """Return the second derivative of half the loss of every sample, (N,), per square of its unit.
+
+    Where the loss grows linearly it is zero; `BEND` of the weight is kept, for far from a solution all residuals are
+    large. With the whole weight a step among many large residuals would be much too short, and an interval too narrow
+    (Huber 1981, "Robust Statistics", ch. 7).
+    """
+    return np.where(np.abs(residual) <= cut * std, 1.0, BEND) * weights_of(residual, std, cut)
 
 
 def blocks_of(
     problem: Shooting, linear: Linearization, std: Array, point: Point, cut: float = CUT
 ) -> list[Block]:
-    """Weighted normal equations of every segment with the prior of z; that of theta is in the first.
+    """Newton's equations of every segment with the prior of z; that of theta is in the first.
 
     `std` has the unit of each sample; `cut` is in standard deviations [-].
     """
-    root = np.sqrt(weights_of(linear.residual, std, cut))
-    shared, own, residual = linear.shared * root[:, None], linear.own * root[:, None], linear.residual * root
+    root = np.sqrt(curvatures_of(linear.residual, std, cut))[:, None]
+    slope = weights_of(linear.residual, std, cut) * linear.residual
     blocks = []
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
-        block, stiff = block_of(shared[a:b], own[a:b], residual[a:b]), problem.prior_std[s] ** -2.0
-        blocks.append(block._replace(bb=block.bb + np.diag(stiff), b=block.b - stiff * point.z[s]))
+        shared, own, stiff = linear.shared[a:b], linear.own[a:b], problem.prior_std[s] ** -2.0
+        block = block_of(shared * root[a:b], own * root[a:b], np.zeros(b - a))
+        right = own.T @ slope[a:b] - stiff * point.z[s]
+        blocks.append(block._replace(bb=block.bb + np.diag(stiff), a=shared.T @ slope[a:b], b=right))
     (off, slope), first = problem.prior(point.theta), blocks[0]
     blocks[0] = first._replace(aa=first.aa + slope.T @ slope, a=first.a - slope.T @ off)
     return blocks
@@ -154,22 +169,30 @@ def segment_costs(problem: Shooting, residual: Array, std: Array, z: Array, cut:
 
 
 def tried(
-    problem: Shooting, point: Point, steps: Sequence[tuple[Array, Array]], std: Array, cut: float
+    problem: Shooting, point: Point, steps: Sequence[tuple[Array, Array]], own: Array, std: Array, cut: float
 ) -> tuple[Point, Array]:
-    """Return the points that several steps of theta (P,) and z (S, q) lead to, and half their losses, (C,).
+    """Return the points that several steps lead to, and half their losses, (C,).
 
     Each segment goes that part of its own step, of `PARTS`, which suits it best: given theta, segments are independent.
-    Steps have the units of the coordinates, `std` (N,) that of each sample; `cut` is in standard deviations [-].
+
+    Args:
+        problem: For its bounds and its residuals.
+        point: Where the steps begin.
+        steps: Of theta (P,) and of z with it (S, q), in the units of the coordinates.
+        own: What these hold of the step of z that is best without a step of theta, in its units, (S, q).
+        std: Standard deviation of each sample in its unit, (N,).
+        cut: Huber's, in standard deviations [-].
     """
     theta = np.clip(point.theta + np.array([step for step, _ in steps]), problem.low, problem.high)
-    z = point.z + np.multiply.outer(PARTS, [step for _, step in steps])
+    less = np.multiply.outer(1.0 - np.array(PARTS), own)[:, None]
+    z = point.z + np.array([step for _, step in steps]) - less
     z = np.clip(z, -problem.farthest, problem.farthest)
     flat = Point(np.tile(theta, (len(PARTS), 1)), z.reshape(-1, *point.z.shape))
     costs = segment_costs(problem, problem.residuals(flat), std, flat.z, cut).reshape(*z.shape[:3])
     best = costs.argmin(axis=0)[None]
-    own = np.take_along_axis(costs, best, axis=0)[0].sum(axis=-1)
+    total = np.take_along_axis(costs, best, axis=0)[0].sum(axis=-1)
     chosen = Point(theta, np.take_along_axis(z, best[..., None], axis=0)[0])
-    return chosen, own + 0.5 * np.square(problem.prior(theta)[0]).sum(axis=-1)
+    return chosen, total + 0.5 * np.square(problem.prior(theta)[0]).sum(axis=-1)
 
 
 def solve(
@@ -226,7 +249,8 @@ def solve(
                 converged = True
                 break
             steps = [step_of(problem, reduced, point, damping * factor)[:2] for factor in DAMPINGS]
-            points, costs = tried(problem, point, steps, std, cut)
+            own = np.array([inner[:, -1] for inner in reduced[2]])
+            points, costs = tried(problem, point, steps, own, std, cut)
             best = int(np.argmin(costs))
             if costs[best] < cost:
                 damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
