@@ -5,6 +5,7 @@ import contextlib
 import json
 import threading
 import time
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -138,8 +139,9 @@ def test_a_table_without_a_policy_shows_the_errors():
 def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, monkeypatch):
     """Policies, results and motions come back: nothing is left to do here, and the table is that of one machine."""
     cluster, _ = two_machines
-    how = {"rows": ["calibrated", "pid"], "setpoints": ["P01"], "plants": 1, "seeds": 1, "steps": 4096}
-    away = transfer.t1(out=tmp_path, address=cluster.address, **how)
+    here = transfer.TransferSettings(rows=["calibrated", "pid"], plants=1, seeds=1, steps=4096, processes=1)
+    there = replace(here, processes=None, address=cluster.address)
+    away = transfer.t1(out=tmp_path, setpoints=["P01"], settings=there)
     assert (tmp_path / "policies" / "calibrated-seed1" / "policy.onnx").is_file()
     assert len(list((tmp_path / "trials").glob("*.npz"))) == 2
 
@@ -147,7 +149,7 @@ def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, mon
         raise AssertionError("was played already")
 
     monkeypatch.setattr("finssim.evaluation.robot_trials.play", played_here)
-    again = transfer.t1(out=tmp_path, processes=1, **how)
+    again = transfer.t1(out=tmp_path, setpoints=["P01"], settings=here)
     assert again["rows"] == away["rows"] and away["rows"]["pid"]["success"] == 1
     found = anatomy(
         out=tmp_path / "anatomy", causes=("lag",), rows=("pid",), seeds=1, trials=1, address=cluster.address
