@@ -273,7 +273,7 @@ def two_publishers(bench: Bench) -> None:
 
 def on_wire(**fields: Any) -> Touch:
     """Return a fault that sets fields of the wire."""
-    return lambda bench: vars(bench.wire).update(fields)
+    return lambda bench: _set(bench.wire, fields)
 
 
 def jump_mcu_clock(step: float) -> Touch:
