@@ -651,7 +651,8 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
             )
             runtime = Runtime(
                 vehicle, perception, make_pilot("pid", vehicle), station_of(goal), arm=True, bridge=bridge,
-                recorder=recorder, )  # fmt: skip
+                recorder=recorder,
+            )  # fmt: skip
             if aided:
                 runtime.attach(link_of("mavlink", vehicle))
             bench = Bench(pool, FaultyWire(pool, RATE), runtime, recorder)

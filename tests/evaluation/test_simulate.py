@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from finssim.cli.simulate import CommandError, SimulationChoice, simulate
+from finssim.cli.simulate import CommandError, simulate
 from finssim.core.files import OutputError
 from finssim.sim import SimulatorError
 from finssim.vehicles import VehicleError, load_vehicle
@@ -15,9 +15,15 @@ from finssim.vehicles import VehicleError, load_vehicle
 
 def run(out, **changes):
     """The command's call, with some arguments changed."""
-    choice = {key: changes.pop(key) for key in ("hydrodynamics", "water", "device") if key in changes}
-    arguments = {"vehicle": "finsrov", "command": "surge=10", "duration": 2.0, "depth": 5.0, **changes}
-    simulate(**arguments, choice=SimulationChoice(**choice), out=Path(out))
+    arguments = {
+        "vehicle": "finsrov",
+        "command": "surge=10",
+        "duration": 2.0,
+        "hydrodynamics": "calibrated",
+        "depth": 5.0,
+        "device": "cpu",
+    }
+    simulate(**(arguments | changes), out=Path(out))
     return pd.read_csv(out)
 
 

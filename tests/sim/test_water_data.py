@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from finssim.cli.simulate import SimulationChoice, simulate
+from finssim.cli.simulate import simulate
 from finssim.evaluation.plants import PlantError, load_plant
 from finssim.learning.train import TrainingSettings
 from finssim.physics.water import Flow, WaterArrays, flow_at, wave_number
@@ -241,8 +241,8 @@ def test_the_command_simulates_in_the_water_of_a_file(tmp_path, table):
     """The vehicle drifts east with the water, and the record beside the table names it."""
     (tmp_path / "water.yaml").write_text("current: profile.csv\ndepth: 30.0\n")
     out = tmp_path / "run.csv"
-    choice = SimulationChoice(water=tmp_path / "water.yaml")
-    simulate(vehicle="finsrov", command="surge=0", duration=60.0, out=out, depth=1.0, choice=choice)
+    water = tmp_path / "water.yaml"
+    simulate(vehicle="finsrov", command="surge=0", duration=60.0, out=out, depth=1.0, water=water)
     rows = np.genfromtxt(out, delimiter=",", names=True)
     assert rows["x"][-1] > 5.0 and abs(rows["y"][-1]) < 2.0
     assert json.loads((tmp_path / "run.csv.json").read_text())["water"]["profile"]["depths"] == [

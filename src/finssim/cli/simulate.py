@@ -5,9 +5,8 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from finssim.core.provenance import provenance
 from finssim.core.rotations import quat_to_euler
 from finssim.core.text_table import number, write_csv
 from finssim.evaluation.tables import Table, print_tables
-from finssim.sim import Simulator, Water
+from finssim.sim import Simulator
 from finssim.sim.recorder import STATE_COLUMNS
 from finssim.sim.water import load_water
 from finssim.vehicles import AXES, load_vehicle
@@ -70,35 +69,16 @@ LONGEST = 86400.0
 """Longest run that is recorded [s]: a table of a day has a million rows."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulationChoice:
-    """Model of the vehicle, its water, and the device that computes."""
-
-    hydrodynamics: str = "calibrated"
-    """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
-    water: Path | None = None
-    """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state; still water if
-    not given."""
-    device: str = "cpu"
-    """(DEVICE) Compute device: cpu or cuda."""
-
-    def flow(self) -> Water | None:
-        """Return the water of the file; None without one.
-
-        Raises:
-            SurroundingsError: The file is refused.
-        """
-        return None if self.water is None else load_water(self.water)
-
-
 def simulate(
     *,
     vehicle: str,
     command: str,
     duration: float,
     out: Path,
+    hydrodynamics: str = "calibrated",
     depth: float = 5.0,
-    choice: Annotated[SimulationChoice, "options"] = SimulationChoice(),
+    water: Path | None = None,
+    device: str = "cpu",
     as_json: bool = False,
 ) -> None:
     """Simulate a vehicle from rest under a constant wrench and record its motion.
@@ -114,8 +94,11 @@ def simulate(
             axes are 0.
         duration: Simulated time [s].
         out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json records its origin.
+        hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         depth: Depth of the body origin at the start [m].
-        choice: Model of the vehicle, its water, and the device that computes.
+        water (FILE): Water file (.yaml): currents, a profile over depth and time, waves or a sea state; still water if
+            not given.
+        device (DEVICE): Compute device: cpu or cuda.
         as_json: Print one JSON object instead of a table.
 
     Raises:
@@ -131,13 +114,9 @@ def simulate(
     tau, chosen = parse_wrench(command), load_vehicle(vehicle)
     allocator, names = Allocator.from_vehicle(chosen), chosen.thruster_names
     thrust = allocator.allocate(tau)
-    flow = choice.flow()
+    flow = None if water is None else load_water(water)
     simulator = Simulator(
-        chosen,
-        hydrodynamics=choice.hydrodynamics,
-        control_step=CONTROL_STEP,
-        water=flow,
-        device=choice.device,
+        chosen, hydrodynamics=hydrodynamics, control_step=CONTROL_STEP, water=flow, device=device
     )
     with atomic_write(out) as table, atomic_write(f"{out}.json") as origin:
         rows = _run(simulator, thrust, depth, steps=round(duration / CONTROL_STEP))
@@ -146,7 +125,7 @@ def simulate(
         write_csv(table, columns, [[f"{value:.9g}" for value in row] for row in rows])
         about = {
             "vehicle": {"name": chosen.name, "sha256": chosen.sha256},
-            "hydrodynamics": choice.hydrodynamics,
+            "hydrodynamics": hydrodynamics,
             "command": dict(zip(AXES, tau.tolist(), strict=True)),
             "thrust": dict(zip(names, thrust.tolist(), strict=True)),
             "depth": depth,

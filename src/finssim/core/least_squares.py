@@ -189,9 +189,8 @@ def eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
     """Return the damped normal matrix (P, P) and right side (P,) of the shared unknowns alone, and (bb + damping)⁻¹
     [abᵀ b], (Q, P + 1)."""
     diagonal = np.diagonal(block.bb)
-    scale = np.sqrt(
-        np.where(diagonal > 0.0, diagonal, 1.0)
-    )  # an unknown that is held must not stiffen the others
+    # Each unknown in a unit of its own, so that one that a prior holds does not stiffen the others.
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     bb = block.bb / np.outer(scale, scale) + np.diag(damping * (diagonal > 0.0) + 1e-14)
     right = np.column_stack([block.ab.T, block.b]) / scale[:, None]
     inner = np.asarray(np.linalg.solve(bb, right) / scale[:, None], float)

@@ -100,7 +100,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
     """
     linear = solution.linear
     curved = curvatures_of(linear.residual, solution.std)
-    slope = weights_of(linear.residual, solution.std) * linear.residual
+    loss_slope = weights_of(linear.residual, solution.std) * linear.residual
     slopes = shared_slopes(problem, solution)
     trial = problem.groups[problem.measured.segment]
     unit = "blocks" if problem.few or len(np.unique(trial)) < FEWEST_TRIALS else "trials"
@@ -109,7 +109,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
     parts = [np.flatnonzero(group == label) for label in np.unique(group)]
     known = problem.prior(solution.point.theta)[1]
     normal = [(slopes[rows].T * curved[rows]) @ slopes[rows] for rows in parts]
-    score = [slopes[rows].T @ slope[rows] for rows in parts]
+    score = [slopes[rows].T @ loss_slope[rows] for rows in parts]
     return Evidence(
         names=problem.names,
         normal=np.array(normal) / problem.repeats,

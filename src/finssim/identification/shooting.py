@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 CUT = 2.5
 """Whitened residual above which Huber's loss grows linearly."""
 
-BEND = 0.1
+LARGE_CURVATURE = 0.1
 """Curvature of the loss of a large residual, as a part of its weight."""
 
 CLOSE = 0.25
@@ -100,11 +100,11 @@ def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
 def curvatures_of(residual: Array, std: Array, cut: float = CUT) -> Array:
     """Return the second derivative of half the loss of every sample, (N,), per square of its unit.
 
-    Where the loss grows linearly it is zero; `BEND` of the weight is kept, for far from a solution all residuals are
-    large. With the whole weight a step among many large residuals would be much too short, and an interval too narrow
-    (Huber 1981, "Robust Statistics", ch. 7).
+    Where the loss grows linearly it is zero; `LARGE_CURVATURE` of the weight is kept, for far from a solution all
+    residuals are large. With the whole weight a step among many large residuals would be much too short, and an
+    interval too narrow.
     """
-    return np.where(np.abs(residual) <= cut * std, 1.0, BEND) * weights_of(residual, std, cut)
+    return np.where(np.abs(residual) <= cut * std, 1.0, LARGE_CURVATURE) * weights_of(residual, std, cut)
 
 
 def blocks_of(
@@ -115,13 +115,13 @@ def blocks_of(
     `std` has the unit of each sample; `cut` is in standard deviations [-].
     """
     root = np.sqrt(curvatures_of(linear.residual, std, cut))[:, None]
-    slope = weights_of(linear.residual, std, cut) * linear.residual
+    loss_slope = weights_of(linear.residual, std, cut) * linear.residual
     blocks = []
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
         shared, own, stiff = linear.shared[a:b], linear.own[a:b], problem.prior_std[s] ** -2.0
         block = block_of(shared * root[a:b], own * root[a:b], np.zeros(b - a))
-        right = own.T @ slope[a:b] - stiff * point.z[s]
-        blocks.append(block._replace(bb=block.bb + np.diag(stiff), a=shared.T @ slope[a:b], b=right))
+        right = own.T @ loss_slope[a:b] - stiff * point.z[s]
+        blocks.append(block._replace(bb=block.bb + np.diag(stiff), a=shared.T @ loss_slope[a:b], b=right))
     (off, slope), first = problem.prior(point.theta), blocks[0]
     blocks[0] = first._replace(aa=first.aa + slope.T @ slope, a=first.a - slope.T @ off)
     return blocks
@@ -168,7 +168,7 @@ def segment_costs(problem: Shooting, residual: Array, std: Array, z: Array, cut:
     return np.asarray(np.where(np.isfinite(loss), 0.5 * loss, np.inf))
 
 
-def tried(
+def best_points(
     problem: Shooting, point: Point, steps: Sequence[tuple[Array, Array]], own: Array, std: Array, cut: float
 ) -> tuple[Point, Array]:
     """Return the points that several steps lead to, and half their losses, (C,).
@@ -250,7 +250,7 @@ def solve(
                 break
             steps = [step_of(problem, reduced, point, damping * factor)[:2] for factor in DAMPINGS]
             own = np.array([inner[:, -1] for inner in reduced[2]])
-            points, costs = tried(problem, point, steps, own, std, cut)
+            points, costs = best_points(problem, point, steps, own, std, cut)
             best = int(np.argmin(costs))
             if costs[best] < cost:
                 damping = float(np.clip(damping * DAMPINGS[best], 1e-9, 1e9))
@@ -512,7 +512,7 @@ SHOWN_BY = (
 STEPS = np.array([0.002] * 9 + [0.005] * 3)
 """Steps of the finite differences of initial states [m/s, rad/s, rad, m]."""
 
-GENTLE = 8.0
+LINEAR_GROWTH = 8.0
 """Growth within a segment above which these steps are smaller in proportion, because differences over large responses
 are not derivatives."""
 
@@ -815,7 +815,7 @@ class Shooting:
         each sample, (N, P + q)."""
         P = len(self.parameters.names)
         count, steps = P + len(self.free), np.tile(self._steps[self.free], (len(self.segments), 1))
-        steps *= GENTLE / np.maximum(self._grown, GENTLE)[:, None]
+        steps *= LINEAR_GROWTH / np.maximum(self._grown, LINEAR_GROWTH)[:, None]
         sides = 1 if one_sided else 2
         theta, z = (np.repeat(part[None], 1 + sides * count, axis=0) for part in point)
         up, i = 1 + sides * np.arange(count), np.arange(P)
