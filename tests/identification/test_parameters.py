@@ -107,6 +107,19 @@ def test_stiffness_is_the_restoring_moment_of_the_plant():
     assert k == pytest.approx(5.0)
 
 
+def test_what_tilts_a_vehicle_at_rest_turns_it_once_it_rolls():
+    """A bias of roll or pitch is a centre of buoyancy beside that of gravity: B r_b - W r_g = (b_pitch, -b_roll, k)."""
+    p = made("bluerov2_heavy", AXES, ("k", "buoyancy_excess"))
+    x, given = p.start.copy(), {"roll.bias": 0.2, "pitch.bias": -0.3, "k": 2.0, "surge.bias": 1.5}
+    for name, value in given.items():
+        x[p.names.index(name)] = value
+    plants, v = p.plants(x), VEHICLES["bluerov2_heavy"]
+    B = v.water.density * v.water.gravity * float(plants.fields["volume"][0, 0])
+    arm = B * plants.fields["r_b"][0, 0] - v.weight * v.body.center_of_gravity
+    np.testing.assert_allclose(arm, [-0.3, -0.2, 2.0], atol=1e-9)
+    np.testing.assert_allclose(plants.bias[0, 0], [-1.5, 0, 0, 0, 0, 0], atol=1e-12)
+
+
 def test_a_set_without_coefficients_is_refused():
     """A mesh has no damping that could be fitted."""
     sets = VEHICLES["finsrov"].hydrodynamics

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from finssim.identification.drag_shape import WIDER, _average
+from finssim.identification.drag_shape import WIDER, _average, averaged
 from finssim.identification.programme import programmes
-from finssim.identification.simulation_error import fit_by_simulation
+from finssim.identification.simulation_error import FitProgress, Stages, fit_by_simulation, prepare
 from finssim.identification.synthetic import record, trials_of
 from finssim.identification.vehicle_file import number_in
 from finssim.trials.findings import CalibrationError
@@ -41,6 +41,21 @@ def test_only_absent_damping_is_improbable(name, axis, absent):
                 assert not estimate.identifiable and "not distinguishable from zero" in estimate.note
     for term in count:
         assert count[term] > 1 if term == absent else count[term] == 0
+
+
+@pytest.mark.slow
+def test_intervals_reach_from_the_free_drag_to_the_averaged_one():
+    """With another drag the other numbers move; their intervals keep the ends that they had and gain the way."""
+    vehicle, some = trials("bluerov2_heavy", "sway")
+    fit = Stages(prepare(some[::3], vehicle)[0], vehicle, ("sway",), (), {}, None, FitProgress(None))
+    free = fit.first({"sway": "both"}, {})
+    shape = fit.shapes(free)["sway"]
+    end = averaged(free, {"sway": shape._replace(value=1.2 * free.x[1:3])})
+    way = end.x[0] - free.x[0]
+    assert free.problem.names[:3] == ("sway.added_mass", "sway.d1", "sway.d2")
+    assert abs(way) > 0.05 * free.x[0]
+    expected = free.found.interval[0] + [min(way, 0.0), max(way, 0.0)]
+    np.testing.assert_allclose(end.found.interval[0], expected)
 
 
 def test_the_average_over_shapes_holds_what_the_data_cannot_exclude():

@@ -149,12 +149,15 @@ def test_a_log_may_hold_few_columns_slowly():
     assert np.diff(trial.t) == pytest.approx(0.2)
     assert len(trial.phase) == len(trial.t) == 70
     six = load_vehicle("bluerov2")
-    plan = programmes("surge", six, levels=[20.0])
-    trial = simulate_programme(plan, six, noise="none", inputs=("pwm", "command"))[0]
-    assert trial.header.inputs == "commanded"
+    plan = programmes("surge", six, levels=[0.5, 20.0])
+    weak, *_, strong = simulate_programme(plan, six, noise="none", spread=0.0, inputs=("pwm", "command"))
+    assert strong.header.inputs == "commanded"
     for name, thruster in six.thrusters.items():
-        thrust = thruster.thrust(thruster.shaft_speed(trial.channels[f"pwm_{name}"]))
-        np.testing.assert_allclose(thrust, trial.channels[f"command_{name}"], atol=1e-3)
+        thrust = thruster.thrust(thruster.shaft_speed(strong.channels[f"pwm_{name}"]))
+        np.testing.assert_allclose(thrust, strong.channels[f"command_{name}"], atol=1e-5)
+        # Within the dead band nothing turns, though 0.2 N were asked for.
+        assert not weak.channels[f"command_{name}"].any()
+    assert abs(weak.channels["u"]).max() < 1e-3 < abs(strong.channels["u"]).max()
 
 
 @pytest.mark.slow

@@ -193,7 +193,10 @@ def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
 
 
 def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
-    """Return a fit with its drag at the average over shapes, and the other numbers where they then are best."""
+    """Return a fit with its drag at the average over shapes, and the other numbers where they then are best.
+
+    Their intervals reach over both: what a shape of drag moves is uncertain by that.
+    """
     if not shapes:
         return stage
     problem, solution = stage.problem, stage.solution
@@ -213,9 +216,8 @@ def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
     if not np.isfinite(end.cost):
         return stage
     shift = end.point.theta - solution.point.theta
-    found = stage.found._replace(
-        free=stage.found.free + shift, interval=stage.found.interval + shift[:, None]
-    )
+    reach = np.stack([np.minimum(shift, 0.0), np.maximum(shift, 0.0)], axis=-1)
+    found = stage.found._replace(free=stage.found.free + shift, interval=stage.found.interval + reach)
     return Stage(problem, replace(end, converged=solution.converged, step=solution.step), found)
 
 

@@ -428,8 +428,8 @@ class Parameters:
             weight = self.vehicle.weight
             volume = (weight + self.value(x, "buoyancy_excess")) / (water.density * water.gravity)
             fields["volume"] = volume[:, None]
-        free_centre = bool(set(CENTRES) & set(self.names))
-        if "k" in self._at or free_centre:
+        free_centre, tilted = bool(set(CENTRES) & set(self.names)), {"roll", "pitch"} & set(self.biases)
+        if "k" in self._at or free_centre or tilted:
             r_g, file, B = (
                 self.centre_of_gravity(x),
                 body.center_of_gravity,
@@ -439,6 +439,9 @@ class Parameters:
             if "k" in self._at:
                 z = self.r_h[2]
                 r_b[:, 2] = z + (self.value(x, "k") + self.vehicle.weight * (r_g[:, 2] - z)) / B
+            # What tilts a vehicle at rest is beside its centre of gravity, and turns it once it rolls or pitches.
+            r_b[:, 0] += self.value(x, "pitch.bias", 0.0) / B
+            r_b[:, 1] -= self.value(x, "roll.bias", 0.0) / B
             fields["r_b"] = r_b[:, None]
         if free_centre:
             outer = np.einsum("wi,wj->wij", r_g, r_g)
@@ -459,7 +462,7 @@ class Parameters:
         for j, name in enumerate(self.gains):
             gains[:, j] = self.value(x, name)
         bias = np.zeros((W, 1, 6))
-        for axis in self.biases:
+        for axis in set(self.biases) - tilted:
             bias[:, 0, AXES.index(axis)] = -self.value(x, f"{axis}.bias")
         return Plants(
             fields=fields,

@@ -186,7 +186,7 @@ def _start(simulator: Simulator, depth: float, speed: ArrayLike, spread: float, 
 
 
 def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.float32]:
-    """Thrusts by (row, world, thruster) [N], zero after the end of a programme."""
+    """Thrusts by (row, world, thruster) [N] that the speed controllers give, zero after the end of a programme."""
     allocator = Allocator.from_vehicle(vehicle)
     length = max(len(p.phase) for p in programmes)
     tau = np.zeros((length, len(programmes), 6))
@@ -196,6 +196,10 @@ def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.f
     thrust = allocator.allocate(distinct)
     # The allocator leaves dust of its rounding where nothing is wanted.
     thrust[~distinct.any(axis=1)] = 0.0
+    for k, thruster in enumerate(vehicle.thrusters.values()):
+        if thruster.esc is not None:  # which does not turn the shaft slowly
+            pulse = thruster.pulse(thruster.speed(thrust[:, k]))
+            thrust[:, k] = thruster.thrust(thruster.shaft_speed(pulse))
     return np.asarray(thrust[index.ravel()].reshape(length, len(programmes), -1), dtype=np.float32)
 
 
