@@ -170,6 +170,8 @@ def test_a_thrust_scale_is_the_note_of_what_it_multiplies():
     assert note == "from thrust_scale 0.97 -, 95 % interval 0.95 to 0.99"
     assert after.origin_of("thrusters.V_LB.c_minus").origin == "published"
     assert state_text(fit.estimates["thrust_scale"], fit, after) == "written"
+    unsure = dataclasses.replace(fit.estimates["thrust_scale"], identifiable=False)
+    assert state_text(unsure, fit, after) == "unsure"
 
 
 def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):

@@ -170,7 +170,7 @@ def test_places_that_the_file_has_wrong_are_found(by_sticks):
     height = by_sticks.estimates["thruster_height"]
     assert height.identifiable and height.ci95[0] < -0.048 < height.ci95[1] < -0.0725 + 0.04
     said = {one.subject: one for one in by_sticks.findings if one.code == "place_contradicted"}
-    assert said["T1, T2, T3, T4"].values["file"] == -0.0725
+    assert said["height of T1, T2, T3, T4"].values["file"] == -0.0725
     vehicle = calibrated(by_sticks)
     for name, thruster in vehicle.thrusters.items():
         expected = height.estimate if name in ("T1", "T2", "T3", "T4") else 0.0

@@ -137,9 +137,15 @@ def test_a_recommended_dive_goes_to_both_sides_and_ends_where_it_began(tmp_path)
     ):
         with pytest.raises(CalibrationError, match=sentence):
             programmes(axes, FINSROV, legs=some)
-    (tmp_path / "fit.json").write_text("{}")
-    with pytest.raises(CalibrationError, match="recommends no next dive"):
-        read_legs(tmp_path)
+    for text, sentence in (
+        ("{}", "no next dive: expected the report"),
+        ('{"next_dive": null}', "drove no axis"),
+    ):
+        (tmp_path / "fit.json").write_text(text)
+        with pytest.raises(CalibrationError, match=sentence):
+            read_legs(tmp_path)
+    with pytest.raises(CalibrationError, match=r"cannot read .*nowhere \(No such file"):
+        read_legs(tmp_path / "nowhere")
 
 
 def test_an_axis_without_authority_is_refused():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from finssim.core.files import OutputError
-from finssim.identification.fit import Curve, Dive
+from finssim.identification.fit import Curve, Dive, Estimate
 from finssim.identification.programme import Leg
-from finssim.identification.report import write_report
+from finssim.identification.report import fit_report, write_report
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import finding
 from identification.made_fits import made_fit
@@ -70,6 +70,23 @@ def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
     assert places == sorted(places)
     record = json.loads((tmp_path / "report" / "fit.json").read_text(encoding="utf-8"))
     assert record["next_dive"]["legs"] == [{"axis": "yaw", "level": 2.0, "hold": 4.0, "times": 3}]
+
+
+def test_words_of_numbers_fit_what_they_are_of():
+    """A place in metres, tight intervals with a decimal, and no metres of the file where a stiffness is kept."""
+    more = [
+        Estimate(name=name, estimate=value, ci95=ci, unit=unit, identifiable=told, note="", path=path)
+        for name, value, ci, unit, told, path in (
+            ("gravity_y", 1e-4, (-0.003, 0.0032), "m", True, "body.center_of_gravity.1"),
+            ("yaw.m_eff", 1.0, (0.997, 1.003), "kg m²", True, None),
+            ("roll.k", 5.0, (1.0, 9.0), "N m/rad", False, "body.center_of_buoyancy.2"),
+        )
+    ]
+    fit = made_fit()
+    fit = dataclasses.replace(fit, estimates=dict(fit.estimates) | {one.name: one for one in more})
+    report = fit_report(fit, calibrated(fit), ())
+    assert "gravity_y (±0.0031 m)" in report.lead[0] and "yaw.m_eff (±0.3 %)" in report.lead[0]
+    assert report.remarks[-1].endswith("yaw.d2 0.4776, heave.d1 80.1, roll.k"), report.remarks
 
 
 def test_the_pictures_are_files_too(folder):

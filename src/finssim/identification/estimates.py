@@ -344,7 +344,7 @@ def other_estimates(
                 span = 1.96 * float(np.sqrt(variance))
                 if abs(alone - coordinate.start) > span:
                     what = (
-                        ", ".join(horizontal(p.vehicle))
+                        f"height of {', '.join(horizontal(p.vehicle))}"
                         if name == PLACES[0]
                         else f"{name[-1]} of the centre of gravity"
                     )

@@ -81,8 +81,8 @@ class Dive:
 
     def __str__(self) -> str:
         legs = [
-            f"{leg.axis} at ±{leg.level:g} {'N' if leg.axis in AXES[:3] else 'N m'}, first steps of {leg.hold:g} s, "
-            f"{leg.times} times"
+            f"{leg.axis} at ±{leg.level:g} {'N' if leg.axis in AXES[:3] else 'N m'}, first steps of {leg.hold:g} s"
+            + (f", {leg.times} times" if leg.times > 1 else "")
             for leg in self.legs
         ]
         return (

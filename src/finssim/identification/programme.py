@@ -243,13 +243,19 @@ def read_legs(path: Path) -> list[Leg]:
         CalibrationError: There is no such file, or it recommends no dive.
     """
     path = path / "fit.json" if path.is_dir() else path
+    expected = "expected the report of finssim calibrate hydrodynamics, or its fit.json"
     try:
         dive = json.loads(path.read_text(encoding="utf-8"))["next_dive"]
-        return [Leg(**leg) for leg in dive["legs"]]
-    except (OSError, ValueError, KeyError, TypeError):
+        legs = [Leg(**leg) for leg in dive["legs"]] if dive is not None else []
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path} ({error.strerror}): {expected}") from None
+    except (ValueError, KeyError, TypeError):
+        raise CalibrationError(f"{path} recommends no next dive: {expected}") from None
+    if not legs:
         raise CalibrationError(
-            f"{path} recommends no next dive: expected fit.json of the report of finssim calibrate hydrodynamics"
-        ) from None
+            f"{path} recommends no next dive, because its trials drove no axis: leave --from out"
+        )
+    return legs
 
 
 def which_axes(names: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:

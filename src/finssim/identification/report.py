@@ -328,7 +328,7 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     """
     scales = estimate.name == "thrust_scale" or estimate.name.startswith("gain.")
     if scales and any(path.endswith(".c_plus") for path in fit.changes):
-        return "written"
+        return "written" if estimate.identifiable else "unsure"
     if estimate.path is None:
         return "" if estimate.identifiable else "not told"
     before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
@@ -474,8 +474,9 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
     for name, estimate in fit.estimates.items():
         if estimate.note:
             notes.setdefault(estimate.note, []).append(name)
+    kept = {name: file_number(fit.estimates[name], vehicle) for name in retained_values(fit, vehicle)}
     unchanged = ", ".join(
-        f"{name} {number_text(value)}" for name, value in retained_values(fit, vehicle).items()
+        name if value is None else f"{name} {number_text(value)}" for name, value in kept.items()
     )
     sentence = vehicle.calibrations[-1].sentence()
     undrawn = len(fit.curves) - MAX_CURVES
@@ -509,8 +510,10 @@ def _lead(fit: Fit) -> list[str]:
     known, unknown = list[str](), list[str]()
     for name, e in fit.estimates.items():
         if not name.endswith(IMPLIED):
-            part = 0.5 * (e.ci95[1] - e.ci95[0]) / max(abs(e.estimate), 1e-12)
-            size = f"±{100.0 * part:.0f} %" if part < 1.0 else "hardly"
+            half = 0.5 * (e.ci95[1] - e.ci95[0])
+            part = half / max(abs(e.estimate), 1e-12)
+            size = f"±{100.0 * part:.{0 if part > 0.0095 else 1}f} %" if part < 1.0 else "hardly"
+            size = f"±{half:.2g} m" if e.unit == "m" else size  # of a place zero is a value like others
             (known if e.identifiable else unknown).append(f"{name} ({size})")
     told = f": {', '.join(known)}" if known else ""
     out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{told}."]
