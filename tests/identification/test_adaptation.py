@@ -1,6 +1,7 @@
 """Changes of a vehicle while it is driven: payload, weak thruster and drag, in simulated driving with known truth."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from finssim.identification.adaptation import (
     WINDOW,
     Adaptation,
     Follower,
+    _thinned,
     _whitened,
     calibrate_changes,
     windows_of,
@@ -53,6 +55,15 @@ def driven(plant=dict, seed=1):
     columns = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
     options = {"inputs": ("command",), "columns": columns, "noise": "sensors"}
     return simulate_programme([programme], VEHICLE, seed=seed, plant=plant(), **options)[0]
+
+
+@pytest.mark.parametrize("end", (4.999999999999998, 5.0, 5.05))
+def test_times_that_are_rounded_are_thinned(end):
+    """The last of every tenth of a second may lie a rounding error behind the last sample."""
+    segment = next(windows_of(driven(), VEHICLE))[0]
+    t = np.linspace(0.0, end, 101)
+    (thin, values) = _thinned(replace(segment, measured={"u": (t, t)})).measured["u"]
+    assert len(thin) == 51 and np.array_equal(thin, values) and np.diff(thin).min() > 0.09
 
 
 def followed(*trials):

@@ -319,7 +319,7 @@ def _thinned(segment: Segment) -> Segment:
     measured: Mapping[str, tuple[Array, Array]] = {
         name: (t[rows], values[rows])
         for name, (t, values) in segment.measured.items()
-        for rows in [np.unique(np.searchsorted(t, np.arange(0.0, t[-1] + 1e-9, APART)))]
+        for rows in [np.unique(np.searchsorted(t, np.arange(0.0, t[-1] + 1e-9, APART) - 1e-9))]
     }
     return replace(segment, measured=dict(measured))
 
