@@ -46,3 +46,15 @@ def test_a_fit_without_thrust_designs_nothing():
 
     trials = coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r", noise=0.01)
     assert fit_hydrodynamics(trials, ROV, design=True).next_dive is None
+
+
+@pytest.mark.slow
+def test_trials_that_measured_different_columns_get_a_dive_too():
+    """One trial with depth, one with speed: the next dive measures both, and depth is then not compared."""
+    plan = programmes("heave", VEHICLE, levels={"heave": (18.0,)}, coast=3.0)[:2]
+    some = [
+        simulate_programme([one], VEHICLE, seed=1, rate=20.0, columns=[own])[0]
+        for one, own in zip(plan, ("depth", "w"), strict=True)
+    ]
+    dive = fit_hydrodynamics(some, VEHICLE, design=True).next_dive
+    assert {leg.axis for leg in dive.legs} == {"heave"}

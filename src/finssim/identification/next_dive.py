@@ -143,7 +143,9 @@ def _information(
         return [], np.empty(0)
     problem = stages.problem(dict(old.parameters.damping), {}, cut)
     std = dict(zip(old.measured.names, _std_by_channel(stage), strict=True))
-    point = Point(solution.point.theta, np.zeros(problem.prior_std.shape))
+    # Without a stream that only some fitted trials have, such as positions beside velocities, its lag has no place.
+    own = [old.names.index(name) for name in problem.names]
+    point = Point(solution.point.theta[own], np.zeros(problem.prior_std.shape))
     linear = problem.linearise(point)
     clean = replace(
         solution,
@@ -154,9 +156,9 @@ def _information(
     assert isinstance(clean, FitSolution)
     evidence = evidence_of(problem, clean, problem.groups[problem.measured.segment])
     finite = np.isfinite(evidence.normal).all(axis=(1, 2))
-    return [leg for leg, good in zip(kept, finite, strict=True) if good], evidence.normal[
-        finite
-    ] / old.repeats
+    normal = np.zeros((int(finite.sum()), len(old.names), len(old.names)))
+    normal[:, np.array(own)[:, None], own] = evidence.normal[finite] / old.repeats
+    return [leg for leg, good in zip(kept, finite, strict=True) if good], normal
 
 
 def _std_by_channel(stage: Stage) -> list[float]:
