@@ -4,8 +4,8 @@
 
 Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
 pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
-0.1 s, a tether that pulls with up to 2 N, a stiffness that the file does not know, horizontal thrusters and centres of
-gravity up to 5 cm from where the file has them, and in every second draw no roll or
+0.1 s, a tether that pulls with up to 2 N in one direction of the world, a stiffness that the file does not know,
+horizontal thrusters and centres of gravity up to 5 cm from where the file has them, and in every second draw no roll or
 pitch. Fitted on the lowest level, compared on two higher ones; intervals against the truth. The plant itself replays
 these trials no better than its tether, noise and clock allow; a file that does as well by chance leaves nothing to
 gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated. With
@@ -20,16 +20,19 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from finssim.core.rotations import quat_conjugate, quat_rotate
 from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.identification.prediction import replay
 from finssim.identification.programme import Programme
 from finssim.identification.synthetic import NoiseProfile, record, trials_of
 from finssim.identification.vehicle_file import calibrated, scaled_thrust
+from finssim.sim import Simulator
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Header, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
@@ -49,7 +52,7 @@ GAIN = 1.2
 
 
 def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float, np.ndarray]:
-    """A plant, its thrust over the file's, and the tether's force on it."""
+    """A plant, its thrust over the file's, and the tether's force on it [N], world frame, (3,)."""
     chosen = vehicle.hydrodynamics["calibrated"]
     size = lambda std: np.exp(std * rng.standard_normal(6))  # noqa: E731
     mass = np.diag(chosen.added_mass) * size(0.35)
@@ -72,9 +75,19 @@ def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float, n
             "body.displaced_volume": float(0.0135 * (1.0 + rng.uniform(0.0, 0.01))),
         }
     )
-    tether = np.zeros(6)
-    tether[:3] = rng.uniform(-1.0, 1.0, 3) * rng.uniform(0.0, 2.0)
+    tether = rng.uniform(-1.0, 1.0, 3) * rng.uniform(0.0, 2.0)
     return plant, float(rng.uniform(0.65, 1.1)), tether
+
+
+def pulling(force: np.ndarray) -> Callable[[Simulator], None]:
+    """What pulls at every vehicle with a force [N], (3,), in the world frame."""
+
+    def pull(simulator: Simulator) -> None:
+        q = simulator.numpy("quaternion")[:, 0]
+        body = quat_rotate(quat_conjugate(q), np.broadcast_to(force, (len(q), 3)))
+        simulator.command.disturbance.numpy()[:, 0, :3] = body
+
+    return pull
 
 
 def horizontal(vehicle: Vehicle) -> list:
@@ -125,7 +138,7 @@ def draw(seed: int, unequal: float = 0.0) -> dict[str, object]:
         for level in LEVELS
     ]
     gains = scale * (1.0 + unequal * np.random.default_rng([9, seed]).standard_normal(len(plant.thrusters)))
-    recording = record(programmes, plant, seed=seed, plant={"gain": gains}, disturbance=tether)
+    recording = record(programmes, plant, seed=seed, plant={"gain": gains}, each_step=pulling(tether))
     trials = trials_of(
         recording, programmes, plant, noise=NOISE, seed=seed, rate=RATE, inputs=("pwm",),
         columns=("u", "v", "w", "p", "q", "r", "x", "y", "z", "qx", "qy", "qz", "qw"),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.core.rotations import quat_conjugate, quat_from_euler, quat_rotate
 from finssim.identification.rollout import Rollouts, Segment, segments, streams
 from finssim.sim.simulator import Simulator
 from finssim.trials.findings import CalibrationError
@@ -184,6 +185,31 @@ def test_a_current_carries_the_vehicle():
     current = np.array([0.1, 0.0, 0.0])
     response = Rollouts(vehicle, [segment(vehicle, np.zeros((600, 8)), current=current)]).run()
     assert response.nu[-1, 0, 0, 0] == pytest.approx(0.1, rel=0.02)
+
+
+def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
+    """A force along the body at the start acts as one that is fixed in the world, beside one that is not."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    turn = vehicle.thruster_matrix()[5] * 8.0
+    force, heading = np.tile(turn, (150, 1)), quat_from_euler(0.0, 0.0, 0.7)
+    constant = np.array([[[0.5, 0.0, 0.0, 0.0, 0.0, 0.1]]])
+    rollouts = Rollouts(vehicle, [segment(vehicle, force, quaternion=heading)])
+    response = rollouts.run(disturbance=constant, pull=np.array([[[2.0, -1.0, 0.0]]]))
+    sim = Simulator(vehicle, control_step=STEP, substeps=1, integrator="rk4")
+    for _ in range(100):
+        sim.set_thrust(turn)
+        sim.step()
+    for name, value in (("position", [0.0, 0.0, -DEPTH]), ("quaternion", heading), ("velocity", 0.0)):
+        sim.numpy(name)[...] = value
+    world, expected = quat_rotate(heading, np.array([2.0, -1.0, 0.0])), [np.zeros(6)]
+    for _ in force:
+        pull = quat_rotate(quat_conjugate(sim.numpy("quaternion")[0, 0]), world)
+        sim.command.disturbance.numpy()[0, 0] = constant[0, 0] + np.append(pull, np.zeros(3))
+        sim.set_thrust(turn)
+        sim.step()
+        expected.append(sim.numpy("velocity")[0, 0].copy())
+    assert response.nu[-1, 0, 0, 5] > 0.8
+    np.testing.assert_allclose(response.nu[:, 0, 0], expected, atol=3e-6)
 
 
 def test_a_submerged_vehicle_does_not_surface_while_it_drifts():

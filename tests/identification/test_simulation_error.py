@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from finssim.core.rotations import quat_conjugate, quat_rotate
 from finssim.identification.excitation import compared, excites
 from finssim.identification.programme import programmes
 from finssim.identification.rollout import segments, streams
@@ -193,6 +194,26 @@ def test_an_axis_that_a_trial_does_not_excite_moves_as_it_was_seen_to():
         assert not np.isfinite(first.held[:, 0]).any() and "v" in second.measured
     (alone,) = cut(drifting)
     assert {"u", "v"} <= set(alone.measured), "no trial excites sway: this one has to show it"
+
+
+@pytest.mark.slow
+def test_a_tether_that_pulls_in_one_direction_does_not_bend_the_drag():
+    """The vehicle turns under a pull of 1.8 N; without a pull of its own in each segment, mass and drag are lost."""
+    vehicle, force = load_vehicle("bluerov2_heavy"), np.array([1.5, -1.0, 0.0])
+
+    def pull(simulator):
+        q = simulator.numpy("quaternion")[:, 0]
+        body = quat_rotate(quat_conjugate(q), np.broadcast_to(force, (len(q), 3)))
+        simulator.command.disturbance.numpy()[:, 0, :3] = body
+
+    some = simulate_programme(
+        programmes(["surge", "yaw"], vehicle), vehicle, seed=2, each_step=pull, noise=known_trials.NOISE,
+        rate=50.0, inputs=("force",),
+    )  # fmt: skip
+    found, true = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
+    for name, size in (("surge.m_eff", 0.05), ("surge.d1", 0.15), ("surge.d2", 0.1), ("yaw.m_eff", 0.01)):
+        assert found[name].estimate == pytest.approx(true[name], rel=size)
+        assert found[name].ci95[0] < true[name] < found[name].ci95[1]
 
 
 @pytest.mark.slow

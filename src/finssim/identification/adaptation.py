@@ -90,6 +90,8 @@ class _Coordinates:
     """The unknowns in standard deviations of the prior, in the form of `parameters.Parameters`."""
 
     nuisances = 0
+    axes = biases = ()
+    """None: a push along x and y is among the unknowns."""
 
     def __init__(self, of: Adaptation, mean: Array, std: Array) -> None:
         self.vehicle, self._of, self._mean, self._std = of.vehicle, of, mean, std

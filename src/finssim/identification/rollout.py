@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finssim.core.rotations import quat_from_euler, quat_rotate
+from finssim.core.rotations import quat_conjugate, quat_from_euler, quat_rotate
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.sim.plant_arrays import NO_LIMIT, vehicle_parameters
 from finssim.sim.simulator import Simulator
@@ -530,6 +530,7 @@ class Rollouts:
         *,
         initial: Mapping[str, ArrayLike] | None = None,
         disturbance: ArrayLike | None = None,
+        pull: Array | None = None,
         earlier: Array | None = None,
         candidates: int | None = None,
     ) -> Response:
@@ -540,6 +541,8 @@ class Rollouts:
                 those in the vehicle file's water: a trial's own density scales them.
             initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
             disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
+            pull: Extra force at the body origin [N], (C, S, 3): along the body's axes at the segment's start, and from
+                then on in the same direction of the world.
             earlier: By how much each change of a sampled command comes before the middle between its samples, as a
                 part of the time between them [-], (C, S, `changes.max()`).
             candidates: C; the longest first axis among the arrays if None.
@@ -550,6 +553,7 @@ class Rollouts:
         arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
         arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
         arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
+        arrays |= {} if pull is None or not pull.any() else {"pull": pull}
         arrays |= {} if earlier is None else {"earlier": earlier}
         C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
         n, S = self._force.shape[:2]
@@ -618,7 +622,7 @@ class Rollouts:
                 ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
                 ring[...] = sim.state.actuator.numpy().reshape(C, S, 1, MAX_THRUSTERS)
         self._place(sim, write, start)
-        return self._march(sim, C, out, given.get("earlier", np.zeros((C, S, int(self.changes.max())))))
+        return self._march(sim, C, out, given)
 
     def _place(
         self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
@@ -649,14 +653,24 @@ class Rollouts:
             now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
             nu[:, those] = now
 
-    def _march(self, sim: Simulator, C: int, out: dict[str, Single], earlier: Array) -> NDArray[np.bool_]:
-        """Simulate the segments; write the response of every world and return which reached the end."""
+    def _march(
+        self, sim: Simulator, C: int, out: dict[str, Single], given: dict[str, NDArray[Any]]
+    ) -> NDArray[np.bool_]:
+        """Simulate the segments; write the response of every world and return which reached the end.
+
+        Of what is given, pulls and earlier changes of commands are used here; see `run`.
+        """
         n, S = self._force.shape[:2]
         command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
         views = {
             name: getattr(sim.state, own).numpy().reshape(C, S, -1)
             for name, own in (("nu", "velocity"), ("position", "position"), ("quaternion", "quaternion"))
         }
+        earlier = given.get("earlier", np.zeros((C, S, int(self.changes.max()))))
+        tau = sim.command.disturbance.numpy().reshape(C, S, 6)[..., :3]
+        constant, pull = tau.copy(), None
+        if "pull" in given:
+            pull = quat_rotate(views["quaternion"], given["pull"].astype(np.float32))
         impulses = self._impulses(sim, C)
         for axes, those, values in self._held:
             views["nu"][:, those[:, None], axes] = values[0]
@@ -670,6 +684,8 @@ class Rollouts:
                 command[:, those] += (
                     np.clip(after / (high - low), 0.0, 1.0)[..., None] * self._change[k, those]
                 )
+            if pull is not None:
+                tau[...] = constant + quat_rotate(quat_conjugate(views["quaternion"]), pull)
             sim.step()
             self._impose(views["nu"], impulses, k + 1)
             for name, view in views.items():

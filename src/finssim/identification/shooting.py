@@ -475,6 +475,10 @@ PULL, COASTING = 0.003, (0, 1, 5)
 """Standard deviation of a constant pull on a vehicle that coasts, as of a tether, as a part of its weight, with half
 its length as the lever; and the axes that coast."""
 
+TETHER = 0.01
+"""Standard deviation of the horizontal pull of a tether on a driven vehicle, as a part of its weight. In a segment it
+keeps its direction in the world, while the vehicle turns."""
+
 CHANGE_STD = 12.0**-0.5
 """Standard deviation of the time of a change between two samples of a command, as a part of the time between them."""
 
@@ -554,8 +558,8 @@ class Shooting:
         streams: Names of the streams in use; each may lag the inputs.
         offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
         free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
-            heading and place where some segment knows them and they matter; and of the wrench that pulls at a vehicle
-            that coasts, 12 to 17.
+            heading and place where some segment knows them and they matter; of the wrench of a tether, 12 to 17; and
+            of the times of changes of the command, from 18 on.
         edges: First sample of each segment, and N, (S + 1,).
         low: Least theta, (P,).
         high: Largest theta, (P,).
@@ -609,25 +613,17 @@ class Shooting:
         states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
         self.released = bool(swinging is not None and swinging.all())
         self.coasts = self.released and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
-        if swinging is not None and swinging.any():  # unknowns 12 to 17 are pulls
-            body, coasting = parameters.vehicle.body, set(parameters.axes).difference(parameters.biases)
-            pulled = [i for i in COASTING if AXES[i] in coasting and (i < 3 or twisted or not self.coasts)]
-            pull = (
-                PULL
-                * parameters.vehicle.weight
-                * np.where(np.array(pulled, int) < 3, 1.0, 0.5 * body.size[0])
-            )
-            self.free = np.concatenate([self.free, 12 + np.array(pulled, int)])
-            states_std = np.hstack([states_std, np.where(swinging[:, None], pull, 1e-9)])
+        pulls = self._pulls(np.zeros(len(segments), bool) if swinging is None else swinging, twisted)
+        pulled = np.flatnonzero(pulls.any(axis=0))
+        self.free = np.concatenate([self.free, 12 + pulled])  # unknowns 12 to 17
+        states_std = np.hstack([states_std, np.maximum(pulls[:, pulled], 1e-9)])
         self._steps = np.append(STEPS, np.full(6, 0.1 * PULL * parameters.vehicle.weight))
         self.rollouts = Rollouts(
             parameters.vehicle,
             segments,
             max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
         )
-        changes = np.arange(
-            self.rollouts.changes.max()
-        )  # unknowns from 18 on are times of changes of the command
+        changes = np.arange(self.rollouts.changes.max())
         self.free = np.concatenate([self.free, 18 + changes])
         states_std = np.hstack(
             [states_std, np.where(changes < self.rollouts.changes[:, None], CHANGE_STD, 1e-9)]
@@ -695,6 +691,21 @@ class Shooting:
         self._rows = np.zeros((len(rows) + len(far), P + len(far)))
         self._rows[: len(rows), :P], self._rows[len(rows) :, P:] = rows, clock
         self._target = np.concatenate([target, 0.0 * far])
+
+    def _pulls(self, swinging: NDArray[np.bool_], twisted: bool) -> Array:
+        """Return the standard deviations of the constant pulls on the vehicle in each segment [N, N m], (S, 6).
+
+        `swinging` and `twisted` are those of the constructor.
+        """
+        p, out = self.parameters, np.zeros((len(self.segments), 6))
+        body, weight = p.vehicle.body, p.vehicle.weight
+        if {"surge", "sway"} & set(p.axes):
+            out[~swinging, :2] = TETHER * weight
+        coasting = set(p.axes).difference(p.biases)
+        for i in COASTING:
+            if AXES[i] in coasting and (i < 3 or twisted or not self.coasts):
+                out[swinging, i] = PULL * weight * (1.0 if i < 3 else 0.5 * body.size[0])
+        return out
 
     def prior(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
@@ -764,7 +775,8 @@ class Shooting:
         response = self.rollouts.run(
             fields,
             initial=initial,
-            disturbance=p.bias + full[..., 12:18],
+            disturbance=p.bias + full[..., 12:18] * (np.arange(6) > 2),
+            pull=full[..., 12:15],
             earlier=full[..., 18:],
             candidates=C,
         )

@@ -162,14 +162,15 @@ class Stages:
         if any(a not in self.free or a in self.held for a in swinging):
             self.extras.add("k")
         self.slow = False
-        driven = {a for a in swinging if a not in self.free and a not in self.held}
-        if driven and any(s.drive.thrusters for s in prepared):
+        rolled = any(a not in self.free and a not in self.held for a in swinging)
+        if rolled and any(s.drive.thrusters for s in prepared):
             self.extras |= set(places(vehicle))
             # Unequal thrusters show in what a push along one axis does to all others.
             self.slow = any(map(is_sampled, prepared))
             self.extras |= {GAINS} if self.slow and not self.imposed else set()
         self.fitted = self._fitted_axes()
-        self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING)]
+        # In a free swing alone, what tilts the vehicle at rest acts as a sensor that was mounted askew.
+        self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING and driven)]
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
 
