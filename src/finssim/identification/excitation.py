@@ -70,8 +70,24 @@ def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
 
 def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
     """Return the axes that the trials excite, of those that some trial measures."""
-    found = {axis for s in trials for axis in excites(s, vehicle)}
+    found = set[str]().union(*excitations(trials, vehicle))
     return tuple(a for a in AXES if a in found and a in observable(trials))
+
+
+def excitations(trials: Sequence[Streams], vehicle: Vehicle) -> list[set[str]]:
+    """Return the axes that each trial excites.
+
+    Pushes along the body of a tilted vehicle move it up and down. If no trial drives heave, those count that tilt:
+    imposed as it was seen, heave would bias the drag of surge and sway.
+    """
+    out = [excites(s, vehicle) for s in trials]
+    if any("heave" in moved for moved in out):
+        return out
+    for s, moved in zip(trials, out, strict=True):
+        told = s.drive.source == "passive" or s.trial.header.axis
+        if not told and moved & {"roll", "pitch"} and answers(s.motion, AXES.index("heave")):
+            moved.add("heave")
+    return out
 
 
 def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:

@@ -36,8 +36,8 @@ from finssim.identification.excitation import (
     SWINGING,
     answers,
     compared,
+    excitations,
     excited,
-    excites,
     horizon,
     observable,
     sampling,
@@ -139,7 +139,7 @@ class Stages:
         self.published = dict(published or {})
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known, self.likely = length, dict(known), likely
-        self.excites = [excites(s, vehicle) for s in prepared]
+        self.excites = excitations(prepared, vehicle)
         # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
         # without thrust nothing does.
         driven = any(one.drive.source != "passive" for one in prepared)
