@@ -116,6 +116,28 @@ def test_a_calibrated_vehicle_holds_the_numbers():
     assert fit.quality["yaw"]["nrmse"] < 0.05 and len(fit.curves) == 1
 
 
+def spiked(trial, column, value):
+    """Return the trial with one in a hundred samples of a column replaced."""
+    y = trial.channels[column].copy()
+    y[50::100] = value
+    return replace(trial, channels={**trial.channels, column: y})
+
+
+@pytest.mark.slow
+def test_rare_spikes_leave_a_right_fit_and_do_not_hide_a_wrong_one():
+    """R² and NRMSE are those of the samples without spikes; a velocity that ignores its inputs stays unexplained."""
+    vehicle = load_vehicle("finsrov")
+    some = trials_of(vehicle, "yaw", count=2, rate=20.0, columns=("u", "v", "r"), inputs=("wrench",))
+    fit = fit_by_simulation([spiked(t, "r", 10.0) for t in some], vehicle)
+    figures = fit.quality["yaw"]
+    assert figures["rejected"] > 0 and figures["r2"] > 0.99
+    assert max(figures[name] for name in ("nrmse", "held_out", "file")) < 0.05
+    assert fit.changes and fit.estimates["yaw.m_eff"].identifiable
+    other = [replace(t, channels={**t.channels, "r": np.sin(6.0 * t.t)}) for t in some]
+    wrong_fit = fit_by_simulation([spiked(t, "r", 10.0) for t in other], vehicle, axes=("yaw",))
+    assert "axis_refused" in {one.code for one in wrong_fit.findings}
+
+
 @pytest.mark.slow
 def test_thrust_against_mass_is_said_and_not_picked():
     """Motion gives only ratios: with a free thrust scale no mass is identifiable, and a sentence says why."""

@@ -13,6 +13,7 @@ from finssim.identification.simulation_error import prepare
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.check import check, check_trials, print_reports, set_findings
 from finssim.trials.findings import CalibrationError
+from finssim.trials.free_motion import compared_columns
 from finssim.trials.trial import Header, Trial
 from finssim.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
@@ -331,6 +332,20 @@ def test_stuck_held_and_clipped_sensors_are_found(simulated):
     }
     clipped = changed(trial, r=lambda y: np.maximum(y, -1.5))
     assert told(clipped, "clipped_below", "care")[0]["value"] == -1.5
+
+
+def test_speeds_that_no_vehicle_has_are_told_and_left_out(simulated):
+    """Rare ones; where they are many, the unit is wrong and the trial is refused."""
+
+    def spiked(y):
+        return np.where(np.arange(len(y)) % 100 == 50, 50.0, y)
+
+    spikes = changed(simulated["surge"], u=spiked, r=spiked)
+    found = told(spikes, "wild", "care")
+    assert [one["value"] for one in found] == [50.0, 50.0] and report(spikes).verdict != "refused"
+    columns = compared_columns(spikes)
+    assert max(np.abs(columns[name][1]).max() for name in ("u", "r")) < 15.0
+    assert not told(simulated["surge"], "wild")
 
 
 def test_saturation_is_found(simulated):

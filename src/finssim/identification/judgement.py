@@ -20,6 +20,7 @@ from finssim.identification.uncertainty import (
 )
 from finssim.trials.findings import Finding, finding
 from finssim.trials.free_motion import DETERMINED_BY
+from finssim.trials.motion import without_spikes
 from finssim.trials.trial import COLUMNS
 
 Array = NDArray[np.float64]
@@ -32,14 +33,32 @@ SHOWN = 4
 """Trials in the curve of an axis."""
 
 
+def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
+    """Return which samples count in figures of quality, (N,).
+
+    Others are those that the fit rejects and that stand alone among the residuals of their channel and trial, at most a
+    twentieth of these: the errors of a wrong model last, or are many, and count.
+    """
+    m = problem.measured
+    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    residual = solution.linear.residual
+    series = len(m.names) * problem.groups[m.segment] + m.channel
+    out = np.abs(residual) <= 2.0 * CUT * solution.std
+    for one in np.unique(series[~out]):
+        rows = np.flatnonzero(series == one)
+        rows = rows[np.argsort(clock[rows], kind="stable")]
+        out[rows] |= without_spikes(clock[rows], residual[rows, None])
+    return out
+
+
 def _shown_by(
-    problem: Shooting, axis: str
+    problem: Shooting, axis: str, good: NDArray[np.bool_]
 ) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
-    """Return the most direct used channel that determines an axis, its samples (n,), their trials (n,), and the range
-    of the channel in each trial, from the 5th to the 95th percentile; no samples without such a channel."""
+    """Return the most direct used channel that determines an axis, its good samples (n,) of (N,), their trials (n,),
+    and the range of the channel in each trial, from the 5th to the 95th percentile; no samples without a channel."""
     m = problem.measured
     name = next((c for c in DETERMINED_BY[axis] if c in m.names), "")
-    rows = np.flatnonzero(m.channel == m.names.index(name)) if name else np.empty(0, int)
+    rows = np.flatnonzero(good & (m.channel == m.names.index(name))) if name else np.empty(0, int)
     trial = problem.groups[m.segment][rows]
     spans = {
         int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
@@ -54,12 +73,14 @@ def quality(
 
     Units are those of the channel; R² and NRMSE have none.
     """
-    out = {}
+    out, good = {}, believed(problem, solution)
     for axis in axes:
-        name, rows, trial, spans = _shown_by(problem, axis)
+        name, rows, trial, spans = _shown_by(problem, axis, good)
         if not name:
             continue
         moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
+        _, every, of, _ = _shown_by(problem, axis, np.ones_like(good))
+        every = every[np.isin(of, moving)]
         inside = np.isin(trial, moving)
         rows, trial = rows[inside], trial[inside]
         residual, value = solution.linear.residual[rows], problem.measured.value[rows]
@@ -70,7 +91,9 @@ def quality(
             "rmse": float(np.sqrt(np.mean(residual**2))),
             "nrmse": float(np.mean([rms[g] / max(spans[g], 1e-12) for g in moving])),
             "samples": float(len(rows)),
-            "rejected": float(np.sum(np.abs(residual) > 2.0 * CUT * solution.std[rows])),
+            "rejected": float(
+                np.sum(np.abs(solution.linear.residual[every]) > 2.0 * CUT * solution.std[every])
+            ),
             "trials": float(len(moving)),
             "speed_low": low,
             "speed_high": high,
@@ -99,6 +122,7 @@ def held_out(
         by_trial: Whether whole trials are left out.
     """
     problem, point = stage.problem, stage.solution.point
+    good = believed(problem, stage.solution)
     trial = problem.groups[problem.measured.segment]
     group = np.unique(trial if by_trial else time_blocks(problem, trial), return_inverse=True)[1]
     evidence = evidence_of(problem, stage.solution, group)
@@ -123,13 +147,13 @@ def held_out(
     known |= dict.fromkeys(AXES_BIAS, 0.0) | ({"thrust_scale": 1.0} if problem.parameters.likely else {})
     plain = np.array([known[name] for name in file.names])
     after = _predicted_error(
-        problem, np.array([without(k) for k in range(len(evidence.normal))]), stage.solution
+        problem, np.array([without(k) for k in range(len(evidence.normal))]), stage.solution, good
     )
     after = after[np.arange(len(group)), group]
-    before = _predicted_error(file, plain[None], stage.solution)[:, 0]
+    before = _predicted_error(file, plain[None], stage.solution, good)[:, 0]
     out = {}
     for axis in axes:
-        _, rows, trial, spans = _shown_by(problem, axis)
+        _, rows, trial, spans = _shown_by(problem, axis, good)
         moving = [g for g, span in spans.items() if 0.2 * max(spans.values()) < span]
         rms = [
             [float(np.sqrt(np.mean(error[rows[trial == g]] ** 2))) / max(spans[g], 1e-12) for g in moving]
@@ -141,14 +165,17 @@ def held_out(
     return out, after
 
 
-def _predicted_error(problem: Shooting, theta: Array, solution: FitSolution) -> Array:
-    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to it, (N, C).
+def _predicted_error(
+    problem: Shooting, theta: Array, solution: FitSolution, good: NDArray[np.bool_]
+) -> Array:
+    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to the good
+    samples (N,), (N, C).
 
     The unit is that of the channel.
     """
     z, linear = solution.point.z, solution.linear
     error = problem.residuals(Point(theta, np.repeat(z[None], len(theta), axis=0)))
-    weight = solution.std**-2.0
+    weight = good * solution.std**-2.0
     for s, (a, b) in enumerate(zip(problem.edges, problem.edges[1:], strict=False)):
         own, stiff = linear.own[a:b], problem.prior_std[s] ** -2.0
         normal = (own.T * weight[a:b]) @ own + np.diag(stiff)
@@ -164,7 +191,7 @@ def unexplained(
 
     R² has no unit.
     """
-    _, rows, trial, _ = _shown_by(problem, axis)
+    _, rows, trial, _ = _shown_by(problem, axis, believed(problem, solution))
     worst, least = "", np.inf
     for g, one in enumerate(used):
         those = rows[trial == g]
@@ -191,10 +218,10 @@ def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> t
     band = 1.96 * np.sqrt(solution.std**2 + np.einsum("ni,ij,nj->n", slopes, variance, slopes))
     how = "simulated from the inputs alone" if error is None else "each stretch predicted without it"
     error = solution.linear.residual if error is None else error
-    m, out = problem.measured, []
+    m, out, good = problem.measured, [], believed(problem, solution)
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
-        name, rows, trial, spans = _shown_by(problem, axis)
+        name, rows, trial, spans = _shown_by(problem, axis, good)
         parts = []
         for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
             those = rows[trial == g]

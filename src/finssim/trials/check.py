@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from finssim.core.rotations import quat_rotate, quat_to_euler
 from finssim.trials.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
 from finssim.trials.free_motion import FEWEST_SPEEDS, compared_columns, free_motion
-from finssim.trials.inputs import InputForces, drive, implausible
+from finssim.trials.inputs import InputForces, drive, implausible, within_reach
 from finssim.trials.motion import (
     AttitudeSignal,
     Motion,
@@ -380,9 +380,12 @@ def _values(trial: Trial, name: str) -> list[Finding]:
         return []
     if np.ptp(y) == 0.0:
         return [finding("constant", value=y[0])]
+    wild = ~within_reach(name, y)
+    findings = (
+        [finding("wild", samples=wild.sum(), value=np.abs(y).max(), unit=column.unit)] if wild.any() else []
+    )
     if _coarse(y):
-        return []
-    findings = []
+        return findings
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
         findings.append(
             finding("above_surface", height=above)

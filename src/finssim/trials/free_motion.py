@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from finssim.core.rotations import quat_to_euler
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import CalibrationError
+from finssim.trials.inputs import within_reach
 from finssim.trials.motion import Motion, attitude_samples, spans_of, white_noise, without_spikes
 from finssim.trials.trial import Trial
 from finssim.vehicles import AXES
@@ -59,13 +60,17 @@ RISING, SHORTEST_RISE = 0.01, 3.0
 
 
 def compared_columns(trial: Trial) -> dict[str, tuple[Array, Array]]:
-    """Return the columns of `CHANNELS` that a trial measures: times on its clock [s] and values in their units."""
+    """Return the columns of `CHANNELS` that a trial measures: times on its clock [s] and values in their units.
+
+    Speeds that no vehicle has are left out.
+    """
     measured = {c: trial.series(c) for c in CHANNELS}
     t, q, given = attitude_samples(trial)
     for name, angle in zip(EULER, quat_to_euler(q), strict=True):
         if name in given and not len(measured[name][0]):
             measured[name] = (t, angle)
-    return {c: pair for c, pair in measured.items() if len(pair[0])}
+    kept = {c: (t, y, within_reach(c, y)) for c, (t, y) in measured.items()}
+    return {c: (t[good], y[good]) for c, (t, y, good) in kept.items() if good.any()}
 
 
 def free_motion(moved: Motion, measured: Mapping[str, tuple[Array, Array]], axis: str) -> tuple[float, float]:

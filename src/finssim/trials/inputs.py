@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finssim.core.rotations import skew
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.trial import INPUT_PREFIXES, TAU, Header, Trial
+from finssim.trials.trial import INPUT_PREFIXES, NU, TAU, Header, Trial
 from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.capability import terminal_speeds
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
@@ -27,6 +27,8 @@ FASTEST = 20.0
 """No vehicle moves faster [m/s]."""
 FASTEST_TURN = 15.0
 """Nor turns faster [rad/s]."""
+LIMITS = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
+"""Column -> its limit [m/s, rad/s]."""
 BEYOND = 5.0
 """Times the speed that a vehicle file gives at full thrust, or the work of the thrust, beyond which no error of that
 file explains a log."""
@@ -68,14 +70,13 @@ def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
         trial: As it was read.
         vehicle: The one that made it; None: only what holds for all is looked at.
     """
-    fastest = {name: _fastest(trial, name) for name in ("u", "v", "w", "p", "q", "r")}
-    limits = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
+    fastest = {name: _fastest(trial, name) for name in NU}
     findings = [
         finding("speed_unit", column=name, value=speed)
         if name in "uvw"
         else finding("degrees", column=name, value=speed, unit="rad/s")
         for name, speed in fastest.items()
-        if speed > limits[name]
+        if speed > LIMITS[name]
     ]
     if findings or vehicle is None or trial.header.passive:
         return findings
@@ -84,6 +85,14 @@ def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
             if 0.0 < reach and BEYOND * reach + ADRIFT < fastest[name]:
                 findings.append(finding("speed_beyond", column=name, value=fastest[name], reach=reach))
     return findings or _unearned(trial, vehicle)
+
+
+def within_reach(column: str, values: Array) -> NDArray[np.bool_]:
+    """Return which values, (n,), of a column some vehicle can have; all of a column that is no velocity.
+
+    Values have the unit of the column.
+    """
+    return np.abs(values) <= LIMITS.get(column, np.inf)
 
 
 def _fastest(trial: Trial, name: str) -> float:
