@@ -57,6 +57,31 @@ def driven(plant=dict, seed=1):
     return simulate_programme([programme], VEHICLE, seed=seed, plant=plant(), **options)[0]
 
 
+@pytest.mark.slow
+def test_motors_that_stand_still_below_their_slowest_speed_are_not_weak():
+    """Vertical motors that small commands do not turn: nothing has changed."""
+    vertical = [name.startswith("V") for name in VEHICLE.thruster_names]
+
+    def stand_still(simulator):
+        simulator.command.thrust.numpy()[:, 0, vertical] = 0.0
+
+    plan = multisine({"surge": 8.0, "sway": 6.0, "yaw": 1.0}, VEHICLE, seed=3, duration=28.0, band=(0.1, 1.0))
+    columns = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
+    options = {"inputs": ("command",), "columns": columns, "noise": "sensors", "each_step": stand_still}
+    trial = simulate_programme([plan], VEHICLE, seed=3, **options)[0]
+    for k in np.flatnonzero(vertical):
+        name, thruster = VEHICLE.thruster_names[k], VEHICLE.thrusters[VEHICLE.thruster_names[k]]
+        low, high = thruster.thrust(
+            np.array([thruster.dead_rpm_minus, thruster.dead_rpm_plus]) * np.pi / 30.0
+        )
+        share = 0.5 + 0.49 * np.sin(2.0 * np.pi * (0.2 + 0.07 * k) * trial.t)
+        trial.channels[f"command_{name}"] = low + (high - low) * share
+    followed = Adaptation(VEHICLE)
+    for window in windows_of(trial, VEHICLE):
+        followed.update(window)
+    assert not [name for name, e in followed.estimates.items() if e.identifiable]
+
+
 @pytest.mark.parametrize("end", (4.999999999999998, 5.0, 5.05))
 def test_times_that_are_rounded_are_thinned(end):
     """The last of every tenth of a second may lie a rounding error behind the last sample."""

@@ -85,6 +85,9 @@ RELEVANT = {"drag": 0.1, "thruster": 0.1}
 RELEVANT_WEIGHT = 0.005
 """Least additional weight that counts, over the vehicle's own weight [-]."""
 
+CERTAIN = 1.5
+"""Least change over the half width of its 95 % interval: of a dozen numbers one is hardly ever so far off by chance."""
+
 
 class _Coordinates:
     """The unknowns in standard deviations of the prior, in the form of `parameters.Parameters`."""
@@ -233,8 +236,24 @@ class Adaptation:
         right = own @ y / alike  # (1 + J) y = J y of the data alone
         J, right = J / np.outer(std, std), right / std + J @ (self._start / std) / std
         # No window is better than the model: (J⁻¹ + Q)⁻¹.
-        worse = np.linalg.inv(np.eye(n) + J @ np.diag(self._discrepancy**2))
+        discrepancy = self._discrepancy + self._standing(window)
+        worse = np.linalg.inv(np.eye(n) + J @ np.diag(discrepancy**2))
         return worse @ J, worse @ right
+
+    def _standing(self, window: Sequence[Segment]) -> Array:
+        """Return the part of each thruster's commands in a window that its motor may not follow, (P,); 0 elsewhere.
+
+        A motor stands still below its slowest speed, whether or not the simulated one does [-].
+        """
+        out = np.zeros(len(self.names))
+        for i, (name, thruster) in enumerate(self.vehicle.thrusters.items()):
+            command = np.concatenate([s.force[:, i] for s in window if s.thrusters] or [np.zeros(1)])
+            turns = np.array([thruster.dead_rpm_minus, thruster.dead_rpm_plus]) * 2.0 * np.pi / 60.0
+            low, high = thruster.thrust(turns)
+            slow = np.where((low < command) & (command < high), command, 0.0)
+            size = np.linalg.norm(command)
+            out[self.names.index(f"thruster.{name}")] = np.linalg.norm(slow) / size if size > 0.0 else 0.0
+        return out
 
     @property
     def estimates(self) -> dict[str, Estimate]:
@@ -248,7 +267,7 @@ class Adaptation:
             kind = name.partition(".")[0]
             least = RELEVANT.get(kind, RELEVANT_WEIGHT * self.vehicle.weight)
             least = least if kind in ("drag", "thruster", "weight") else 0.1 * least
-            differs = abs(value - start) > max(half, least)
+            differs = abs(value - start) > max(CERTAIN * half, least)
             out[name] = Estimate.within(name, value, half, unit, differs, "as in the vehicle file")
         return out
 
