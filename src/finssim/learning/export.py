@@ -76,9 +76,7 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
         x, integral = graph.integrals(network.errors, parts["integral"], n)
         after = [integral]
     if network.mean is not None:
-        x = graph.node(
-            "Mul", [graph.node("Sub", [x, graph.weight(network.mean)]), graph.weight(network.scale)]
-        )
+        x = graph.scaled(x, network.mean, network.scale)
     scaled = x
     window = [parts[name] for name in ("past", "oldest", "last") if name in parts]
     y = graph.node("Concat", [x, *window], axis=1) if window else x
@@ -124,6 +122,10 @@ class _Graph:
         """y = x W + b."""
         bias = [] if layer.bias is None else [self.weight(layer.bias)]
         return self.node("Gemm", [x, self.weight(layer.weight), *bias])
+
+    def scaled(self, x: str, mean: Any, scale: Any) -> str:
+        """(x - mean) scale."""
+        return self.node("Mul", [self.node("Sub", [x, self.weight(mean)]), self.weight(scale)])
 
     def integrals(self, errors: Sequence[int], before: str, n: int) -> tuple[str, str]:
         """The observation as the policy sees it and the integrals after, as of `with_integrals`."""
@@ -213,7 +215,8 @@ def write_seeing(network: Any, n: int, m: int) -> bytes:
     """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, *shape), by name."""
     graph = _Graph()
     scale = graph.weight(np.full((), 1.0 / 255.0, np.float32))
-    features = ["observation"]
+    mean, factor = (x.cpu().numpy() for x in (network.mean, network.scale))
+    features = [graph.scaled("observation", mean, factor)]
     for name in network.shapes:
         x = graph.node("Mul", [graph.node("Cast", [name], to=TensorProto.FLOAT), scale])
         x = graph.node("Transpose", [x], perm=[0, 3, 1, 2])

@@ -15,7 +15,13 @@ ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Id
 
 
 class SeeingNetwork(nn.Module):
-    """A convolutional encoder for each picture, and layers on what they give beside the row: to the mean action."""
+    """A convolutional encoder for each picture, and layers on what they give beside the row: to the mean action.
+
+    The row is scaled first: less `mean`, times `scale`, 0 and 1 until a learner sets them.
+    """
+
+    mean: torch.Tensor
+    scale: torch.Tensor
 
     def __init__(
         self,
@@ -39,6 +45,8 @@ class SeeingNetwork(nn.Module):
         """
         super().__init__()
         self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("scale", torch.ones(inputs))
         self.encoders = nn.ModuleDict()
         for name, (rows, columns, depth) in self.shapes.items():
             layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # effect of water on a complete picture
@@ -46,7 +54,7 @@ class SeeingNetwork(nn.Module):
                 layers += [nn.Conv2d(a, b, 3, stride=2, padding=1), nn.ELU()]
                 rows, columns = (rows + 1) // 2, (columns + 1) // 2
             layers += [nn.Flatten(), nn.Linear(channels[-1] * rows * columns, features), nn.ELU()]
-            self.encoders[name] = nn.Sequential(*layers)
+            self.encoders[name] = nn.Sequential(*layers).to(memory_format=torch.channels_last)
         self.layers = stack(inputs + len(self.shapes) * features, hidden, outputs, 0.01)
 
     def encode(self, pictures: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -55,10 +63,14 @@ class SeeingNetwork(nn.Module):
         scaled = {name: pictures[name].to(kind) / 255.0 for name in self.shapes}
         return torch.cat([self.encoders[name](x.permute(0, 3, 1, 2)) for name, x in scaled.items()], dim=1)
 
+    def act(self, observation: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """Action (N, m) for rows (N, n) and the features of their pictures."""
+        answer: torch.Tensor = self.layers(torch.cat([(observation - self.mean) * self.scale, features], 1))
+        return answer
+
     def forward(self, observation: torch.Tensor, **pictures: torch.Tensor) -> torch.Tensor:
         """Action (N, m) for rows (N, n) and pictures."""
-        answer: torch.Tensor = self.layers(torch.cat([observation, self.encode(pictures)], dim=1))
-        return answer
+        return self.act(observation, self.encode(pictures))
 
 
 def plain_network(network: nn.Module) -> Network | None:

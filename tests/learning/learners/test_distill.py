@@ -20,6 +20,7 @@ from finssim.extensions.perception.camera_docking import CameraDocking
 from finssim.learning.demonstrations import CollectSettings, Episode, collect, load, save
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
+from finssim.learning.learners.distill import LEAST_DEVIATION
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.learning.train import TrainingSettings, train
 from finssim.tasks import Environment, make
@@ -35,6 +36,7 @@ def test_a_network_that_sees_is_the_same_in_onnx():
     torch.manual_seed(0)
     network = SeeingNetwork(5, {"left": (9, 14, 3), "right": (6, 6, 3), "sonar": (12, 9, 1)}, 4)
     torch.nn.init.normal_(network.layers[-1].weight, std=0.2)
+    network.mean[:], network.scale[:] = torch.linspace(-1.0, 1.0, 5), torch.linspace(0.5, 8.0, 5)
     random = np.random.default_rng(1)
     row = random.normal(size=(7, 5)).astype(np.float32)
     pictures = {
@@ -94,6 +96,22 @@ def test_a_training_goes_on_from_its_state_bit_for_bit():
     assert other.update() == row
     for a, b in zip(one.student.parameters(), other.student.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_the_student_scales_its_row_by_what_the_first_rollout_saw():
+    """Velocities of centimetres a second count as much as features do; what hardly varies is not blown up."""
+    kind = learner_named("distill")
+    learner = kind(Environment(TASK, worlds=8, seed=3), kind.settings(TASK, changes=TINY), seed=3)
+    learner.update()
+    rows, network = learner._kept["row"][:200].clone(), learner.network()
+    scaled = (rows - network.mean) * network.scale
+    small = rows.std(0, correction=0) < LEAST_DEVIATION
+    assert 0 < small.sum() < len(small)
+    assert torch.allclose(scaled[:, ~small].std(0, correction=0), torch.ones(1), atol=1e-3)
+    assert torch.all(scaled[:, small].abs() <= (rows - rows.mean(0))[:, small].abs() / LEAST_DEVIATION + 1e-3)
+    assert torch.allclose(scaled.mean(0), torch.zeros(1), atol=1e-3)
+    learner.update()
+    assert torch.equal((rows - network.mean) * network.scale, scaled)
 
 
 def test_the_student_learns_what_the_teacher_does():

@@ -22,6 +22,9 @@ from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.tasks import Environment
 
+LEAST_DEVIATION = 0.02
+"""Rows are scaled by their numbers' standard deviations [1], by this at least: what hardly varies stays small."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DistillSettings:
@@ -140,6 +143,10 @@ class Distill(ActingLearner):
         s, fresh = self.settings, self.environment.worlds * self.settings.rollout
         with torch.no_grad():
             self._roll_out()
+        if self._rounds == 0:
+            rows = self._kept["row"][: self._count]
+            self.student.mean[:] = rows.mean(0)
+            self.student.scale[:] = 1.0 / rows.std(0, correction=0).clamp(min=LEAST_DEVIATION)
         self._rounds += 1
         self.steps += fresh
         loss, prediction = self._fit(max(1, round(s.passes * fresh / s.batch)))
@@ -179,8 +186,7 @@ class Distill(ActingLearner):
             batch = {name: values[index] for name, values in self._kept.items()}
             batch |= {name: varied(batch[name], s.colour) for name in self._pictures}
             features = self.student.encode(batch)
-            action = self.student.layers(torch.cat([batch["row"], features], dim=1))
-            loss = nn.functional.mse_loss(action, batch["action"])
+            loss = nn.functional.mse_loss(self.student.act(batch["row"], features), batch["action"])
             prediction = nn.functional.mse_loss(self._predictor(features), batch["taught"])
             self.optimizer.zero_grad()
             (loss + s.auxiliary * prediction).backward()
@@ -198,7 +204,7 @@ class Distill(ActingLearner):
             "student": self.student.state_dict(),
             "predictor": self._predictor.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "kept": self._kept,
+            "kept": {name: values[: self._count] for name, values in self._kept.items()},
             "counts": [self._count, self._rounds],
             "teacher": [
                 [layer.weight, layer.bias] for layer in self.teacher.layers if isinstance(layer, Linear)
@@ -214,7 +220,7 @@ class Distill(ActingLearner):
         self._predictor.load_state_dict(state["predictor"])
         self.optimizer.load_state_dict(state["optimizer"])
         for name, values in state["kept"].items():
-            self._kept[name].copy_(values)
+            self._kept[name][: len(values)] = values
         self._count, self._rounds = state["counts"]
         if state["teacher"] is not None:
             layers = [part for W, b in state["teacher"] for part in (Linear(W, b), Activation("Tanh"))]
