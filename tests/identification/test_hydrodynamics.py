@@ -60,6 +60,7 @@ def test_sticks_and_motion_capture_at_5_hz(joystick, by_sticks):
     vehicle, fit, (_, held) = load_vehicle("bluerov2_heavy"), by_sticks, joystick
     found, before = scores(calibrated(fit), held), scores(vehicle, held)
     assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.04, found
+    assert found.keys() == before.keys() > {"roll", "pitch"}
     assert all(found[axis] < 0.8 * before[axis] for axis in found), (found, before)
     scale = fit.estimates["thrust_scale"]
     assert scale.ci95[0] < scale.estimate < scale.ci95[1] and scale.ci95[1] > 1.5 * scale.ci95[0]

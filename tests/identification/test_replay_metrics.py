@@ -147,6 +147,18 @@ def test_excited_axes_come_from_the_header_or_the_input():
     assert excited_axes(tau, np.array([20.0, 0.0, 20.0, 0.0, 0.0, 5.0])) == ("sway",)
 
 
+def test_the_heights_of_a_vehicle_file_do_not_choose_the_axes():
+    """A push 5 cm above the reference, or at it: pitch counts if it swings, and alone if nothing else is driven."""
+    limits, tau = np.array([20.0, 20.0, 28.0, 3.0, 3.0, 7.0]), np.zeros((50, 6))
+    tau[:, 0] = 20.0
+    for height in (0.0, 0.05):
+        tau[:, 4] = height * tau[:, 0]
+        assert excited_axes(tau, limits) == ("surge",)
+        assert excited_axes(tau, limits, swinging=("pitch",)) == ("surge", "pitch")
+    tau[:, 0] = 0.0
+    assert excited_axes(tau, limits) == ("pitch",)
+
+
 def test_the_aggregate_weights_axes_equally_whatever_their_trials():
     rows = [{"surge": 0.1}] * 6 + [{"sway": 0.3}] * 2 + [{"heave": None}]
     found = aggregate(rows)

@@ -16,6 +16,7 @@ from rich.console import Console
 from finssim.core.files import atomic_directory, refuse_unwritable
 from finssim.core.quiet import start_warp
 from finssim.core.rotations import quat_rotate, quat_to_euler
+from finssim.identification.excitation import SWINGING, answers
 from finssim.identification.replay_metrics import (
     RESPONSES,
     SEED,
@@ -30,6 +31,7 @@ from finssim.identification.replay_metrics import (
     resampled,
     response_span,
     score,
+    steered,
 )
 from finssim.identification.replay_report import (
     REPLAY_FILE,
@@ -137,7 +139,7 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
     t = np.arange(0.0, float(trial.t[-1] - trial.t[0]) + 0.5 / rate, 1.0 / rate)
     clock = t + float(trial.t[0])
     tau = _shifted(resampled(m.t, m.tau, clock), vehicle.wrench_reference)
-    axes = excited_axes(tau, np.asarray(vehicle.wrench_limits), trial.header.axis)
+    axes = _excited(s, vehicle)
     nu, raw_nu = resampled(m.t, m.nu, clock), resampled(m.t, m.raw, clock)
     measured = {name: nu[:, k] for k, name in enumerate(NU)}
     raw = {name: raw_nu[:, k] for k, name in enumerate(NU)}
@@ -157,7 +159,7 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
         t0=float(trial.t[0]),
         rate=rate,
         axes=axes,
-        phase=find_phases(t, tau, axes, phase_at(trial, clock)),
+        phase=find_phases(t, tau, steered(axes), phase_at(trial, clock)),
         tau=tau,
         measured={name: x for name, x in measured.items() if np.isfinite(x).any()},
         raw={name: x for name, x in raw.items() if np.isfinite(x).any()},
@@ -169,10 +171,15 @@ def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
     )
 
 
+def _excited(s: Streams, vehicle: Vehicle) -> tuple[Axis, ...]:
+    tau = _shifted(s.motion.tau, vehicle.wrench_reference)
+    swinging = [axis for axis in SWINGING if answers(s.motion, AXES.index(axis))]
+    return excited_axes(tau, np.asarray(vehicle.wrench_limits), s.trial.header.axis, swinging)
+
+
 def _rate(s: Streams, vehicle: Vehicle) -> float:
     """50 Hz, or that of the slowest measured velocity of an excited axis where it is below [1/s]."""
-    tau = _shifted(s.motion.tau, vehicle.wrench_reference)
-    axes = excited_axes(tau, np.asarray(vehicle.wrench_limits), s.trial.header.axis) or AXES
+    axes = steered(_excited(s, vehicle)) or AXES
     clocks = [s.trial.series(NU[AXES.index(axis)])[0] for axis in axes]
     rates = [1.0 / float(np.median(np.diff(t))) for t in clocks if len(t) > 1]
     rate = min([RATE, s.motion.rate, *rates])
@@ -233,7 +240,7 @@ def _late(pair: Pair, at: Callable[[float], dict[str, Array]]) -> float:
     Commands and motion are often recorded by two computers, and a fit allows for their clocks as well.
     """
     scored = pair.scored()
-    names = [pair.response(axis) for axis in pair.axes if pair.response(axis) in pair.measured]
+    names = [pair.response(axis) for axis in steered(pair.axes) if pair.response(axis) in pair.measured]
 
     def cost(late: float) -> float:
         values, total = at(late), 0.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finssim.identification.excitation import SWINGING
 from finssim.trials.findings import Finding
 from finssim.trials.trial import COLUMNS, NU, Array
 from finssim.vehicles.vehicle import AXES, Axis
@@ -80,14 +81,20 @@ class Pair:
         return inside if inside.any() else np.ones(len(self.t), dtype=bool)
 
 
-def excited_axes(tau: Array, limits: Array, named: Sequence[Axis] = ()) -> tuple[Axis, ...]:
+def excited_axes(
+    tau: Array, limits: Array, named: Sequence[Axis] = (), swinging: Sequence[Axis] = ()
+) -> tuple[Axis, ...]:
     """The axes that a trial excites.
+
+    Where others are driven, roll and pitch count if they are seen to swing: their wrench rests on heights in the
+    vehicle file, which a calibration changes, and its replay has to be scored on the axes of the one before.
 
     Args:
         tau: Wrench about the vehicle's `wrench_reference` [N, N m], (n, 6).
         limits: `Vehicle.wrench_limits` [N, N m], (6,): what counts as much on each axis; 0 where the thrusters have
             no hold on an axis.
         named: What the header says; taken as it is where it says anything.
+        swinging: Those of roll and pitch that the measured motion shows.
 
     Returns:
         In canonical order; empty where there is no input (a passive trial, thrusters off).
@@ -100,7 +107,15 @@ def excited_axes(tau: Array, limits: Array, named: Sequence[Axis] = ()) -> tuple
     )
     share = np.sqrt(np.nanmean(np.square(tau / scale), axis=0)) if len(tau) else np.zeros(6)
     largest = float(share.max(initial=0.0))
-    return tuple(a for a, x in zip(AXES, share, strict=True) if largest > 1e-9 and x >= EXCITED * largest)
+    pushed = tuple(a for a, x in zip(AXES, share, strict=True) if largest > 1e-9 and x >= EXCITED * largest)
+    if set(pushed) <= set(SWINGING):
+        return pushed
+    return tuple(axis for axis in AXES if axis in (*steered(pushed), *swinging))
+
+
+def steered(axes: Sequence[Axis]) -> tuple[Axis, ...]:
+    """Return axes without roll and pitch, which a push along another axis tilts; all where there is no other."""
+    return tuple(axis for axis in axes if axis not in SWINGING) or tuple(axes)
 
 
 def find_phases(
