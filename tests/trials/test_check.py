@@ -1,6 +1,7 @@
 """`trials check` finds what is wrong with a log, and says what it can and cannot identify."""
 
 import json
+import re
 from dataclasses import replace
 from io import StringIO
 
@@ -8,13 +9,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from finssim.identification.excitation import excited
 from finssim.identification.programme import programmes
 from finssim.identification.simulation_error import prepare
 from finssim.identification.synthetic import simulate_programme
 from finssim.trials.check import check, check_trials, print_reports, set_findings
 from finssim.trials.findings import CalibrationError
 from finssim.trials.free_motion import compared_columns
-from finssim.trials.trial import Header, Trial
+from finssim.trials.trial import TAU, Header, Trial
 from finssim.trials.trial_files import write_trial
 from finssim.vehicles import load_vehicle
 
@@ -270,6 +272,23 @@ def test_the_check_of_a_passive_trial_agrees_with_the_fit():
                 prepare([trial], VEHICLE, ["yaw"])
         else:
             assert prepare([trial], VEHICLE, ["yaw"])[0][0].released == {"yaw"}
+
+
+def test_the_check_agrees_with_the_fit_on_swings_and_on_inputs_that_are_zero(simulated):
+    """A surge trial with an IMU alone shows the pitch that it starts; inputs that push nothing show nothing."""
+    columns = {name: None for name in COLUMNS if name not in ("p", "q", "r", "ax", "ay", "az")}
+    for header, swinging in (({"axis": ()}, ("roll", "pitch")), ({"axis": ("surge",)}, ())):
+        imu = changed(simulated["surge"], header=header, **columns)
+        fitted = excited(prepare([imu], VEHICLE)[0], VEHICLE)
+        found = tuple(a.axis for a in report(imu).axes if a.excited)
+        assert found == fitted and set(found) <= set(swinging) and bool(found) == bool(swinging)
+        assert (report(imu).verdict == "refused") != bool(swinging)
+    still = changed(simulated["surge"], **dict.fromkeys(TAU, np.zeros_like))
+    (sentence,) = [str(one) for one in report(still).findings if one.code == "inputs_zero"]
+    with pytest.raises(CalibrationError, match=re.escape(sentence)):
+        prepare([still], VEHICLE)
+    used, remarks = prepare([still, simulated["yaw"]], VEHICLE)
+    assert len(used) == 1 and sentence in str(remarks[0])
 
 
 def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused(simulated):

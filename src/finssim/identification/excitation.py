@@ -14,7 +14,7 @@ from finssim.identification.rollout import (
 )
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.free_motion import DETERMINED_BY
-from finssim.trials.motion import Motion, gyroscope_bias
+from finssim.trials.motion import Motion, answers, gyroscope_bias, usual_range
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle, VehicleError
 
 Array = NDArray[np.float64]
@@ -31,9 +31,6 @@ SEEN = 0.9
 
 PUSH = 0.03
 """Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
-
-ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
-"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
 
 
 def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: bool = False) -> Segment:
@@ -114,24 +111,13 @@ def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
     tau = s.motion.tau @ np.linalg.inv(twist_shift(list(vehicle.wrench_reference)))
     out: set[str] = set()
     for i, axis in enumerate(AXES):
-        pushed = limits[i] > 0.0 and _range(tau[:, i]) > PUSH * limits[i]
+        pushed = limits[i] > 0.0 and usual_range(tau[:, i]) > PUSH * limits[i]
         # Weight rights roll and pitch: a small swing determines them, whatever started it. If they were not
         # fitted, the file's stiffness, which may be a guess, would determine the later course of surge and sway.
         swings = i in (3, 4)
         if answers(s.motion, i) and (pushed or swings):
             out.add(axis)
     return out
-
-
-def answers(motion: Motion, i: int) -> bool:
-    """Return whether the velocity of an axis, 0 surge to 5 yaw, exceeds its noise."""
-    noise = motion.noise_std[i]
-    return _range(motion.nu[:, i]) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
-
-
-def _range(values: Array) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0
 
 
 def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:

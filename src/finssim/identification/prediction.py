@@ -16,7 +16,7 @@ from rich.console import Console
 from finssim.core.files import atomic_directory, refuse_unwritable
 from finssim.core.quiet import start_warp
 from finssim.core.rotations import quat_rotate, quat_to_euler
-from finssim.identification.excitation import SWINGING, answers
+from finssim.identification.excitation import SWINGING
 from finssim.identification.replay_metrics import (
     RESPONSES,
     SEED,
@@ -43,7 +43,7 @@ from finssim.identification.replay_report import (
 from finssim.identification.rollout import Response, Rollouts, Segment, Streams, segments, streams
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.motion import phase_at, white_noise
+from finssim.trials.motion import answers, phase_at, white_noise
 from finssim.trials.trial import NU, Array, Trial
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import AXES, Axis

@@ -34,7 +34,6 @@ from finssim.identification.estimates import (
 )
 from finssim.identification.excitation import (
     SWINGING,
-    answers,
     compared,
     excitations,
     excited,
@@ -73,7 +72,8 @@ from finssim.identification.uncertainty import (
 from finssim.identification.weak_form import weak_form
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.free_motion import DETERMINED_BY
-from finssim.trials.inputs import require_axes, require_fittable
+from finssim.trials.inputs import no_input, require_axes, require_fittable
+from finssim.trials.motion import answers
 from finssim.trials.trial import Trial
 from finssim.vehicles import AXES, HydrodynamicSet, Vehicle
 
@@ -753,6 +753,8 @@ def prepare(
         show(trial.name)
         try:
             one = streams(trial, vehicle)
+            for item in no_input(one.drive):
+                raise CalibrationError(item.text, trial.name)
             if trial.header.passive:
                 named = trial.header.axis or AXES
                 one = released(one, [a for a in AXES if a in named and (axes is None or a in axes)])
@@ -763,7 +765,7 @@ def prepare(
         prepared.append(one)
         remarks += [item.about(trial.name) for item in one.motion.findings]
     if not prepared:
-        others = f"; and {len(reasons) - 1} trials more" if len(reasons) > 1 else ""
+        others = f"; and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         raise CalibrationError(f"no trial can be used: {reasons[0]}{others}")
     return prepared, remarks
 
@@ -807,7 +809,7 @@ def _axes(
     if axes is None:
         if not moved:
             raise CalibrationError(
-                f"no trial excites an axis of {vehicle.name}: name the axes, or give trials with larger inputs"
+                f"{vehicle.name}: {finding('nothing_excited').text}; name the axes, or give trials with larger inputs"
             )
         named = {axis for s in prepared for axis in s.trial.header.axis}
         return moved, [finding("axis_untold", axis) for axis in AXES if axis in named and axis not in seen]

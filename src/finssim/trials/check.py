@@ -17,10 +17,11 @@ from scipy.signal import lfilter
 from finssim.core.rotations import quat_rotate, quat_to_euler
 from finssim.trials.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
 from finssim.trials.free_motion import FEWEST_SPEEDS, compared_columns, free_motion
-from finssim.trials.inputs import InputForces, drive, implausible, within_reach
+from finssim.trials.inputs import InputForces, drive, implausible, no_input, within_reach
 from finssim.trials.motion import (
     AttitudeSignal,
     Motion,
+    answers,
     attitude_samples,
     attitude_signal,
     holds_gravity,
@@ -432,8 +433,8 @@ def input_findings(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[
     findings = list(inputs.findings)
     if inputs.source == "passive":
         return findings
-    if not np.any(inputs.force):
-        return [*findings, finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
+    if dead := no_input(inputs):
+        return [*findings, *dead]
     findings += (
         _wrench_beyond(vehicle, inputs) if not inputs.thrusters else _thrusters(trial, vehicle, inputs)
     )
@@ -558,7 +559,7 @@ def _blocked(
         return ""
     if not np.isfinite(report.fastest):
         return "velocity and input are never known together"
-    if report.excited and report.coasts > 10.0 * report.driven:
+    if report.excited and report.coasts > 10.0 * report.driven and report.axis not in ("roll", "pitch"):
         return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without: something else moves it"
     if report.excited:
         return ""
@@ -958,13 +959,21 @@ ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Time constants of the speeds of vehicles [s]."""
 
 
-def axis_reports(motion: Motion, inputs: InputForces, vehicle: Vehicle) -> list[AxisReport]:
-    """Return one report per axis, without identifiability."""
+def axis_reports(
+    motion: Motion, inputs: InputForces, vehicle: Vehicle, named: Sequence[str] = ()
+) -> list[AxisReport]:
+    """Return one report per axis, without identifiability.
+
+    Weight rights roll and pitch, so that a swing excites them whatever started it, unless the header names others.
+    """
     passive = inputs.source == "passive"
-    return [_axis(i, motion, passive, vehicle) for i in range(6)]
+    swings = bool(np.any(inputs.force)) and not named
+    return [
+        _axis(i, motion, passive, vehicle, swings and i in (3, 4) and answers(motion, i)) for i in range(6)
+    ]
 
 
-def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport:
+def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle, swings: bool) -> AxisReport:
     nu, tau, dt = motion.nu[:, i], motion.tau[:, i], 1.0 / motion.rate
     valid = np.isfinite(nu) & np.isfinite(tau)
     blank = AxisReport(axis=AXES[i], source=motion.nu_source[i])
@@ -991,7 +1000,7 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle) -> AxisReport
         driven=float((valid & ~quiet).sum() * dt),
         coasts=float((valid & quiet & moving).sum() * dt),
         rests=float((valid & quiet & ~moving).sum() * dt),
-        excited=bool(fastest > floor and (driven or passive)),
+        excited=bool(swings or fastest > floor and (driven or passive)),
     )
 
 
@@ -1187,7 +1196,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     measured = compared_columns(trial)
     axes = [
         with_identifiability(axis, trial_motion, inputs, vehicle, measured)
-        for axis in axis_reports(trial_motion, inputs, vehicle)
+        for axis in axis_reports(trial_motion, inputs, vehicle, trial.header.axis)
     ]
     density = (trial.header.water.density or vehicle.water.density) / vehicle.water.density
     excess = vehicle.buoyancy * density - vehicle.weight

@@ -422,6 +422,13 @@ def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
     )
 
 
+def no_input(inputs: InputForces) -> list[Finding]:
+    """Return a finding where inputs were recorded and nothing is ever pushed, for which no fit may use a trial."""
+    if inputs.source == "passive" or np.any(inputs.force):
+        return []
+    return [finding("pulses_dead" if inputs.source == "pwm" else "inputs_zero")]
+
+
 def _other_columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
     """Columns of the vehicle's actuators besides thrusters, in the order of its channels.
 

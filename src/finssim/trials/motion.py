@@ -774,3 +774,19 @@ def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
     values = [r**3, 3.0 * s**3 - 6.0 * s**2 + 4.0, 3.0 * r**3 - 6.0 * r**2 + 4.0, s**3]
     slopes = [-(r**2), 3.0 * s**2 - 4.0 * s, -3.0 * r**2 + 4.0 * r, s**2]
     return cell, np.stack(values) / 6.0, np.stack(slopes) / 2.0
+
+
+ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
+"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
+
+
+def answers(moved: Motion, i: int) -> bool:
+    """Return whether the velocity of an axis, 0 surge to 5 yaw, exceeds its noise."""
+    noise = moved.noise_std[i]
+    return usual_range(moved.nu[:, i]) > max(ANSWER[i], 4.0 * noise if np.isfinite(noise) else 0.0)
+
+
+def usual_range(values: Array) -> float:
+    """Return the range from the 2nd to the 98th percentile of the finite values, in their unit; 0 without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0
