@@ -21,6 +21,7 @@ from finssim.learning.demonstrations import CollectSettings, Episode, collect, l
 from finssim.learning.export import write_seeing
 from finssim.learning.learners import LearningError, learner_named
 from finssim.learning.learners.distill import LEAST_DEVIATION
+from finssim.learning.resume import ResumeError
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.learning.train import TrainingSettings, train
 from finssim.tasks import Environment, make
@@ -96,6 +97,9 @@ def test_a_training_goes_on_from_its_state_bit_for_bit():
     assert other.update() == row
     for a, b in zip(one.student.parameters(), other.student.parameters(), strict=True):
         assert torch.equal(a, b)
+    del state["learner"]["student"]["mean"]  # as an earlier version wrote it
+    with pytest.raises(ResumeError, match="earlier version: leave out --resume"):
+        other.load(state)
 
 
 def test_the_student_scales_its_row_by_what_the_first_rollout_saw():

@@ -17,6 +17,7 @@ from torch import nn
 from finssim.learning.learners.base import ActingLearner
 from finssim.learning.learners.ppo import Ppo
 from finssim.learning.network import Activation, Linear, Network
+from finssim.learning.resume import ResumeError
 from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import SeeingNetwork
@@ -215,7 +216,13 @@ class Distill(ActingLearner):
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Take what `learned` gave.
+
+        Raises:
+            ResumeError: It is of a version whose students did not scale their row.
+        """
+        if "mean" not in state["student"]:
+            raise ResumeError("the checkpoint is of an earlier version: leave out --resume")
         self.student.load_state_dict(state["student"])
         self._predictor.load_state_dict(state["predictor"])
         self.optimizer.load_state_dict(state["optimizer"])
