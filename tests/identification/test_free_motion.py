@@ -331,6 +331,13 @@ def test_a_real_release_is_found_and_fitted():
 
 
 @pytest.mark.slow
+def test_surge_and_sway_are_judged_by_a_coordinate_each():
+    """Motion capture gives no u and v: x would stand for both."""
+    fit = fit_by_simulation([hinsdale("traj005-1")], HEAVY, axes=["surge", "sway"])
+    assert [curve.y_label for curve in fit.curves] == ["x [m]", "y [m]"]
+
+
+@pytest.mark.slow
 def test_real_releases_that_disagree_write_nothing():
     """The arm moved between the two: one pitch cannot explain both, which is stated."""
     trials = [hinsdale(name) for name in ("traj005-1", "traj_alt_009-0")]

@@ -12,6 +12,7 @@ from finssim.identification.hydrodynamics import fit_hydrodynamics, judged
 from finssim.identification.prediction import replay
 from finssim.identification.programme import programmes
 from finssim.identification.replay_report import _remarks
+from finssim.identification.report import fit_report
 from finssim.identification.synthetic import simulate_programme
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.check import check_trials
@@ -60,6 +61,7 @@ def test_sticks_and_motion_capture_at_5_hz(joystick, by_sticks):
     vehicle, fit, (_, held) = load_vehicle("bluerov2_heavy"), by_sticks, joystick
     found, before = scores(calibrated(fit), held), scores(vehicle, held)
     assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.04, found
+    assert len(fit.curves) == 6 and all("held-out trials" in curve.title for curve in fit.curves)
     assert found.keys() == before.keys() > {"roll", "pitch"}
     assert all(found[axis] < 0.8 * before[axis] for axis in found), (found, before)
     scale = fit.estimates["thrust_scale"]
@@ -118,6 +120,9 @@ def test_a_heading_that_decays(tmp_path):
     assert ratio.identifiable
     assert ratio.ci95[1] - ratio.ci95[0] < 0.05 * ratio.estimate
     assert scores(calibrated(fit), trials)["yaw"] < 0.02
+    (curve,) = fit_hydrodynamics(trials, vehicle).curves
+    assert curve.y_label == "yaw [rad]" and np.nanmax(np.abs(np.diff(curve.measured))) < 1.0
+    assert any("yaw.m_eff (assumed" in sentence for sentence in fit_report(fit, calibrated(fit)).lead)
     linear = fit_hydrodynamics(trials, vehicle, damping="linear", **options)
     assert linear.estimates["yaw.d1/m_eff"].estimate > 0.1 and "yaw.d2/m_eff" not in linear.estimates
     assert fit.quality["yaw"]["rmse"] < 0.2 * linear.quality["yaw"]["rmse"]

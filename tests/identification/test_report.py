@@ -131,6 +131,28 @@ def test_many_curves_are_drawn_up_to_a_limit_that_is_said(tmp_path):
     assert "52 more curves are not drawn" in (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
 
 
+def test_lines_of_a_curve_break_at_gaps():
+    """Two stretches with a gap in the first: a hole in each line between them, and time goes on."""
+    t = np.concatenate([np.arange(0.0, 1.0, 0.1), np.arange(11.0, 12.0, 0.1)])
+    curve = Curve.joined(
+        "c",
+        "u",
+        [
+            (t, t, t),
+            (
+                t[:10],
+                t[:10],
+                t[:10],
+            ),
+        ],
+    )
+    holes = np.flatnonzero(np.isnan(curve.x))
+    assert holes.tolist() == [10, 21, 32]
+    for line in (curve.measured, curve.fitted):
+        np.testing.assert_array_equal(np.isnan(line), np.isnan(curve.x))
+    assert np.nanmax(np.diff(curve.x[:10])) < 0.11 and curve.x[22] == pytest.approx(t[-1] + 1.0)
+
+
 def test_somebodys_files_are_not_replaced(tmp_path):
     """A folder with other files is refused; an earlier report is replaced."""
     (tmp_path / "thesis.tex").touch()

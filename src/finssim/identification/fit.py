@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from finssim.core.page import notebook_html
 from finssim.trials.findings import CalibrationError, Finding, plain
+from finssim.trials.motion import longest_step
 from finssim.vehicles import AXES, Vehicle
 
 if TYPE_CHECKING:
@@ -125,14 +126,14 @@ class Curve:
     @classmethod
     def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, ...]]) -> Curve:
         """Stretches of time [s], measured and fitted values, and bands if there are any, (k,) each, one after the other
-        with a second between."""
-        x, start = [], 0.0
-        for t, *_ in parts:
-            x += [t - t[0] + start, [np.nan]]
-            start = float(x[-2][-1]) + 1.0
-        measured, fitted, *band = (
-            np.concatenate([y for p in parts for y in (p[k], [np.nan])]) for k in range(1, len(parts[0]))
-        )
+        with a second between; lines break there and at gaps."""
+        x, columns, start = list[Array](), list[list[Array]](), 0.0
+        for t, *values in parts:
+            gaps = [*(1 + np.flatnonzero(np.diff(t) > longest_step(t))), len(t)]
+            x.append(np.insert(t - t[0] + start, gaps, np.nan))
+            columns.append([np.insert(y, gaps, np.nan) for y in values])
+            start += float(t[-1] - t[0]) + 1.0
+        measured, fitted, *band = (np.concatenate(some) for some in zip(*columns, strict=True))
         label = "time, one after the other [s]"
         return cls(
             title=title, x_label=label, y_label=y_label, x=np.concatenate(x), measured=measured, fitted=fitted,

@@ -6,18 +6,24 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from finssim.core.progress import progress_bar
-from finssim.identification.fit import Fit
+from finssim.identification.fit import Curve, Fit
+from finssim.identification.judgement import SHOWN
 from finssim.identification.plant_terms import SET, matrices, with_diagonal
+from finssim.identification.replay_metrics import Pair, response_span
 from finssim.identification.report import finish, refuse_places, usable_trials
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.inputs import drive, require_axes
-from finssim.trials.trial import Trial
+from finssim.trials.trial import COLUMNS, NU, Trial
 from finssim.vehicles import AXES, Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from finssim.identification.prediction import Replay
 
 UNKNOWN_VOLTAGE = (
     "no battery voltage: from what batteries have and the file's inertia; it is in every interval"
@@ -85,8 +91,22 @@ def fit_hydrodynamics(
     return judged(fit, held_out)
 
 
-def _by_replay(fit: Fit, trials: Sequence[Trial]) -> dict[str, tuple[float, float]]:
-    """Return the NRMSE by axis of the calibrated vehicle and of the file, medians over the trials [-].
+def _replay(pairs: Sequence[Pair], trials: Sequence[Trial], fit: Fit) -> Replay:
+    """Return the replay of some pairs' trials by the calibrated vehicle, on the axes of the pairs."""
+    from finssim.identification.prediction import replay
+
+    axes = {pair.name: pair.axes for pair in pairs}
+    named = [
+        replace(t, header=t.header.model_copy(update={"axis": axes[t.name]}))
+        for t in trials
+        if t.name in axes
+    ]
+    return replay(named, calibrated(fit))
+
+
+def _by_replay(fit: Fit, trials: Sequence[Trial]) -> tuple[dict[str, tuple[float, float]], Replay | None]:
+    """Return the NRMSE by axis of the calibrated vehicle and of the file, medians over the trials [-], and the replay
+    of the former; None if no trial can be replayed.
 
     Both are scored on the axes that the file's thrusters excite.
     """
@@ -95,21 +115,35 @@ def _by_replay(fit: Fit, trials: Sequence[Trial]) -> dict[str, tuple[float, floa
     try:
         before = replay(trials, fit.before)
     except CalibrationError:
-        return {}
-    axes = {pair.name: pair.axes for pair in before.pairs}
-    named = [
-        replace(t, header=t.header.model_copy(update={"axis": axes[t.name]}))
-        for t in trials
-        if t.name in axes
-    ]
-    after = replay(named, calibrated(fit))
+        return {}, None
+    after = _replay(before.pairs, trials, fit)
     found: dict[str, list[tuple[float, float]]] = {}
     for new, old in zip(*(one.scores["calibrated"] for one in (after, before)), strict=True):
         for axis, score in old.items():
             if score.value is not None:
                 value = new[axis].value
                 found.setdefault(axis, []).append((math.inf if value is None else value, score.value))
-    return {axis: tuple(np.median(pairs, axis=0).tolist()) for axis, pairs in found.items()}
+    return {axis: tuple(np.median(pairs, axis=0).tolist()) for axis, pairs in found.items()}, after
+
+
+def _held_out_curves(after: Replay, fit: Fit) -> tuple[Curve, ...]:
+    """Return the curves of a fit, with the replays of held-out trials in place of an axis' own where there are any."""
+    own = {curve.title.partition(":")[0]: curve for curve in fit.curves}
+    for axis in own:
+        name = NU[AXES.index(axis)]
+        widths = [response_span(p, name).value if axis in p.axes else None for p in after.pairs]
+        shown = [
+            p
+            for width, p in sorted(zip(widths, after.pairs, strict=True), key=lambda r: -(r[0] or 0.0))
+            if width
+        ]
+        if shown:
+            own[axis] = Curve.joined(
+                f"{axis}: {name} of held-out trials, replayed",
+                f"{name} [{COLUMNS[name].unit}]",
+                [(p.t, p.measured[name], p.simulated["calibrated"][name]) for p in shown[:SHOWN]],
+            )
+    return tuple(own.values())
 
 
 WORSE = 1.02
@@ -120,14 +154,16 @@ JUDGED_TOGETHER = ("roll", "pitch")
 
 
 def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
-    """Return a fit that keeps the vehicle file's numbers of each axis that it predicts worse than the file does.
+    """Return a fit that keeps the vehicle file's numbers of each axis that it predicts worse than the file does, with
+    curves of the trials that judge it.
 
     Args:
         fit: The fit, whose quality holds the NRMSE over what was left out of it in turn, and that of the file.
         held_out: Trials that judge instead, as far as they show an axis.
     """
     quality = {axis: dict(figures) for axis, figures in fit.quality.items()}
-    for axis, pair in (_by_replay(fit, held_out) if held_out else {}).items():
+    scores, after = _by_replay(fit, held_out) if held_out else ({}, None)
+    for axis, pair in scores.items():
         if axis in quality:
             quality[axis] |= dict(zip(("held_out", "file"), pair, strict=True))
     fit = replace(fit, quality=quality)
@@ -140,6 +176,9 @@ def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
             lost |= {axis for axis in JUDGED_TOGETHER if axis in rows}
     for axis in AXES:
         fit = _file_kept(fit, axis) if axis in lost else fit
+    if after is not None:
+        after = _replay(after.pairs, held_out, fit) if lost else after
+        fit = replace(fit, curves=_held_out_curves(after, fit))
     return fit
 
 

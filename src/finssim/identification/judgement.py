@@ -18,6 +18,7 @@ from finssim.identification.shooting import CUT, FitSolution, Point, Shooting
 from finssim.identification.uncertainty import (
     intervals,
 )
+from finssim.trials.conversion import EULER
 from finssim.trials.findings import Finding, finding
 from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.motion import without_spikes
@@ -51,19 +52,45 @@ def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
     return out
 
 
+def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
+    """Return the measured channel that shows each axis: the most direct one; empty where there is none.
+
+    Of x and y, where no velocity is measured, surge and sway have one each: that which their own numbers move more.
+    """
+    m, p = problem.measured, problem.parameters
+    out = {axis: next((c for c in DETERMINED_BY[axis] if c in m.names), "") for axis in p.axes}
+    planar = [axis for axis in ("surge", "sway") if out.get(axis) == "x"]
+    if not planar or "y" not in m.names:
+        return out
+
+    def moved(axis: str, column: str) -> float:
+        own = [c for c, name in enumerate(p.names) if name.startswith(f"{axis}.")]
+        rows = m.channel == m.names.index(column)
+        slopes = solution.linear.shared[np.ix_(rows, own)] * p.scale[own] / solution.std[rows, None]
+        return float(np.sum(slopes**2))
+
+    straight = sum(
+        moved(axis, column) for axis, column in zip(("surge", "sway"), "xy", strict=True) if axis in planar
+    )
+    across = sum(
+        moved(axis, column) for axis, column in zip(("surge", "sway"), "yx", strict=True) if axis in planar
+    )
+    best = dict(zip(("surge", "sway"), "xy" if straight >= across else "yx", strict=True))
+    return out | {axis: best[axis] for axis in planar}
+
+
 def _shown_by(
-    problem: Shooting, axis: str, good: NDArray[np.bool_]
-) -> tuple[str, NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
-    """Return the most direct used channel that determines an axis, its good samples (n,) of (N,), their trials (n,),
-    and the range of the channel in each trial, from the 5th to the 95th percentile; no samples without a channel."""
+    problem: Shooting, name: str, good: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
+    """Return the good samples (n,), of (N,), of a channel, their trials (n,), and the range of the channel in each
+    trial, from the 5th to the 95th percentile."""
     m = problem.measured
-    name = next((c for c in DETERMINED_BY[axis] if c in m.names), "")
     rows = np.flatnonzero(good & (m.channel == m.names.index(name))) if name else np.empty(0, int)
     trial = problem.groups[m.segment][rows]
     spans = {
         int(g): float(np.ptp(np.percentile(m.value[rows][trial == g], [5.0, 95.0]))) for g in np.unique(trial)
     }
-    return name, rows, trial, spans
+    return rows, trial, spans
 
 
 def quality(
@@ -73,13 +100,14 @@ def quality(
 
     Units are those of the channel; R² and NRMSE have none.
     """
-    out, good = {}, believed(problem, solution)
+    out, good, names = {}, believed(problem, solution), channels(problem, solution)
     for axis in axes:
-        name, rows, trial, spans = _shown_by(problem, axis, good)
+        name = names[axis]
+        rows, trial, spans = _shown_by(problem, name, good)
         if not name:
             continue
         moving = [g for g, span in spans.items() if span > 0.2 * max(spans.values())]
-        _, every, of, _ = _shown_by(problem, axis, np.ones_like(good))
+        every, of, _ = _shown_by(problem, name, np.ones_like(good))
         every = every[np.isin(of, moving)]
         inside = np.isin(trial, moving)
         rows, trial = rows[inside], trial[inside]
@@ -122,7 +150,7 @@ def held_out(
         by_trial: Whether whole trials are left out.
     """
     problem, point = stage.problem, stage.solution.point
-    good = believed(problem, stage.solution)
+    good, names = believed(problem, stage.solution), channels(problem, stage.solution)
     trial = problem.groups[problem.measured.segment]
     group = np.unique(trial if by_trial else time_blocks(problem, trial), return_inverse=True)[1]
     evidence = evidence_of(problem, stage.solution, group)
@@ -153,7 +181,7 @@ def held_out(
     before = _predicted_error(file, plain[None], stage.solution, good)[:, 0]
     out = {}
     for axis in axes:
-        _, rows, trial, spans = _shown_by(problem, axis, good)
+        rows, trial, spans = _shown_by(problem, names[axis], good)
         moving = [g for g, span in spans.items() if 0.2 * max(spans.values()) < span]
         rms = [
             [float(np.sqrt(np.mean(error[rows[trial == g]] ** 2))) / max(spans[g], 1e-12) for g in moving]
@@ -191,7 +219,7 @@ def unexplained(
 
     R² has no unit.
     """
-    _, rows, trial, _ = _shown_by(problem, axis, believed(problem, solution))
+    rows, trial, _ = _shown_by(problem, channels(problem, solution)[axis], believed(problem, solution))
     worst, least = "", np.inf
     for g, one in enumerate(used):
         those = rows[trial == g]
@@ -219,14 +247,15 @@ def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> t
     how = "simulated from the inputs alone" if error is None else "each stretch predicted without it"
     error = solution.linear.residual if error is None else error
     m, out, good = problem.measured, [], believed(problem, solution)
+    names = channels(problem, solution)
     clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
     for axis in axes:
-        name, rows, trial, spans = _shown_by(problem, axis, good)
-        parts = []
+        name, parts = names[axis], []
+        rows, trial, spans = _shown_by(problem, name, good)
         for g in sorted(sorted(spans, key=lambda g: -spans[g])[:SHOWN]):
             those = rows[trial == g]
             those = those[np.argsort(clock[those], kind="stable")]
-            value = m.value[those]
+            value = np.unwrap(m.value[those]) if name in EULER else m.value[those]
             parts.append((clock[those], value, value - error[those], band[those]))
         if name:
             title = f"{axis}: {name}, {how}"

@@ -37,7 +37,7 @@ from finssim.identification.vehicle_file import (
 from finssim.trials.findings import CalibrationError, Finding, finding, plain, sentences
 from finssim.trials.trial import Trial
 from finssim.trials.trial_files import load_trials
-from finssim.vehicles import Vehicle
+from finssim.vehicles import AXES, Vehicle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,12 +130,12 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         grid = figure.add_gridspec(
             rows,
             columns,
-            left=0.75 / width,
+            left=0.85 / width,
             right=1.0 - 0.12 / width,
             bottom=0.5 / height,
             top=1.0 - 0.3 / height,
             hspace=0.35,
-            wspace=0.27,
+            wspace=0.3,
         )
         for i, curve in enumerate(part):
             _draw(figure, grid[i // columns, i % columns], curve)
@@ -166,7 +166,7 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
         band = curve.band[order]
         above.fill_between(x, fitted - band, fitted + band, color=VERMILION, alpha=0.25, linewidth=0.0)
     above.plot(
-        x, fitted, color=VERMILION, linewidth=1.2, label="fitted" if curve.band is None else "fit, 95 %"
+        x, fitted, color=VERMILION, linewidth=1.2, label="model" if curve.band is None else "fit, 95 %"
     )
     below.axhline(0.0, color=GRAY, linewidth=0.6)
     above.set_title(curve.title, fontsize=9)
@@ -505,6 +505,10 @@ IMPLIED = (".added_mass", ".bias")
 """Ends of the names of estimates that follow from others, or may well be zero."""
 
 
+RATIOS = ("/m_eff", ".terminal_speed")
+"""Ends of the names of what a motion without thrust shows of an axis, whose inertia is then assumed."""
+
+
 def _lead(fit: Fit) -> list[str]:
     """Return what is known, what is not, and what to record next."""
     known, unknown = list[str](), list[str]()
@@ -515,6 +519,9 @@ def _lead(fit: Fit) -> list[str]:
             size = f"±{100.0 * part:.{0 if part > 0.0095 else 1}f} %" if part < 1.0 else "hardly"
             size = f"±{half:.2g} m" if e.unit == "m" else size  # of a place zero is a value like others
             (known if e.identifiable else unknown).append(f"{name} ({size})")
+    free = {name.partition(".")[0] for name in fit.estimates if name.endswith(RATIOS)}
+    assumed = [axis for axis in AXES if axis in free and f"{axis}.m_eff" not in fit.estimates]
+    unknown += [f"{axis}.m_eff (assumed: give it by --fix {axis}.m=NUMBER)" for axis in assumed]
     told = f": {', '.join(known)}" if known else ""
     out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{told}."]
     out += [f"Not determined: {', '.join(unknown)}."] if unknown else []
