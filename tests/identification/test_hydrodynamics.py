@@ -219,7 +219,7 @@ def test_published_numbers_are_data(joystick, by_sticks):
     assert "surge reaches 0.79 m/s, the fitted trials 0.4" in said and "extrapolated" in said
     yaw = [t for t in fitted if t.name.startswith("yaw")]
     told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in yaw]
-    with pytest.raises(CalibrationError, match="a top speed shows the drag of surge"):
+    with pytest.raises(CalibrationError, match="but the fitted axes are yaw"):
         fit_hydrodynamics(yaw, vehicle, axes=["yaw"], published={"top_speed": 1.0})
     with pytest.raises(CalibrationError, match="a bollard pull shows the thrust"):
         fit_hydrodynamics(told, vehicle, axes=["yaw"], published={"bollard_pull": pull})

@@ -9,8 +9,9 @@ import pytest
 
 from finssim.core.files import OutputError
 from finssim.identification.fit import Curve, Dive, Estimate
+from finssim.identification.plant_terms import matrices
 from finssim.identification.programme import Leg
-from finssim.identification.report import fit_report, write_report
+from finssim.identification.report import fit_json, fit_report, write_report
 from finssim.identification.vehicle_file import calibrated
 from finssim.trials.findings import finding
 from identification.made_fits import made_fit
@@ -61,7 +62,7 @@ def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
     write_report(fit, tmp_path / "report", calibrated(fit))
     text = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     order = (
-        '<img alt="Measured and fitted',
+        '<img alt="Measured and simulated',
         "4 of 6 parameters",
         "Not determined: yaw.d2 (hardly)",
         "Record next: yaw at ±2 N m",
@@ -72,8 +73,25 @@ def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
     assert record["next_dive"]["legs"] == [{"axis": "yaw", "level": 2.0, "hold": 4.0, "times": 3}]
 
 
+def test_a_given_inertia_is_not_called_determined_and_a_kept_stiffness_is_one():
+    """The file holds the height of the centre of buoyancy; k follows from it."""
+    given = Estimate(
+        name="yaw.m_eff", estimate=0.4, ci95=(0.4, 0.4), unit="kg m²", identifiable=True, note="given"
+    )
+    k = Estimate(
+        name="roll.k", estimate=8.0, ci95=(0.0, 90.0), unit="N m/rad", identifiable=False,
+        path="body.center_of_buoyancy.2",
+    )  # fmt: skip
+    fit = made_fit(estimates=made_fit().estimates | {"yaw.m_eff": given, "roll.k": k})
+    vehicle = calibrated(fit)
+    lead = fit_report(fit, vehicle).lead
+    assert "Given: yaw.m_eff 0.4 kg m²." in lead and "yaw.m_eff" not in lead[0]
+    kept = fit_json(fit, vehicle)["kept"]["roll.k"]
+    assert kept == pytest.approx(matrices(fit.before).arm[2]) and kept > 1.0
+
+
 def test_words_of_numbers_fit_what_they_are_of():
-    """A place in metres, tight intervals with a decimal, and no metres of the file where a stiffness is kept."""
+    """A place in metres, tight intervals with a decimal, and a kept stiffness as such, of which the file has a height."""
     more = [
         Estimate(name=name, estimate=value, ci95=ci, unit=unit, identifiable=told, note="", path=path)
         for name, value, ci, unit, told, path in (
@@ -86,7 +104,7 @@ def test_words_of_numbers_fit_what_they_are_of():
     fit = dataclasses.replace(fit, estimates=dict(fit.estimates) | {one.name: one for one in more})
     report = fit_report(fit, calibrated(fit), ())
     assert "gravity_y (±0.0031 m)" in report.lead[0] and "yaw.m_eff (±0.3 %)" in report.lead[0]
-    assert report.remarks[-1].endswith("yaw.d2 0.4776, heave.d1 80.1, roll.k"), report.remarks
+    assert report.remarks[-1].endswith("yaw.d2 0.4776, heave.d1 80.1, roll.k 13.08"), report.remarks
 
 
 def test_the_pictures_are_files_too(folder):

@@ -284,7 +284,8 @@ def test_one_trial_says_what_its_intervals_rest_on():
     """With a single trial, blocks within it stand for trials, which is said."""
     vehicle = load_vehicle("finsrov")
     fit = fit_by_simulation(trials_of(vehicle, "yaw", count=1), wrong(vehicle))
-    assert "block_intervals" in {one.code for one in fit.findings}
+    (found,) = [one for one in fit.findings if one.code == "block_intervals"]
+    assert found.values == {"axes": ("yaw",), "trials": 1} and "of yaw (1)" in str(found)
     assert np.isfinite(fit.estimates["yaw.m_eff"].ci95).all()
 
 

@@ -407,10 +407,12 @@ def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
     reports = check_trials(list(simulated.values()), VEHICLE)
     text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
     assert json.loads(text)["trials"][0]["axes"]["surge"]["tells"]["m_eff"]["can"] is True
-    page = StringIO()
-    print_reports(reports, Console(file=page, width=100), set_findings(reports))
-    lines = page.getvalue().split("\n")
-    assert max(map(len, lines)) <= 100 and any(line.startswith("surge") for line in lines)
+    for width in (100, 80):
+        page = StringIO()
+        print_reports(reports, Console(file=page, width=width), set_findings(reports))
+        lines = page.getvalue().split("\n")
+        assert max(map(len, lines)) <= width and any(line.startswith("surge") for line in lines)
+        assert any(" velocity " in line and " rest" in line for line in lines)
 
 
 def test_the_command_reads_folders_and_reports_broken_ones(simulated, tmp_path, capsys):

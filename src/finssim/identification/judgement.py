@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,8 +268,17 @@ def fit_findings(
     solution: FitSolution,
     found: Confidence,
     used: Sequence[Streams],
+    trials: Mapping[str, int],
 ) -> list[Finding]:
-    """Return findings that a reader needs before using the numbers."""
+    """Return findings that a reader needs before using the numbers.
+
+    Args:
+        problem: What was fitted.
+        solution: Where the fit ended.
+        found: What is known there.
+        used: The trials.
+        trials: Axis -> number of trials that excite it.
+    """
     out = []
     if solution.interrupted:
         out.append(finding("interrupted"))
@@ -287,7 +296,9 @@ def fit_findings(
             else:
                 out.append(finding("motion_late", stream, **given))
     if found.evidence.unit == "blocks":
-        out.append(finding("block_intervals", trials=len(used)))
+        fewest = min(trials.values())
+        scarce = tuple(axis for axis, count in trials.items() if count == fewest)
+        out.append(finding("block_intervals", axes=scarce, trials=fewest))
     return out
 
 

@@ -28,6 +28,7 @@ from finssim.identification.fit import Correlation, Curve, Estimate, Fit
 from finssim.identification.vehicle_file import (
     all_findings,
     calibrated,
+    file_number,
     number_in,
     retained_values,
     write_ranges,
@@ -92,7 +93,7 @@ def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
     """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
     pictures: dict[str, tuple[str, Figure]] = {}
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
-        pictures[f"curves_{i}.png"] = ("Measured and fitted, and the residual", figure)
+        pictures[f"curves_{i}.png"] = ("Measured and simulated, and the residual", figure)
     if fit.correlation is not None and len(fit.correlation.names) > 1:
         pictures["correlation.png"] = ("Correlation of the errors", draw_correlation(fit.correlation))
     return {name: (text, png(figure)) for name, (text, figure) in pictures.items()}
@@ -310,16 +311,6 @@ def interval_text(estimate: Estimate) -> str:
     return f"{number_text(low)} to {number_text(high)}"
 
 
-def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
-    """The vehicle's own number for an estimate; None where the file holds something else that follows from it.
-
-    It has the unit of the estimate.
-    """
-    if estimate.path is None or estimate.path.startswith("body."):
-        return None
-    return number_in(vehicle, estimate.path)
-
-
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
     """Return the state of a parameter: `written`, `file kept`, or whether the data determine it if the file has no
     place for it.
@@ -474,10 +465,8 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
     for name, estimate in fit.estimates.items():
         if estimate.note:
             notes.setdefault(estimate.note, []).append(name)
-    kept = {name: file_number(fit.estimates[name], vehicle) for name in retained_values(fit, vehicle)}
-    unchanged = ", ".join(
-        name if value is None else f"{name} {number_text(value)}" for name, value in kept.items()
-    )
+    kept = retained_values(fit, vehicle)
+    unchanged = ", ".join(f"{name} {number_text(value)}" for name, value in kept.items())
     sentence = vehicle.calibrations[-1].sentence()
     undrawn = len(fit.curves) - MAX_CURVES
     return Report(
@@ -511,9 +500,11 @@ RATIOS = ("/m_eff", ".terminal_speed")
 
 def _lead(fit: Fit) -> list[str]:
     """Return what is known, what is not, and what to record next."""
-    known, unknown = list[str](), list[str]()
+    known, unknown, given = list[str](), list[str](), list[str]()
     for name, e in fit.estimates.items():
-        if not name.endswith(IMPLIED):
+        if e.note.startswith("given"):
+            given.append(f"{name} {number_text(e.estimate)} {e.unit}")
+        elif not name.endswith(IMPLIED):
             half = 0.5 * (e.ci95[1] - e.ci95[0])
             part = half / max(abs(e.estimate), 1e-12)
             size = f"±{100.0 * part:.{0 if part > 0.0095 else 1}f} %" if part < 1.0 else "hardly"
@@ -524,6 +515,7 @@ def _lead(fit: Fit) -> list[str]:
     unknown += [f"{axis}.m_eff (assumed: give it by --fix {axis}.m=NUMBER)" for axis in assumed]
     told = f": {', '.join(known)}" if known else ""
     out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{told}."]
+    out += [f"Given: {', '.join(given)}."] if given else []
     out += [f"Not determined: {', '.join(unknown)}."] if unknown else []
     out += [f"R{str(fit.next_dive)[1:]}."] if fit.next_dive is not None else []
     return [*out, *(["The fit was interrupted before it converged."] if fit.interrupted else [])]

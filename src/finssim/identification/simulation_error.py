@@ -174,13 +174,22 @@ class Stages:
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
 
+    def trials_of(self) -> dict[str, int]:
+        """Return the number of trials that excite each axis."""
+        return {axis: sum(axis in one for one in self.excites) for axis in self.axes}
+
     def require_shown(self) -> None:
         """Refuse a published number that is not of what is fitted.
 
         Raises:
             CalibrationError: Surge is not fitted, or the thrust is known.
         """
-        if "top_speed" in self.published and ("surge" not in self.axes or "surge" in self.free):
+        if "top_speed" in self.published and "surge" not in self.axes:
+            raise CalibrationError(
+                f"a top speed shows the drag of surge, but the fitted axes are {', '.join(self.axes)}: "
+                "leave it out, or fit surge too"
+            )
+        if "top_speed" in self.published and "surge" in self.free:
             raise CalibrationError(
                 "a top speed shows the drag of surge, which no trial here drives: leave it out"
             )
@@ -447,7 +456,7 @@ class Stages:
             lagged=np.ones(len(self.segments), bool) if acted and not other else None,
             swinging=swinging,
             twisted=self.twisted,
-            few=min(sum(axis in one for one in self.excites) for axis in self.axes) < FEWEST_TRIALS,
+            few=min(self.trials_of().values()) < FEWEST_TRIALS,
         )
 
     def result(
@@ -492,7 +501,7 @@ class Stages:
             *self.remarks,
             *averages,
             *(finding("trial_left_out", name) for name in left_out),
-            *fit_findings(stage.problem, stage.solution, stage.found, self.used),
+            *fit_findings(stage.problem, stage.solution, stage.found, self.used, self.trials_of()),
             *bounds,
             *held,
             *traded,

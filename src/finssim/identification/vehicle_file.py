@@ -21,6 +21,7 @@ from finssim.core.files import atomic_write
 from finssim.core.provenance import provenance
 from finssim.core.registry import ACTUATORS, TERMS
 from finssim.identification.fit import Estimate, Fit
+from finssim.identification.plant_terms import matrices
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
 from finssim.vehicles import (
     AXES,
@@ -499,7 +500,7 @@ def calibrated(fit: Fit) -> Vehicle:
 def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
     """Parameters with a place in the vehicle file that the fit left as they were, with the number they keep.
 
-    They have the units of the file.
+    They have the units of the estimates.
 
     Args:
         fit: The fit.
@@ -511,8 +512,19 @@ def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
             continue
         before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
         if before is not None and before == after and not estimate.identifiable:
-            retained[name] = before
+            retained[name] = float(file_number(estimate, fit.before) or 0.0)
     return retained
+
+
+def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
+    """Return the vehicle's own number for an estimate, in its unit; None where the vehicle file has no place for it."""
+    if estimate.path is None:
+        return None
+    if estimate.name == "buoyancy_excess":
+        return float(matrices(vehicle).excess)
+    if estimate.name in ("roll.k", "pitch.k"):
+        return float(matrices(vehicle).arm[2])
+    return number_in(vehicle, estimate.path)
 
 
 def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:

@@ -240,9 +240,12 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
 
 def _table(heads: Sequence[str], left_aligned: Sequence[str], title: str | None = None) -> Table:
     """An empty table of columns, some of them to the left."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    table = Table(
+        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title=title, title_justify="left"
+    )
     for name in heads:
-        table.add_column(name, justify="left" if name in left_aligned else "right", overflow="fold")
+        justify: Literal["left", "right"] = "left" if name in left_aligned else "right"
+        table.add_column(name, justify=justify, overflow="fold", min_width=max(map(len, name.split())))
     return table
 
 
@@ -253,7 +256,7 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
         if not a.source or a.fastest != a.fastest:
             table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 7)
             continue
-        force = f"{a.strongest:.3g}" if a.strongest > 1e-6 else "-"
+        force = f"{a.strongest:.3g}" if a.strongest > 1e-3 else "-"
         speeds = (f"{a.fastest:.2g}", f"{a.noise:.1g}", f"{a.decades:.1f}")
         rest = (force, "yes" if a.both_directions else "no", f"{a.coasts:.1f} s", f"{a.rests:.1f} s")
         source = a.source.removeprefix("derived ")
