@@ -91,7 +91,7 @@ def test_a_given_inertia_is_not_called_determined_and_a_kept_stiffness_is_one():
 
 
 def test_words_of_numbers_fit_what_they_are_of():
-    """A place in metres, tight intervals with a decimal, and a kept stiffness as such, of which the file has a height."""
+    """A place in metres, tight intervals with a decimal, and a kept stiffness instead of the height in the file."""
     more = [
         Estimate(name=name, estimate=value, ci95=ci, unit=unit, identifiable=told, note="", path=path)
         for name, value, ci, unit, told, path in (
