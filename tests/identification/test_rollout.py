@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from finssim.core.rotations import quat_conjugate, quat_from_euler, quat_rotate
+from finssim.identification.parameters import Parameters
 from finssim.identification.rollout import Rollouts, Segment, segments, streams
+from finssim.identification.shooting import Point, Shooting
 from finssim.sim.simulator import Simulator
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import Header, Trial
@@ -210,6 +212,25 @@ def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
         expected.append(sim.numpy("velocity")[0, 0].copy())
     assert response.nu[-1, 0, 0, 5] > 0.8
     np.testing.assert_allclose(response.nu[:, 0, 0], expected, atol=3e-6)
+
+
+def test_pulls_say_nothing_of_an_unknown_thrust():
+    """Their deviation is known for the thrust of the file's voltage: they have the scale of all forces."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    times = np.linspace(0.1, 1.9, 10)
+    measured = {name: (times, np.zeros(10)) for name in ("u", "v")}
+    one = segment(vehicle, np.zeros((100, 8)), measured=measured)
+    axes = ("surge", "sway")
+    free = Parameters(
+        vehicle, axes=axes, damping=dict.fromkeys(axes, "both"), extras=("thrust_scale",), likely=True
+    )
+    problem = Shooting([one], free, ("u", "v"))
+    start, scale = problem.start(), problem.names.index("thrust_scale")
+    points = Point(np.tile(start.theta, (2, 1)), np.tile(start.z, (2, 1, 1)))
+    points.theta[:, scale], points.z[:, 0, problem.free == 12] = (0.5, 1.0), ((2.0,), (1.0,))
+    residual = problem.residuals(points)
+    assert np.abs(residual[:, 0]).max() > 0.02
+    np.testing.assert_allclose(residual[:, 0], residual[:, 1], atol=1e-7)
 
 
 def test_a_submerged_vehicle_does_not_surface_while_it_drifts():

@@ -707,6 +707,14 @@ class Shooting:
                 out[swinging, i] = PULL * weight * (1.0 if i < 3 else 0.5 * body.size[0])
         return out
 
+    def _scale(self, theta: Array) -> Array:
+        """Return the scale of thrust of vectors (C, P) [-], (C,), which pulls have too.
+
+        With known deviations they would tell the size of all forces, and so of all masses.
+        """
+        names = self.parameters.names
+        return theta[:, names.index("thrust_scale")] if "thrust_scale" in names else np.ones(len(theta))
+
     def prior(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
         of one vector, (R, P).
@@ -776,7 +784,7 @@ class Shooting:
             fields,
             initial=initial,
             disturbance=p.bias + full[..., 12:18] * (np.arange(6) > 2),
-            pull=full[..., 12:15],
+            pull=full[..., 12:15] * self._scale(points.theta)[:, None, None],
             earlier=full[..., 18:],
             candidates=C,
         )
