@@ -93,7 +93,7 @@ def task_rate(name: str, worlds: int, device: str, seconds: float) -> float:
 def learner_rate(name: str, task: str, worlds: int, device: str, seconds: float) -> float:
     """Return environment steps per second of training, rollouts and updates included."""
     kind, chosen = learner_named(name), task_named(task)
-    settings = kind.settings(chosen, worlds=worlds, steps=10**9)
+    settings = kind.settings(chosen, worlds=worlds, steps=10**9, device=device)
     environment = finssim.make(chosen, worlds=worlds, seed=1, observe="training", device=device)
     learner = kind(environment, settings, seed=1, device=device)
     learner.update()

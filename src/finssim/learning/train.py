@@ -311,7 +311,8 @@ def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> 
     given = settings.settings
     changes = dict(given) if isinstance(given, Mapping) else parse_settings(given)
     values = kind.settings(
-        task, randomized=settings.randomize is not None, worlds=settings.worlds, steps=settings.steps, changes=changes
+        task, randomized=settings.randomize is not None, worlds=settings.worlds, steps=settings.steps, changes=changes,
+        device=settings.device,
     )  # fmt: skip
     return _taught(values, settings.init, learner, (settings.action or task.action) == task.action)
 

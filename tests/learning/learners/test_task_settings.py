@@ -54,3 +54,17 @@ def test_a_task_of_ones_own_has_the_defaults():
     kind = learner_named("sb3-ppo")
     module = sys.modules[type(kind.settings(Guess())).__module__]
     assert kind.settings(Guess(), worlds=256) == module.OnPolicySettings()
+
+
+def test_a_gpu_takes_as_many_gradient_steps_of_more_samples():
+    """Worlds, samples of a step and steps grow alike, or with the worlds that are asked for; a change stays."""
+    kind, task = learner_named("ppo"), task_named("t1")
+    cpu, gpu = kind.settings(task), kind.settings(task, device="cuda")
+    assert (gpu.worlds, gpu.batch, gpu.steps) == (64 * cpu.worlds, 64 * cpu.batch, 64 * cpu.steps)
+    assert (gpu.epochs, gpu.rollout, gpu.learning_rate) == (cpu.epochs, cpu.rollout, cpu.learning_rate)
+    asked = kind.settings(task, worlds=2048, steps=5_000_000, changes={"batch": 1000}, device="cuda")
+    assert (asked.worlds, asked.batch, asked.steps) == (2048, 1000, 5_000_000)
+    assert kind.settings(task, worlds=2048, device="cuda").batch == 8 * cpu.batch
+    assert kind.settings(task, worlds=2048).batch == cpu.batch
+    taught = task_named("formation")  # the teacher acts on the host
+    assert kind.settings(taught, device="cuda") == kind.settings(taught)

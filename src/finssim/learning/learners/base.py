@@ -177,14 +177,30 @@ class ActingLearner:
     rollout_samples: ClassVar[int] = 0
     """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as the settings say."""
 
+    gpu_factor: ClassVar[int] = 1
+    """Factor on worlds, samples of a gradient step and control steps on a GPU: as many gradient steps."""
+
     @classmethod
     def settings_for(
-        cls, task: Task, changes: Mapping[str, Any], worlds: int | None, steps: int | None
+        cls,
+        task: Task,
+        changes: Mapping[str, Any],
+        worlds: int | None,
+        steps: int | None,
+        device: str = "cpu",
     ) -> Any:
-        """The settings of a training: defaults with the task's `changes` changes; then worlds and steps, unless "
-        "None."""
+        """Return the settings of a training: defaults with the task's changes, and with worlds and steps unless None.
+
+        On a GPU a gradient step takes samples in proportion to the worlds. A teacher acts on the host, so that a
+        training with one has the settings of a processor.
+        """
         stated = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
-        settings = replace(cls.Settings(), **{**changes, **stated})
+        settings = replace(cls.Settings(), **changes)
+        if device != "cpu" and cls.gpu_factor > 1 and not settings.teacher:
+            factor = cls.gpu_factor if worlds is None else max(1, worlds // settings.worlds)
+            scaled = {name: factor * getattr(settings, name) for name in ("worlds", "batch", "steps")}
+            settings = replace(settings, **scaled)
+        settings = replace(settings, **stated)
         if not cls.rollout_samples:
             return settings
         least = math.ceil(cls.rollout_samples / (settings.worlds * len(task.agents)))

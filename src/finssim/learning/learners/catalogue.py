@@ -79,8 +79,9 @@ class LearnerKind:
         worlds: int | None = None,
         steps: int | None = None,
         changes: Mapping[str, Any] | None = None,
+        device: str = "cpu",
     ) -> Any:
-        """The settings of a training; what is None keeps its default for the task.
+        """The settings of a training; what is None keeps its default for the task and the device, cpu or cuda.
 
         Raises:
             LearningError: A change names no setting, has another type than the setting's own, or counts too few.
@@ -88,7 +89,7 @@ class LearnerKind:
         task_changes = {}
         if self.own is None:
             task_changes = task_settings(task.name, self.key, randomized)
-        chosen = self._class().settings_for(task, task_changes, worlds, steps)
+        chosen = self._class().settings_for(task, task_changes, worlds, steps, device)
         return replace(
             chosen, **{name: _fitting(chosen, name, value) for name, value in (changes or {}).items()}
         )

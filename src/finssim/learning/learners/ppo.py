@@ -87,6 +87,7 @@ class Ppo(ActingLearner):
 
     Settings = PpoSettings
     rollout_samples = ROLLOUT_SAMPLES
+    gpu_factor = 64
 
     def __init__(
         self,
