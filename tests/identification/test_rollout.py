@@ -219,7 +219,10 @@ def test_pulls_say_nothing_of_an_unknown_thrust():
     vehicle = load_vehicle("bluerov2_heavy")
     times = np.linspace(0.1, 1.9, 10)
     measured = {name: (times, np.zeros(10)) for name in ("u", "v")}
-    one = segment(vehicle, np.zeros((100, 8)), measured=measured)
+    still = np.zeros((100, 8))
+    one = segment(
+        vehicle, still, measured=measured, change=still, which=np.full(100, -1), place=np.zeros((100, 2))
+    )
     axes = ("surge", "sway")
     free = Parameters(
         vehicle, axes=axes, damping=dict.fromkeys(axes, "both"), extras=("thrust_scale",), likely=True

@@ -243,7 +243,7 @@ def test_a_tether_that_pulls_in_one_direction_does_not_bend_the_drag():
 
     some = simulate_programme(
         programmes(["surge", "yaw"], vehicle), vehicle, seed=2, each_step=pull, noise=known_trials.NOISE,
-        rate=50.0, inputs=("force",),
+        rate=5.0, inputs=("command",),
     )  # fmt: skip
     found, true = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
     for name, size in (("surge.m_eff", 0.05), ("surge.d1", 0.15), ("surge.d2", 0.1), ("yaw.m_eff", 0.01)):

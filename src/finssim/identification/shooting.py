@@ -699,7 +699,8 @@ class Shooting:
         """
         p, out = self.parameters, np.zeros((len(self.segments), 6))
         body, weight = p.vehicle.body, p.vehicle.weight
-        if {"surge", "sway"} & set(p.axes):
+        # Where the motion is known well, mistakes of the model would pass for pulls.
+        if {"surge", "sway"} & set(p.axes) and any(s.change is not None for s in self.segments):
             out[~swinging, :2] = TETHER * weight
         coasting = set(p.axes).difference(p.biases)
         for i in COASTING:
