@@ -52,7 +52,7 @@ SETTINGS: Table = {
     "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SIGHT},
     "gate": {"distill": {"teacher_steps": 600_000}, **SIGHT},
     # Its student succeeds in all episodes after a quarter of these steps.
-    "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800}, **SIGHT},
+    "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800, "learning_rate": 2.0e-3}, **SIGHT},
     "camera-docking": SIGHT,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
     # After 1.5 million steps, half of the seeds have only started to capture.
