@@ -85,8 +85,8 @@ RELEVANT = {"drag": 0.1, "thruster": 0.1}
 RELEVANT_WEIGHT = 0.005
 """Least additional weight that counts, over the vehicle's own weight [-]."""
 
-CERTAIN = 1.5
-"""Least change over the half width of its 95 % interval: of a dozen numbers one is hardly ever so far off by chance."""
+DIFFERENT = 1.5
+"""Least change over the half width of its 95 % interval: among a dozen numbers, an error above 1 is usual."""
 
 
 class _Coordinates:
@@ -267,7 +267,7 @@ class Adaptation:
             kind = name.partition(".")[0]
             least = RELEVANT.get(kind, RELEVANT_WEIGHT * self.vehicle.weight)
             least = least if kind in ("drag", "thruster", "weight") else 0.1 * least
-            differs = abs(value - start) > max(CERTAIN * half, least)
+            differs = abs(value - start) > max(DIFFERENT * half, least)
             out[name] = Estimate.within(name, value, half, unit, differs, "as in the vehicle file")
         return out
 

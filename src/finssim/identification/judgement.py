@@ -69,13 +69,8 @@ def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
         slopes = solution.linear.shared[np.ix_(rows, own)] * p.scale[own] / solution.std[rows, None]
         return float(np.sum(slopes**2))
 
-    straight = sum(
-        moved(axis, column) for axis, column in zip(("surge", "sway"), "xy", strict=True) if axis in planar
-    )
-    across = sum(
-        moved(axis, column) for axis, column in zip(("surge", "sway"), "yx", strict=True) if axis in planar
-    )
-    best = dict(zip(("surge", "sway"), "xy" if straight >= across else "yx", strict=True))
+    orders = [dict(zip(("surge", "sway"), columns, strict=True)) for columns in ("xy", "yx")]
+    best = max(orders, key=lambda order: sum(moved(axis, order[axis]) for axis in planar))
     return out | {axis: best[axis] for axis in planar}
 
 

@@ -476,8 +476,8 @@ PULL, COASTING = 0.003, (0, 1, 5)
 its length as the lever; and the axes that coast."""
 
 TETHER = 0.01
-"""Standard deviation of the horizontal pull of a tether on a driven vehicle, as a part of its weight. In a segment it
-keeps its direction in the world, while the vehicle turns."""
+"""Standard deviation of the horizontal pull of a tether on a driven vehicle in slow logs, as a part of its weight. In a
+segment it keeps its direction in the world, while the vehicle turns."""
 
 CHANGE_STD = 12.0**-0.5
 """Standard deviation of the time of a change between two samples of a command, as a part of the time between them."""
@@ -699,9 +699,12 @@ class Shooting:
         """
         p, out = self.parameters, np.zeros((len(self.segments), 6))
         body, weight = p.vehicle.body, p.vehicle.weight
-        # Where the motion is known well, mistakes of the model would pass for pulls.
-        if {"surge", "sway"} & set(p.axes) and any(s.change is not None for s in self.segments):
-            out[~swinging, :2] = TETHER * weight
+        # In fast logs, which show the motion well, errors of the model would be taken for pulls.
+        slow = np.isin(
+            [s.index for s in self.segments], [s.index for s in self.segments if s.change is not None]
+        )
+        if {"surge", "sway"} & set(p.axes):
+            out[slow & ~swinging, :2] = TETHER * weight
         coasting = set(p.axes).difference(p.biases)
         for i in COASTING:
             if AXES[i] in coasting and (i < 3 or twisted or not self.coasts):

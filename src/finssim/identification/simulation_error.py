@@ -174,7 +174,7 @@ class Stages:
         self.remarks: list[Finding] = []
         self.weak_start = self._weak_start()
 
-    def trials_of(self) -> dict[str, int]:
+    def trial_counts(self) -> dict[str, int]:
         """Return the number of trials that excite each axis."""
         return {axis: sum(axis in one for one in self.excites) for axis in self.axes}
 
@@ -456,7 +456,7 @@ class Stages:
             lagged=np.ones(len(self.segments), bool) if acted and not other else None,
             swinging=swinging,
             twisted=self.twisted,
-            few=min(self.trials_of().values()) < FEWEST_TRIALS,
+            few=min(self.trial_counts().values()) < FEWEST_TRIALS,
         )
 
     def result(
@@ -501,7 +501,7 @@ class Stages:
             *self.remarks,
             *averages,
             *(finding("trial_left_out", name) for name in left_out),
-            *fit_findings(stage.problem, stage.solution, stage.found, self.used, self.trials_of()),
+            *fit_findings(stage.problem, stage.solution, stage.found, self.used, self.trial_counts()),
             *bounds,
             *held,
             *traded,

@@ -310,9 +310,10 @@ def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> 
     """
     given = settings.settings
     changes = dict(given) if isinstance(given, Mapping) else parse_settings(given)
+    teacher = settings.init not in (None, "none") or "teacher" in changes  # which acts on the host
     values = kind.settings(
         task, randomized=settings.randomize is not None, worlds=settings.worlds, steps=settings.steps, changes=changes,
-        device=settings.device,
+        device="cpu" if teacher else settings.device,
     )  # fmt: skip
     return _taught(values, settings.init, learner, (settings.action or task.action) == task.action)
 

@@ -1,11 +1,13 @@
 """Settings by task: what outranks what, and every line of the tables is of something that there is."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 
 from finssim.learning.learners import LEARNERS, base, learner_named
 from finssim.learning.learners.base import ON_POLICY, RANDOMIZED, SETTINGS, task_settings
+from finssim.learning.train import TrainingSettings, _values
 from finssim.tasks import TASKS, numeric_tasks, task_named
 from reference.guess import Guess
 
@@ -68,3 +70,11 @@ def test_a_gpu_takes_as_many_gradient_steps_of_more_samples():
     assert kind.settings(task, worlds=2048).batch == cpu.batch
     taught = task_named("formation")  # the teacher acts on the host
     assert kind.settings(taught, device="cuda") == kind.settings(taught)
+
+
+def test_a_training_that_imitates_first_keeps_its_size_on_a_gpu():
+    """Whom it imitates acts on the host, in every world."""
+    kind, task = learner_named("ppo"), task_named("t1")
+    plain = _values(TrainingSettings(device="cuda"), kind, "ppo", task)
+    taught = _values(TrainingSettings(device="cuda", init="pid"), kind, "ppo", task)
+    assert plain.worlds == 64 * taught.worlds and taught == replace(kind.settings(task), teacher="pid")

@@ -178,7 +178,7 @@ class ActingLearner:
     """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as the settings say."""
 
     gpu_factor: ClassVar[int] = 1
-    """Factor on worlds, samples of a gradient step and control steps on a GPU: as many gradient steps."""
+    """Factor on worlds, batch and steps on a GPU, which keeps the number of gradient steps."""
 
     @classmethod
     def settings_for(

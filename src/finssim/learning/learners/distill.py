@@ -24,7 +24,7 @@ from finssim.learning.torch_networks import SeeingNetwork
 from finssim.tasks import Environment
 
 LEAST_DEVIATION = 0.02
-"""Rows are scaled by their numbers' standard deviations [1], by this at least: what hardly varies stays small."""
+"""Least standard deviation by which a number of the row is divided [-]: what hardly varies stays small."""
 
 
 @dataclass(frozen=True, kw_only=True)
