@@ -10,6 +10,7 @@ import math
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,9 +39,11 @@ MOST_WORLDS = 2**22
 """Most worlds whose memory is measured."""
 COMPARED_WORLDS, COMPARED_TIME = 64, 5.0
 """Worlds, and time, over which a device is compared with the processor [s]."""
-TOLERANCES = {"position": 1e-4, "observation": 1e-3}
+TOLERANCES = {"position": 1e-4, "observation": 1e-3, "recording": 1e-3}
 """Largest difference from the processor: position [m], and element of an observation of T1 [-], after `COMPARED_TIME`;
-single precision gives 1e-6 and 1e-4."""
+single precision gives 1e-6 and 1e-4. Then that of a parameter of PPO with recordings from one without [-], after
+`COMPARED_UPDATES`."""
+COMPARED_UPDATES = 4
 STEERED = ("path", "waypoints", "terrain", "homing")
 """Tasks of a vehicle with fins."""
 LEARNERS = {"ppo": "t1", "sb3-ppo": "t1", "rsl-rl": "t1", "torchrl-ppo": "t1", "distill": "camera-docking"}
@@ -90,13 +93,19 @@ def task_rate(name: str, worlds: int, device: str, seconds: float) -> float:
     return rate(environment.advance, worlds, device, seconds)
 
 
-def learner_rate(name: str, task: str, worlds: int, device: str, seconds: float) -> float:
-    """Return environment steps per second of training, rollouts and updates included."""
+def learner_of(name: str, task: str, worlds: int, device: str, **changes: Any) -> Any:
+    """Return a learner at the start of an endless training. `changes` are of its settings."""
     kind, chosen = learner_named(name), task_named(task)
-    settings = kind.settings(chosen, worlds=worlds, steps=10**9, device=device)
+    settings = replace(kind.settings(chosen, worlds=worlds, steps=10**9, device=device), **changes)
     environment = finssim.make(chosen, worlds=worlds, seed=1, observe="training", device=device)
-    learner = kind(environment, settings, seed=1, device=device)
-    learner.update()
+    return kind(environment, settings, seed=1, device=device)
+
+
+def learner_rate(name: str, task: str, worlds: int, device: str, seconds: float, **changes: Any) -> float:
+    """Return environment steps per second of training, rollouts and updates included."""
+    learner = learner_of(name, task, worlds, device, **changes)
+    for _ in range(COMPARED_UPDATES):  # recordings are made
+        learner.update()
     before, began = learner.steps, time.perf_counter()
     while time.perf_counter() - began < seconds:
         learner.update()
@@ -158,8 +167,14 @@ def differences(device: str) -> dict[str, float]:
         for _ in range(round(COMPARED_TIME / 0.1)):
             step = environment.step(action)
         ends[where] = simulator.numpy("position").copy(), np.array(step.observation)
-    ours, theirs = ends["cpu"], ends[device]
-    return {name: float(np.abs(a - b).max()) for name, a, b in zip(TOLERANCES, ours, theirs, strict=True)}
+    learned = []
+    for recorded in (True, False):
+        learner = learner_of("ppo", "t1", COMPARED_WORLDS, device, recorded=recorded)
+        for _ in range(COMPARED_UPDATES):
+            learner.update()
+        learned.append(learner.learned()["numbers"]["policy"])
+    pairs = zip((*ends["cpu"], learned[0]), (*ends[device], learned[1]), strict=True)
+    return {name: float(np.abs(a - b).max()) for name, (a, b) in zip(TOLERANCES, pairs, strict=True)}
 
 
 def _thrusting(model: str, worlds: int, device: str) -> Simulator:
@@ -230,6 +245,11 @@ def gpu(
         )
         for name, task in LEARNERS.items()
     }
+    if find_device(device).is_cuda:
+        figure = partial(learner_rate, recorded=False)
+        plan["learner, ppo, not recorded"] = partial(
+            figure, "ppo", "t1", of(LEARNER_WORLDS), device, 5.0 * seconds
+        )
     plan |= {
         f"camera, {site}": partial(picture_rate, site, of(CAMERA_WORLDS), device, seconds)
         for site in ("pool", "dock")

@@ -97,7 +97,7 @@ def test_adam_is_torchs(device):
     for size in (0.01, 3.0, 0.1, 1.0, 0.02):
         gradient = (size * rng.normal(size=9)).astype(np.float32)
         row.gradient[:] = arrays.array(gradient)
-        ours.step(0.01)
+        ours.step(ours.schedule(0.01, 1)[0])
         theirs.grad = torch.from_numpy(gradient)
         nn.utils.clip_grad_norm_([theirs], 0.5)
         torchs.step()

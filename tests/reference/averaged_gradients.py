@@ -15,7 +15,7 @@ def optimized(arrays, gradients):
     adam = Adam(parameters, arrays, 0.5)
     for gradient in gradients:
         parameters.gradient[:] = arrays.array(gradient)
-        adam.step(0.1)
+        adam.step(adam.schedule(0.1, 1)[0])
     return arrays.numpy(row.values)
 
 

@@ -101,12 +101,12 @@ class EpisodeTally:
         self._rewards = arrays.view(environment.arrays.reward)
         self._shortened = self._ends.done() | True if shortened else self._ends.done() & False
         self._episodes: deque[tuple[float, ...]] = deque(maxlen=max(SHORTEST_WINDOW, environment.worlds))
-        self._reward, self._looks = arrays.zeros(1), 0
+        self._reward, self._looks = arrays.zeros(1), arrays.zeros(1)
 
     def look(self) -> None:
         """Count the episodes that ended in the step just done, and its reward."""
         self._reward += self._rewards.mean()
-        self._looks += 1
+        self._looks += 1.0
         done = self._ends.done()
         self._ends.look(done & ~self._shortened)
         self._shortened &= ~done
@@ -127,14 +127,14 @@ class EpisodeTally:
             *(f"earned_{n}" for n in self.environment.task.earnings),
         )
         means = np.mean(self._episodes, axis=0) if self._episodes else np.zeros(len(names))
-        reward = float(self._arrays.numpy(self._reward)[0]) / max(self._looks, 1)
+        reward, looks = (float(self._arrays.numpy(x)[0]) for x in (self._reward, self._looks))
         self._start_row()
-        return {**dict(zip(names, means.tolist(), strict=True)), "mean_reward": reward}
+        return {**dict(zip(names, means.tolist(), strict=True)), "mean_reward": reward / max(looks, 1.0)}
 
     def _start_row(self) -> None:
         self._ends.clear()
         self._reward[:] = 0.0
-        self._looks = 0
+        self._looks[:] = 0.0
 
     def state(self) -> dict[str, Any]:
         """Return the state that `load` takes."""

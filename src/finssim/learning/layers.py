@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,8 @@ class Arrays:
         self.processes = 1 if group is None else group.size
         self._rng: Any = np.random.Generator(np.random.SFC64(seed))
         """Of first weights and orders of samples; of noise too with NumPy."""
+        self._pool: Any = None
+        """Memory of all recordings."""
         if torch_device is not None:
             import torch
 
@@ -127,6 +129,17 @@ class Arrays:
         q *= np.sign(np.diag(r))
         return (gain * (q if rows >= columns else q.T)).astype(np.float32)
 
+    def recorded(self, function: Callable[..., None]) -> Callable[..., None]:
+        """Return a function that does the same; on a GPU it repeats a recording, see `Recording`.
+
+        Args:
+            function: It takes arrays, and writes its results into arrays that stay where they are.
+        """
+        if self.device is None or self.group is not None or not self.device.startswith("cuda"):
+            return function
+        self._pool = self._pool or self.xp.cuda.graph_pool_handle()
+        return Recording(function, self._pool)
+
     def state(self) -> dict[str, Any]:
         """The random streams, for `load`."""
         saved: dict[str, Any] = {"numpy": self._rng.bit_generator.state}
@@ -139,6 +152,51 @@ class Arrays:
         self._rng.bit_generator.state = state["numpy"]
         if self.device is not None:
             self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
+
+
+class Recording:
+    """A function of torch tensors, repeated on a GPU as one CUDA graph for each shape of its arguments.
+
+    Launching the kernels of a small network one by one takes longer than they run. A graph repeats the same kernels at
+    the same addresses with the same scalars: whatever changes between calls must be in the arguments, or in tensors
+    that are written in place. Nothing in it may wait for the host. The first calls run as written, in which torch's
+    libraries allocate what they need.
+    """
+
+    FIRST_CALLS = 2
+
+    def __init__(self, function: Callable[..., None], pool: Any) -> None:
+        """Take the function, whose results are what it writes in place, and torch's handle of memory for graphs.
+
+        Recordings share the memory: none needs what it holds after a call.
+        """
+        self._function, self._pool = function, pool
+        self._calls: dict[Any, int] = {}
+        self._graphs: dict[Any, tuple[Any, list[Array]]] = {}
+
+    def __call__(self, *arguments: Array) -> None:
+        """Call the function, or repeat its recording with the values of these arguments."""
+        import torch
+
+        shapes = tuple(argument.shape for argument in arguments)
+        calls = self._calls[shapes] = self._calls.get(shapes, 0) + 1
+        if calls <= self.FIRST_CALLS:
+            stream, current = torch.cuda.Stream(), torch.cuda.current_stream()
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
+                self._function(*arguments)
+            current.wait_stream(stream)
+            return
+        if shapes not in self._graphs:
+            own = [argument.clone() for argument in arguments]
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, pool=self._pool):
+                self._function(*own)
+            self._graphs[shapes] = graph, own
+        graph, own = self._graphs[shapes]
+        for target, argument in zip(own, arguments, strict=True):
+            target.copy_(argument)
+        graph.replay()
 
 
 class NetworkParameters:
@@ -334,6 +392,8 @@ class Gru:
 class Adam:
     """Adam (Kingma and Ba 2015), after shortening gradients that are longer than `largest`."""
 
+    B1, B2, EPSILON = 0.9, 0.999, 1e-5
+
     def __init__(self, parameters: NetworkParameters, arrays: Arrays, largest: float) -> None:
         """Take what to optimise."""
         self.parameters, self.arrays, self.xp, self.largest = parameters, arrays, arrays.xp, largest
@@ -341,13 +401,18 @@ class Adam:
         self.mean, self.square = arrays.zeros(n), arrays.zeros(n)
         self.count = 0
 
-    def step(self, rate: float, b1: float = 0.9, b2: float = 0.999, epsilon: float = 1e-5) -> None:
-        """One step down the gradient, of a learning rate [-]."""
+    def schedule(self, rate: float, steps: int) -> Array:
+        """Count coming steps of a learning rate [-]; return what `step` takes for each, (steps, 2)."""
+        counts = self.count + 1.0 + np.arange(steps)
+        self.count += steps
+        return self.arrays.array(np.stack([rate / (1.0 - self.B1**counts), 1.0 - self.B2**counts], axis=1))
+
+    def step(self, scheduled: Array) -> None:
+        """One step down the gradient, with a row of `schedule`, (2,)."""
         g = self.arrays.average(self.parameters.gradient)
         norm = self.xp.sqrt((g * g).sum())
         g *= self.largest / self.xp.clip(norm, self.largest, None)
-        self.count += 1
-        self.mean += (1.0 - b1) * (g - self.mean)
-        self.square += (1.0 - b2) * (g * g - self.square)
-        c1, c2 = 1.0 - b1**self.count, 1.0 - b2**self.count
-        self.parameters.values -= (rate / c1) * self.mean / (self.xp.sqrt(self.square / c2) + epsilon)
+        self.mean += (1.0 - self.B1) * (g - self.mean)
+        self.square += (1.0 - self.B2) * (g * g - self.square)
+        root = self.xp.sqrt(self.square / scheduled[1])
+        self.parameters.values -= scheduled[0] * self.mean / (root + self.EPSILON)

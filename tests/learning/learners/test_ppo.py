@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import finssim
 from finssim.control.policy import Policy
@@ -51,6 +52,9 @@ def made(task, arrays=None, seed=3, ranges="fossen_learn_to_swim", **changes):
     )
     return Ppo(environment, settings, seed=seed, arrays=arrays)
 
+
+STILL = np.array([0.0, 1.0], np.float32)
+"""A step of Adam that moves nothing."""
 
 VARIANTS = [
     {},
@@ -102,12 +106,9 @@ def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
     guard(wp.array, "numpy")
     with learner.arrays.plain():
         learner._roll_out()
+        learner._advantages()
         assert touched == []
-        learner._improve_value(learner._c[0], learner._r[0], 1e-3)
-        advantage, target = learner._advantages()
-        assert touched == []
-        before = learner.arrays.zeros(learner._rows, learner.settings.memory)
-        learner._learn(advantage, target, before, 1e-3)
+        learner._learn(1e-3)
     assert len(touched) <= 6, "losses and noise, once for the row"
     network = learner.network()
     assert isinstance(network, Network)
@@ -125,6 +126,67 @@ def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
     looks = touched.count("__bool__")
     assert steps == looks == 10, "on a processor alone: whether all episodes have ended"
     assert len(touched) - looks <= 8, "the measures, once at the end"
+
+
+class Tape(TorchDispatchMode):
+    """What a CUDA graph is of, on a processor: the operations of a function, repeated with the same memory and scalars.
+
+    As a graph does, it refuses to read a number back.
+    """
+
+    def __init__(self, function, arguments):
+        super().__init__()
+        self.operations = []
+        with self:
+            function(*arguments)
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        assert func is not torch.ops.aten._local_scalar_dense.default, "a number is read back"
+        result = func(*args, **(kwargs or {}))
+        self.operations.append((func, args, kwargs or {}, result))
+        return result
+
+    def replay(self):
+        for func, args, kwargs, result in self.operations:
+            again = func(*args, **kwargs)
+            if isinstance(again, torch.Tensor) and again.data_ptr() != result.data_ptr():
+                result.copy_(again)
+
+
+class Taped(Torch):
+    """A GPU's recordings by tapes; the first call is taken down while it is made."""
+
+    replays = 0
+
+    def recorded(self, function):
+        tapes = {}
+
+        def call(*arguments):
+            shapes = tuple(argument.shape for argument in arguments)
+            if shapes not in tapes:
+                own = [argument.clone() for argument in arguments]
+                tapes[shapes] = Tape(function, own), own
+                return
+            tape, own = tapes[shapes]
+            for target, argument in zip(own, arguments, strict=True):
+                target.copy_(argument)
+            tape.replay()
+            self.replays += 1
+
+        return call
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_recorded_operations_learn_the_same_when_repeated(changes):
+    """Each part of an update depends on nothing but memory that stays: a graph of a GPU can repeat it."""
+    learners = [made(StationKeeping(time_limit=1.0), arrays, **changes) for arrays in (Torch(3), Taped(3))]
+    for _ in range(4):
+        rows = [learner.update() for learner in learners]
+        assert rows[0] == rows[1]
+    ours, theirs = (learner._numbers() for learner in learners)
+    for name in ours:
+        assert torch.equal(ours[name], theirs[name]), name
+    assert learners[1].arrays.replays > 3 * (2 * 8 + 1)
 
 
 def torch_module(network):
@@ -238,7 +300,8 @@ def test_time_ends_no_value(task, changes):
     learner = made(task(), ranges=None, rollout=12, discount=0.9, **changes)
     learner.critic.weights[-2][:], learner.critic.weights[-1][:] = 0.0, 10.0
     learner._roll_out()
-    np.testing.assert_allclose(learner._advantages()[1], 10.0, rtol=1e-5)
+    learner._advantages()
+    np.testing.assert_allclose(learner._target, 10.0, rtol=1e-5)
     assert learner.environment.simulator.state.episode.numpy().min() >= 3
 
 
@@ -246,7 +309,8 @@ def test_an_end_by_the_task_ends_the_value():
     learner = made(Guess(), ranges=None)
     learner.critic.weights[-2][:], learner.critic.weights[-1][:] = 0.0, 10.0
     learner._roll_out()
-    assert learner._advantages()[1].max() <= 1.0 + 1e-5
+    learner._advantages()
+    assert learner._target.max() <= 1.0 + 1e-5
 
 
 def test_advantages_are_the_discounted_sum_of_differences_up_to_the_end():
@@ -256,7 +320,8 @@ def test_advantages_are_the_discounted_sum_of_differences_up_to_the_end():
     for x in (learner._r, learner._c):
         x[:] = random.standard_normal(x.shape)
     learner._go[:] = random.random(learner._go.shape) < 0.7
-    found = learner._advantages()[0]
+    learner._advantages()
+    found = learner._advantage
     rows = learner._c.shape[1]
     value = learner.critic(learner._c.reshape(-1, learner._c.shape[2])).reshape(-1, rows).copy()
     for t, w in np.ndindex(found.shape):
@@ -330,7 +395,7 @@ def test_the_value_follows_the_gradient_of_the_mean_squared_error():
         return backward(slope)
 
     learner.critic.backward = noted
-    loss = learner._improve_value(seen, target, 0.0)
+    loss = learner._improve_value(seen, target, STILL)
     error = torch.tensor(value, requires_grad=True)
     expected = 0.5 * torch.nn.functional.mse_loss(error, torch.tensor(target))
     expected.backward()
@@ -361,4 +426,4 @@ def test_imitation_is_half_the_mean_squared_distance_of_the_actions():
     mean = learner.actor(rng.normal(size=(32, inputs)).astype(np.float32)).copy()
     label = rng.normal(size=mean.shape).astype(np.float32)
     expected = 0.5 * np.mean(np.sum((mean - label) ** 2, axis=1))
-    assert learner._imitate(mean, label, 0.0) == pytest.approx(expected, rel=1e-5)
+    assert learner._imitate(mean, label, STILL) == pytest.approx(expected, rel=1e-5)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from finssim.agents.agent import NOWHERE
@@ -80,6 +81,8 @@ class PpoSettings:
     """A baseline of the task by name, or a policy directory, that is imitated first; none if empty."""
     taught: float = 0.2
     """Share of the steps in which it is; in the first third of these it also acts."""
+    recorded: bool = True
+    """True if a GPU repeats recordings of its kernels (CUDA graphs), except with a teacher or several processes."""
 
 
 class Ppo(ActingLearner):
@@ -151,6 +154,17 @@ class Ppo(ActingLearner):
         """What the teacher would have done."""
         self._r, self._go, self._density = (A.empty(s.rollout, self._rows) for _ in range(3))
         """Rewards; 0 where an episode ended, else 1; logarithms of the actions' densities, but for what all share."""
+        self._advantage, self._target = (A.empty(s.rollout, self._rows) for _ in range(2))
+        """Advantages, and targets of the value."""
+        self._before, self._old_log_std = A.zeros(self._rows, s.memory), A.zeros(m)
+        """What the GRU remembered before the rollout, and the action noise then."""
+        self._losses = A.zeros(4)
+        """Sums over the gradient steps of an update."""
+        # A teacher acts on the host, where nothing can be recorded.
+        recorded = A.recorded if s.recorded and self._teacher is None else lambda function: function
+        self._decide = [recorded(partial(self._act, t)) for t in range(s.rollout)]
+        self._conclude = [recorded(partial(self._close, t)) for t in range(s.rollout)]
+        self._judge, self._take_step = recorded(self._advantages), recorded(self._gradient_step)
 
     def _views(self, name: str) -> Array:
         """An array of the environment's, a row for each agent."""
@@ -163,9 +177,10 @@ class Ppo(ActingLearner):
         """
         rate = self.settings.learning_rate * self.remaining
         with self.arrays.plain():
-            before = self.arrays.copy(self._memory[:, self._window :])
+            self._before[:] = self._memory[:, self._window :]
             self._roll_out()
-            losses = self._learn(*self._advantages(), before, rate)
+            self._judge()
+            losses = self._learn(rate)
             if self.settings.normalize:
                 self._rescale()
         self.steps += self.environment.worlds * self.arrays.processes * self.settings.rollout
@@ -175,26 +190,29 @@ class Ppo(ActingLearner):
 
     def _roll_out(self) -> None:
         """Act for `rollout` control steps, and keep what was seen, done and earned."""
-        A, s = self.arrays, self.settings
-        sigma = A.xp.exp(self.noise.values)
-        for t in range(s.rollout):
-            observation, integral = self._integrated(self._observation)
-            x, self._x[t], h, judged = self._encode(observation, self._drawn)
-            if self._c is not self._x:
-                self._c[t] = judged
-            action, noise = self._u[t], A.noise(self._noise)
-            self._density[t] = -0.5 * (noise * noise).sum(1)
-            A.xp.multiply(noise, sigma, out=action)
-            action += self.actor(self._x[t] if h is None else h)
-            if self._taught:
-                self._ask(t)
-            self._action[:] = action
-            self._remember(x, action, h)
-            self._integral[:] = integral
+        for decide, conclude in zip(self._decide, self._conclude, strict=True):
+            self.arrays.noise(self._noise)
+            decide()
             self.environment.advance()
-            self.tally.look()
-            self._close(t)
-        self._c[s.rollout] = self._encode(self._integrated(self._observation)[0], self._drawn)[3]
+            conclude()
+        self._c[-1] = self._encode(self._integrated(self._observation)[0], self._drawn)[3]
+
+    def _act(self, t: int) -> None:
+        """Decide what every row does in step t."""
+        A = self.arrays
+        observation, integral = self._integrated(self._observation)
+        x, self._x[t], h, judged = self._encode(observation, self._drawn)
+        if self._c is not self._x:
+            self._c[t] = judged
+        action, noise = self._u[t], self._noise
+        self._density[t] = -0.5 * (noise * noise).sum(1)
+        A.xp.multiply(noise, A.xp.exp(self.noise.values), out=action)
+        action += self.actor(self._x[t] if h is None else h)
+        if self._taught:
+            self._ask(t)
+        self._action[:] = action
+        self._remember(x, action, h)
+        self._integral[:] = integral
 
     @property
     def _taught(self) -> bool:
@@ -236,6 +254,7 @@ class Ppo(ActingLearner):
         """Store the result of step t; where time ended an episode, the value of its last observation is part of the
         reward."""
         A, e = self.arrays, self.environment
+        self.tally.look()
         self._r[t], self._go[t] = self._reward, 1.0
         terminated, truncated = self._terminated != 0, self._truncated != 0
         done = terminated | truncated
@@ -256,54 +275,63 @@ class Ppo(ActingLearner):
 
     # Advantage
 
-    def _advantages(self) -> tuple[Array, Array]:
-        """Advantages and targets of the value, (time, rows)."""
-        A, s = self.arrays, self.settings
-        value = A.copy(self.critic(self._c.reshape(-1, self._c.shape[2]))).reshape(s.rollout + 1, self._rows)
-        advantage, after = A.empty(s.rollout, self._rows), A.zeros(self._rows)
+    def _advantages(self) -> None:
+        """Compute the advantages and the targets of the value."""
+        s = self.settings
+        value = self.critic(self._c.reshape(-1, self._c.shape[2])).reshape(s.rollout + 1, self._rows)
+        after = self.arrays.zeros(self._rows)
         for t in reversed(range(s.rollout)):
             delta = self._r[t] + s.discount * self._go[t] * value[t + 1] - value[t]
-            after = advantage[t] = delta + s.discount * s.gae_lambda * self._go[t] * after
-        return advantage, advantage + value[:-1]
+            after = self._advantage[t] = delta + s.discount * s.gae_lambda * self._go[t] * after
+        self._target[:] = self._advantage + value[:-1]
 
     # Learning
 
-    def _learn(self, advantage: Array, target: Array, before: Array, rate: float) -> dict[str, float]:
+    def _learn(self, rate: float) -> dict[str, float]:
         """Take gradient steps on samples in random order; with a GRU, on complete rows in random order."""
         A, s, T = self.arrays, self.settings, self.settings.rollout
-        actions = self._label if self._taught else self._u
-        samples = [x[:T] for x in (self._x, self._c, actions, advantage, target, self._density)]
-        if self.gru is None:
-            samples = [x.reshape(T * self._rows, *x.shape[2:]) for x in samples]
         n, size = (self._rows, s.batch // T) if self.gru else (T * self._rows, s.batch)
         size = max(1, size // A.processes)
         edges = [n * k // max(1, n // size) for k in range(max(1, n // size) + 1)]
-        log_std = A.copy(self.noise.values)
-        losses = A.zeros(4)
+        self._old_log_std[:] = self.noise.values
+        self._losses[:] = 0.0
+        steps = s.epochs * (len(edges) - 1)
+        schedules = [optimizer.schedule(rate, steps) for optimizer in self._optimizers]
+        rates = zip(*schedules, strict=True)
         for _ in range(s.epochs):
             order = A.order(n)
             for first, last in zip(edges, edges[1:], strict=False):
-                i = order[first:last]
-                if self.gru is None:
-                    x, c, u, a, v, density = (part[i] for part in samples)
-                    y = self.actor(x)
-                else:
-                    x, c, u, a, v, density = (part[:, i] for part in samples)
-                    y = self.actor(self.gru(x, before[i], self._keep()[:, i]).reshape(-1, s.memory))
-                    c, u, a, v, density = (
-                        part.reshape(-1, *part.shape[2:]) for part in (c, u, a, v, density)
-                    )
-                if self._taught:
-                    losses[0] += self._imitate(y, u, rate)
-                else:
-                    losses[:3] += self._improve_policy(y, u, a, density - log_std.sum(), rate)
-                losses[3] += self._improve_value(c, v, rate)
-        means = A.numpy(losses / float(s.epochs * (len(edges) - 1))).tolist()
+                self._take_step(order[first:last], *next(rates))
+        means = A.numpy(self._losses / float(steps)).tolist()
         names = ("policy_gradient_loss", "approx_kl", "clip_fraction", "value_loss")
         std = float(A.numpy(A.xp.exp(self.noise.values)).mean())
         return {"action_std": std, **dict(zip(names, means, strict=True))}
 
-    def _improve_policy(self, mean: Array, u: Array, advantage: Array, old: Array, rate: float) -> Array:
+    def _gradient_step(self, i: Array, policy_rate: Array, value_rate: Array) -> None:
+        """Take a gradient step of policy and value.
+
+        Args:
+            i: Numbers of the samples; with a GRU, of the rows.
+            policy_rate: Of `Adam.schedule`, for the policy.
+            value_rate: Of `Adam.schedule`, for the value.
+        """
+        s, T = self.settings, self.settings.rollout
+        actions = self._label if self._taught else self._u
+        samples = (self._x[:T], self._c[:T], actions, self._advantage, self._target, self._density)
+        if self.gru is None:
+            x, c, u, a, v, density = (part.reshape(T * self._rows, *part.shape[2:])[i] for part in samples)
+            y = self.actor(x)
+        else:
+            x, c, u, a, v, density = (part[:, i] for part in samples)
+            y = self.actor(self.gru(x, self._before[i], self._keep()[:, i]).reshape(-1, s.memory))
+            c, u, a, v, density = (part.reshape(-1, *part.shape[2:]) for part in (c, u, a, v, density))
+        if self._taught:
+            self._losses[0] += self._imitate(y, u, policy_rate)
+        else:
+            self._losses[:3] += self._improve_policy(y, u, a, density - self._old_log_std.sum(), policy_rate)
+        self._losses[3] += self._improve_value(c, v, value_rate)
+
+    def _improve_policy(self, mean: Array, u: Array, advantage: Array, old: Array, rate: Array) -> Array:
         """One gradient step, after the actor's answers `mean` to a batch.
 
         Args:
@@ -311,7 +339,7 @@ class Ppo(ActingLearner):
             u: What was done, (N, m).
             advantage: A, (N,).
             old: log π_old(u|x) but for its constant, (N,).
-            rate: Of learning.
+            rate: Of `Adam.schedule`.
 
         Returns:
             The loss, the mean divergence from the old policy, and the part of the batch that is clipped.
@@ -334,7 +362,7 @@ class Ppo(ActingLearner):
         numbers[2] = xp.where(free, 0.0 * ratio, 0.0 * ratio + 1.0).mean()
         return numbers
 
-    def _step_policy(self, slope: Array, rate: float) -> None:
+    def _step_policy(self, slope: Array, rate: Array) -> None:
         """One step of the policy's optimiser, from the loss's slope by the actor's answers, (N, m)."""
         s = self.settings
         slope = self.actor.backward(slope, inputs=self.gru is not None)
@@ -342,14 +370,14 @@ class Ppo(ActingLearner):
             self.gru.backward(slope.reshape(s.rollout, -1, s.memory))
         self._optimizers[0].step(rate)
 
-    def _imitate(self, mean: Array, label: Array, rate: float) -> Array:
+    def _imitate(self, mean: Array, label: Array, rate: Array) -> Array:
         """One gradient step towards the teacher's actions, (N, m); the loss."""
         error = mean - label
         self.noise.gradient[:] = 0.0
         self._step_policy(error / float(len(error)), rate)
         return 0.5 * (error * error).sum(1).mean()
 
-    def _improve_value(self, judged: Array, target: Array, rate: float) -> Array:
+    def _improve_value(self, judged: Array, target: Array, rate: Array) -> Array:
         """One gradient step; the loss."""
         error = self.critic(judged)[:, 0] - target
         self.critic.backward((error / float(len(error)))[:, None])
