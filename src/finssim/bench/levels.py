@@ -37,10 +37,6 @@ class LevelStep(NamedTuple):
     """Time of the first sample after the change [s]."""
     end: float
     """Time of the last sample before the next change, or of the log [s]."""
-    before: float
-    """Level before the change, in the unit of the signal."""
-    after: float
-    """Level after the change, in the unit of the signal."""
 
 
 def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
@@ -125,13 +121,4 @@ def find_steps(t: Array, command: Array) -> list[LevelStep]:
     held = [(a, b) for a, b in runs if t[b - 1] - t[a] >= SHORTEST_HELD]
     if len(runs) > 4 * len(held):  # a command that moves all the time
         return []
-    return [
-        LevelStep(
-            float(t[a2 - 1]),
-            float(t[a2]),
-            float(t[b2 - 1]),
-            finite_mean(command[a1:b1]),
-            finite_mean(command[a2:b2]),
-        )
-        for (a1, b1), (a2, b2) in zip(held, held[1:], strict=False)
-    ]
+    return [LevelStep(float(t[a - 1]), float(t[a]), float(t[b - 1])) for a, b in held[1:]]

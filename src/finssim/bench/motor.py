@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.bench.levels import find_steps
+from finssim.bench.levels import LevelStep, find_steps
 from finssim.bench.solve import Solution, solve
 from finssim.identification.fit import Curve, Estimate, Fit
 from finssim.identification.report import finish, refuse_places, usable_trials
@@ -30,10 +30,8 @@ Array = NDArray[np.float64]
 
 RPM = math.pi / 30.0
 
-DOMAINS = ("force", "speed")
-"""Thrust [N] and shaft speed [rad/s]."""
-
 UNIT = {"force": "N", "speed": "rad/s"}
+"""Domain of a thruster's lag -> unit of the response there."""
 
 BEFORE = 0.3
 """Longest part of the level before a step that is fitted together with the step [s]."""
@@ -72,8 +70,8 @@ class MotorLog:
     findings: tuple[Finding, ...]
 
 
-def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> MotorLog | None:
-    """Return command and response of a thruster; None if the trial lacks one of them.
+def log_of(trial: Trial, name: str, thruster: Thruster) -> MotorLog | None:
+    """Return command and response of a thruster in the domain of its lag; None if the trial lacks one of them.
 
     The command is the first of `rpm_command_NAME` [rpm], `command_NAME` [N] and `pwm_NAME` [µs] in the trial, or
     `force_NAME` if the header says that inputs are commanded and speeds are measured. The response is `rpm_NAME`,
@@ -92,12 +90,12 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> MotorLog
         findings.append(finding("pulses_raw"))
     elif column.startswith("pwm_"):
         voltage = np.interp(times, *trial.series("voltage")) if trial.has("voltage") else trial.header.voltage
-        command = _as(domain, thruster.shaft_speed(raw, voltage), thruster, "speed")
+        command = _converted(thruster.shaft_speed(raw, voltage), "speed", thruster)
     elif column.startswith("rpm_"):
-        command = _as(domain, raw * RPM, thruster, "speed")
+        command = _converted(raw * RPM, "speed", thruster)
     else:
         # In the speed, small steps of a force are as visible as large ones.
-        command, held = _as(domain, raw, thruster, "force"), thruster.speed(raw)
+        command, held = _converted(raw, "force", thruster), thruster.speed(raw)
     t, raw = trial.series(measured)
     good = without_spikes(t, raw[:, None])
     if not good.all():
@@ -107,23 +105,28 @@ def log_of(trial: Trial, name: str, thruster: Thruster, domain: str) -> MotorLog
         latest = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
         raw = np.abs(raw) * _last_sign(command)[latest]
         findings.append(finding("sign_of_command", column=measured))
-    from_unit = "speed" if measured.startswith("rpm_") else "force"
-    response = _as(domain, raw * RPM if from_unit == "speed" else raw, thruster, from_unit)
-    steps = find_steps(times, held)
-    levels = []
+    response = (
+        _converted(raw * RPM, "speed", thruster)
+        if measured.startswith("rpm_")
+        else _converted(raw, "force", thruster)
+    )
+    steps, levels = find_steps(times, held), []
     for step in steps:
         rows = (t >= step.end - SETTLED * (step.end - step.time)) & (t <= step.end)
         if rows.any():
             level = float(command[np.searchsorted(times, step.time)])
             levels.append((level, float(np.mean(response[rows]))))
-    records = cut_steps(trial.name, t, response, times, [(s.start, s.time, s.end) for s in steps])
     return MotorLog(
-        records=records, levels=levels, measured=measured, same_unit=same_unit, findings=tuple(findings)
+        records=cut_steps(trial.name, t, response, times, steps),
+        levels=levels,
+        measured=measured,
+        same_unit=same_unit,
+        findings=tuple(findings),
     )
 
 
 def cut_steps(
-    trial: str, t: Array, y: Array, command_times: Array, steps: Sequence[tuple[float, float, float]]
+    trial: str, t: Array, y: Array, command_times: Array, steps: Sequence[LevelStep]
 ) -> list[StepRecord]:
     """Return the samples of the response around every step with at least `FEWEST` samples after it.
 
@@ -134,7 +137,7 @@ def cut_steps(
         t: Times of the response's samples [s], (n,).
         y: Response, thrust [N] or shaft speed [rad/s], (n,).
         command_times: Times of the command's samples [s], (m,).
-        steps: Last time before the change, first after it, and last before the next [s].
+        steps: Of the command.
     """
     records = []
     previous = float(t[0]) if t.size else 0.0
@@ -162,10 +165,11 @@ def _columns(trial: Trial, name: str) -> tuple[str, str] | None:
     return (commands[0], responses[0]) if commands and responses else None
 
 
-def _as(domain: str, values: Array, thruster: Thruster, unit: str) -> Array:
-    if domain == unit:
+def _converted(values: Array, unit: str, thruster: Thruster) -> Array:
+    """Return values of a thrust or speed in the domain of a thruster's lag."""
+    if thruster.domain == unit:
         return values
-    return thruster.thrust(values) if domain == "force" else thruster.speed(values)
+    return thruster.thrust(values) if unit == "speed" else thruster.speed(values)
 
 
 def _last_sign(command: Array) -> Array:
@@ -245,7 +249,9 @@ def fit_response(records: Sequence[StepRecord]) -> MotorResponse:
     low, high = np.array([0.0, math.log(0.1 * sample)]), np.array([longest, math.log(duration)])
     corners = np.stack(np.meshgrid(*np.linspace(low, high, GRID).T), axis=-1).reshape(-1, 2)
     power = np.array([float(np.var(record.y)) * len(record.y) for record in records])
-    remainder = np.array([[float(np.sum(_misfit(record, x) ** 2)) for record in records] for x in corners])
+    remainder = np.array(
+        [[float(np.sum(_step_fit(record, x)[2] ** 2)) for record in records] for x in corners]
+    )
     explained = 1.0 - remainder.min(axis=0) / np.maximum(power, 1e-300)
     moved = (explained > 0.5) & (power > 0.0)
     first = moved if moved.any() else np.arange(len(records)) == np.argmax(explained)
@@ -285,18 +291,13 @@ def unit_response(t: Array, x: Array) -> Array:
     return np.asarray(-np.expm1(-np.maximum(t - x[0], 0.0) / math.exp(x[1])))
 
 
-def _levels(record: StepRecord, x: Array) -> tuple[Array, Array]:
-    """Return the best level before a step and its height, (2,), and the columns that they multiply, (n, 2)."""
-    rows = np.column_stack([np.ones(len(record.t)), unit_response(record.t, x)])
-    return np.linalg.lstsq(rows, record.y, rcond=None)[0], rows
-
-
-def _misfit(record: StepRecord, x: Array) -> Array:
-    """Return the residual of a step with its best levels, (n,)."""
-    r = unit_response(record.t, x)
-    r, y = r - r.mean(), record.y - record.y.mean()
-    power = float(r @ r)
-    return np.asarray(y - r * (float(r @ y) / power) if power > 1e-12 else y)
+def _step_fit(record: StepRecord, x: Array) -> tuple[float, float, Array]:
+    """Return the best level before a step and its height, in the unit of the response, and the residual, (n,)."""
+    r, y = unit_response(record.t, x), record.y - record.y.mean()
+    rise = r - r.mean()
+    power = float(rise @ rise)
+    height = float(rise @ y) / power if power > 1e-12 else 0.0
+    return float(record.y.mean()) - height * float(r.mean()), height, np.asarray(y - rise * height)
 
 
 def _solved(
@@ -310,7 +311,7 @@ def _solved(
     sizes = [len(record.y) for record in chosen]
 
     def residual(x: Array) -> Array:
-        return np.concatenate([_misfit(record, x) / s for record, s in zip(chosen, scale, strict=True)])
+        return np.concatenate([_step_fit(record, x)[2] / s for record, s in zip(chosen, scale, strict=True)])
 
     return solve(
         residual,
@@ -326,10 +327,10 @@ def _solved(
 def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
     """Return the error of one step over its height, and its greatest overshoot of means of three samples minus twice
     their noise."""
-    (start, _), rows = _levels(record, x)
+    start, _, residual = _step_fit(record, x)
     settled = record.y[record.t >= 0.75 * record.t[-1]]
-    height = float(np.mean(settled)) - float(start)
-    error = float(np.sqrt(np.mean(_misfit(record, x) ** 2))) / max(abs(height), 1e-300)
+    height = float(np.mean(settled)) - start
+    error = float(np.sqrt(np.mean(residual**2))) / max(abs(height), 1e-300)
     beyond = (record.y[record.t > 0.0] - np.mean(settled)) * np.sign(height)
     if len(beyond) < FEWEST or height == 0.0:
         return error, 0.0
@@ -345,21 +346,15 @@ NARROW_DEAD_ZONE = 2.0
 """Greatest ratio of the smallest command that turns the shaft to the largest that does not, for a known dead zone."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Study:
     """One thruster over all its trials."""
 
     name: str
-    domain: str
+    thruster: Thruster
+    """The thruster of the vehicle file, whose curve converts between thrust and speed."""
     logs: tuple[MotorLog, ...]
     response: MotorResponse
-    other_error: float
-    """Error of the same fit in the other domain, as a share of the steps' height; NaN if it could not be made."""
-
-    @property
-    def records(self) -> list[StepRecord]:
-        """Steps of all logs."""
-        return [record for log in self.logs for record in log.records]
 
     @property
     def same_unit(self) -> bool:
@@ -401,28 +396,16 @@ def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | Non
     Args:
         name: Name of the thruster.
         trials: All trials.
-        thruster: The thruster of the vehicle file, whose curve converts between thrust and speed.
+        thruster: The thruster of the vehicle file.
     """
-    chosen = thruster.domain
-    logs = {
-        d: [log for trial in trials if (log := log_of(trial, name, thruster, d)) is not None] for d in DOMAINS
-    }
-    records = {
-        d: [record for log in logs_of_domain for record in log.records] for d, logs_of_domain in logs.items()
-    }
-    if not records[chosen]:
-        return None
-    responses = {d: fit_response(logs_of_domain) for d, logs_of_domain in records.items() if logs_of_domain}
-    other = responses.get(DOMAINS[1 - DOMAINS.index(chosen)])
-    return Study(
-        name=name, domain=chosen, logs=tuple(logs[chosen]), response=responses[chosen],
-        other_error=math.nan if other is None else other.error,
-    )  # fmt: skip
+    logs = [log for trial in trials if (log := log_of(trial, name, thruster)) is not None]
+    records = [record for log in logs for record in log.records]
+    return Study(name, thruster, tuple(logs), fit_response(records)) if records else None
 
 
-def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
+def estimates_of(result: Study) -> list[Estimate]:
     """Return the estimates of K, T_d, τ and the dead zone of one thruster."""
-    response, name = result.response, result.name
+    response, name, domain = result.response, result.name, result.thruster.domain
     count = int(response.used.sum())
     rests = f"{count} step{'s' if count != 1 else ''} sampled every {response.sample:.3g} s"
     if not result.sure:
@@ -433,29 +416,28 @@ def estimates_of(result: Study, thruster: Thruster) -> list[Estimate]:
     if response.delay < response.sample:
         late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
     gain, half = result.gain
+    unit = "-" if result.same_unit else f"{UNIT[domain]}/µs"
+    steady = f"steady {'thrust' if domain == 'force' else 'speed'} over what was asked"
+    lag, ends = f"{name}.time_constant", response.time_constant_interval
+    certain = result.sure and not response.hidden
     estimates = [
+        Estimate(lag, response.time_constant, ends, "s", certain, rests, f"thrusters.{lag}"),
+        Estimate(f"{name}.delay", response.delay, response.delay_interval, "s", result.sure, late),
         Estimate(
-            name=f"{name}.time_constant", estimate=response.time_constant, ci95=response.time_constant_interval,
-            unit="s", identifiable=result.sure and not response.hidden, note=rests,
-            path=f"thrusters.{name}.time_constant",
+            f"{name}.gain",
+            gain,
+            (gain - half, gain + half),
+            unit,
+            math.isfinite(half) and half < abs(gain),
+            steady,
         ),
-        Estimate(
-            name=f"{name}.delay", estimate=response.delay, ci95=response.delay_interval, unit="s",
-            identifiable=result.sure, note=late,
-        ),
-        Estimate(
-            name=f"{name}.gain", estimate=gain, ci95=(gain - half, gain + half),
-            unit="-" if result.same_unit else f"{UNIT[result.domain]}/µs",
-            identifiable=math.isfinite(half) and half < abs(gain),
-            note=f"steady {'thrust' if result.domain == 'force' else 'speed'} over what was asked",
-        ),
-    ]  # fmt: skip
-    return estimates + (_dead_zones(result, thruster) if result.same_unit else [])
+    ]
+    return estimates + (_dead_zones(result) if result.same_unit else [])
 
 
-def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
+def _dead_zones(result: Study) -> list[Estimate]:
     """Return the slowest speed of each direction, between the last command at rest and the first that turns."""
-    pairs, moving = result.levels
+    (pairs, moving), thruster = result.levels, result.thruster
     estimates = []
     for side, sign in (("plus", 1.0), ("minus", -1.0)):
         turn = [sign * u for u, _ in moving if sign * u > 0.0]
@@ -463,7 +445,7 @@ def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
             continue
         stand = [sign * u for u, y in pairs if sign * u > 0.0 and (u, y) not in moving]
         low, high = max([u for u in stand if u < min(turn)], default=0.0), min(turn)
-        if result.domain == "force":
+        if thruster.domain == "force":
             low, high = (abs(float(thruster.speed(sign * force))) for force in (low, high))
         bracketed = low > 0.0 and high <= NARROW_DEAD_ZONE * low
         note = "no commands were logged between the last without and the first with rotation"
@@ -472,13 +454,9 @@ def _dead_zones(result: Study, thruster: Thruster) -> list[Estimate]:
         elif low == 0.0:
             note = f"the smallest command tried, {high / RPM:.0f} rpm, already turns the shaft"
         ends = sorted((sign * low / RPM + 0.0, sign * high / RPM + 0.0))
-        estimates.append(
-            Estimate(
-                name=f"{result.name}.dead_rpm_{side}", ci95=(ends[0], ends[1]), unit="rpm", identifiable=bracketed,
-                estimate=sign * (0.5 * (low + high) if low > 0.0 else 0.0) / RPM + 0.0, note=note,
-                path=f"thrusters.{result.name}.dead_rpm_{side}",
-            )
-        )  # fmt: skip
+        rpm = sign * (0.5 * (low + high) if low > 0.0 else 0.0) / RPM + 0.0
+        name = f"{result.name}.dead_rpm_{side}"
+        estimates.append(Estimate(name, rpm, (ends[0], ends[1]), "rpm", bracketed, note, f"thrusters.{name}"))
     return estimates
 
 
@@ -496,7 +474,6 @@ def quality_of(result: Study) -> dict[str, float]:
         "steps": float(len(response.nrmse)),
         "accepted": float(response.accepted.sum()),
         "sample": response.sample,
-        "nrmse_other_domain": result.other_error,
     }
 
 
@@ -511,11 +488,6 @@ def findings_of(result: Study) -> list[Finding]:
         out.append(finding("steps_refused", result.name, limit=NRMSE, error=response.error))
     elif accepted < moved:
         out.append(finding("steps_left_out", result.name, steps=moved - accepted, total=moved, limit=NRMSE))
-    if result.other_error < 0.5 * response.error and response.error > 0.02:
-        other = DOMAINS[1 - DOMAINS.index(result.domain)]
-        out.append(
-            finding("other_domain", result.name, domain=other, other=result.other_error, error=response.error)
-        )
     if result.same_unit and abs(gain - 1.0) > 0.1 + half:
         out.append(finding("steady_gain", result.name, gain=gain))
     return out
@@ -523,18 +495,16 @@ def findings_of(result: Study) -> list[Finding]:
 
 def curve_of(result: Study) -> Curve:
     """Return the used steps, one after the other, with the common response at each step's own levels."""
-    parameters, parts = np.array([result.response.delay, math.log(result.response.time_constant)]), []
-    for record in np.array(result.records, dtype=object)[result.response.used]:
-        level, rows = _levels(record, parameters)
-        parts.append((record.t, record.y, rows @ level))
-    unit = "thrust [N]" if result.domain == "force" else "shaft speed [rad/s]"
+    response, parts = result.response, []
+    records = np.array([record for log in result.logs for record in log.records], dtype=object)
+    x = np.array([response.delay, math.log(response.time_constant)])
+    for record in records[response.used]:
+        parts.append((record.t, record.y, record.y - _step_fit(record, x)[2]))
+    unit = "thrust [N]" if result.thruster.domain == "force" else "shaft speed [rad/s]"
     return Curve.joined(f"{result.name}: steps", unit, parts)
 
 
-def fit_motor(
-    trials: Iterable[Trial],
-    vehicle: Vehicle,
-) -> Fit:
+def fit_motor(trials: Iterable[Trial], vehicle: Vehicle) -> Fit:
     """Fit first order plus dead time to the steps of each thruster, in the vehicle file's domain.
 
     Thrusters without steps get the mean of their propeller group. All thrusters share one link, so the vehicle file
@@ -564,7 +534,7 @@ def fit_motor(
             f"{', '.join(trial.name for trial in trials)}: no command holds a level and changes: log steps of at least "
             "0.5 s, such as those of 'finssim excite'"
         )
-    estimates = [e for result in studies for e in estimates_of(result, vehicle.thrusters[result.name])]
+    estimates = [e for result in studies for e in estimates_of(result)]
     changes = {e.path: e.estimate for e in estimates if e.path is not None and e.identifiable}
     sure = [result for result in studies if result.sure]
     if sure:
@@ -604,10 +574,7 @@ def _common_delay(studies: Sequence[Study]) -> Estimate:
     if any(high < middle or low > middle for low, high in ends):
         note += f"; they differ by {max(delays) - min(delays):.3g} s, more than their intervals"
     low, high = (float(end) for end in np.median(ends, axis=0))
-    return Estimate(
-        name="delay", estimate=middle, ci95=(low, high), unit="s", identifiable=True, note=note,
-        path="thrusters.*.delay",
-    )  # fmt: skip
+    return Estimate("delay", middle, (low, high), "s", True, note, "thrusters.*.delay")
 
 
 def _untested(

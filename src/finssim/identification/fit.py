@@ -25,7 +25,7 @@ __all__ = ["Correlation", "Curve", "Estimate", "Fit"]
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Estimate:
     """One parameter."""
 
@@ -53,7 +53,7 @@ class Estimate:
         """
         ci95 = (float(value - half), float(value + half))
         note = "" if sure else note
-        return cls(name=name, estimate=float(value), ci95=ci95, unit=unit, identifiable=bool(sure), note=note)
+        return cls(name, float(value), ci95, unit, bool(sure), note)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; a number that is not finite becomes None."""
