@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from finssim.bench.levels import settled_rows
 from finssim.core.text_table import read_text_table
+from finssim.core.yaml_file import read_mapping
 from finssim.trials.conversion import UNITS
 from finssim.trials.findings import CalibrationError, Finding, finding
 
@@ -23,33 +24,18 @@ __all__ = ["ThrustTable", "read_table"]
 
 Array = NDArray[np.float64]
 
-_N, _RATE = UNITS["force"], UNITS["rate"]
-_UNITS: dict[str, dict[str, float]] = {
-    "speed": {
-        **dict.fromkeys(("rpm", "1/min", "rev/min", "r/min"), _RATE["rpm"]),
-        **dict.fromkeys(("rad/s", "rads", "radps"), 1.0),
-        **dict.fromkeys(("rps", "rev/s", "1/s", "hz"), _RATE["rps"]),
-    },
-    "force": {
-        **dict.fromkeys(("n", "newton", "newtons"), 1.0),
-        **dict.fromkeys(("kgf", "kg", "kp"), _N["kgf"]),
-        **dict.fromkeys(("gf", "g", "gram", "grams"), _N["gf"]),
-        **dict.fromkeys(("lbf", "lb", "lbs"), _N["lbf"]),
-    },
-    "pulse": {"us": 1.0, "usec": 1.0, "ms": 1e3},
-    "voltage": {"v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3},
-    "time": {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
+_KNOWN = read_mapping(Path(__file__).with_name("quantities.yaml"), CalibrationError, such_as="force: {}")
+"""Quantity of a column -> words and units of its header, and its plausible range."""
+_UNITS = {
+    quantity: {
+        word: UNITS[known["dimension"]][unit] if "dimension" in known else float(unit)
+        for unit, words in known["units"].items()
+        for word in words
+    }
+    for quantity, known in _KNOWN.items()
 }
 """Quantity -> unit, as `_plain` writes it -> rad/s, N, µs, V or s in one of it."""
-_CHOICES = {"speed": "rpm, rad/s, rev/s", "force": "N, kgf, gf, lbf", "pulse": "us, ms"}
-_KEYWORDS = {
-    "speed": {"speed", "rpm", "omega", "rotation", "rotational", "shaft", "rev", "revs", "velocity"},
-    "force": {"force", "thrust", "load", "loadcell"},
-    "pulse": {"pwm", "pulse", "pulsewidth", "esc", "throttle", "signal"},
-    "voltage": {"voltage", "battery", "volt", "volts", "supply", "vbat", "v"},
-    "time": {"time", "t", "timestamp"},
-}
-_IMPLIED = {"rpm": ("speed", _RATE["rpm"]), "pwm": ("pulse", 1.0)}
+_IMPLIED = {"rpm": ("speed", UNITS["rate"]["rpm"]), "pwm": ("pulse", 1.0)}
 """Word -> quantity and factor, of words that imply their unit."""
 
 
@@ -68,7 +54,7 @@ def _recognised(header: str) -> tuple[str, float] | None:
     for word, implied in _IMPLIED.items():
         if word in words and unit in ("", word):
             return implied
-    matches = [name for name, keywords in _KEYWORDS.items() if words & keywords]
+    matches = [name for name, known in _KNOWN.items() if words & set(known["words"])]
     if not unit:
         fixed = 1.0 if matches in (["voltage"], ["time"]) else math.nan
         return (matches[0], fixed) if len(matches) == 1 else None
@@ -100,7 +86,7 @@ def _columns(headers: Sequence[str], rows: Array, label: str) -> dict[str, tuple
                 f"{label}: {quantity} could be {listed}: rename the column that is not meant, or remove it"
             )
         if math.isnan(factor):
-            choices = _CHOICES[quantity]
+            choices = _KNOWN[quantity]["choices"]
             raise CalibrationError(
                 f"{label}: column '{header}' has no unit: write it into the header, one of {choices}, such as "
                 f"'{header} ({choices.split(',')[0]})'"
@@ -117,14 +103,7 @@ def _columns(headers: Sequence[str], rows: Array, label: str) -> dict[str, tuple
 
 STANDING = 0.01
 """Share of the greatest speed below which a shaft counts as standing."""
-PLAUSIBLE = {
-    "pulse": (500.0, 2500.0, "µs"),
-    "speed": (-1e5, 1e5, "rad/s"),
-    "force": (-1e6, 1e6, "N"),
-    "voltage": (0.0, 1e4, "V"),
-}
-"""Quantity -> least and greatest value of a column, and its unit; NaN and 0 are not checked."""
-QUANTITIES = tuple(PLAUSIBLE)
+QUANTITIES = ("pulse", "speed", "force", "voltage")
 """Columns of a `ThrustTable`."""
 
 
@@ -177,7 +156,8 @@ def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> Thru
     if np.count_nonzero(good) < 3:
         raise CalibrationError(f"{label}: {np.count_nonzero(good)} rows hold numbers, expected at least 3")
     full = {key: value[good] for key, value in full.items()}
-    for key, (least, greatest, unit) in PLAUSIBLE.items():
+    for key in QUANTITIES:
+        least, greatest, unit = _KNOWN[key]["range"]
         nonzero = full[key][np.isfinite(full[key]) & (full[key] != 0.0)]
         if nonzero.size and (nonzero.min() < least or nonzero.max() > greatest):
             raise CalibrationError(

@@ -18,7 +18,7 @@ from finssim.control.axis_model import axis_model
 from finssim.core.files import atomic_write
 from finssim.core.quiet import start_warp
 from finssim.core.text_table import write_csv
-from finssim.core.yaml_file import yaml_text
+from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import TAU
 from finssim.vehicles import AXES, Vehicle
@@ -125,36 +125,11 @@ RATE = 50.0
 LONGEST = 3600.0
 """Duration of a multi-sine [s]."""
 
-STEP_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 9.0), ("coast", 2.0), ("rest", 1.0))
-"""Pre-zero, baseline, hold, rest, post-zero of the published procedure, by our phase words [s]."""
-
-PULSE_SEQUENCE = (("rest", 1.0), ("baseline", 1.0), ("excitation", 0.6), ("coast", 3.0), ("rest", 1.0))
-"""A pulse and its ring-down [s]."""
-
-PUBLISHED_LEVELS: dict[Axis, tuple[float, ...]] = {
-    "surge": (6.0, 12.0, 18.0),
-    "sway": (4.5, 9.0, 13.5),
-    "heave": (4.5, 9.0, 13.5),
-    "roll": (0.18, 0.36),
-    "pitch": (0.18, 0.36),
-    "yaw": (0.6, 1.2, 1.8),
-}
-"""FinsROV's identification procedure [N, N m]."""
-
-VALIDATION_LEVELS: dict[Axis, tuple[float, ...]] = {
-    "surge": (3.0, 6.0, 9.0, 12.0, 18.0),
-    "sway": (3.0, 6.0, 9.0, 12.0, 18.0),
-    "heave": (6.0, 9.0, 10.0, 12.0),
-    "roll": (0.5, 0.8, 1.0, 1.5),
-    "pitch": (1.0, 2.0, 3.0),
-    "yaw": (1.0, 2.0, 4.0, 6.0, 8.0),
-}
-"""FinsROV's validation sweeps [N, N m]."""
+PLANS = read_mapping(Path(__file__).with_name("programmes.yaml"), CalibrationError, such_as="steps: []")
+"""Sequences of phases [s], levels by axis [N, N m] and the limits of the vehicle that they are for [N, N m]."""
 
 STEADY = 0.8
 """Fastest surge and sway, part of `level_speed` [-]."""
-FINSROV_LIMITS = (18.586585, 18.068824, 25.636077, 3.791353, 2.535180, 6.947713)
-"""Wrench limits of the vehicle that the published levels are for, order of `AXES` [N, N m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -372,11 +347,10 @@ def _levels(
         if kind == "multisine":
             return (0.5 * limit,)
         limit = min(limit, _level_limit(axis, vehicle))
-        table = VALIDATION_LEVELS if kind == "validation" else PUBLISHED_LEVELS
-        scale = limit / FINSROV_LIMITS[AXES.index(axis)]
+        scale = limit / PLANS["limits"][axis]
         if abs(scale - 1.0) < 0.01:
             scale = 1.0
-        return tuple(sorted({min(_two_digits(scale * x), limit) for x in table[axis]}))
+        return tuple(sorted({min(_two_digits(scale * x), limit) for x in PLANS[kind][axis]}))
     if not requested:
         raise CalibrationError(f"levels of {axis}: none given, expected at least one in {unit}")
     for value in requested:
@@ -402,9 +376,9 @@ def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeat
     """One step or pulse."""
     pulse = kind == "published" and axis in ("roll", "pitch")
     dive = kind == "published" and axis == "heave" and level < 0.0
-    sequence = PULSE_SEQUENCE if pulse else STEP_SEQUENCE
+    sequence = [list(part) for part in PLANS["pulse" if pulse else "step"]]
     if dive:
-        sequence = (*STEP_SEQUENCE[:3], ("coast", coast), STEP_SEQUENCE[4])
+        sequence[3][1] = coast
     counts = [round(seconds * RATE) for _, seconds in sequence]
     phase = np.repeat(np.array([word for word, _ in sequence]), counts)
     tau = np.zeros((len(phase), 6))

@@ -20,6 +20,7 @@ import yaml
 from finssim.core.files import atomic_write
 from finssim.core.provenance import provenance
 from finssim.core.registry import ACTUATORS, TERMS
+from finssim.core.yaml_file import read_mapping
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.plant_terms import matrices
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
@@ -127,40 +128,7 @@ WIDTH = 118
 LONG = 180
 """Longest line of a section of `ONE_LINE`."""
 
-UNITS = {
-    "mass": "kg",
-    "inertia": "kg m²",
-    "center_of_gravity": "m",
-    "center_of_buoyancy": "m",
-    "displaced_volume": "m³",
-    "size": "m",
-    "surface_half_height": "m",
-    "reference_point": "m",
-    "wrench_reference": "m",
-    "added_mass": "kg, kg m²: surge, sway, heave, roll, pitch, yaw",
-    "linear_damping": "N s/m, N m s",
-    "quadratic_damping": "N s²/m², N m s²",
-    "c_plus": "N s²/rad²",
-    "c_minus": "N s²/rad²",
-    "rpm_min": "rpm",
-    "rpm_max": "rpm",
-    "dead_rpm_minus": "rpm",
-    "dead_rpm_plus": "rpm",
-    "force_min": "N",
-    "force_max": "N",
-    "time_constant": "s",
-    "delay": "s",
-    "rate": "Hz",
-    "latency": "s",
-    "gyro_noise_density": "rad/s/√Hz",
-    "accel_noise_density": "m/s²/√Hz",
-    "edge": "m",
-    "rpm_full_scale": "rpm",
-    "command_timeout": "s",
-    "command_rate": "Hz",
-    "max_tilt": "rad",
-    "max_tilt_duration": "s",
-}
+UNITS = read_mapping(Path(__file__).with_name("units.yaml"), CalibrationError, such_as="mass: kg")
 """Key -> unit of its value, written behind it."""
 
 SINGLE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
@@ -241,7 +209,7 @@ def _rows(node: Any) -> bool:
 def _unit(path: Key) -> str:
     """Return the unit of the value at a path; empty if there is none to write."""
     term = TERMS.get(path[2]) if path[0] == "hydrodynamics" and len(path) > 2 else None
-    return UNITS.get(path[-1], "") if term is None else term.units.get(path[-1], "")
+    return str((UNITS if term is None else term.units).get(path[-1], ""))
 
 
 def _common(

@@ -19,6 +19,7 @@ from finssim.core.rotations import (
 )
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.trial import column_of
+from finssim.vehicles.autopilot import DEMANDS
 from finssim.vehicles.part import did_you_mean
 
 Array = NDArray[np.float64]
@@ -33,18 +34,12 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 
 """Seconds in one of each."""
 
 EXTRA_COLUMNS = {
-    "vx": ("m/s", "velocity along world x"),
-    "vy": ("m/s", "velocity along world y"),
-    "vz": ("m/s", "velocity along world z"),
-    "pressure": ("Pa", "absolute pressure, or above that of the surface with surface_pressure 0"),
-    "stick_roll": ("-", "ArduSub's demand of roll in [-1, 1], right side down"),
-    "stick_pitch": ("-", "of pitch, nose up"),
-    "stick_yaw": ("-", "of yaw, clockwise from above"),
-    "stick_throttle": ("-", "of throttle, up"),
-    "stick_forward": ("-", "of forward, ahead"),
-    "stick_lateral": ("-", "of lateral, right"),
+    **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+    "pressure": "Pa",
+    **dict.fromkeys((f"stick_{name}" for name in DEMANDS), "-"),
 }
-"""Names that a map may give beside the canonical columns: they become u v w, depth and pulse widths in the trial."""
+"""Names that a map may give beside the canonical columns -> units: they become u v w, depth and pulse widths in the
+trial."""
 
 UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3, "cdeg": math.pi / 18000.0},
@@ -78,7 +73,7 @@ _DIMENSION = {unit: dimension for dimension, units in UNITS.items() for unit in 
 def unit_of(canonical: str) -> str:
     """The unit that a canonical or extra column is kept in."""
     if canonical in EXTRA_COLUMNS:
-        return EXTRA_COLUMNS[canonical][0]
+        return EXTRA_COLUMNS[canonical]
     column = column_of(canonical)
     if column is None:
         raise CalibrationError(f"'{canonical}' is no column of a trial")

@@ -120,12 +120,11 @@ class Header(_Section):
 
 
 class Column(NamedTuple):
-    """One canonical column."""
+    """One canonical column; the page on trials gives its meaning."""
 
     group: str
     """Columns of one group come from one sensor: command velocity rates acceleration attitude position depth."""
     unit: str
-    meaning: str
 
 
 TAU = ("tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
@@ -134,37 +133,33 @@ TAU = ("tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
 NU = ("u", "v", "w", "p", "q", "r")
 """nu, body frame."""
 
-COLUMNS: dict[str, Column] = {
-    **{name: Column("command", "N", f"force on the vehicle along body {name[-1]}") for name in TAU[:3]},
-    **{
-        name: Column("command", "N m", f"moment about body {axis}")
-        for name, axis in zip(TAU[3:], "xyz", strict=True)
-    },
-    **{
-        name: Column("velocity", "m/s", f"velocity along body {axis}")
-        for name, axis in zip(NU[:3], "xyz", strict=True)
-    },
-    **{
-        name: Column("rates", "rad/s", f"angular rate about body {axis}")
-        for name, axis in zip(NU[3:], "xyz", strict=True)
-    },
-    **{f"a{axis}": Column("acceleration", "m/s²", f"acceleration along body {axis}") for axis in "xyz"},
-    "roll": Column("attitude", "rad", "about body x, the last of yaw-pitch-roll (z-y-x)"),
-    "pitch": Column("attitude", "rad", "about body y; positive is nose down, for z is up"),
-    "yaw": Column("attitude", "rad", "about world z, to the left"),
-    **{f"q{c}": Column("attitude", "-", "quaternion body to world, xyzw") for c in "xyzw"},
-    **{axis: Column("position", "m", f"world {axis}; z up, 0 on the still surface") for axis in "xyz"},
-    "depth": Column("depth", "m", "of the pressure sensor below the still surface, positive down"),
-    "voltage": Column("command", "V", "battery"),
+COLUMNS = {
+    name: Column(group, unit)
+    for group, unit, names in (
+        ("command", "N", TAU[:3]),
+        ("command", "N m", TAU[3:]),
+        ("velocity", "m/s", NU[:3]),
+        ("rates", "rad/s", NU[3:]),
+        ("acceleration", "m/s²", ("ax", "ay", "az")),
+        ("attitude", "rad", ("roll", "pitch", "yaw")),
+        ("attitude", "-", ("qx", "qy", "qz", "qw")),
+        ("position", "m", ("x", "y", "z")),
+        ("depth", "m", ("depth",)),
+        ("command", "V", ("voltage",)),
+    )
+    for name in names
 }
 """Columns with fixed names."""
 
-INPUT_PREFIXES: dict[str, Column] = {
-    "force_": Column("command", "N", "thrust of one thruster"),
-    "rpm_": Column("command", "rpm", "shaft speed of one thruster, positive for positive thrust"),
-    "pwm_": Column("command", "µs", "pulse width sent to the speed controller of one thruster"),
-    "command_": Column("command", "N", "requested thrust of one thruster"),
-    "actuator_": Column("command", "-", "fin or gimbal [rad], buoyancy [m³] or moving mass [m], by its name"),
+INPUT_PREFIXES = {
+    prefix: Column("command", unit)
+    for prefix, unit in (
+        ("force_", "N"),
+        ("rpm_", "rpm"),
+        ("pwm_", "µs"),
+        ("command_", "N"),
+        ("actuator_", "-"),
+    )
 }
 """Columns named PREFIX + name of the thruster, or of another actuator."""
 
