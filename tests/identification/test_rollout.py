@@ -7,7 +7,16 @@ import pytest
 
 from finssim.core.rotations import quat_conjugate, quat_from_euler, quat_rotate
 from finssim.identification.parameters import Parameters
-from finssim.identification.rollout import Rollouts, Segment, segments, streams
+from finssim.identification.rollout import (
+    Changes,
+    Drive,
+    Rollouts,
+    Segment,
+    Sensors,
+    Start,
+    segments,
+    streams,
+)
 from finssim.identification.shooting import Point, Shooting
 from finssim.sim.simulator import Simulator
 from finssim.trials.findings import CalibrationError
@@ -18,34 +27,35 @@ STEP = 0.02
 DEPTH = 50.0
 
 
-def segment(vehicle, force, *, B=None, commanded=True, before=None, **changes):
+def segment(vehicle, force, *, B=None, commanded=True, before=None, changes=None, start=None, **fields):
     """A stretch that starts level and at rest with motors that have been told the first force for long."""
     force = np.asarray(force, float)
     thrusters = B is None
+    drive = Drive(
+        force=force,
+        before=np.repeat(force[:1], 50, axis=0) if before is None else np.asarray(before, float),
+        B=vehicle.thruster_matrix() if thrusters else np.asarray(B, float),
+        commanded=commanded,
+        thrusters=thrusters,
+        changes=changes,
+    )
+    state = {"position": np.zeros(3), "quaternion": np.array([0.0, 0.0, 0.0, 1.0]), "nu": np.zeros(6)}
     given = {
         "trial": "made up",
         "index": 0,
         "t0": 0.0,
         "step": STEP,
-        "force": force,
-        "before": np.repeat(force[:1], 50, axis=0) if before is None else np.asarray(before, float),
-        "B": vehicle.thruster_matrix() if thrusters else np.asarray(B, float),
-        "commanded": commanded,
-        "thrusters": thrusters,
-        "position": np.zeros(3),
-        "quaternion": np.array([0.0, 0.0, 0.0, 1.0]),
-        "nu": np.zeros(6),
-        "known": np.ones(12, bool),
+        "drive": drive,
+        "start": Start(**{**state, **(start or {})}, known=np.ones(12, bool)),
         "sink": -DEPTH,
         "density": vehicle.water.density,
         "current": np.zeros(3),
         "measured": {},
-        "velocity_at": np.zeros(3),
-        "velocity_in_water": False,
-        "position_at": np.zeros(3),
-        "depth_at": np.zeros(3),
+        "sensors": Sensors(
+            velocity_at=np.zeros(3), velocity_in_water=False, position_at=np.zeros(3), depth_at=np.zeros(3)
+        ),
     }
-    return Segment(**{**given, **changes})
+    return Segment(**{**given, **fields})
 
 
 def steps_of(vehicle, n, seed=0, size=3.0):
@@ -94,10 +104,8 @@ def test_motors_of_a_later_segment_are_already_running(domain, substeps):
     force, begin = steps_of(vehicle, 120), 80
     first = Rollouts(vehicle, [segment(vehicle, force)], substeps=substeps).run()
     state = {"nu": first.nu, "quaternion": first.quaternion, "position": first.position}
-    later = replace(
-        segment(vehicle, force[begin:], before=force[:begin]),
-        **{name: values[begin, 0, 0].astype(float) for name, values in state.items()},
-    )
+    start = {name: values[begin, 0, 0].astype(float) for name, values in state.items()}
+    later = segment(vehicle, force[begin:], before=force[:begin], start=start)
     again = Rollouts(vehicle, [later], substeps=substeps).run()
     np.testing.assert_allclose(again.nu[:, 0, 0], first.nu[begin:, 0, 0], atol=5e-5)
 
@@ -139,9 +147,7 @@ def test_an_applied_force_is_linear_between_its_samples():
     for step in (0.1, 0.01):
         t = step * np.arange(1, round(2.0 / step) + 1)
         force = np.outer(20.0 * t, [1.0, 0, 0, 0, 0, 0])
-        s = segment(
-            vehicle, force, B=np.eye(6), commanded=False, before=np.zeros((5, 6)), step=step, nu=np.zeros(6)
-        )
+        s = segment(vehicle, force, B=np.eye(6), commanded=False, before=np.zeros((5, 6)), step=step)
         ends.append(Rollouts(vehicle, [s], substeps=1).run().nu[-1, 0, 0, 0])
     # A staircase would lead by half a coarse step, 1 N of 40 N.
     np.testing.assert_allclose(*ends, rtol=2e-3)
@@ -195,7 +201,7 @@ def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
     turn = vehicle.thruster_matrix()[5] * 8.0
     force, heading = np.tile(turn, (150, 1)), quat_from_euler(0.0, 0.0, 0.7)
     constant = np.array([[[0.5, 0.0, 0.0, 0.0, 0.0, 0.1]]])
-    rollouts = Rollouts(vehicle, [segment(vehicle, force, quaternion=heading)])
+    rollouts = Rollouts(vehicle, [segment(vehicle, force, start={"quaternion": heading})])
     response = rollouts.run(disturbance=constant, pull=np.array([[[2.0, -1.0, 0.0]]]))
     sim = Simulator(vehicle, control_step=STEP, substeps=1, integrator="rk4")
     for _ in range(100):
@@ -221,7 +227,7 @@ def test_pulls_say_nothing_of_an_unknown_thrust():
     measured = {name: (times, np.zeros(10)) for name in ("u", "v")}
     still = np.zeros((100, 8))
     one = segment(
-        vehicle, still, measured=measured, change=still, which=np.full(100, -1), place=np.zeros((100, 2))
+        vehicle, still, measured=measured, changes=Changes(still, np.full(100, -1), np.zeros((100, 2)))
     )
     axes = ("surge", "sway")
     free = Parameters(
@@ -240,7 +246,7 @@ def test_a_submerged_vehicle_does_not_surface_while_it_drifts():
     """Simulated far below and reported where it began, buoyancy stays whole however high it rises."""
     vehicle = load_vehicle("finsrov").replace({"body.displaced_volume": 0.0121})
     response = Rollouts(
-        vehicle, [segment(vehicle, np.zeros((500, 8)), position=np.array([0.0, 0.0, -0.5]))]
+        vehicle, [segment(vehicle, np.zeros((500, 8)), start={"position": np.array([0.0, 0.0, -0.5])})]
     ).run()
     z, w = response.position[:, 0, 0, 2], response.nu[:, 0, 0, 2]
     assert z[0] == pytest.approx(-0.5, abs=1e-5) and z[-1] > -0.4
@@ -252,7 +258,7 @@ def test_a_candidate_that_diverges_is_told_and_harms_no_other():
     vehicle = load_vehicle("finsrov")
     D2 = np.zeros((2, 1, 6, 6))
     D2[1, 0, 0, 0] = -1e5
-    moving = segment(vehicle, np.zeros((100, 8)), nu=np.array([1.0, 0, 0, 0, 0, 0]))
+    moving = segment(vehicle, np.zeros((100, 8)), start={"nu": np.array([1.0, 0, 0, 0, 0, 0])})
     response = Rollouts(vehicle, [moving]).run({"D2": D2})
     assert response.finite[:, 0].tolist() == [True, False]
     assert np.isfinite(response.nu[:, 0]).all() and np.isnan(response.nu[-1, 1]).all()
@@ -277,9 +283,9 @@ def test_a_sampled_command_changes_when_it_is_told_to():
     sampled = segment(
         vehicle,
         np.where((n < 30)[:, None], old, new),
-        change=np.where((which == 0)[:, None], new - old, 0.0),
-        which=which,
-        place=np.stack([n - 20, n - 19], axis=-1) / 10.0,
+        changes=Changes(
+            np.where((which == 0)[:, None], new - old, 0.0), which, np.stack([n - 20, n - 19], axis=-1) / 10.0
+        ),
     )
     rollouts = Rollouts(vehicle, [sampled])
     for at, earlier in ((25, None), (27, -0.2), (21, 0.4)):
@@ -297,9 +303,9 @@ def test_a_slow_command_is_halfway_between_samples_unless_stated_to_hold():
     for stated in (None, "held"):
         header = Header(inputs_between=stated)
         trial = Trial(name="made up", t=t, channels=columns, header=header, phase=None)
-        part = segments(streams(trial, vehicle), vehicle, changes=True)[0]
+        part = segments(streams(trial, vehicle), vehicle, changes=True)[0].drive
         if stated:
-            assert part.change is None and part.force[99, 0] == 0.0 and part.force[100, 0] == 5.0
+            assert part.changes is None and part.force[99, 0] == 0.0 and part.force[100, 0] == 5.0
         else:
-            np.testing.assert_array_equal(np.flatnonzero(part.which == 0), np.arange(90, 100))
-            assert (part.force[:100] == 0.0).all() and (part.change[90:100, 0] == 5.0).all()
+            np.testing.assert_array_equal(np.flatnonzero(part.changes.which == 0), np.arange(90, 100))
+            assert (part.force[:100] == 0.0).all() and (part.changes.change[90:100, 0] == 5.0).all()

@@ -247,7 +247,9 @@ class Adaptation:
         """
         out = np.zeros(len(self.names))
         for i, (name, thruster) in enumerate(self.vehicle.thrusters.items()):
-            command = np.concatenate([s.force[:, i] for s in window if s.thrusters] or [np.zeros(1)])
+            command = np.concatenate(
+                [s.drive.force[:, i] for s in window if s.drive.thrusters] or [np.zeros(1)]
+            )
             turns = np.array([thruster.dead_rpm_minus, thruster.dead_rpm_plus]) * 2.0 * np.pi / 60.0
             low, high = thruster.thrust(turns)
             slow = np.where((low < command) & (command < high), command, 0.0)

@@ -226,7 +226,7 @@ def _add(
 
     late = (
         _late(pair, at)
-        if all(segment.commanded for segment in segments) and model not in pair.diverged
+        if all(segment.drive.commanded for segment in segments) and model not in pair.diverged
         else 0.0
     )
     if late:
@@ -262,7 +262,7 @@ def _responses(segment: Segment, response: Response, rows: slice, k: int) -> dic
     """All responses of one segment over its own steps, (steps + 1,) each."""
     nu = response.nu[rows, 0, k].astype(float)
     q = response.quaternion[rows, 0, k].astype(float)
-    depth_at = np.broadcast_to(segment.depth_at, (len(q), 3))
+    depth_at = np.broadcast_to(segment.sensors.depth_at, (len(q), 3))
     out = {name: nu[:, i] for i, name in enumerate(NU)}
     out["roll"], out["pitch"], _ = quat_to_euler(q)
     out["depth"] = -(response.position[rows, 0, k].astype(float) + quat_rotate(q, depth_at))[:, 2]
@@ -322,12 +322,12 @@ def replay_predictions(
             i
             for i, segment in enumerate(cut)
             if axis in pairs[segment.index].axes
-            and segment.known[k]
+            and segment.start.known[k]
             and response_span(pairs[segment.index], NU[k]).value is not None
         ]
         if not chosen:
             continue
-        start = np.array([cut[i].nu[k] for i in chosen])
+        start = np.array([cut[i].start.nu[k] for i in chosen])
         measured = np.stack([_ahead(pairs[cut[i].index], cut[i], ahead, NU[k]) for i in chosen], axis=-1)
         width = np.array([response_span(pairs[cut[i].index], NU[k]).value for i in chosen])
         out[axis] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +45,65 @@ FLIES = 0.15
 """Height of the origin above the reach of a floating vehicle that is no height above the surface any more [m]."""
 
 
+class Changes(NamedTuple):
+    """Changes of a command between two of its samples, at times that are not known."""
+
+    change: Array
+    """Change within whose sample interval each step lies, in the unit of the command, (steps, k)."""
+    which: NDArray[np.int64]
+    """Index of that change, -1 outside of all, (steps,)."""
+    place: Array
+    """Begin and end of each step as parts of that interval [-], (steps, 2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """Commands of the motors in a segment."""
+
+    force: Array
+    """Command in each step [N, N m]: the mean of a held command, which is the one before within a change; of an applied
+    force, which is linear between samples, the value at the step's end. (steps, k)"""
+    before: Array
+    """Command in its unit in the steps before, the newest last; repeats the first value before the trial began. (m,
+    k)"""
+    B: Array
+    """Wrench about the body origin per unit force, (6, k)."""
+    commanded: bool
+    """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
+    thrusters: bool
+    """True if the k forces are the vehicle's channels: thrusters in canonical order, then its other actuators."""
+    changes: Changes | None = None
+    """None without any."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """State at the start of a segment."""
+
+    position: Array
+    """World frame [m], (3,); 0 if unknown."""
+    quaternion: Array
+    """Body to world, (4,); level and heading 0 if unknown."""
+    nu: Array
+    """Velocity of the body origin [m/s, rad/s], (6,); 0 if unknown."""
+    known: NDArray[np.bool_]
+    """Flags of nu (6), roll, pitch, yaw, x, y, z that come from measurements, (12,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensors:
+    """Places of a trial's sensors."""
+
+    velocity_at: Array
+    """Body point whose velocity u, v, w are [m]."""
+    velocity_in_water: bool
+    """True if u, v, w are relative to the water."""
+    position_at: Array
+    """Body point whose position x, y, z are [m]."""
+    depth_at: Array
+    """Body point of the pressure sensor [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Segment:
     """One stretch of a trial on a uniform grid of `steps` steps."""
@@ -57,59 +116,27 @@ class Segment:
     """Its start on the trial's clock [s]."""
     step: float
     """[s]"""
-    force: Array
-    """Command of the motors in each step [N, N m]: the mean of a held command; of an applied force, which is linear
-    between samples, the value at the step's end. (steps, k)"""
-    before: Array
-    """Command in its unit in the steps before, the newest last; repeats the first value before the trial began. (m,
-    k)"""
-    B: Array
-    """Wrench about the body origin per unit force, (6, k)."""
-    commanded: bool
-    """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
-    thrusters: bool
-    """True if the k forces are the vehicle's channels: thrusters in canonical order, then its other actuators."""
-    position: Array
-    """Position at the start, world frame [m], (3,); 0 if unknown."""
-    quaternion: Array
-    """Rotation at the start, body to world, (4,); level and heading 0 if unknown."""
-    nu: Array
-    """Velocity of the body origin at the start [m/s, rad/s], (6,); 0 if unknown."""
-    known: NDArray[np.bool_]
-    """Flags of nu (6), roll, pitch, yaw, x, y, z at the start that come from measurements, (12,)."""
+    drive: Drive
+    start: Start
     sink: float
     """Added to the height while simulating [m], so that a vehicle that stayed wholly submerged cannot surface."""
     density: float
     """Density of the water [kg/m³]."""
     current: Array
     """World frame [m/s], (3,)."""
+    sensors: Sensors
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times since t0 [s] and values."""
-    velocity_at: Array
-    """Body point whose velocity u, v, w are [m]."""
-    velocity_in_water: bool
-    """True if u, v, w are relative to the water."""
-    position_at: Array
-    """Body point whose position x, y, z are [m]."""
-    depth_at: Array
-    """Body point of the pressure sensor [m]."""
     held: Array | None = None
     """nu [m/s, rad/s] that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is
     free."""
-    change: Array | None = None
-    """Change of the command in its unit within whose sample interval each step lies, (steps, k); `force` there is the
-    command before it. None without any."""
-    which: NDArray[np.int64] | None = None
-    """Index of that change, -1 outside of all, (steps,)."""
-    place: Array | None = None
-    """Begin and end of each step as parts of that interval [-], (steps, 2)."""
     aside: frozenset[str] = frozenset()
     """Columns that show axes which its trial does not drive: what moves them besides has a noise of its own."""
 
     @property
     def steps(self) -> int:
         """Length of the grid."""
-        return len(self.force)
+        return len(self.drive.force)
 
     @property
     def duration(self) -> float:
@@ -251,8 +278,8 @@ def is_sampled(s: Streams) -> bool:
     return SLOW <= usual and float(np.percentile(between, 90.0)) <= 1.5 * usual
 
 
-def _changes(d: InputForces, t0: float, steps: int, step: float) -> dict[str, Array]:
-    """Return `Segment.change`, `which` and `place` of a stretch; nothing without a change."""
+def _changes(d: InputForces, t0: float, steps: int, step: float) -> Changes | None:
+    """Return the changes of a command within a stretch; None without any."""
     begin = t0 + step * np.arange(steps)
     row = np.searchsorted(d.t, begin + 0.5 * step, side="right")  # first sample after each step
     change = np.diff(d.force, axis=0)
@@ -261,26 +288,25 @@ def _changes(d: InputForces, t0: float, steps: int, step: float) -> dict[str, Ar
     largest = np.sort(inside[np.argsort(-size[inside])[:CHANGES]])
     largest = largest[size[largest] > 0.0]
     if not len(largest):
-        return {}
+        return None
     which = np.where(np.isin(row - 1, largest), np.searchsorted(largest, row - 1), -1)
     own = largest[which]
     place = (np.stack([begin, begin + step], axis=-1) - d.t[own, None]) / (d.t[own + 1] - d.t[own])[:, None]
-    return {"change": np.where(which[:, None] < 0, 0.0, change[own]), "which": which, "place": place}
+    return Changes(np.where(which[:, None] < 0, 0.0, change[own]), which, place)
 
 
 def _segment(
     s: Streams, vehicle: Vehicle, t0: float, steps: int, step: float, index: int, sampled: bool
 ) -> Segment:
-    header, d, found = s.trial.header, s.drive, dict[str, Any]()
+    header, d, changes = s.trial.header, s.drive, None
     memory = max(1, int(round(MEMORY / step)))
     if sampled:
-        found = _changes(d, t0, steps, step)
+        changes = _changes(d, t0, steps, step)
         d = replace(d, t=np.concatenate([d.t[:1], 0.5 * (d.t[1:] + d.t[:-1])]))
     force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
-    if found:
-        inside = found["which"] >= 0
+    if changes:
+        inside = changes.which >= 0
         force[memory:][inside] = s.drive.at(t0 + step * (np.flatnonzero(inside) + 0.5))
-    position, quaternion, nu, known = _start(s, t0)
     measured = {}
     for column, (t, values) in s.measured.items():
         # The first sample is where the segment begins, so that neighbours do not share it.
@@ -293,29 +319,30 @@ def _segment(
         index=index,
         t0=t0,
         step=step,
-        force=force[memory:],
-        before=force[:memory],
-        B=np.asarray(d.B, float),
-        commanded=d.commanded,
-        thrusters=d.thrusters,
-        position=position,
-        quaternion=quaternion,
-        nu=nu,
-        known=known,
+        drive=Drive(
+            force=force[memory:],
+            before=force[:memory],
+            B=np.asarray(d.B, float),
+            commanded=d.commanded,
+            thrusters=d.thrusters,
+            changes=changes,
+        ),
+        start=_start(s, t0),
         sink=_sink(s.motion, vehicle, t0, t0 + steps * step),
         density=water.density or vehicle.water.density,
         current=np.asarray(water.current or (0.0, 0.0, 0.0), float),
+        sensors=Sensors(
+            velocity_at=np.asarray(header.velocity_at, float),
+            velocity_in_water=header.velocity == "water",
+            position_at=np.asarray(header.position_at, float),
+            depth_at=depth_place(s.trial, vehicle),
+        ),
         measured=measured,
-        velocity_at=np.asarray(header.velocity_at, float),
-        velocity_in_water=header.velocity == "water",
-        position_at=np.asarray(header.position_at, float),
-        depth_at=depth_place(s.trial, vehicle),
-        **found,
     )
 
 
 def _told(d: InputForces, edges: Array) -> Array:
-    """Return the command of the motors in each step between `edges` [s], (steps, k); see `Segment.force`."""
+    """Return the command of the motors in each step between `edges` [s], (steps, k); see `Drive.force`."""
     if d.commanded:
         return _means(d, edges)
     # An actuator without lag ramps from one value to the next: each is the value at its step's end, or the mean around
@@ -340,8 +367,8 @@ def _means(d: InputForces, edges: Array) -> Array:
     return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None])
 
 
-def _start(s: Streams, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return the state at a time and which of its twelve numbers are known."""
+def _start(s: Streams, t0: float) -> Start:
+    """Return the state at a time."""
     m = s.motion
     i = int(np.argmin(np.abs(m.t - t0)))
     near = slice(max(i - 3, 0), i + 4)
@@ -362,7 +389,12 @@ def _start(s: Streams, t0: float) -> tuple[Array, Array, Array, NDArray[np.bool_
         t, heading = s.measured["yaw"]
         level = quat_from_euler(0.0, 0.0, np.interp(t0, t, np.unwrap(heading)))
         known[STATES.index("yaw")] = True
-    return np.nan_to_num(position), quaternion if attitude else level, np.nan_to_num(nu), known
+    return Start(
+        position=np.nan_to_num(position),
+        quaternion=quaternion if attitude else level,
+        nu=np.nan_to_num(nu),
+        known=known,
+    )
 
 
 def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
@@ -449,7 +481,7 @@ class Rollouts:
                 if not steps
                 else f"segments have steps of {sorted(steps)} s, expected one step for all"
             )
-        wide = [s.trial for s in segments if s.B.shape[1] > MAX_THRUSTERS]
+        wide = [s.trial for s in segments if s.drive.B.shape[1] > MAX_THRUSTERS]
         if wide:
             raise CalibrationError(f"{wide[0]}: more than {MAX_THRUSTERS} input channels cannot be simulated")
         self.vehicle, self.segments, self.hydrodynamics = vehicle, tuple(segments), hydrodynamics
@@ -468,21 +500,23 @@ class Rollouts:
         self._lengths = np.array([s.steps for s in segments])
         n = int(self._lengths.max())
         self._force = np.zeros((n, len(segments), MAX_THRUSTERS), np.float32)
-        memory = max(len(s.before) for s in segments)
+        memory = max(len(s.drive.before) for s in segments)
         self._before = np.zeros((memory, len(segments), MAX_THRUSTERS), np.float32)
-        for i, s in enumerate(segments):
-            k = s.force.shape[1]
-            self._force[: s.steps, i, :k] = s.force
-            self._force[s.steps :, i, :k] = s.force[-1]
-            self._before[:, i, :k] = s.before[:1]
-            self._before[memory - len(s.before) :, i, :k] = s.before
-        self.changes = np.array([0 if s.which is None else s.which.max() + 1 for s in segments])
         self._change, self._which = np.zeros_like(self._force), np.full(self._force.shape[:2], -1)
         self._interval = np.zeros((*self._force.shape[:2], 2))
+        self.changes = np.zeros(len(segments), np.int64)
         for i, s in enumerate(segments):
-            if s.change is not None and s.which is not None and s.place is not None:
-                self._change[: s.steps, i, : s.change.shape[1]] = s.change
-                self._which[: s.steps, i], self._interval[: s.steps, i] = s.which, s.place
+            force, before = s.drive.force, s.drive.before
+            k = force.shape[1]
+            self._force[: s.steps, i, :k] = force
+            self._force[s.steps :, i, :k] = force[-1]
+            self._before[:, i, :k] = before[:1]
+            self._before[memory - len(before) :, i, :k] = before
+            if s.drive.changes is not None:
+                change, which, place = s.drive.changes
+                self._change[: s.steps, i, :k] = change
+                self._which[: s.steps, i], self._interval[: s.steps, i] = which, place
+                self.changes[i] = which.max() + 1
         self.own = self._own_fields()
         self._held = self._imposed()
 
@@ -503,23 +537,22 @@ class Rollouts:
     def _own_fields(self) -> dict[str, NDArray[np.float64]]:
         """Plant fields in which segments differ: how forces reach the body, and the water's density. (S, ...)"""
         out: dict[str, list[Any]] = {}
-        for s in self.segments:
+        for d in (s.drive for s in self.segments):
             B = np.zeros((6, MAX_THRUSTERS))
-            B[:, : s.B.shape[1]] = s.B
+            B[:, : d.B.shape[1]] = d.B
             field: dict[str, Any] = {"B": B}
             names = ("force_min", "force_max", "dead_minus", "dead_plus", "time_constant", "slew", "play")
-            lagged = s.commanded and s.thrusters
-            if lagged:
+            if d.commanded and d.thrusters:
                 field |= {name: self.nominal[name] for name in (*names, "delay", "speed_lag")}
             else:
                 # Wrenches that were asked for pass through the motors too, as if through six equal ones.
                 n = len(self.vehicle.thrusters)
-                tc = float(np.mean(self.nominal["time_constant"][:n])) if s.commanded else 0.0
+                tc = float(np.mean(self.nominal["time_constant"][:n])) if d.commanded else 0.0
                 values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT, 0.0)
                 field |= {
                     name: np.full(MAX_THRUSTERS, value) for name, value in zip(names, values, strict=True)
                 }
-                field |= {"delay": self.nominal["delay"] if s.commanded else 0.0, "speed_lag": 0}
+                field |= {"delay": self.nominal["delay"] if d.commanded else 0.0, "speed_lag": 0}
             for name, value in field.items():
                 out.setdefault(name, []).append(np.asarray(value, float))
         return {name: np.stack(values) for name, values in out.items()}
@@ -629,7 +662,7 @@ class Rollouts:
     ) -> None:
         """Set every world to the state `start`, if it gives one, otherwise to its segment's own."""
         for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
-            values = start.get(name, np.stack([getattr(s, name) for s in self.segments])[None])
+            values = start.get(name, np.stack([getattr(s.start, name) for s in self.segments])[None])
             if name == "position":
                 values = values + np.array([s.sink for s in self.segments])[:, None] * [0.0, 0.0, 1.0]
             write(getattr(sim.state, own), values)

@@ -422,10 +422,10 @@ def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArr
         return nu[..., 3 + "pqr".index(name)]
     if name in ("u", "v", "w"):
         i = "uvw".index(name)
-        at = np.stack([s.velocity_at for s in segments]).astype(np.float32)
+        at = np.stack([s.sensors.velocity_at for s in segments]).astype(np.float32)
         j, k = (i + 1) % 3, (i + 2) % 3
         out = nu[..., i] + (nu[..., 3 + j] * at[:, k] - nu[..., 3 + k] * at[:, j] if at.any() else 0.0)
-        in_water = np.array([s.velocity_in_water for s in segments])
+        in_water = np.array([s.sensors.velocity_in_water for s in segments])
         if in_water.any():
             flow = np.stack([s.current for s in segments])
             body = quat_rotate(quat_conjugate(q), np.broadcast_to(flow, (*q.shape[1:3], 3)))[..., i]
@@ -434,7 +434,7 @@ def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArr
     if name in EULER:
         return euler_angle(name, q)
     sensor = "depth_at" if name == "depth" else "position_at"
-    at = np.stack([getattr(s, sensor) for s in segments])
+    at = np.stack([getattr(s.sensors, sensor) for s in segments])
     i = 2 if name == "depth" else "xyz".index(name)
     out = response.position[..., i] + (quat_rotate(q, at)[..., i] if at.any() else 0.0)
     return np.asarray(-out if name == "depth" else out, np.float32)
@@ -600,7 +600,7 @@ class Shooting:
         self.segments, self.parameters = tuple(segments), parameters
         self.measured = Residuals(segments, channels)
         names = self.measured.names
-        known = np.stack([s.known for s in segments])
+        known = np.stack([s.start.known for s in segments])
         # Heading and place are free where something that is compared depends on them.
         flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
         turned = flat or "yaw" in names or any(s.current.any() for s in segments)
@@ -647,7 +647,7 @@ class Shooting:
                 offsets_std[swinging, self.offsets.index(angle)] = REST_STD
         # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
         vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
-        by_thruster, sideways = np.array([s.thrusters for s in segments]), horizontal(vehicle)
+        by_thruster, sideways = np.array([s.drive.thrusters for s in segments]), horizontal(vehicle)
         self._by_thruster = by_thruster[:, None, None]
         for j, (name, thruster) in enumerate(vehicle.thrusters.items()):
             if name in sideways:
@@ -679,7 +679,7 @@ class Shooting:
         self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
         self.farthest = np.full(self.prior_std.shape[1], np.inf)
         self.farthest[np.flatnonzero(self.free >= 18)] = 0.5
-        self.lagged = np.array([s.commanded for s in segments]) if lagged is None else lagged
+        self.lagged = np.array([s.drive.commanded for s in segments]) if lagged is None else lagged
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
@@ -701,7 +701,7 @@ class Shooting:
         body, weight = p.vehicle.body, p.vehicle.weight
         # In fast logs, which show the motion well, errors of the model would be taken for pulls.
         slow = np.isin(
-            [s.index for s in self.segments], [s.index for s in self.segments if s.change is not None]
+            [s.index for s in self.segments], [s.index for s in self.segments if s.drive.changes is not None]
         )
         if {"surge", "sway"} & set(p.axes):
             out[slow & ~swinging, :2] = TETHER * weight
@@ -777,7 +777,8 @@ class Shooting:
         full = np.zeros((*points.z.shape[:2], 18 + int(self.rollouts.changes.max())))
         full[..., self.free] = points.z[..., : len(self.free)]
         nu, quaternion, position = (
-            np.stack([getattr(s, name) for s in self.segments]) for name in ("nu", "quaternion", "position")
+            np.stack([getattr(s.start, name) for s in self.segments])
+            for name in ("nu", "quaternion", "position")
         )
         initial = {
             "nu": nu + full[..., :6],

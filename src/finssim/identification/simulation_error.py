@@ -307,8 +307,8 @@ class Stages:
         kept = list[Segment]()
         for g in range(len(self.used)):
             own = [s for s in self.segments if s.index == g]
-            own.sort(key=lambda s: -float(np.ptp(s.force, axis=0).sum()))
-            kept += own[: math.ceil(part * len(own))] if np.any(own[0].force) else own
+            own.sort(key=lambda s: -float(np.ptp(s.drive.force, axis=0).sum()))
+            kept += own[: math.ceil(part * len(own))] if np.any(own[0].drive.force) else own
         self.segments = kept
 
     def refuse_divergence(self, solution: FitSolution) -> None:
@@ -448,7 +448,7 @@ class Stages:
         """
         swinging = np.array([not other and bool(self.used[s.index].released) for s in other or self.segments])
         # If every input is stated to have acted, a request for a lag doubts that.
-        acted = not any(s.commanded for s in self.segments)
+        acted = not any(s.drive.commanded for s in self.segments)
         return Shooting(
             other or self.segments,
             self.parameters(kinds, start),
