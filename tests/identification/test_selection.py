@@ -5,7 +5,8 @@ import pytest
 
 from finssim.identification.drag_shape import WIDER, _average, averaged
 from finssim.identification.programme import programmes
-from finssim.identification.simulation_error import FitProgress, Stages, fit_by_simulation, prepare
+from finssim.identification.simulation_error import fit_by_simulation, prepare
+from finssim.identification.stages import FitProgress, Stages
 from finssim.identification.synthetic import record, trials_of
 from finssim.identification.vehicle_file import number_in
 from finssim.trials.findings import CalibrationError

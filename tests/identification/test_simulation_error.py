@@ -9,11 +9,8 @@ from finssim.core.rotations import quat_conjugate, quat_rotate
 from finssim.identification.excitation import compared, excites
 from finssim.identification.programme import programmes
 from finssim.identification.rollout import segments, streams
-from finssim.identification.simulation_error import (
-    FitProgress,
-    Stages,
-    fit_by_simulation,
-)
+from finssim.identification.simulation_error import fit_by_simulation
+from finssim.identification.stages import FitProgress, Stages
 from finssim.identification.synthetic import simulate_programme
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.findings import CalibrationError

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from finssim.identification.confidence import Confidence, Stage
 from finssim.identification.parameters import DETERMINED, PLACES, USUAL_SPEED, Parameters
 from finssim.identification.shooting import Shooting, solve
-from finssim.identification.uncertainty import (
-    Covariance,
-)
+from finssim.identification.uncertainty import Covariance
 from finssim.trials.free_motion import DETERMINED_BY
 from finssim.vehicles import AXES, Vehicle
 

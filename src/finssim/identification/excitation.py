@@ -8,10 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finssim.identification.rollout import (
-    Segment,
-    Streams,
-)
+from finssim.identification.rollout import Segment, Streams
 from finssim.sim.plant_arrays import twist_shift
 from finssim.trials.free_motion import DETERMINED_BY
 from finssim.trials.motion import Motion, answers, gyroscope_bias, usual_range

@@ -11,13 +11,9 @@ from finssim.core.least_squares import boxed
 from finssim.identification.confidence import Confidence, Stage, evidence_of, shared_slopes, time_blocks
 from finssim.identification.excitation import speeds
 from finssim.identification.fit import Curve
-from finssim.identification.rollout import (
-    Streams,
-)
+from finssim.identification.rollout import Streams
 from finssim.identification.shooting import CUT, FitSolution, Point, Shooting
-from finssim.identification.uncertainty import (
-    intervals,
-)
+from finssim.identification.uncertainty import intervals
 from finssim.trials.conversion import EULER
 from finssim.trials.findings import Finding, finding
 from finssim.trials.free_motion import DETERMINED_BY

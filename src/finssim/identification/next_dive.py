@@ -21,7 +21,7 @@ from finssim.trials.motion import up_in_body
 from finssim.vehicles import AXES, Vehicle
 
 if TYPE_CHECKING:
-    from finssim.identification.simulation_error import Stages
+    from finssim.identification.stages import Stages
 
 Array = NDArray[np.float64]
 

@@ -10,22 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finssim.core.least_squares import Block, arrow_reduced, block_of, boxed, huber_loss, huber_weight
-from finssim.core.rotations import (
-    quat_conjugate,
-    quat_from_rotvec,
-    quat_multiply,
-    quat_rotate,
-    wrap_angle,
-)
+from finssim.core.rotations import quat_conjugate, quat_from_rotvec, quat_multiply, quat_rotate, wrap_angle
 from finssim.identification.parameters import LONGEST_DELAY, Parameters, horizontal
-from finssim.identification.rollout import (
-    Response,
-    Rollouts,
-    Segment,
-)
-from finssim.identification.uncertainty import (
-    correlated_samples,
-)
+from finssim.identification.rollout import Response, Rollouts, Segment
+from finssim.identification.uncertainty import correlated_samples
 from finssim.physics.types import MAX_THRUSTERS
 from finssim.trials.conversion import EULER
 from finssim.trials.free_motion import CHANNELS

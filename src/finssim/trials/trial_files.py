@@ -20,14 +20,7 @@ from finssim.core.text_table import number, read_text_table, write_csv
 from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.trials.conversion import ordered, sampled, tidy_quaternions, upside_down, without_dead
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.trial import (
-    COLUMNS,
-    INPUT_PREFIXES,
-    PHASES,
-    Header,
-    Trial,
-    column_of,
-)
+from finssim.trials.trial import COLUMNS, INPUT_PREFIXES, PHASES, Header, Trial, column_of
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.part import did_you_mean, sentence_of
 

@@ -37,16 +37,7 @@ from finssim.trials.conversion import (
 )
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import STICKS, mixed_pulses
-from finssim.trials.trial import (
-    COLUMNS,
-    INPUT_PREFIXES,
-    NU,
-    PHASES,
-    Array,
-    Header,
-    Trial,
-    column_of,
-)
+from finssim.trials.trial import COLUMNS, INPUT_PREFIXES, NU, PHASES, Array, Header, Trial, column_of
 from finssim.trials.trial_files import vehicle_reference
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.autopilot import FRAMES
