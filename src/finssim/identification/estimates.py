@@ -52,118 +52,16 @@ class Number(NamedTuple):
     """Estimate without the bound that it rests on, in the unit of the number; None where it rests on none."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class AxisResult:
-    """Estimates, changes of the vehicle file and findings of one axis, from its numbers.
-
-    What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
-    interval: a wide interval is a better answer than a number that it excludes.
-    """
+    """Estimates, changes of the vehicle file and findings of one axis."""
 
     axis: str
-    numbers: Mapping[str, Number]
-    """Fitted numbers by name, of `UNITS`."""
-    file: Matrices
-    """The vehicle as its file has it."""
     speeds: tuple[float, float]
     """Lowest and highest that the damping rests on [m/s, rad/s]."""
-    drag_known: bool
-    """True if the damping is known well enough to be written; both of its terms are written, or neither."""
-    given: float | None = None
-    """Effective inertia where it is known [kg, kg m²]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        """Estimate term by term."""
-        self.i = AXES.index(self.axis)
-        low, high = self.speeds
-        unit = "m/s" if self.i < 3 else "rad/s"
-        if self.given is not None:
-            self.note("m_eff", self.given, (self.given, self.given), True, "given")
-        elif "m_eff" in self.numbers:
-            self.add("m_eff")
-        if f"{self.axis}.m_eff" in self.estimates:
-            self.added_mass(float(self.file.M_RB[self.i, self.i]))
-        for name, family in (("d1", "linear_damping"), ("d2", "quadratic_damping")):
-            if name in self.numbers:
-                own = self.add(name, self.path(family))
-                if own.ci95[0] <= 0.0 <= own.ci95[1] < np.inf:
-                    note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
-                    self.note(name, own.estimate, own.ci95, False, note, own.path)
-            if self.drag_known:
-                value = max(self.numbers[name].value, 0.0) if name in self.numbers else 0.0
-                file = {"d1": self.file.D1, "d2": self.file.D2}[name][self.i, self.i]
-                if name not in self.numbers or value != file:
-                    self.changes[self.path(family)] = value
-        if not self.drag_known:
-            self.findings.append(finding("damping_unknown", self.axis, low=low, high=high, unit=unit))
-        if "k" in self.numbers:
-            self.add("k", "body.center_of_buoyancy.2")
-        if "bias" in self.numbers:  # identifiable wherever it has an interval, for it may well be zero
-            bias = self.add("bias")
-            self.note("bias", bias.estimate, bias.ci95, bool(np.isfinite(bias.ci95).all()), BIAS_NOTE)
-        if 0.0 < low and high < DECADE * low:
-            self.findings.append(finding("few_speeds", self.axis, low=low, high=high, unit=unit))
-
-    def path(self, family: str) -> str:
-        """Return the path of the axis' own entry in a matrix of the vehicle file."""
-        return f"{SET}.{family}.{self.i}.{self.i}"
-
-    def note(
-        self,
-        name: str,
-        value: float,
-        ends: tuple[float, float],
-        sure: bool,
-        note: str,
-        path: str | None = None,
-    ) -> Estimate:
-        """Take an estimate. Value and interval are in `unit`."""
-        unit = UNITS["m_eff" if name == "added_mass" else name][self.i > 2]
-        name, ends = f"{self.axis}.{name}", (float(ends[0]), float(ends[1]))
-        self.estimates[name] = Estimate(
-            name=name, estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note, path=path
-        )
-        return self.estimates[name]
-
-    def add(self, name: str, path: str | None = None) -> Estimate:
-        """Take the estimate of a number, and a finding where it rests on its bound."""
-        value, (low, high), free = self.numbers[name]
-        unit, note, sure = UNITS[name][self.i > 2], "", False
-        if free is not None:
-            note = "held at its bound" + (
-                f"; free, it would be {free:.3g} {unit}" if np.isfinite(free) else ""
-            )
-            self.findings.append(finding("at_bound", f"{self.axis}.{name}", free=free, unit=unit))
-        elif not np.isfinite([low, high]).all():
-            note = "the trials do not determine it"
-        elif 0.5 * (high - low) > CERTAIN * abs(value):
-            part = 0.5 * (high - low) / abs(value) if value else np.inf
-            note = (
-                f"uncertain by ±{100.0 * part:.0f} %" if part < 1.0 else "uncertain by more than its own size"
-            )
-        else:
-            sure = True
-        return self.note(name, value, (low, high), sure, note, path)
-
-    def added_mass(self, rigid: float) -> None:
-        """m_eff less the rigid part. The rigid part is in [kg] or [kg m²]."""
-        whole = self.estimates[f"{self.axis}.m_eff"]
-        value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
-        sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
-        if value <= 0.0:
-            sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {whole.unit}"
-            fields = {"effective": whole.estimate, "rigid": rigid, "unit": whole.unit}
-            self.findings.append(finding("inertia_too_small", self.axis, **fields))
-        elif ends[0] <= 0.0:
-            sure, note = False, "not distinguishable from zero"
-        half = 0.5 * (whole.ci95[1] - whole.ci95[0])
-        before, path = float(self.file.M_A[self.i, self.i]), self.path("added_mass")
-        if value > 0.0 and (half < USEFUL * whole.estimate or outside(before, ends)):
-            self.changes[path] = value
-        self.note("added_mass", value, ends, sure, note, path)
 
     def believe_nothing(self, reason: str) -> None:
         """Leave the numbers as they are, call none of them identifiable and write none."""
@@ -172,6 +70,107 @@ class AxisResult:
         }
         self.changes = {}
         self.findings.append(finding("axis_refused", self.axis, reason=reason))
+
+
+def axis_result(
+    p: Parameters,
+    x: Array,
+    numbers: Mapping[str, Number],
+    axis: str,
+    *,
+    speeds: tuple[float, float],
+    drag_known: bool,
+    given: float | None = None,
+) -> AxisResult:
+    """Return the result of one axis.
+
+    What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
+    interval: a wide interval is a better answer than a number that it excludes.
+
+    Args:
+        p: What was free.
+        x: Where the fit ended, in the units of the coordinates, (P,).
+        numbers: Of `numbers_of`.
+        axis: Which.
+        speeds: Lowest and highest that the damping rests on [m/s, rad/s].
+        drag_known: Whether the damping is known well enough to be written; both of its terms are written, or neither.
+        given: Effective inertia where it is known [kg, kg m²].
+    """
+    out, i, file = AxisResult(axis, speeds), AXES.index(axis), matrices(p.moved(x))
+    rigid, (low, high), unit = float(file.M_RB[i, i]), speeds, "m/s" if i < 3 else "rad/s"
+
+    def take(
+        name: str, value: float, ends: tuple[float, float], sure: bool, note: str, path: str | None = None
+    ) -> Estimate:
+        """Take an estimate."""
+        own = UNITS["m_eff" if name == "added_mass" else name][i > 2]
+        ends = (float(ends[0]), float(ends[1]))
+        one = Estimate(f"{axis}.{name}", float(value), ends, own, sure, note, path)
+        out.estimates[one.name] = one
+        return one
+
+    def add(name: str, number: Number, path: str | None = None) -> Estimate:
+        """Take the estimate of a number, and a finding where it rests on its bound."""
+        value, (least, most), free = number
+        own, note = UNITS[name][i > 2], ""
+        if free is not None:
+            note = "held at its bound" + (
+                f"; free, it would be {free:.3g} {own}" if np.isfinite(free) else ""
+            )
+            out.findings.append(finding("at_bound", f"{axis}.{name}", free=free, unit=own))
+        elif not np.isfinite([least, most]).all():
+            note = "the trials do not determine it"
+        elif 0.5 * (most - least) > CERTAIN * abs(value):
+            part = 0.5 * (most - least) / abs(value) if value else np.inf
+            note = "uncertain by " + (f"±{100.0 * part:.0f} %" if part < 1.0 else "more than its own size")
+        return take(name, value, (least, most), not note, note, path)
+
+    mass = numbers.get(f"{axis}.added_mass")
+    if given is not None:
+        _added_mass(out, take("m_eff", given, (given, given), True, "given"), file, take)
+    elif mass is not None:
+        free = None if mass.free is None else mass.free + rigid
+        ends = (mass.ends[0] + rigid, mass.ends[1] + rigid)
+        _added_mass(out, add("m_eff", Number(mass.value + rigid, ends, free)), file, take)
+    for name, matrix in (("d1", file.D1), ("d2", file.D2)):
+        drag, path = numbers.get(f"{axis}.{name}"), _diagonal(axis, name)
+        if drag is not None:
+            e = add(name, drag, path)
+            if e.ci95[0] <= 0.0 <= e.ci95[1] < np.inf:
+                note = f"not distinguishable from zero at speeds of {low:.2g}-{high:.2g} {unit}"
+                take(name, e.estimate, e.ci95, False, note, path)
+        if drag_known:
+            value = 0.0 if drag is None else max(drag.value, 0.0)
+            if drag is None or value != matrix[i, i]:
+                out.changes[path] = value
+    if not drag_known:
+        out.findings.append(finding("damping_unknown", axis, low=low, high=high, unit=unit))
+    if "k" in numbers and axis in ("roll", "pitch"):
+        add("k", numbers["k"], "body.center_of_buoyancy.2")
+    if f"{axis}.bias" in numbers:  # identifiable wherever it has an interval, for it may well be zero
+        bias = add("bias", numbers[f"{axis}.bias"])
+        take("bias", bias.estimate, bias.ci95, bool(np.isfinite(bias.ci95).all()), BIAS_NOTE)
+    if 0.0 < low and high < DECADE * low:
+        out.findings.append(finding("few_speeds", axis, low=low, high=high, unit=unit))
+    return out
+
+
+def _added_mass(out: AxisResult, whole: Estimate, file: Matrices, take: Callable[..., Estimate]) -> None:
+    """Take the added mass of an axis: its effective inertia less the file's rigid part."""
+    i = AXES.index(out.axis)
+    rigid, before = float(file.M_RB[i, i]), float(file.M_A[i, i])
+    value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
+    sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
+    if value <= 0.0:
+        sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {whole.unit}"
+        fields = {"effective": whole.estimate, "rigid": rigid, "unit": whole.unit}
+        out.findings.append(finding("inertia_too_small", out.axis, **fields))
+    elif ends[0] <= 0.0:
+        sure, note = False, "not distinguishable from zero"
+    half, path = 0.5 * (whole.ci95[1] - whole.ci95[0]), _diagonal(out.axis, "added_mass")
+    if value > 0.0 and (half < USEFUL * whole.estimate or outside(before, ends)):
+        out.changes[path] = value
+    take("added_mass", value, ends, sure, note, path)
 
 
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
@@ -289,29 +288,6 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
     return out
 
 
-def axis_result(
-    p: Parameters, x: Array, numbers: Mapping[str, Number], axis: str, **known: Any
-) -> AxisResult:
-    """The result of one axis.
-
-    Args:
-        p: What was free.
-        x: Where the fit ended, in the units of the coordinates, (P,).
-        numbers: Of `numbers_of`.
-        axis: Which.
-        known: Further fields of `AxisResult`.
-    """
-    own, file, i = dict[str, Number](), matrices(p.moved(x)), AXES.index(axis)
-    if f"{axis}.added_mass" in numbers:
-        mass, rigid = numbers[f"{axis}.added_mass"], float(file.M_RB[i, i])
-        free = None if mass.free is None else mass.free + rigid
-        own["m_eff"] = Number(mass.value + rigid, (mass.ends[0] + rigid, mass.ends[1] + rigid), free)
-    own |= {n: numbers[f"{axis}.{n}"] for n in ("d1", "d2", "bias") if f"{axis}.{n}" in numbers}
-    if "k" in numbers and axis in ("roll", "pitch"):
-        own["k"] = numbers["k"]
-    return AxisResult(axis=axis, numbers=own, file=file, **known)
-
-
 def other_estimates(
     p: Parameters, numbers: Mapping[str, Number]
 ) -> tuple[dict[str, Estimate], list[Finding]]:
@@ -354,15 +330,7 @@ def other_estimates(
         elif half > limit:
             note = f"uncertain by ±{half:.2g} {unit}"
         path = f"{SET}.{name}" if name in p.terms else paths.get(name)
-        out[name] = Estimate(
-            name=name,
-            estimate=value,
-            ci95=(low, high),
-            unit=unit,
-            identifiable=not note,
-            note=note,
-            path=path,
-        )
+        out[name] = Estimate(name, value, (low, high), unit, not note, note, path)
     return out, bounds
 
 

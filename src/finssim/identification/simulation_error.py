@@ -401,9 +401,7 @@ def _axes(
     driven = any(s.drive.source != "passive" for s in prepared)
     remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
     unmoved = [axis for axis in axes if axis in seen and axis not in moved]
-    remarks += [
-        finding("axis_doubtful", axis) if driven else finding("axis_not_free", axis) for axis in unmoved
-    ]
+    remarks += [finding("axis_doubtful" if driven else "axis_not_free", axis) for axis in unmoved]
     chosen = tuple(a for a in AXES if a in axes and a in seen and (driven or a in moved))
     if not chosen:
         raise CalibrationError(f"no measurement that determines {', '.join(axes)} is in these trials")

@@ -348,7 +348,7 @@ def _traded(group: list[str], ratio: float) -> Finding:
         return finding("damping_traded", **fields)
     if kinds & masses and kinds & {"d1", "d2", "k"} and len(axes) == 1:
         return finding("inertia_traded", **fields)
-    return finding("stiffness_traded", **fields) if "k" in kinds else finding("traded", **fields)
+    return finding("stiffness_traded" if "k" in kinds else "traded", **fields)
 
 
 def arrow_evidence(
