@@ -23,7 +23,7 @@ from finssim.sim.ranges_file import SHIPPED, load_ranges
 from finssim.studies.sweep import load_sweep
 from finssim.survey.survey_file import load_survey_file
 from finssim.tasks.sensing import load_sensing
-from finssim.trials.importers.assemble import read_map
+from finssim.trials.importers.column_map import read_map
 from finssim.trials.trial_files import read_header
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.device_files import DEVICES, load_device

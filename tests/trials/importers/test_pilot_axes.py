@@ -14,7 +14,7 @@ from finssim.identification.hydrodynamics import fit_hydrodynamics
 from finssim.pool.ardusub_sitl import SitlWorld
 from finssim.trials.check import check_trials
 from finssim.trials.importers import ardusub
-from finssim.trials.importers.assemble import ColumnMap
+from finssim.trials.importers.column_map import ColumnMap
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.importers.log import Request
 from finssim.vehicles import load_vehicle

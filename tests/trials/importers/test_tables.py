@@ -8,7 +8,7 @@ import pytest
 from finssim.core.files import OutputError
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers import import_trials
-from finssim.trials.importers.assemble import read_map
+from finssim.trials.importers.column_map import read_map
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.trial_files import load_trial
 

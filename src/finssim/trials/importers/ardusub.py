@@ -22,7 +22,8 @@ from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.conversion import GRAVITY
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import STICK_CHANNELS, mixed_pulses, outputs_of
-from finssim.trials.importers.assemble import ArduSubMap, LogFrame, Stream, in_our_axes
+from finssim.trials.importers.assemble import Stream, in_our_axes
+from finssim.trials.importers.column_map import ArduSubMap, LogFrame
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.trial import Array
 from finssim.vehicles import Vehicle

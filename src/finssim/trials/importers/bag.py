@@ -18,7 +18,8 @@ from finssim.core.mcap_files import intact_mcap, without_profile
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers import finssim_record
 from finssim.trials.importers.ardusub import ARMED_FLAG, MANUAL, ArduPilotLog, with_inputs
-from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream, shipped_maps
+from finssim.trials.importers.assemble import Stream
+from finssim.trials.importers.column_map import ColumnSource, SourceMap, shipped_maps
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.table import used_columns
 from finssim.trials.importers.topics import LogTopic, log_of, times_of

@@ -12,17 +12,8 @@ from typing import Annotated
 from finssim.core.files import plain_name
 from finssim.core.importer import importers
 from finssim.trials.findings import CalibrationError, finding
-from finssim.trials.importers.assemble import (
-    ColumnMap,
-    SourceMap,
-    SplitRule,
-    merge,
-    moved_in_time,
-    read_map,
-    split_rule,
-    split_table,
-    trial_of,
-)
+from finssim.trials.importers.assemble import merge, moved_in_time, split_table, trial_of
+from finssim.trials.importers.column_map import ColumnMap, SourceMap, SplitRule, read_map, split_rule
 from finssim.trials.importers.log import Request, TrialStreams, importer_of
 from finssim.trials.importers.table import SUFFIXES, read_stream
 from finssim.trials.trial import Trial

@@ -12,7 +12,8 @@ from finssim.core.files import plain_name
 from finssim.core.mcap_files import mcap_metadata
 from finssim.core.yaml_file import json_value
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.importers.assemble import ColumnSource, SourceMap, Stream
+from finssim.trials.importers.assemble import Stream
+from finssim.trials.importers.column_map import ColumnSource, SourceMap
 from finssim.vehicles import VehicleError, catalogue_vehicle
 
 NATIVE = "finssim_msgs/msg/"

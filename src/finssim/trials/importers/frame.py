@@ -10,7 +10,8 @@ from pydantic import ValidationError
 
 from finssim.core.files import plain_name
 from finssim.trials.findings import CalibrationError
-from finssim.trials.importers.assemble import ColumnMap, SourceMap, merge, trial_of
+from finssim.trials.importers.assemble import merge, trial_of
+from finssim.trials.importers.column_map import ColumnMap, SourceMap
 from finssim.trials.importers.table import memory_table, table_stream
 from finssim.trials.trial import Trial, column_of
 from finssim.trials.trial_files import ColumnTable

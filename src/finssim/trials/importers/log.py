@@ -8,7 +8,8 @@ from typing import Any
 
 from finssim.core.importer import importers, recognised
 from finssim.trials.findings import CalibrationError
-from finssim.trials.importers.assemble import ColumnMap, Stream
+from finssim.trials.importers.assemble import Stream
+from finssim.trials.importers.column_map import ColumnMap
 from finssim.vehicles import Vehicle
 
 __all__ = ["Request", "TrialStreams", "importer_of"]

@@ -18,7 +18,8 @@ from finssim.core.text_table import decoded, text_table
 from finssim.core.yaml_file import read_mapping
 from finssim.trials.conversion import EULER, factor
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
-from finssim.trials.importers.assemble import SourceMap, Stream, TimeColumn, Validity, in_our_axes, present
+from finssim.trials.importers.assemble import Stream, in_our_axes
+from finssim.trials.importers.column_map import SourceMap, TimeColumn, Validity, present
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.trial import Array, column_of
 from finssim.trials.trial_files import ColumnTable, read_table

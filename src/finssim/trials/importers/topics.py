@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from finssim.trials.findings import CalibrationError, Finding, finding
-from finssim.trials.importers.assemble import SourceMap, Stream
+from finssim.trials.importers.assemble import Stream
+from finssim.trials.importers.column_map import SourceMap
 from finssim.trials.importers.log import TrialStreams
 from finssim.trials.importers.table import memory_table, stream_of
 from finssim.trials.trial import Array

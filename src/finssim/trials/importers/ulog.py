@@ -16,7 +16,8 @@ from finssim.core.frames import FROM_FOSSEN
 from finssim.core.importer import Importer
 from finssim.trials.findings import CalibrationError, Finding, finding
 from finssim.trials.importers.ardusub_outputs import outputs_of, thrusters_of
-from finssim.trials.importers.assemble import Stream, present, shipped_maps
+from finssim.trials.importers.assemble import Stream
+from finssim.trials.importers.column_map import present, shipped_maps
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array

@@ -13,7 +13,7 @@ import numpy as np
 from finssim.core.importer import Importer
 from finssim.core.text_table import read_text
 from finssim.trials.findings import CalibrationError, finding
-from finssim.trials.importers.assemble import TimeColumn, shipped_maps
+from finssim.trials.importers.column_map import TimeColumn, shipped_maps
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.importers.table import used_columns
 from finssim.trials.importers.topics import LogTopic, log_of
