@@ -13,11 +13,12 @@ from finssim.identification.excitation import excited
 from finssim.identification.programme import programmes
 from finssim.identification.simulation_error import prepare
 from finssim.identification.synthetic import simulate_programme
-from finssim.trials.check import check, check_trials, print_reports, set_findings
+from finssim.trials.check import check, check_trials
 from finssim.trials.findings import CalibrationError
 from finssim.trials.free_motion import compared_columns
 from finssim.trials.trial import TAU, Header, Trial
 from finssim.trials.trial_files import write_trial
+from finssim.trials.trial_report import print_reports, set_findings
 from finssim.vehicles import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2_heavy")

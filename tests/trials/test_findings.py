@@ -23,10 +23,12 @@ def producers() -> dict[str, list[tuple[str, set[str] | None]]]:
             continue
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "finding":
-                code = ast.literal_eval(node.args[0])
+                code = node.args[0]
                 named = {keyword.arg for keyword in node.keywords}
                 place = f"{path.name}:{node.lineno}"
-                found[code].append((place, None if None in named else named - {"severity"}))
+                for one in [code.body, code.orelse] if isinstance(code, ast.IfExp) else [code]:
+                    given = None if None in named else named - {"severity"}
+                    found[ast.literal_eval(one)].append((place, given))
     return found
 
 

@@ -4,286 +4,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rich import box
-from rich.markup import escape
-from rich.table import Table
 from scipy.signal import lfilter
 
-from finssim.core.rotations import quat_rotate, quat_to_euler
-from finssim.trials.findings import SEVERITIES, CalibrationError, Finding, finding, listed, plain
+from finssim.trials.findings import CalibrationError, Finding, finding, listed
 from finssim.trials.free_motion import FEWEST_SPEEDS, compared_columns, free_motion
 from finssim.trials.inputs import InputForces, drive, implausible, no_input, within_reach
-from finssim.trials.motion import (
-    AttitudeSignal,
-    Motion,
-    answers,
-    attitude_samples,
-    attitude_signal,
-    holds_gravity,
-    longest_step,
-    motion,
-    on_grid,
-    up_in_body,
-    white_noise,
-)
+from finssim.trials.motion import Motion, answers, motion, up_in_body
 from finssim.trials.significance import Relation, relation
 from finssim.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
 from finssim.trials.trial_files import load_trial, trials_at, vehicle_of
 from finssim.vehicles import AXES, Vehicle, VehicleError, load_vehicle
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    pass
 
-# Checks between the trials of a set: vehicles, roles, names, and what they determine together.
-
-
-def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
-    """Return the names of the trials that determine a parameter of an axis; held-out and refused ones do not count."""
-    return [
-        report.name
-        for report in reports
-        if report.verdict != "refused" and report.role != "held-out"
-        for axis_report in report.axes
-        if axis_report.axis == axis and parameter in axis_report.tells and axis_report.tells[parameter].can
-    ]
-
-
-def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
-    """Findings about the set."""
-    findings = []
-    vehicles = {report.vehicle for report in reports if report.vehicle}
-    if len(vehicles) > 1:
-        findings.append(finding("several_vehicles", vehicles=tuple(sorted(vehicles))))
-    names = [report.name for report in reports]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        findings.append(finding("equal_names", names=tuple(twice)))
-    good = [report for report in reports if report.verdict != "refused"]
-    if reports and not good:
-        findings.append(finding("none_usable"))
-        return findings
-    held_out = [report.name for report in good if report.role == "held-out"]
-    if held_out and len(held_out) == len(good):
-        findings.append(finding("all_held_out"))
-    elif not held_out and len(good) > 1:
-        findings.append(finding("none_held_out"))
-    fitting = len(good) - len(held_out)
-    if 0 < fitting < 5:
-        findings.append(finding("few_trials", trials=fitting))
-    nothing = [a for a in AXES if not any(identified_by(reports, a, parameter) for parameter in PARAMETERS)]
-    if nothing and len(nothing) < len(AXES):
-        findings.append(finding("axes_untold", axes=tuple(map(str, nothing))))
-    return findings
-
-
-# Result of a check of trials, as data.
-
-Verdict = Literal["usable", "usable with care", "refused"]
-
-PARAMETERS = ("m_eff", "d1", "d2", "k", "buoyancy")
-"""Parameters that a trial may determine of an axis; k of roll and pitch, buoyancy of heave."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreamReport:
-    """Columns that are sampled together."""
-
-    columns: tuple[str, ...]
-    group: str
-    samples: int
-    rate: float
-    """Samples per second while there are any [Hz]."""
-    jitter: float
-    """Standard deviation of the time between samples, gaps aside, as a share of its mean."""
-    gaps: int
-    longest_gap: float
-    """[s]"""
-    missing: float
-    """Part of the trial's time without this stream."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Identifiability:
-    """Result for one parameter: whether a trial determines it, and why."""
-
-    can: bool
-    why: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class AxisReport:
-    """Excitation of one axis and what follows from it."""
-
-    axis: str
-    source: str
-    """Source of the velocity: measured, derived from ..., or nothing."""
-    fastest: float = np.nan
-    """95th percentile of the speed [m/s, rad/s]."""
-    noise: float = np.nan
-    """Noise of one velocity sample [m/s, rad/s]."""
-    decades: float = 0.0
-    """Logarithm (base 10) of the ratio of the fastest to the slowest speed above the noise."""
-    strongest: float = 0.0
-    """95th percentile of the wrench [N, N m]."""
-    work: float = 0.0
-    """Done by the inputs along this axis [J]; of a passive trial 0."""
-    both_directions: bool = False
-    driven: float = 0.0
-    """Time of input [s]."""
-    coasts: float = 0.0
-    """Time of motion without input [s]."""
-    rests: float = 0.0
-    """Time without input and motion [s]."""
-    excited: bool = False
-    tells: dict[str, Identifiability] = field(default_factory=dict)
-    """Identifiability by parameter."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialReport:
-    """One trial."""
-
-    name: str
-    vehicle: str | None = None
-    role: str | None = None
-    duration: float = 0.0
-    """[s]"""
-    rows: int = 0
-    inputs: str = ""
-    """Kind of input: rpm, force, tau, pwm, command, passive, or nothing."""
-    streams: tuple[StreamReport, ...] = ()
-    axes: tuple[AxisReport, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    sha256: str = ""
-
-    @property
-    def verdict(self) -> Verdict:
-        """Return the verdict of the worst finding."""
-        levels = {finding_.severity for finding_ in self.findings}
-        return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values; numbers that are not finite become None."""
-        record = {key: value for key, value in asdict(self).items() if key != "axes"}
-        record |= {"verdict": self.verdict, "findings": [entry.as_json() for entry in self.findings]}
-        axes = {axis.axis: {k: v for k, v in asdict(axis).items() if k != "axis"} for axis in self.axes}
-        return {**plain(record), "axes": plain(axes)}
-
-
-# Reports of checked trials as tables for people, readable at a hundred columns.
-
-COLOURS = {"usable": "green", "usable with care": "yellow", "refused": "red"}
-MARKS = {"refused": "[red]✗[/red]", "care": "[yellow]![/yellow]", "note": "[dim]·[/dim]"}
-MANY = 4
-"""More trials than this are printed without the tables of each."""
-
-
-def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequence[Finding] = ()) -> None:
-    """Print what was found.
-
-    Args:
-        reports: By trial.
-        console: Where to.
-        common: Findings about all of them together.
-    """
-    for report in reports:
-        _print_trial(report, console, brief=len(reports) > MANY)
-    if len(reports) > 1:
-        table = _table(("axis", *PARAMETERS), ("axis",), "trials that determine a parameter")
-        for axis in AXES:
-            counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
-            table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
-        console.print(table)
-    for entry in common:
-        console.print(f"{MARKS[entry.severity]} {escape(str(entry))}")
-
-
-def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
-    colour = COLOURS[report.verdict]
-    driven = f", {report.inputs}" if report.inputs else ""
-    role = f", {report.role}" if report.role else ""
-    console.print(
-        f"[bold]{escape(report.name)}[/bold]  {report.duration:.1f} s, {report.rows} rows{driven}{role}"
-        f"{', ' + escape(report.vehicle) if report.vehicle else ''}: [{colour}]{report.verdict}[/{colour}]"
-    )
-    grid = Table.grid(padding=(0, 1))
-    for entry in sorted(report.findings, key=lambda f: SEVERITIES.index(f.severity)):
-        if not (brief and entry.severity == "note"):
-            grid.add_row("", MARKS[entry.severity], escape(str(entry)))
-    if grid.row_count:
-        console.print(grid, highlight=False)
-    if brief:
-        return
-    if report.streams:
-        heads = ("columns", "samples", "rate", "jitter", "gaps", "longest", "missing")
-        table = _table(heads, ("columns",))
-        for s in report.streams:
-            rates = (
-                f"{s.rate:.3g} Hz",
-                f"{s.jitter:.0%}",
-                str(s.gaps),
-                f"{s.longest_gap:.2g} s",
-                f"{s.missing:.0%}",
-            )
-            table.add_row(escape(listed(s.columns, 4)), str(s.samples), *rates)
-        console.print(table)
-    if report.axes:
-        console.print(_axes(report.axes))
-        console.print(_identifiability_table(report.axes), highlight=False)
-    console.print()
-
-
-def _table(heads: Sequence[str], left_aligned: Sequence[str], title: str | None = None) -> Table:
-    """An empty table of columns, some of them to the left."""
-    table = Table(
-        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title=title, title_justify="left"
-    )
-    for name in heads:
-        justify: Literal["left", "right"] = "left" if name in left_aligned else "right"
-        table.add_column(name, justify=justify, overflow="fold", min_width=max(map(len, name.split())))
-    return table
-
-
-def _axes(axes: Sequence[AxisReport]) -> Table:
-    heads = ("axis", "velocity", "up to", "noise", "decades", "input", "both ways", "coast", "rest")
-    table = _table(heads, ("axis", "velocity"))
-    for a in axes:
-        if not a.source or a.fastest != a.fastest:
-            table.add_row(a.axis, a.source.removeprefix("derived ") or "[dim]unknown[/dim]", *[""] * 7)
-            continue
-        force = f"{a.strongest:.3g}" if a.strongest > 1e-3 else "-"
-        speeds = (f"{a.fastest:.2g}", f"{a.noise:.1g}", f"{a.decades:.1f}")
-        rest = (force, "yes" if a.both_directions else "no", f"{a.coasts:.1f} s", f"{a.rests:.1f} s")
-        source = a.source.removeprefix("derived ")
-        table.add_row(a.axis, source, *speeds, *rest, style="" if a.excited else "dim")
-    return table
-
-
-def _identifiability_table(axes: Sequence[AxisReport]) -> Table:
-    """Return a table of what each axis determines, and the reasons for the rest; reasons that several share are listed
-    once."""
-    grid = Table.grid(padding=(0, 1))
-    for a in axes:
-        by_reason: dict[tuple[bool, str], list[str]] = {}
-        for name, verdict in a.tells.items():
-            by_reason.setdefault((verdict.can, verdict.why), []).append(name)
-        if len(by_reason) == 1 and not next(iter(by_reason))[0]:
-            grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
-        elif by_reason:
-            parts = [
-                f"[green]{', '.join(names)}[/green] ({escape(reason)})"
-                if can
-                else f"not {', '.join(names)} ({escape(reason)})"
-                for (can, reason), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
-            ]
-            grid.add_row("", a.axis, "; ".join(parts))
-    return grid
-
+from finssim.trials.agreement import AGAINST, LEVEL, frame_findings, unit_findings
+from finssim.trials.trial_report import (
+    PARAMETERS,
+    AxisReport,
+    Identifiability,
+    StreamReport,
+    TrialReport,
+    print_reports,
+    set_findings,
+)
 
 # Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
 
@@ -391,11 +140,7 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     if _coarse(y):
         return findings
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
-        findings.append(
-            finding("above_surface", height=above)
-            if name == "z"
-            else finding("depth_above_surface", height=above)
-        )
+        findings.append(finding("above_surface" if name == "z" else "depth_above_surface", height=above))
     begins = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
     lengths = np.diff(np.concatenate([begins, [len(y)]]))
     usual = float(np.median(lengths))
@@ -411,9 +156,8 @@ def _values(trial: Trial, name: str) -> list[Finding]:
         # A signal that passes through its extreme touches it once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
-            fields = {"value": extreme, "samples": runs.sum()}
             findings.append(
-                finding("clipped_above", **fields) if highest else finding("clipped_below", **fields)
+                finding("clipped_above" if highest else "clipped_below", value=extreme, samples=runs.sum())
             )
     return findings
 
@@ -453,23 +197,11 @@ def _wrench_beyond(vehicle: Vehicle, inputs: InputForces) -> list[Finding]:
     findings = []
     for i, (axis, limit) in enumerate(zip(AXES, vehicle.wrench_limits, strict=True)):
         tau = np.abs(inputs.force[:, i])
-        if not tau.any() or limit == 0.0:
-            continue
-        beyond = float((tau > 1.05 * limit).sum() / (tau > 0.0).sum())
+        beyond = float((tau > 1.05 * limit).sum() / max((tau > 0.0).sum(), 1)) if limit != 0.0 else 0.0
         if beyond > OFTEN:
-            fields: dict[str, Any] = {
-                "column": inputs.names[i],
-                "limit": float(limit),
-                "unit": "N" if i < 3 else "N m",
-                "vehicle": vehicle.name,
-                "share": beyond,
-                "axis": str(axis),
-            }
-            findings.append(
-                finding("command_beyond", **fields)
-                if inputs.commanded
-                else finding("wrench_beyond", **fields)
-            )
+            fields = {"column": inputs.names[i], "limit": float(limit), "unit": "N" if i < 3 else "N m"}
+            fields |= {"vehicle": vehicle.name, "share": beyond, "axis": str(axis)}
+            findings.append(finding("command_beyond" if inputs.commanded else "wrench_beyond", **fields))
     return findings
 
 
@@ -539,13 +271,12 @@ def with_identifiability(
     passive = inputs.source == "passive"
     if blocked := _blocked(report, inputs, motion, measured):
         report = replace(report, excited=report.excited and not passive)
-        return replace(report, tells={name: Identifiability(can=False, why=blocked) for name in names})
-    verdicts = (
-        _passive_identifiability(report) if passive else _driven_identifiability(report, motion, vehicle)
-    )
-    return replace(
-        report, tells={name: Identifiability(can=verdicts[name][0], why=verdicts[name][1]) for name in names}
-    )
+        verdicts = dict.fromkeys(names, (False, blocked))
+    else:
+        verdicts = (
+            _passive_identifiability(report) if passive else _driven_identifiability(report, motion, vehicle)
+        )
+    return replace(report, tells={name: Identifiability(*verdicts[name]) for name in names})
 
 
 def _blocked(
@@ -637,302 +368,6 @@ def _driven_identifiability(
         "k": (angle >= LEAST_TILT, k if angle >= LEAST_TILT or valid.sum() < 10 else f"{k} only"),
         "buoyancy": (floats, buoyancy),
     }
-
-
-# Whether a trial's numbers agree with each other: units, signs, axes.
-
-RATE = 25.0
-"""Rate of the grid on which columns are compared [Hz]."""
-
-AGAINST = -0.5
-"""Correlation below which two columns that should agree run against each other."""
-
-NEGATIVE = 4.0
-"""Factor by which noise, smoothing and errors of scale change a slope of -1 at most."""
-
-WITH = 0.7
-"""Correlation above which their ratio means something."""
-
-FEWEST = 25
-"""Points of a grid with motion that a comparison needs."""
-
-DEGREES = 57.3
-
-DRIFTS = 0.2
-"""Range of the heading less the integrated gyro and its constant error that is a drift [rad]."""
-
-WALK = 2.5
-"""Range of a random walk without its trend, in standard deviations of its end, that chance hardly exceeds."""
-
-WIGGLES = 10.0
-"""Independent values that a smoother may leave of pure noise."""
-
-LARGEST_TURN = 1.0
-"""Turn between two samples of an attitude above which its rates may be aliases [rad]."""
-
-STEEP = 0.6
-"""Cosine of the pitch below which the heading means nothing."""
-
-LEVEL = 0.7
-"""Cosine of the tilt below which restoring moments act on yaw and weight on surge and sway."""
-
-GYRO_BIAS = 0.03
-"""Steady difference between heading and integrated gyro that no calibrated gyro has [rad/s]."""
-
-
-def unit_findings(trial: Trial) -> list[Finding]:
-    """Return findings about angles in degrees, recognised by values that radians cannot have."""
-    findings = []
-    for name, limit in (("roll", 1.05 * np.pi), ("pitch", 0.55 * np.pi)):
-        _, y = trial.series(name)
-        if len(y) and np.abs(y).max() > limit:
-            findings.append(_degrees(name, float(np.abs(y).max()), "rad"))
-    _, yaw = trial.series("yaw")
-    if len(yaw) > 1:
-        jumps = np.abs(np.diff(yaw))
-        if np.abs(yaw).max() > 2.5 * np.pi and (np.any(np.abs(jumps - 360.0) < 30.0) or not trial.has("r")):
-            findings.append(_degrees("yaw", float(np.abs(yaw).max()), "rad"))
-    return findings
-
-
-def _degrees(name: str, value: float, unit: str) -> Finding:
-    return finding("degrees", column=name, value=value, unit=unit)
-
-
-def frame_findings(trial: Trial, vehicle: Vehicle) -> list[Finding]:
-    """Gravity against the attitude, rates against its changes, velocity against those of position and depth."""
-    t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
-    if len(t) < FEWEST:
-        return []
-    attitude = attitude_signal(trial, t)
-    return [
-        *_gravity(trial, vehicle.water.gravity, t, attitude),
-        *_rates(trial, t, attitude),
-        *_heading(trial),
-        *_vertical(trial, t, attitude),
-        *_horizontal(trial, t, attitude),
-    ]
-
-
-def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    if not trial.has("az") or trial.header.acceleration == "kinematic":
-        return []
-    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
-    f = np.nan_to_num(f[np.isfinite(f[:, 2])])
-    mean = np.linalg.norm(f.mean(axis=0))
-    usual = np.median(np.linalg.norm(f, axis=1))  # of a vehicle that turns over, too
-    for size, unit, scale in (
-        (1.0, "g", 9.80665),
-        (1000.0, "milli-g", 9.80665e-3),
-        (100.0 * g, "cm/s²", 0.01),
-    ):
-        if abs(mean / size - 1.0) < 0.15 and abs(usual / size - 1.0) < 0.3:
-            return [finding("acceleration_unit", value=mean, unit=unit, factor=scale)]
-    if not holds_gravity(trial, g):
-        if abs(mean / g - 1.0) < 0.2:
-            return [finding("gravity_wrong_way", az=f.mean(axis=0)[2])]
-        return [finding("no_gravity")] if mean < 0.3 * g else []
-    up = up_in_body(attitude.quaternion) if attitude.tilt else np.tile([0.0, 0.0, 1.0], (len(t), 1))
-    f, _ = on_grid(trial, ("ax", "ay", "az"), t)
-    good = np.isfinite(f).all(axis=1) & np.isfinite(up).all(axis=1)
-    if good.sum() < FEWEST:
-        return []
-    f, up = f[good], up[good]
-    middle, expected = np.median(f, axis=0), np.median(up, axis=0)
-    cosine = float(middle @ expected / (np.linalg.norm(middle) * np.linalg.norm(expected)))
-    if cosine < -0.5:
-        return [finding("gravity_wrong_way", az=middle[2])]
-    findings = []
-    if cosine < np.cos(np.radians(15.0)):
-        against = "the attitude" if attitude.tilt else "level"
-        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        # Without an attitude a vehicle that is level at any time shows that its accelerometer is.
-        cosines = np.sum(f * up, axis=1) / np.linalg.norm(f, axis=1)
-        if attitude.tilt or np.percentile(cosines, 98.0) < np.cos(np.radians(15.0)):
-            findings.append(finding("accelerometer_turned", angle=angle, reference=against))
-    for i, angle_name in ((0, "pitch"), (1, "roll")):
-        swing = g * np.std(up[:, i])
-        if swing > 0.4 and _against(relation(g * up[:, i], f[:, i], nuisances=np.ones((len(f), 1)))):
-            findings.append(finding("acceleration_sign", column=f"a{'xy'[i]}", angle=angle_name))
-    return findings
-
-
-def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    findings: list[Finding] = []
-    _, q, _ = attitude_samples(trial)
-    if len(q) < FEWEST or _too_slow(trial, q):
-        return []
-    gyro, _ = on_grid(trial, ("p", "q", "r"), t)
-    angles = quat_to_euler(q)
-    for i, (rate, angle) in enumerate((("p", "roll"), ("q", "pitch"), ("r", "yaw"))):
-        derived = attitude.rates[:, i]
-        moving = (
-            np.isfinite(gyro[:, i]) & np.isfinite(derived) & (np.abs(derived) > 3.0 * attitude.rates_std[i])
-        )
-        if moving.sum() < FEWEST or not _stands_out(derived, np.unwrap(angles[i])):
-            continue
-        found = relation(derived, gyro[:, i], nuisances=np.ones((len(t), 1)))  # a gyro may have a bias
-        with_it = found.correlation > WITH and found.sure
-        if _against(found):
-            findings.append(finding("rate_sign", column=rate, other=angle))
-        elif with_it and 0.6 * DEGREES < found.slope < 1.6 * DEGREES:
-            findings.append(_degrees(rate, float(np.abs(gyro[:, i][moving]).max()), "rad/s"))
-        elif with_it and 0.6 < found.slope * DEGREES < 1.6:
-            findings.append(
-                _degrees(angle, float(np.nanmax(np.abs(trial.channels.get(angle, derived)))), "rad")
-            )
-    return findings
-
-
-def _heading(trial: Trial) -> list[Finding]:
-    """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
-    t, r = trial.series("r")
-    at, q, named = attitude_samples(trial)
-    if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST or _too_slow(trial, q):
-        return []
-    roll, pitch, yaw = quat_to_euler(q)
-    inside = (t >= at[0]) & (t <= at[-1])
-    if inside.sum() < FEWEST:
-        return []
-    t, r = t[inside], r[inside]
-    phi, theta = np.interp(t, at, roll), np.interp(t, at, pitch)
-    q_at = np.interp(t, *trial.series("q")) if trial.has("q") else np.zeros(len(t))
-    if not {"roll", "pitch"} & set(named) and _tilts_unseen(trial):
-        return []
-    rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), STEEP)
-    # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch starts again.
-    step = np.diff(t)
-    wide = (step > longest_step(t)) | (np.cos(theta[1:]) < STEEP) | (np.cos(theta[:-1]) < STEEP)
-    turns = np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step)
-    turned = np.concatenate([[0.0], np.cumsum(turns)])
-    difference = np.interp(t, at, np.unwrap(yaw)) - turned
-    for edge in np.flatnonzero(wide):
-        difference[edge + 1 :] += difference[edge] - difference[edge + 1]
-    bias, _ = np.polyfit(t - t[0], difference, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
-    rest = difference - bias * (t - t[0])
-    noise = 1.4826 * float(np.median(np.abs(np.diff(difference)))) * 6.0
-    # Noise of the gyro adds up to a random walk, and every second sample shows what is lost between samples.
-    noise += WALK * white_noise(r) * float(np.sqrt(np.median(step) * (t[-1] - t[0])))
-    coarse = np.cumsum(0.5 * (rate[2::2] + rate[:-2:2]) * (step[1::2] + step[: 2 * (len(step) // 2) : 2]))
-    noise += float(np.ptp(coarse - np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)[1::2]))
-    wander = float(np.ptp(rest)) - noise
-    if wander < DRIFTS and abs(bias) * (t[-1] - t[0]) < GYRO_BIAS * (t[-1] - t[0]) + noise:
-        return []
-    drift = float(np.ptp(difference)) - noise
-    return [finding("heading_drift", drift=drift)]
-
-
-def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    _, up = on_grid(trial, ("z", "depth"), t, 3)
-    moves = [
-        np.nanstd(rate) > 0.01 and _stands_out(rate, trial.series(name)[1])
-        for name, rate in zip(("z", "depth"), up.T, strict=True)
-        if np.isfinite(rate).sum() >= FEWEST
-    ]
-    if sum(moves) == 2:
-        if _against(relation(-up[:, 1], up[:, 0], nuisances=np.ones((len(t), 1)))):
-            return [finding("z_down")]
-        if wrong_unit := _unit_ratio(-up[:, 1], up[:, 0], "z", "depth"):
-            return wrong_unit
-    if not attitude.tilt and _tilts_unseen(trial):
-        return []
-    vertical = "z" if trial.has("z") else "depth"
-    rising = np.where(np.isfinite(up[:, 0]), up[:, 0], -up[:, 1])
-    through = _through_world(trial, t, attitude)[:, 2]
-    good = np.isfinite(rising) & np.isfinite(through)
-    if good.sum() < FEWEST or min(np.std(rising[good]), np.std(through[good])) < 0.015:
-        return []
-    if not _stands_out(np.where(good, rising, np.nan), trial.series(vertical)[1]):
-        return []
-    found = relation(rising, through, nuisances=np.ones((len(t), 1)))
-    if _against(found):
-        return [finding("rate_sign", column="w", other=vertical)]
-    return _unit_ratio(through, rising, vertical, "w") if attitude.tilt else []
-
-
-def _unit_ratio(x: Array, y: Array, of: str, over: str) -> list[Finding]:
-    """Return a finding if y surely goes with x and is another multiple of it than noise in either explains."""
-    one = np.ones((len(x), 1))
-    found, back = relation(x, y, nuisances=one), relation(y, x, nuisances=one)
-    if found.correlation < WITH or not found.sure:
-        return []
-    low, high = found.slope, 1.0 / back.slope
-    if low > 1.6 or high < 0.6:
-        return [finding("speed_ratio", columns=of, ratio=float(np.sqrt(low * high)), velocity=over)]
-    return []
-
-
-def _horizontal(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
-    if not (trial.has("x", "y", "u", "v") and attitude.heading):
-        return []
-    if not attitude.tilt and _tilts_unseen(trial):
-        return []
-    _, world = on_grid(trial, ("x", "y"), t, 3)
-    through = _through_world(trial, t, attitude)[:, :2]
-    good = np.isfinite(world).all(axis=1) & np.isfinite(through).all(axis=1)
-    if good.sum() < FEWEST or min(np.std(world[good]), np.std(through[good])) < 0.02:
-        return []
-    if not any(_stands_out(world[good, i], trial.series("xy"[i])[1]) for i in range(2)):
-        return []
-    a, b = (v[good, 0] + 1j * v[good, 1] for v in (through, world))
-    size = np.linalg.norm(a) * np.linalg.norm(b)
-    turned, mirrored = np.vdot(a, b) / size, np.vdot(a.conj(), b) / size
-    likelier = mirrored if abs(mirrored) > abs(turned) else turned
-    expected = through * [1.0, -1.0 if likelier is mirrored else 1.0]
-    c, s = likelier.real / abs(likelier), likelier.imag / abs(likelier)
-    expected = expected @ np.array([[c, s], [-s, c]])
-    if not relation(np.where(good[:, None], expected, np.nan).T.ravel(), world.T.ravel()).sure:
-        return []
-    if abs(turned) > WITH and abs(np.angle(turned)) > np.radians(15.0):
-        angle = float(np.degrees(np.angle(turned)))
-        return [finding("heading_disagrees", angle=angle)]
-    if abs(mirrored) > WITH > abs(turned) + 0.3:
-        return [finding("mirrored")]
-    ratio = float(np.linalg.norm(b) / np.linalg.norm(a))
-    if abs(turned) > WITH and not 0.6 < ratio < 1.6:
-        return [finding("speed_ratio", columns="x, y", ratio=ratio, velocity="u, v")]
-    return []
-
-
-def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
-    nu, _ = on_grid(trial, ("u", "v", "w"), t)
-    valid = np.isfinite(attitude.turn).all(axis=1)
-    through = quat_rotate(np.where(valid[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0]), np.nan_to_num(nu))
-    if attitude.heading:
-        through[~valid] = np.nan
-    through[~np.isfinite(nu[:, :2]).all(axis=1), :2] = np.nan
-    through[~np.isfinite(nu[:, 2]), 2] = np.nan
-    return np.asarray(through)
-
-
-def _too_slow(trial: Trial, q: Array) -> bool:
-    """Return whether a vehicle turns so far between two samples of its attitude that their rates may be aliases.
-
-    The gyro has to say so too: an angle in degrees turns far by itself.
-    """
-    turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
-    step = trial.duration / max(len(q) - 1, 1)
-    gyro = [float(np.percentile(np.abs(trial.series(name)[1]), 98.0)) for name in "pqr" if trial.has(name)]
-    return bool(np.percentile(turns, 98.0) > LARGEST_TURN and max(gyro, default=0.0) * step > LARGEST_TURN)
-
-
-def _tilts_unseen(trial: Trial) -> bool:
-    """Return whether the gyro shows tilts of a vehicle that is taken as level for want of a measured tilt."""
-    for t, rate in (trial.series(name) for name in "pq" if trial.has(name)):
-        if np.ptp(np.cumsum((rate - np.median(rate))[1:] * np.diff(t))) > LARGEST_TURN:
-            return True
-    return False
-
-
-def _stands_out(rates: Array, samples: Array) -> bool:
-    """Return whether what changed at these rates on the grid moved by more than a smoother makes of the noise."""
-    moved = np.cumsum(np.nan_to_num(rates - np.nanmean(rates))) / RATE
-    return not float(np.std(moved)) < white_noise(samples) * np.sqrt(WIGGLES / len(samples))
-
-
-def _against(found: Relation) -> bool:
-    """Return whether a signal is significantly the negative of another that it should equal."""
-    return found.correlation < AGAINST and found.sure and -NEGATIVE < found.slope < -1.0 / NEGATIVE
 
 
 # Excitation of every axis of a trial: speeds, wrenches, levels, coasts, work.
@@ -1206,7 +641,7 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     findings += work_findings(axes, trial_motion, trial.header.axis, excess)
     if not any(axis.excited or any(one.can for one in axis.tells.values()) for axis in axes):
         moved = any(axis.source for axis in axes)
-        findings.append(finding("nothing_excited") if moved else finding("nothing_measured"))
+        findings.append(finding("nothing_excited" if moved else "nothing_measured"))
     for named in trial.header.axis:
         axis = next(axis for axis in axes if axis.axis == named)
         if not axis.excited:

@@ -426,7 +426,7 @@ def no_input(inputs: InputForces) -> list[Finding]:
     """Return a finding where inputs were recorded and nothing is ever pushed, for which no fit may use a trial."""
     if inputs.source == "passive" or np.any(inputs.force):
         return []
-    return [finding("pulses_dead") if inputs.source == "pwm" else finding("inputs_zero")]
+    return [finding("pulses_dead" if inputs.source == "pwm" else "inputs_zero")]
 
 
 def _other_columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
