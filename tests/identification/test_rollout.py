@@ -64,11 +64,9 @@ def steps_of(vehicle, n, seed=0, size=3.0):
     return np.repeat(levels, 10, axis=0)[:n]
 
 
-def plain(vehicle, force, *, hydrodynamics="calibrated", substeps=1):
+def plain(vehicle, force, *, hydrodynamics="calibrated"):
     """Velocity after every step of an ordinary simulation whose motors already ran on the first command."""
-    sim = Simulator(
-        vehicle, control_step=STEP, substeps=substeps, integrator="rk4", hydrodynamics=hydrodynamics
-    )
+    sim = Simulator(vehicle, control_step=STEP, substeps=1, integrator="rk4", hydrodynamics=hydrodynamics)
     for _ in range(100):
         sim.set_thrust(force[0])
         sim.step()
@@ -96,17 +94,16 @@ def test_a_rollout_is_an_ordinary_simulation(name, hydrodynamics):
 
 
 @pytest.mark.parametrize("domain", ["force", "speed"])
-@pytest.mark.parametrize("substeps", [1, 3])
-def test_motors_of_a_later_segment_are_already_running(domain, substeps):
+def test_motors_of_a_later_segment_are_already_running(domain):
     """A segment cut from a run goes on as that run did, lag and delay line included."""
     slew = {"force": 100.0, "speed": 2000.0}[domain]
     vehicle = load_vehicle("finsrov").replace({"thrusters.*.domain": domain, "thrusters.*.slew": slew})
     force, begin = steps_of(vehicle, 120), 80
-    first = Rollouts(vehicle, [segment(vehicle, force)], substeps=substeps).run()
+    first = Rollouts(vehicle, [segment(vehicle, force)]).run()
     state = {"nu": first.nu, "quaternion": first.quaternion, "position": first.position}
     start = {name: values[begin, 0, 0].astype(float) for name, values in state.items()}
     later = segment(vehicle, force[begin:], before=force[:begin], start=start)
-    again = Rollouts(vehicle, [later], substeps=substeps).run()
+    again = Rollouts(vehicle, [later]).run()
     np.testing.assert_allclose(again.nu[:, 0, 0], first.nu[begin:, 0, 0], atol=5e-5)
 
 
@@ -144,12 +141,12 @@ def test_an_applied_force_is_linear_between_its_samples():
     """Coarse samples of a ramp move the vehicle as fine ones do."""
     vehicle = load_vehicle("finsrov")
     ends = []
-    for step in (0.1, 0.01):
+    for step in (0.025, 0.0025):
         t = step * np.arange(1, round(2.0 / step) + 1)
         force = np.outer(20.0 * t, [1.0, 0, 0, 0, 0, 0])
         s = segment(vehicle, force, B=np.eye(6), commanded=False, before=np.zeros((5, 6)), step=step)
-        ends.append(Rollouts(vehicle, [s], substeps=1).run().nu[-1, 0, 0, 0])
-    # A staircase would lead by half a coarse step, 1 N of 40 N.
+        ends.append(Rollouts(vehicle, [s]).run().nu[-1, 0, 0, 0])
+    # A staircase would lead by half a coarse step, 0.25 N of 40 N.
     np.testing.assert_allclose(*ends, rtol=2e-3)
 
 

@@ -284,7 +284,6 @@ def test_a_table_that_is_no_trial_is_refused_with_the_reason(tmp_path, text, sai
     ("header", "said"),
     [
         ("velocty_at: [0, 0, 0]", "unknown key 'velocty_at', did you mean 'velocity_at'"),
-        ("convert: {body: FRD}", "convert is gone: import the table with a map"),
         ("velocity_at: [0, 0]", r"velocity_at is \[0, 0\], expected 3 numbers \[x, y, z\]"),
         ("wrench_at: centre", "wrench_at is 'centre', expected 3 numbers .* center_of_gravity or origin"),
         ("water: {density: -3}", "water: density is -3, expected > 0"),

@@ -96,11 +96,8 @@ def _replay(pairs: Sequence[Pair], trials: Sequence[Trial], fit: Fit) -> Replay:
     from finssim.identification.prediction import replay
 
     axes = {pair.name: pair.axes for pair in pairs}
-    named = [
-        replace(t, header=t.header.model_copy(update={"axis": axes[t.name]}))
-        for t in trials
-        if t.name in axes
-    ]
+    some = [t for t in trials if t.name in axes]
+    named = [replace(t, header=t.header.model_copy(update={"axis": axes[t.name]})) for t in some]
     return replay(named, calibrated(fit))
 
 
@@ -291,18 +288,9 @@ def calibrate_hydrodynamics(
         progress(0.0, "reading the trials")
         used, held_out = usable_trials(trials)
         fit = fit_hydrodynamics(
-            used,
-            body,
-            axes=chosen,
-            estimate=further,
-            damping=damping,
-            known=known,
-            horizon=horizon,
-            held_out=held_out,
-            published=published,
-            design=True,
-            progress=progress,
-        )
+            used, body, axes=chosen, estimate=further, damping=damping, known=known, horizon=horizon,
+            held_out=held_out, published=published, design=True, progress=progress,
+        )  # fmt: skip
     return finish("hydrodynamics", fit, options)
 
 

@@ -60,12 +60,13 @@ def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
         return out
 
     def moved(axis: str, column: str) -> float:
+        """Return how much the numbers of an axis move a column."""
         own = [c for c, name in enumerate(p.names) if name.startswith(f"{axis}.")]
         rows = m.channel == m.names.index(column)
         slopes = solution.linear.shared[np.ix_(rows, own)] * p.scale[own] / solution.std[rows, None]
         return float(np.sum(slopes**2))
 
-    orders = [dict(zip(("surge", "sway"), columns, strict=True)) for columns in ("xy", "yx")]
+    orders = ({"surge": "x", "sway": "y"}, {"surge": "y", "sway": "x"})
     best = max(orders, key=lambda order: sum(moved(axis, order[axis]) for axis in planar))
     return out | {axis: best[axis] for axis in planar}
 
@@ -147,10 +148,8 @@ def held_out(
     evidence = evidence_of(problem, stage.solution, group)
     total = evidence.information
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
-    unwritten = [
-        problem.parameters.names.index(name) for name in AXES_BIAS if name in problem.parameters.names
-    ]
-
+    fitted = problem.parameters.names
+    unwritten = [fitted.index(name) for name in AXES_BIAS if name in fitted]
     low, high = (problem.low - point.theta) * scale - 1e-12, (problem.high - point.theta) * scale + 1e-12
 
     def without(k: int) -> Array:
@@ -160,15 +159,12 @@ def held_out(
         theta[unwritten] = 0.0
         return theta
 
-    known = dict(zip(problem.names, point.theta, strict=True)) | dict(
-        zip(file.parameters.names, file.parameters.expected, strict=True)
-    )
+    known = dict(zip(problem.names, point.theta, strict=True))
+    known |= dict(zip(file.parameters.names, file.parameters.expected, strict=True))
     known |= dict.fromkeys(AXES_BIAS, 0.0) | ({"thrust_scale": 1.0} if problem.parameters.likely else {})
     plain = np.array([known[name] for name in file.names])
-    after = _predicted_error(
-        problem, np.array([without(k) for k in range(len(evidence.normal))]), stage.solution, good
-    )
-    after = after[np.arange(len(group)), group]
+    each = np.array([without(k) for k in range(len(evidence.normal))])
+    after = _predicted_error(problem, each, stage.solution, good)[np.arange(len(group)), group]
     before = _predicted_error(file, plain[None], stage.solution, good)[:, 0]
     out = {}
     for axis in axes:

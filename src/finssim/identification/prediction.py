@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +47,6 @@ from finssim.trials.motion import answers, phase_at, white_noise
 from finssim.trials.trial import NU, Array, Trial
 from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.vehicle import AXES, Axis
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Replay", "replay", "run_replay"]
 
@@ -484,13 +481,12 @@ def _seconds(horizon: float) -> Array:
 def run_replay(
     paths: Sequence[str | Path],
     *,
-    vehicle: str | Path | Vehicle,
+    vehicle: str,
     hydrodynamics: str | Sequence[str] = "calibrated",
     horizon: float | None = None,
     out: Path | None = None,
     seed: int = 1,
     as_json: bool = False,
-    console: Console | None = None,
 ) -> Replay:
     """Simulate models with recorded inputs and score them: NRMSE per axis and trial, in-sample trials labelled.
 
@@ -504,7 +500,6 @@ def run_replay(
         out (DIR): Directory for replay.json, replay.md and figures.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
-        console: Where the tables go; standard output if None.
 
     Raises:
         CalibrationError, VehicleError, OutputError: As they say.
@@ -528,7 +523,7 @@ def run_replay(
     if as_json:
         print(json.dumps(result.as_json(), allow_nan=False))
         return result
-    console = console or Console()
+    console = Console()
     print_replay(result, console)
     if out is not None:
         console.print(f"written: {out}", highlight=False, soft_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,6 @@ from finssim.identification.excitation import SWINGING
 from finssim.trials.findings import Finding
 from finssim.trials.trial import COLUMNS, NU, Array
 from finssim.vehicles.vehicle import AXES, Axis
-
-if TYPE_CHECKING:
-    pass
-
 
 RESPONSES = (*NU, "roll", "pitch", "depth")
 """Compared columns: body velocities, and attitude and depth if they were measured."""
@@ -160,8 +156,7 @@ def _active(tau: Array, axes: Sequence[Axis]) -> NDArray[np.bool_]:
 
 def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
     """The replayed models, in their order."""
-    models: Mapping[str, None] = {model: None for pair in pairs for model in pair.simulated}
-    return tuple(models)
+    return tuple(dict.fromkeys(model for pair in pairs for model in pair.simulated))
 
 
 def resampled(t: Array, values: Array, times: Array) -> Array:

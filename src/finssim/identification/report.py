@@ -128,16 +128,9 @@ def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
         width, height = (3.9 * columns if columns > 1 else 5.4), 2.9 * rows
         # A fixed layout: finding the best one takes longer than drawing.
         figure = new_figure(width, height, constrained=False)
-        grid = figure.add_gridspec(
-            rows,
-            columns,
-            left=0.85 / width,
-            right=1.0 - 0.12 / width,
-            bottom=0.5 / height,
-            top=1.0 - 0.3 / height,
-            hspace=0.35,
-            wspace=0.3,
-        )
+        edges = {"left": 0.85 / width, "right": 1.0 - 0.12 / width, "bottom": 0.5 / height}
+        edges |= {"top": 1.0 - 0.3 / height, "hspace": 0.35, "wspace": 0.3}
+        grid = figure.add_gridspec(rows, columns, **edges)
         for i, curve in enumerate(part):
             _draw(figure, grid[i // columns, i % columns], curve)
         yield figure
@@ -397,10 +390,8 @@ class Report:
                 table.add_row(*map(Text, self.cells(estimate)), style=style)
         console.print(self.headline, highlight=False, markup=False)
         console.print(table)
-        for line in [
-            *(f"  {sentence}" for sentence in (*self.lead, *self.summary)),
-            *(f"· {note}" for note in self.notes),
-        ]:
+        lines = [f"  {sentence}" for sentence in (*self.lead, *self.summary)]
+        for line in [*lines, *(f"· {note}" for note in self.notes)]:
             console.print(line, highlight=False, markup=False)
         for sentence in self.advice:
             console.print(f"! {sentence}", highlight=False, markup=False, style="yellow")

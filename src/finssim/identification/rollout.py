@@ -458,7 +458,6 @@ class Rollouts:
         segments: Sequence[Segment],
         *,
         hydrodynamics: str = "calibrated",
-        substeps: int | None = None,
         max_delay: float = 0.5,
     ) -> None:
         """Set up.
@@ -467,8 +466,6 @@ class Rollouts:
             vehicle: Gives every number that a candidate does not.
             segments: All of one step; they may be of different lengths and drives.
             hydrodynamics: Key of the vehicle's hydrodynamic sets.
-            substeps: Physics steps in a step; enough for `LONGEST_STEP` if None. Applied forces are linear between
-                samples with one, which is what the default step has; with more they lead by up to half a step.
             max_delay: Longest delay that a candidate may have [s].
 
         Raises:
@@ -491,7 +488,7 @@ class Rollouts:
         self._options: dict[str, Any] = {
             "hydrodynamics": hydrodynamics,
             "control_step": self.step,
-            "substeps": substeps or max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
+            "substeps": max(1, math.ceil(self.step / LONGEST_STEP - 1e-9)),
             "integrator": "rk4",
             "max_delay": max(max_delay, float(self.nominal["delay"])),
             "water_moves": bool(self._current.any()),

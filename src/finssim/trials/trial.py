@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from finssim.core.page import notebook_html
 from finssim.trials.findings import CalibrationError, Finding
-from finssim.vehicles.part import Part, refuse_section, refuse_value
+from finssim.vehicles.part import Part, refuse_value
 from finssim.vehicles.vehicle import Axis
 
 __all__ = ["Array", "Header", "NU", "PHASES", "TAU", "Trial", "TrialWater", "column_of"]
@@ -103,10 +103,6 @@ class Header(_Section):
     @classmethod
     def _single_axis(cls, data: Any) -> Any:
         """Accept a single axis without brackets."""
-        if isinstance(data, dict) and "convert" in data:
-            raise refuse_section(
-                "convert is gone: import the table with a map of its columns, units, frame and clocks (trials import)"
-            )
         if isinstance(data, dict) and isinstance(data.get("axis"), str):
             return {**data, "axis": [data["axis"]]}
         return data
