@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 import textwrap
 from collections import Counter
@@ -15,12 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from finssim.core.files import atomic_write
 from finssim.core.provenance import provenance
 from finssim.core.registry import ACTUATORS, TERMS
-from finssim.core.yaml_file import read_mapping
+from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.plant_terms import matrices
 from finssim.trials.findings import CalibrationError, Finding, finding, plain
@@ -154,7 +152,7 @@ def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> 
     text = "\n".join(lines) + "\n"
     if tree.get("calibrations"):
         text += "\n# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds.\n"
-        text += _yaml({"calibrations": tree["calibrations"]}, flow=False)
+        text += yaml_text({"calibrations": tree["calibrations"]}, default_flow_style=False, width=math.inf)
     return text
 
 
@@ -257,28 +255,7 @@ def _on_single_line(path: Key) -> bool:
 
 def _word(value: Any) -> str:
     """Return a value as YAML on one line, as allowed inside a list or mapping."""
-    return _yaml([value], flow=True).strip()[1:-1]
-
-
-class _VehicleDumper(yaml.SafeDumper):
-    """Quotes digests and other words that are numbers to our reader, as 1e5 is in YAML 1.2."""
-
-
-_VehicleDumper.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+$"), list("-+0123456789.")
-)
-
-
-def _yaml(value: Any, *, flow: bool) -> str:
-    text = yaml.dump(
-        value,
-        Dumper=_VehicleDumper,
-        default_flow_style=flow,
-        sort_keys=False,
-        allow_unicode=True,
-        width=math.inf,
-    )
-    return str(text)
+    return yaml_text([value], default_flow_style=True, width=math.inf).strip()[1:-1]
 
 
 def _prose(text: str) -> list[str]:
@@ -543,20 +520,12 @@ def _calibration_record(fit: Fit) -> CalibrationRecord:
         kind=fit.kind,  # type: ignore[arg-type]
         method=fit.method,
         trials=dict(fit.trials),
-        settings=json.loads(json.dumps(dict(fit.settings), default=_plain_value)),
+        settings=plain(fit.settings),
         start=fit.before.sha256,
         finssim=origin["finssim"],
         revision=origin["revision"],
         interrupted=fit.interrupted,
     )
-
-
-def _plain_value(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, (set, frozenset)):
-        return sorted(value)
-    return str(value)
 
 
 def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
