@@ -10,10 +10,10 @@ from finssim.identification.parameters import Parameters
 from finssim.identification.rollout import (
     Changes,
     Drive,
+    InitialState,
     Rollouts,
     Segment,
-    Sensors,
-    Start,
+    SensorPlaces,
     segments,
     streams,
 )
@@ -46,12 +46,12 @@ def segment(vehicle, force, *, B=None, commanded=True, before=None, changes=None
         "t0": 0.0,
         "step": STEP,
         "drive": drive,
-        "start": Start(**{**state, **(start or {})}, known=np.ones(12, bool)),
+        "start": InitialState(**{**state, **(start or {})}, known=np.ones(12, bool)),
         "sink": -DEPTH,
         "density": vehicle.water.density,
         "current": np.zeros(3),
         "measured": {},
-        "sensors": Sensors(
+        "sensors": SensorPlaces(
             velocity_at=np.zeros(3), velocity_in_water=False, position_at=np.zeros(3), depth_at=np.zeros(3)
         ),
     }

@@ -7,8 +7,6 @@ from finssim.core.lazy import exports
 if TYPE_CHECKING:
     from finssim.bench.thruster import fit_thruster
 
-__all__ = [
-    "fit_thruster",
-]
+__all__ = ["fit_thruster"]
 
 __getattr__, __dir__ = exports(__name__)

@@ -598,12 +598,7 @@ def _untested(
 
 
 def calibrate_motor(
-    trials: Sequence[Path],
-    *,
-    vehicle: str,
-    out: Path,
-    report: Path | None = None,
-    as_json: bool = False,
+    trials: Sequence[Path], *, vehicle: str, out: Path, report: Path | None = None, as_json: bool = False
 ) -> Vehicle:
     """Fit the motors' response to steps: delay and lag [s], dead zone.
 

@@ -386,12 +386,7 @@ def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeat
     word = "dive" if dive else ("plus" if level > 0.0 else "minus")
     name = f"{axis}_{word}_{abs(level):.4g}" + (f"_{repeat + 1}" if repeats > 1 else "")
     return Programme(
-        name=name,
-        axes=(axis,),
-        rate=RATE,
-        tau_desired=tau,
-        phase=phase,
-        ascent_speed=0.01 if dive else None,
+        name=name, axes=(axis,), rate=RATE, tau_desired=tau, phase=phase, ascent_speed=0.01 if dive else None
     )
 
 

@@ -287,10 +287,7 @@ class Aggregate(NamedTuple):
 
 
 def aggregate(
-    scores: Sequence[Mapping[Any, float | None]],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = SEED,
+    scores: Sequence[Mapping[Any, float | None]], *, resamples: int = RESAMPLES, seed: int = SEED
 ) -> Aggregate:
     """Equal-weight mean over the axes of the median over the trials of an axis.
 

@@ -185,12 +185,7 @@ ARROW = 0.06
 
 
 def draw_arrows(
-    axes: Axes,
-    at: Array,
-    vectors: Array,
-    used: NDArray[np.bool_],
-    unit: str,
-    per: float,
+    axes: Axes, at: Array, vectors: Array, used: NDArray[np.bool_], unit: str, per: float
 ) -> None:
     """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
 

@@ -77,7 +77,7 @@ class Drive:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
+class InitialState:
     """State at the start of a segment."""
 
     position: Array
@@ -91,7 +91,7 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensors:
+class SensorPlaces:
     """Places of a trial's sensors."""
 
     velocity_at: Array
@@ -117,14 +117,14 @@ class Segment:
     step: float
     """[s]"""
     drive: Drive
-    start: Start
+    start: InitialState
     sink: float
     """Added to the height while simulating [m], so that a vehicle that stayed wholly submerged cannot surface."""
     density: float
     """Density of the water [kg/m³]."""
     current: Array
     """World frame [m/s], (3,)."""
-    sensors: Sensors
+    sensors: SensorPlaces
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times since t0 [s] and values."""
     held: Array | None = None
@@ -331,7 +331,7 @@ def _segment(
         sink=_sink(s.motion, vehicle, t0, t0 + steps * step),
         density=water.density or vehicle.water.density,
         current=np.asarray(water.current or (0.0, 0.0, 0.0), float),
-        sensors=Sensors(
+        sensors=SensorPlaces(
             velocity_at=np.asarray(header.velocity_at, float),
             velocity_in_water=header.velocity == "water",
             position_at=np.asarray(header.position_at, float),
@@ -367,7 +367,7 @@ def _means(d: InputForces, edges: Array) -> Array:
     return np.asarray(np.diff(integral, axis=0) / np.diff(edges)[:, None])
 
 
-def _start(s: Streams, t0: float) -> Start:
+def _start(s: Streams, t0: float) -> InitialState:
     """Return the state at a time."""
     m = s.motion
     i = int(np.argmin(np.abs(m.t - t0)))
@@ -389,7 +389,7 @@ def _start(s: Streams, t0: float) -> Start:
         t, heading = s.measured["yaw"]
         level = quat_from_euler(0.0, 0.0, np.interp(t0, t, np.unwrap(heading)))
         known[STATES.index("yaw")] = True
-    return Start(
+    return InitialState(
         position=np.nan_to_num(position),
         quaternion=quaternion if attitude else level,
         nu=np.nan_to_num(nu),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -356,9 +356,8 @@ class Residuals:
             sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
             for _ in range(10):
                 # The factor undoes the clipping for a normal distribution at 2.5 standard deviations.
-                sigma = (
-                    1.011 * float(np.sqrt(np.mean(np.minimum(r, CUT * sigma) ** 2))) if sigma > 0.0 else 0.0
-                )
+                clipped = np.minimum(r, CUT * sigma)
+                sigma = 1.011 * float(np.sqrt(np.mean(clipped**2))) if sigma > 0.0 else 0.0
             out[j] = max(sigma, floor[j])
         return out
 
@@ -368,10 +367,8 @@ class Residuals:
         It has the unit of the channel.
         """
         out = np.zeros(len(self.names))
-        for a, b in zip(self.edges, self.edges[1:], strict=False):
-            for j in np.unique(self.channel[a:b]):
-                values = self.value[a:b][self.channel[a:b] == j]
-                out[j] = max(out[j], float(np.ptp(np.percentile(values, [2.0, 98.0]))))
+        for j, values in self._runs():
+            out[j] = max(out[j], float(np.ptp(np.percentile(values, [2.0, 98.0]))))
         return out
 
     def roughness(self) -> Array:
@@ -379,19 +376,21 @@ class Residuals:
 
         It has the unit of the channel.
         """
+        steps: list[list[Array]] = [[np.empty(0)] for _ in self.names]
+        for j, values in self._runs():
+            steps[j].append(np.abs(np.diff(values, 3)))
         out = np.zeros(len(self.names))
-        for j in range(len(self.names)):
-            parts = [
-                np.diff(self.value[a:b][self.channel[a:b] == j], 3)
-                for a, b in zip(self.edges, self.edges[1:], strict=False)
-            ]
-            d = np.abs(np.concatenate(parts)) if parts else np.empty(0)
-            out[j] = (
-                float(np.sqrt(np.mean(np.minimum(d, 3.0 * 1.4826 * np.median(d) + 1e-12) ** 2) / 20.0))
-                if len(d)
-                else 0.0
-            )
+        for j, d in enumerate(map(np.concatenate, steps)):
+            if len(d):
+                cut = 3.0 * 1.4826 * np.median(d) + 1e-12
+                out[j] = float(np.sqrt(np.mean(np.minimum(d, cut) ** 2) / 20.0))
         return out
+
+    def _runs(self) -> Iterator[tuple[int, Array]]:
+        """Yield each segment's samples of each of its channels, by the index of the channel."""
+        for a, b in zip(self.edges, self.edges[1:], strict=False):
+            for j in np.unique(self.channel[a:b]):
+                yield int(j), self.value[a:b][self.channel[a:b] == j]
 
 
 def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArray[np.float32]:
@@ -586,6 +585,7 @@ class Shooting:
             correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
         """
         self.segments, self.parameters = tuple(segments), parameters
+        self.groups = np.array([s.index for s in segments])
         self.measured = Residuals(segments, channels)
         names = self.measured.names
         known = np.stack([s.start.known for s in segments])
@@ -606,11 +606,8 @@ class Shooting:
         self.free = np.concatenate([self.free, 12 + pulled])  # unknowns 12 to 17
         states_std = np.hstack([states_std, np.maximum(pulls[:, pulled], 1e-9)])
         self._steps = np.append(STEPS, np.full(6, 0.1 * PULL * parameters.vehicle.weight))
-        self.rollouts = Rollouts(
-            parameters.vehicle,
-            segments,
-            max_delay=LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5,
-        )
+        longest = LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5
+        self.rollouts = Rollouts(parameters.vehicle, segments, max_delay=longest)
         changes = np.arange(self.rollouts.changes.max())
         self.free = np.concatenate([self.free, 18 + changes])
         states_std = np.hstack(
@@ -642,7 +639,6 @@ class Shooting:
                 self._leverage[by_thruster, 3, j] = -thruster.axis[1]
                 self._leverage[by_thruster, 4, j] = thruster.axis[0]
         self.edges = self.measured.edges
-        self.groups = np.array([s.index for s in segments])
         self.few = few
         self.judged = len(parameters.names) - parameters.nuisances
         far = np.full(len(self.streams), LATEST)
@@ -688,9 +684,7 @@ class Shooting:
         p, out = self.parameters, np.zeros((len(self.segments), 6))
         body, weight = p.vehicle.body, p.vehicle.weight
         # In fast logs, which show the motion well, errors of the model would be taken for pulls.
-        slow = np.isin(
-            [s.index for s in self.segments], [s.index for s in self.segments if s.drive.changes is not None]
-        )
+        slow = np.isin(self.groups, [s.index for s in self.segments if s.drive.changes is not None])
         if {"surge", "sway"} & set(p.axes):
             out[slow & ~swinging, :2] = TETHER * weight
         coasting = set(p.axes).difference(p.biases)
@@ -833,10 +827,8 @@ class Shooting:
         theta, z = (np.repeat(part[None], 1 + sides * count, axis=0) for part in point)
         up, i = 1 + sides * np.arange(count), np.arange(P)
         step = self._relative_step * np.maximum(np.abs(point.theta[:P]), 0.25 * self.parameters.scale)
-        high, low = (
-            np.minimum(point.theta[:P] + step, self.high[:P]),
-            np.maximum(point.theta[:P] - step, self.low[:P]),
-        )
+        high = np.minimum(point.theta[:P] + step, self.high[:P])
+        low = np.maximum(point.theta[:P] - step, self.low[:P])
         if one_sided:  # away from a bound
             theta[up[:P], i] = np.where(high > point.theta[:P], high, low)
             wide = theta[up[:P], i] - point.theta[:P]
@@ -859,10 +851,8 @@ class Shooting:
 
     def _growth(self, linear: Linearization) -> Array:
         own = np.abs(linear.own[:, :6])
-        speeds = [
-            i for i, name in enumerate(self.measured.names) if name in STREAMS["velocity"] + STREAMS["rates"]
-        ]
-        own[~np.isin(self.measured.channel, speeds)] = 0.0
+        speeds = np.isin(self.measured.names, STREAMS["velocity"] + STREAMS["rates"])
+        own[~speeds[self.measured.channel]] = 0.0
         own[~np.isfinite(linear.residual)] = np.inf
         return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 

@@ -33,6 +33,7 @@ from finssim.physics.plant import DERIVED
 from finssim.physics.types import vec6
 from finssim.sim import Simulator, TetherLine, Water
 from finssim.sim.sensors import SensorSuite
+from finssim.trials.conversion import EULER, QUATERNION
 from finssim.trials.findings import CalibrationError
 from finssim.trials.trial import TAU, Header, Trial, TrialWater
 from finssim.vehicles import Vehicle, catalogue
@@ -316,12 +317,9 @@ def measure(
     heading = quat_from_euler(0.0, 0.0, error(noise.yaw_std))
     q_measured = quat_multiply(heading, quat_multiply(q, tilt))
     x_measured = x + error(noise.position_std, 3)
-    out: dict[str, Array] = {}
-    for i, name in enumerate(("qx", "qy", "qz", "qw")):
-        out[name] = q_measured[..., i]
-    out |= dict(zip(("roll", "pitch", "yaw"), quat_to_euler(q_measured), strict=True))
-    for i, name in enumerate("xyz"):
-        out[name] = x_measured[..., i]
+    out: dict[str, Array] = {name: q_measured[..., i] for i, name in enumerate(QUATERNION)}
+    out |= dict(zip(EULER, quat_to_euler(q_measured), strict=True))
+    out |= {name: x_measured[..., i] for i, name in enumerate("xyz")}
     rates, force, depth = _sensor_channels(recording, vehicle, noise, every, seed)
     if depth is None:
         at = vehicle.sensors.depth.position if vehicle.sensors.depth else np.zeros(3)
@@ -473,7 +471,9 @@ def trials_of(
     Raises:
         CalibrationError: A rate, column, input or profile that cannot be.
     """
-    profile = _profile(noise)
+    if isinstance(noise, str) and noise not in NOISE_PROFILES:
+        raise CalibrationError(f"unknown noise '{noise}'; available: {', '.join(NOISE_PROFILES)}")
+    profile = NOISE_PROFILES[noise] if isinstance(noise, str) else noise
     every = round(1.0 / (rate * recording.step)) if rate > 0.0 else 0
     if every < 1 or abs(every * recording.step * rate - 1.0) > 1e-6:
         raise CalibrationError(f"rate is {rate:g} Hz, expected {1.0 / recording.step:g} Hz over an integer")
@@ -484,7 +484,10 @@ def trials_of(
             raise CalibrationError(
                 f"synthetic trials have no column '{name}'; available: {', '.join(measured)}"
             )
-    logged = _inputs(recording, vehicle, inputs, every)
+    logged = _inputs(recording, vehicle, inputs, every) | {name: measured[name] for name in chosen}
+    named = vehicle.name
+    if vehicle.path is not None and vehicle.name not in catalogue():
+        named = str(vehicle.path.resolve())
     water = TrialWater(current=current) if current is not None else TrialWater()
     out = []
     for w, programme in enumerate(programmes):
@@ -495,13 +498,10 @@ def trials_of(
             Trial(
                 name=programme.name,
                 t=t,
-                channels={name: logged[name][: len(t), w].copy() for name in logged}
-                | {name: measured[name][: len(t), w].copy() for name in chosen},
+                channels={name: values[: len(t), w].copy() for name, values in logged.items()},
                 phase=programme.phase[rows],
                 header=Header(
-                    vehicle=vehicle.name
-                    if vehicle.name in catalogue() or vehicle.path is None
-                    else str(vehicle.path.resolve()),
+                    vehicle=named,
                     axis=programme.axes,
                     description=f"simulated: {programme.name}",
                     inputs="commanded" if set(inputs) <= {"command", "pwm"} else "applied",
@@ -511,14 +511,6 @@ def trials_of(
             )
         )
     return out
-
-
-def _profile(noise: NoiseProfile | str) -> NoiseProfile:
-    if isinstance(noise, NoiseProfile):
-        return noise
-    if noise not in NOISE_PROFILES:
-        raise CalibrationError(f"unknown noise '{noise}'; available: {', '.join(NOISE_PROFILES)}")
-    return NOISE_PROFILES[noise]
 
 
 def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every: int) -> dict[str, Array]:

@@ -435,10 +435,7 @@ def calibrated(fit: Fit) -> Vehicle:
     tree = file_tree(after)
     tree.pop("calibrations", None)
     return after.model_copy(
-        update={
-            "provenance": folded(tree, origins),
-            "calibrations": (*before.calibrations, record),
-        }
+        update={"provenance": folded(tree, origins), "calibrations": (*before.calibrations, record)}
     )
 
 

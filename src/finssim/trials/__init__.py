@@ -8,11 +8,6 @@ if TYPE_CHECKING:
     from finssim.trials.trial import Header, Trial
     from finssim.trials.trial_files import load_trial, write_trial
 
-__all__ = [
-    "Header",
-    "Trial",
-    "load_trial",
-    "write_trial",
-]
+__all__ = ["Header", "Trial", "load_trial", "write_trial"]
 
 __getattr__, __dir__ = exports(__name__)

@@ -510,12 +510,7 @@ def _answer(nu: Array, tau: Array, rate: float) -> Relation:
     return best._replace(chance=len(ANSWERS) * best.chance)
 
 
-def check(
-    paths: Sequence[Path],
-    *,
-    vehicle: str | None = None,
-    as_json: bool = False,
-) -> int:
+def check(paths: Sequence[Path], *, vehicle: str | None = None, as_json: bool = False) -> int:
     """Report what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
 
     Example: finssim trials check trials --vehicle bluerov2
@@ -594,12 +589,7 @@ def _report_of(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
         return replace(report, findings=tuple(findings))
     inputs, axes = _motion_of(trial, vehicle, findings)
     findings += frame_findings(trial, vehicle)
-    return replace(
-        report,
-        inputs=inputs,
-        axes=tuple(axes),
-        findings=tuple(dict.fromkeys(findings)),
-    )
+    return replace(report, inputs=inputs, axes=tuple(axes), findings=tuple(dict.fromkeys(findings)))
 
 
 def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:

@@ -210,11 +210,7 @@ def _column(trial: Trial, name: str, at: Array, order: int) -> _Column:
 
 
 def _origin(
-    trial: Trial,
-    vehicle: Vehicle,
-    at: Array,
-    attitude: AttitudeSignal,
-    omega: Array,
+    trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal, omega: Array
 ) -> tuple[Array, Array, Array]:
     """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
     of its slope by axis, (3, 2)."""

@@ -447,17 +447,18 @@ def _attitude(log: ArduPilotLog) -> Stream | None:
     return in_our_axes(log.stream(kind, channels), FRD)
 
 
+def _instance(log: ArduPilotLog, first: str, others: str, number: int) -> tuple[str, ArduPilotLog]:
+    """Return the kind of message of a sensor, from 0, and the log with only its messages of that kind."""
+    kind = f"{others}{number + 1}" if number and log.has(f"{others}{number + 1}") else first
+    return kind, log.some(kind, "I", number)
+
+
 def _inertial(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
     """Specific force, and in DataFlash logs the rates."""
     if not log.telemetry:
-        kind = (
-            "IMU"
-            if requested.imu == 0 or not log.has(f"IMU{requested.imu + 1}")
-            else f"IMU{requested.imu + 1}"
-        )
+        kind, instance = _instance(log, "IMU", "IMU", requested.imu)
         if not log.has(kind):
             return None
-        instance = log.some(kind, "I", requested.imu)
         if not instance.has(kind):
             raise CalibrationError(f"{log.shown}: holds no IMU {requested.imu}: give 'ardusub: {{imu: 0}}'")
         channels = {f"a{axis.lower()}": instance.numbers(kind, f"Acc{axis}") for axis in "XYZ"}
@@ -479,10 +480,7 @@ def _depth(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
     chosen = primary if requested.barometer is None else requested.barometer
     if log.telemetry:
         return _depth_from_pressure(log, chosen)
-    kind = "BARO" if chosen == 0 or not log.has(f"BAR{chosen + 1}") else f"BAR{chosen + 1}"
-    if not log.has(kind):
-        return None
-    instance = log.some(kind, "I", chosen)
+    kind, instance = _instance(log, "BARO", "BAR", chosen)
     if not instance.has(kind):
         return None
     of = finding("depth_of_barometer", number=chosen)
