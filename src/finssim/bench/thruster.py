@@ -380,12 +380,8 @@ def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
     volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
 
     def add(key: str, value: float, ends: tuple[float, float], unit: str, sure: bool, note: str = "") -> None:
-        rows.append(
-            Estimate(
-                name=f"{name}.{key}", estimate=float(value), ci95=ends, unit=unit, identifiable=sure, note=note,
-                path=None if key == "reverse_ratio" else f"{path}.{key}",
-            )
-        )  # fmt: skip
+        target = None if key == "reverse_ratio" else f"{path}.{key}"
+        rows.append(Estimate(f"{name}.{key}", float(value), ends, unit, sure, note, target))
 
     for direction, sign in SIDES:
         side, zone = result.sides.get(direction), result.dead.get(direction)
@@ -495,8 +491,10 @@ def fit_thruster(
         for estimate in estimates_of(target, path, result):
             estimates[estimate.name] = estimate
             key = estimate.name.rpartition(".")[2]
+            # A nominal speed limit has to rise, so that pulses give the forces that were measured.
             old = abs(getattr(result.before, key)) if key.startswith("rpm_") else math.inf
-            if key.startswith(WRITTEN) and (estimate.identifiable or _raised(result, estimate, old)):
+            raised = not result.speeds_measured and abs(estimate.estimate) > old
+            if key.startswith(WRITTEN) and (estimate.identifiable or raised):
                 changes |= {f"thrusters.{name}.{key}": estimate.estimate for name in thrusters}
         if result.esc is not None:
             changes |= {f"thrusters.{name}.esc": result.esc.esc.values() for name in thrusters}
@@ -515,11 +513,6 @@ def fit_thruster(
         trials={table.name: table.sha256 for table in read},
         settings={"voltage": voltage, "group": group},
     )
-
-
-def _raised(result: Bench, estimate: Estimate, old: float) -> bool:
-    """Return whether a nominal speed limit has to rise, so that pulses give the forces that were measured."""
-    return not result.speeds_measured and abs(estimate.estimate) > old
 
 
 def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:

@@ -359,7 +359,11 @@ def _grouped(
         if section == "thrusters":
             if groups:
                 result["thruster_groups"] = groups
-            result["thrusters"] = {name: _group_first(values) for name, values in thrusters.items()}
+            first_keys = ("group", "position", "axis")  # as a person writes them
+            result["thrusters"] = {
+                name: {key: own[key] for key in first_keys if key in own} | own
+                for name, own in thrusters.items()
+            }
         else:
             result[section] = dict(values) if isinstance(values, dict) else values
     return result, origins
@@ -377,11 +381,6 @@ def _same(
         return False
     paths = [path for path, _ in leaves(thrusters[first][key], (key,))]
     return all(origins[("thrusters", first, *p)] == origins[("thrusters", member, *p)] for p in paths)
-
-
-def _group_first(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a thruster as a person writes them: the group, the place, then the rest."""
-    return {key: values[key] for key in ("group", "position", "axis") if key in values} | dict(values)
 
 
 # From a fit to a vehicle: the numbers that the data determine, each with its origin and interval, and the record.
@@ -426,7 +425,9 @@ def calibrated(fit: Fit) -> Vehicle:
     changed = [tuple(path.split(".")) for path in fit.changes]
     origins = {}
     for path, full_path, value in numbers(after):
-        estimate = _estimate_of(path, fit.estimates, after) or _scale_of(path, fit.estimates)
+        estimate = _estimate_of(path, fit.estimates, after)
+        if estimate is None and path[0] == "thrusters" and path[-1] in SCALED:
+            estimate = fit.estimates.get("thrust_scale")
         determined = estimate is not None and estimate.identifiable and _covers(changed, path, after)
         if old_values.get(full_path) == value and not determined:
             origins[path] = before.origin_of(".".join(full_path))
@@ -560,11 +561,6 @@ def _estimate_of(leaf: Key, estimates: Mapping[str, Estimate], vehicle: Vehicle)
     return None
 
 
-def _scale_of(leaf: Key, estimates: Mapping[str, Estimate]) -> Estimate | None:
-    """The common scale of all thrusts, for the numbers that it multiplies."""
-    return estimates.get("thrust_scale") if leaf[0] == "thrusters" and leaf[-1] in SCALED else None
-
-
 def _note(estimate: Estimate | None, value: float) -> str:
     """`95 % interval 37.9 to 40.2`, with the estimate itself where the file holds something else of it."""
     if estimate is None:
@@ -623,9 +619,17 @@ def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None
 
     target = yaml_path(path, "ranges")
     vehicle = calibrated(fit) if vehicle is None else vehicle
-    text = _ranges_text(fit, vehicle)
+    tree = dict[str, Any]()
+    for entry, factor in range_factors(fit, vehicle).items():
+        _insert(tree, entry, factor)
+    lines = [
+        "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
+        "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
+        f'source: "95 % intervals, {vehicle.calibrations[-1].sentence()}; vehicle {vehicle.sha256[:16]}"',
+        *_factor_lines(tree),
+    ]
     with atomic_write(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
         load_ranges(temporary)
 
 
@@ -699,19 +703,6 @@ def _around(factors: Iterable[Factor]) -> Factor:
 
 def _stated(vehicle: Vehicle, path: str) -> bool:
     return any(path == stated or stated.startswith(f"{path}.") for stated in vehicle.provenance)
-
-
-def _ranges_text(fit: Fit, vehicle: Vehicle) -> str:
-    record, tree = vehicle.calibrations[-1], dict[str, Any]()
-    for entry, factor in range_factors(fit, vehicle).items():
-        _insert(tree, entry, factor)
-    lines = [
-        "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
-        "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
-        f'source: "95 % intervals, {record.sentence()}; vehicle {vehicle.sha256[:16]}"',
-        *_factor_lines(tree),
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def _factor_lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:

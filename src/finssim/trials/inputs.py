@@ -277,30 +277,12 @@ ORDER = ("rpm_", "force_", "tau", "pwm_", "command_")
 """Kinds of input, from the closest to what acted to the least close."""
 
 
-def input_columns(trial: Trial, vehicle: Vehicle) -> dict[str, list[str]]:
-    """Input columns that hold numbers, by kind, in canonical order.
+def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
+    """Return the input columns of a kind that hold numbers, in canonical order.
 
     Raises:
         CalibrationError: One names a thruster that the vehicle has not.
     """
-    return {kind: _columns(trial, vehicle, kind) for kind in ORDER}
-
-
-def first_complete(present: dict[str, list[str]], trial: Trial, vehicle: Vehicle) -> str:
-    """Return the kind of input closest to what acted, of those that are present for every thruster.
-
-    Of a wrench any axis will do.
-
-    Raises:
-        CalibrationError: None is.
-    """
-    for kind in ORDER:
-        if present[kind] and (kind == "tau" or len(present[kind]) == len(vehicle.thrusters)):
-            return kind
-    raise CalibrationError(_missing_inputs(present, vehicle), trial.name)
-
-
-def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
     if kind == "tau":
         return [name for name in TAU if trial.has(name)]
     names = {c.removeprefix(kind): c for c in trial.channels if c.startswith(kind)}
@@ -385,8 +367,12 @@ def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
     """
     if trial.header.passive:
         return _undriven(trial)
-    present = input_columns(trial, vehicle)
-    kind = first_complete(present, trial, vehicle)
+    present = {kind: _columns(trial, vehicle, kind) for kind in ORDER}
+    # Of a wrench any axis will do, of thrusters each has to be there.
+    complete = [k for k in ORDER if present[k] and (k == "tau" or len(present[k]) == len(vehicle.thrusters))]
+    if not complete:
+        raise CalibrationError(_missing_inputs(present, vehicle), trial.name)
+    kind = complete[0]
     columns = present[kind]
     others = _other_columns(trial, vehicle, kind)
     commanded, held, stepped = _between(trial, kind, columns)

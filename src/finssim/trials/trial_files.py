@@ -430,12 +430,6 @@ def read_header(path: Path) -> Header:
         ) from None
 
 
-def header_text(header: Header) -> str:
-    """`trial.yaml` of a header: what differs from the defaults."""
-    tree = header.model_dump(mode="json", exclude_defaults=True)
-    return yaml_text(tree) if tree else "{}\n"
-
-
 def _content(path: Path) -> str:
     """Return the content of a file without comments and blank lines."""
     lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
@@ -554,7 +548,8 @@ def write_trial(
                 f"cannot write {folder}: the directory holds other files ({other[0]}): give a new one"
             )
     with atomic_directory(target, replaces=HEADER) as temporary:
-        (temporary / HEADER).write_text(header_text(trial.header), encoding="utf-8")
+        header = trial.header.model_dump(mode="json", exclude_defaults=True)
+        (temporary / HEADER).write_text(yaml_text(header) if header else "{}\n", encoding="utf-8")
         write_table(temporary / f"data.{format}", {"t": trial.t, **trial.channels}, trial.phase)
 
 
