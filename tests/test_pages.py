@@ -20,7 +20,7 @@ from finssim.localization.camera_file import write_camera
 from finssim.localization.overhead_camera import load_pool
 from finssim.sim.ranges_file import load_ranges
 from finssim.studies.sweep import load_sweep
-from finssim.survey.pool_fit import run
+from finssim.survey.pool import run
 from finssim.tasks.sensing import load_sensing
 from finssim.trials.importers.dispatch import read_trials
 from finssim.vehicles import VehicleError, load_vehicle

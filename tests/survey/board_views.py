@@ -8,7 +8,7 @@ import numpy as np
 from finssim.core.optics import Lens
 from finssim.core.rotations import quat_from_euler, quat_to_matrix
 from finssim.localization.detection.pictures import pictures
-from finssim.survey.camera import Board, BoardView, see_board
+from finssim.survey.boards import Board, BoardView, see_board
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[1] / "data" / "opencv_chessboards"
 BOARD = Board(columns=9, rows=6, square=0.03)

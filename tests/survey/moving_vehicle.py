@@ -22,7 +22,7 @@ from finssim.core.rotations import (
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import corners
 from finssim.localization.overhead_camera import Pool
-from finssim.survey.mounts import Moment
+from finssim.survey.mounts_fit import Moment
 from finssim.survey.pose import Pose
 
 EDGE = 0.093

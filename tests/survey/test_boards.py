@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from finssim.survey.camera import Board, parse_size, see_board
+from finssim.survey.boards import Board, parse_size, see_board
 from finssim.trials.findings import CalibrationError
 
 CHESSBOARD = Board(columns=9, rows=6, square=0.025)

@@ -8,7 +8,7 @@ import pytest
 
 from finssim.identification.uncertainty import intervals, trial_covariance
 from finssim.localization.camera_file import load_camera
-from finssim.survey.camera import (
+from finssim.survey.camera_fit import (
     MODELS,
     adjust,
     calibrate_camera,

@@ -10,7 +10,7 @@ from finssim.localization.detection.detections import Detection, Frame, in_our_o
 from finssim.localization.detection.families import corners
 from finssim.localization.overhead_camera import load_pool
 from finssim.survey.points import observe, read_survey
-from finssim.survey.pool_fit import run
+from finssim.survey.pool import run
 from finssim.trials.findings import CalibrationError
 
 from .surveyed_pools import PLUMB_BOB, overhead

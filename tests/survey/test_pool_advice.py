@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from finssim.core.optics import Interface, Lens
-from finssim.survey.pool_fit import _numbers, calibrate_pool, doubted
+from finssim.survey.pool_findings import numbers
+from finssim.survey.pool_fit import calibrate_pool, doubted
 from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
 
@@ -140,29 +141,6 @@ def test_a_guessed_focal_length_is_enough(factor):
     assert "focal_pulled" in codes(unsaid)
 
 
-def rim(camera, count=8):
-    """Marks above the water as `survey` gives those under it, seen in straight lines."""
-    rng = np.random.default_rng(2)
-    points = rng.uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (count, 3))
-    pixels, ok = camera.lens.project((points - camera.position) @ camera.R_pc)
-    assert ok.all()
-    return points, pixels + 0.25 * rng.standard_normal((count, 2))
-
-
-@pytest.mark.slow
-def test_marks_above_the_water_are_told_from_wrong_rows():
-    """Eight marks on the rim whose flag was forgotten, and one mark under water that is 20 cm off."""
-    wet = survey(overhead(), WATER, FLOOR, 40)
-    points, pixels = rim(overhead())
-    wrong = wet.points.copy()
-    wrong[7, 0] += 0.2
-    seen = observations(np.concatenate([wrong, points]), np.concatenate([wet.pixels, pixels]))
-    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
-    of = {one.code: one.values for one in fit.findings}
-    assert of["marks_dry"]["marks"] == tuple(f"p{i}" for i in range(40, 48))
-    assert of["rows_wrong"] == {"rows": 1}
-
-
 def test_points_without_water_are_noticed():
     """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
     camera = before_tank(30.0)
@@ -268,5 +246,5 @@ def test_a_survey_that_is_rougher_than_stated_is_noticed_with_its_error():
     fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
     assert "survey_rough" not in codes(fit)
     rough = replace(fit, noise=replace(fit.noise, survey=0.002, scale=3.0))
-    (found,) = (one for one in _numbers(rough, seen) if one.code == "survey_rough")
+    (found,) = (one for one in numbers(rough, seen) if one.code == "survey_rough")
     assert found.values == {"times": 3.0, "error": pytest.approx(6.0)}

@@ -10,7 +10,7 @@ from finssim.core.files import OutputError
 from finssim.core.optics import Interface, back_project
 from finssim.localization.camera_file import write_camera
 from finssim.localization.overhead_camera import load_pool
-from finssim.survey.pool_fit import run
+from finssim.survey.pool import run
 from finssim.trials.findings import CalibrationError
 
 from .surveyed_pools import FLOOR, GLASS, PLUMB_BOB, TANK, TANK_LENS, before_tank, overhead, survey, window

@@ -39,7 +39,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "calibrate thruster": "finssim.bench.thruster:calibrate_thruster",
         "calibrate motor": "finssim.bench.motor:calibrate_motor",
         "calibrate camera": "finssim.survey.camera:run",
-        "calibrate pool": "finssim.survey.pool_fit:run",
+        "calibrate pool": "finssim.survey.pool:run",
         "calibrate mounts": "finssim.survey.mounts:run",
         "replay": "finssim.identification.prediction:run_replay",
     },

@@ -98,6 +98,17 @@ def huber_loss(size: Array, limit: float) -> Array:
     return np.asarray(np.where(size <= limit, size**2, limit * (2.0 * size - limit)))
 
 
+def unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """Return a normal matrix (P, P) with each unknown in a unit of its own, so that its diagonal is 1, and the factors
+    (P,) by which steps in these units are larger.
+
+    Args:
+        normal: In any units [-] and frame, (P, P).
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    return normal / np.outer(scale, scale), scale
+
+
 def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
     """Return the minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
 
@@ -111,8 +122,8 @@ def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
     """
     from scipy.optimize import lsq_linear
 
-    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
-    L = np.linalg.cholesky(normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale)))
+    scaled, scale = unit_diagonal(normal)
+    L = np.linalg.cholesky(scaled + 1e-9 * np.eye(len(scale)))
     root = np.linalg.solve(L, right / scale)
     free = np.linalg.solve(L.T, root) / scale
     if ((free >= low) & (free <= high)).all():
@@ -163,8 +174,8 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
         damping: What the diagonals grow by, as a part of themselves [-].
     """
     total, right, inners = arrow_reduced(blocks, damping)
-    scale = np.sqrt(np.maximum(np.diagonal(total), 1e-300))
-    step, *_ = np.linalg.lstsq(total / np.outer(scale, scale), right / scale, rcond=1e-13)
+    scaled, scale = unit_diagonal(total)
+    step, *_ = np.linalg.lstsq(scaled, right / scale, rcond=1e-13)
     step = step / scale
     own = [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
     promised = sum(

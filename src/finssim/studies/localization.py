@@ -33,7 +33,8 @@ from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.localization.poses.methods import METHODS, Constraints
 from finssim.sim.overhead_camera import ObjectPose, OverheadCamera, Ripples, Scene, TagInScene, TiledBasin
 from finssim.survey.points import Observations, observe, read_survey
-from finssim.survey.pool_fit import PoolFit, calibrate_pool, pool_record
+from finssim.survey.pool import pool_record
+from finssim.survey.pool_fit import PoolFit, calibrate_pool
 from finssim.survey.pool_model import PoolFitSettings
 from finssim.vehicles import Tags
 from finssim.vehicles.equipment import TagMount

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
-    from finssim.survey.camera import Board, BoardView, calibrate_camera
+    from finssim.survey.boards import Board, BoardView
+    from finssim.survey.camera_fit import calibrate_camera
 
 __all__ = [
     "Board",

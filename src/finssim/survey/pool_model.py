@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from finssim.core.least_squares import Step, descend
+from finssim.core.least_squares import Step, descend, unit_diagonal
 from finssim.core.optics import (
     COEFFICIENTS,
     Camera,
@@ -29,12 +29,19 @@ from finssim.trials.findings import CalibrationError
 
 Array = NDArray[np.float64]
 
+UP = np.array([0.0, 0.0, 1.0])
+
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
 LENS_NAMES = ("focal", "center_x", "center_y", *(f"distortion_{k}" for k in range(1, 6)))
 NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
 """Order of every vector of parameters: camera centre [m], rotation by pool axes [rad], tilt of the plane about the
 reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal
 length, optical centre [px], first five coefficients of distortion as the lens lists them."""
+
+
+def mask_of(names: Iterable[str]) -> NDArray[np.bool_]:
+    """Return a mask of some of the `NAMES`, (18,)."""
+    return np.isin(NAMES, list(names))
 
 
 def extended_lens(lens: Lens) -> Lens:
@@ -63,6 +70,10 @@ class PoolModel:
     def clearance(self) -> float:
         """Distance of the camera from the plane, on its own side [m]."""
         return float(self.interface.normal @ self.camera.position + self.interface.offset)
+
+    def lean(self, normal: Array) -> float:
+        """Return the angle between the plane's normal and another one, unit, pool frame (3,) [rad]."""
+        return float(np.arccos(np.clip(self.interface.normal @ normal, -1.0, 1.0)))
 
     @cached_property
     def tangents(self) -> Array:
@@ -297,8 +308,7 @@ def active_names(settings: PoolFitSettings, extra: tuple[str, ...] = ()) -> NDAr
     }
     groups = {*(settings.fit or ("pose", "height", "tilt", "index")), *extra}
     groups |= {name for name in ("focal", "center") if getattr(settings, f"{name}_sigma") > 0.0}
-    names = {name for group in groups if not held.get(group) for name in FITTED[group]}
-    return np.array([name in names for name in NAMES])
+    return mask_of(name for group in groups if not held.get(group) for name in FITTED[group])
 
 
 def lens_std(settings: PoolFitSettings, width: int) -> tuple[float, ...]:
@@ -360,6 +370,59 @@ class Prior:
         return r[informative] / std[informative], J[informative] / std[informative, None]
 
 
+SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
+
+ANYWHERE = 0.5
+"""Prior of the water's depth over the camera's distance where it was not measured, and its standard deviation: so weak
+that it matters only where the pixels contain no information."""
+
+
+def stated_plane(model: PoolModel, settings: PoolFitSettings) -> tuple[Array | None, float]:
+    """Return the normal towards the camera, pool frame (3,), and the distance of the plane from the reference point
+    [m]; None and NaN where unknown."""
+    towards, depth = model.camera.position - model.reference, settings.water_depth
+    if settings.plane is not None:
+        normal, offset = settings.unit_plane
+        sign = 1.0 if normal @ towards > 0.0 else -1.0
+        return sign * normal, float(-sign * (normal @ model.reference + offset))
+    if not settings.surface:
+        return None, np.nan
+    normal = UP if towards[2] > 0.0 else -UP
+    if settings.water_height is not None:
+        return normal, float(normal[2] * (settings.water_height - model.reference[2]))
+    return normal, np.nan if depth is None else depth
+
+
+def prior_of(model: PoolModel, start: PoolModel, settings: PoolFitSettings, stds: tuple[float, ...]) -> Prior:
+    """Return the prior of plane, index and lens.
+
+    Args:
+        model: Model whose camera gives the side of the points.
+        start: Model with the index and the lens as given.
+        settings: Options.
+        stds: Standard deviations of the lens's parameters in their units, in the order of `LENS_NAMES`.
+    """
+    normal, depth = stated_plane(model, settings)
+    tilt = settings.tilt_sigma
+    if tilt is None:
+        tilt = float(
+            PLANE_TILT if settings.plane is not None else SURFACE_TILT if settings.surface else np.inf
+        )
+    depth_std = max(settings.place_sigma, 1e-6)
+    if not np.isfinite(depth):
+        apparent = float(np.linalg.norm(start.camera.position - start.reference))
+        depth, depth_std = ANYWHERE * apparent, ANYWHERE * apparent
+    return Prior(
+        normal=normal,
+        tilt_std=tilt if tilt > 0.0 else np.inf,
+        depth=depth,
+        depth_std=depth_std,
+        start=start,
+        index_std=settings.index_sigma if settings.index_sigma > 0.0 else np.inf,
+        lens_std=stds,
+    )
+
+
 class PoolSolution(NamedTuple):
     """End of the search."""
 
@@ -400,8 +463,8 @@ def solve(
 
     def linearise(model: PoolModel) -> Step[PoolModel]:
         N, g = normal_equations(model, observed, whiten, free, prior)
-        bounds, scale = _bounds(model, observed, free), np.sqrt(np.maximum(np.diagonal(N), 1e-300))
-        H, b = N / np.outer(scale, scale), g / scale
+        bounds, (H, scale) = _bounds(model, observed, free), unit_diagonal(N)
+        b = g / scale
 
         def stepped(damping: float) -> tuple[PoolModel | None, float]:
             step, x = np.zeros(len(NAMES)), _sliding(H + damping * np.eye(len(free)), b, scale, bounds)
