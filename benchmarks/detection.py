@@ -15,15 +15,17 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from finssim.localization.detection.detector import REFINEMENTS, Detector, RegionTracker, detector
+from finssim.localization.detection.detections import Detection
+from finssim.localization.detection.detector import REFINEMENTS, Detector, Region, RegionTracker, detector
 from finssim.localization.detection.families import FAMILIES
 from reference.tag_picture import draw, pose_corners
 
@@ -111,6 +113,21 @@ def measured(way: Detector, pictures: list[tuple[int, Any, Any]]) -> dict[str, f
     }
 
 
+@dataclass
+class Counting:
+    """A detector that counts the pixels that it searches."""
+
+    detector: Detector
+    pixels: int = 0
+    pictures: int = 0
+
+    def detect(self, image: NDArray[np.uint8], region: Region | None = None) -> list[Detection]:
+        """Search a picture, or a part of it."""
+        left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
+        self.pixels += image[max(top, 0) : bottom, max(left, 0) : right].size
+        return self.detector.detect(image, region)
+
+
 def speed() -> list[dict[str, Any]]:
     """Processor time per picture, the best of several rounds [ms]."""
     rows = []
@@ -119,16 +136,18 @@ def speed() -> list[dict[str, Any]]:
     for refine in ("fit", "edges"):
         find = detector("tag25h9", refine=refine)
         whole = best(lambda find=find: [find.detect(picture) for picture in pictures]) / len(pictures)
-        tracker = RegionTracker(find, [15, 16])
+        counting = Counting(find)
+        tracker = RegionTracker(cast(Detector, counting), [15, 16])
         tracker.detect(pictures[0], 0.0)
-        before = tracker.counts.pixels
+        counting.pixels = counting.pictures = 0
 
-        def follow(tracker: RegionTracker = tracker) -> None:
+        def follow(tracker: RegionTracker = tracker, counting: Counting = counting) -> None:
             for k in (*range(1, 8), *range(6, -1, -1)):
-                tracker.detect(pictures[k], tracker.counts.pictures / 30.0)
+                counting.pictures += 1
+                tracker.detect(pictures[k], counting.pictures / 30.0)
 
         regions = best(follow) / 14
-        share = (tracker.counts.pixels - before) / ((tracker.counts.pictures - 1) * pictures[0].size)
+        share = counting.pixels / (counting.pictures * pictures[0].size)
         rows.append({"refine": refine, "whole_ms": whole, "regions_ms": regions, "share": share})
         print(f"{refine:9} {whole:9.1f} {regions:12.2f} {whole / regions:8.1f} {share:10.1%}")
     return rows

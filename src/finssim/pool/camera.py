@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from finssim.core.optics import Camera, Interface, Lens
 from finssim.core.rotations import quat_from_rotvec, quat_multiply, quat_rotate, quat_to_matrix
+from finssim.localization.detection.detector import adjugate, from_square
 from finssim.localization.detection.families import bitmap, family_named
 from finssim.localization.overhead_camera import Pool
 from finssim.pool.plant_spec import Basin, PlantSpecError, Severity, basin_of, by_severity
@@ -77,8 +78,8 @@ class CornerFit:
             (T,). Those of a tag of which not all nodes have pixels mean nothing.
         """
         with np.errstate(all="ignore"):
-            square = [_from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
-            H, back = np.array(square), np.array([_adjugate(tag) for tag in square])
+            square = [from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
+            H, back = np.array(square), np.array([adjugate(tag) for tag in square])
             projected = pixels @ back[:, :, :2].transpose(0, 2, 1) + back[:, None, :, 2]
             moved = (
                 (projected[..., :2] / projected[..., 2:] - self._square)
@@ -136,28 +137,6 @@ def _interpolation(along: Array, points: Array) -> Array:
     vandermonde = np.vander(along, len(along))
     by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(vandermonde) for x in points.T)
     return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
-
-
-def _from_square(corners: list[list[float]]) -> list[list[float]]:
-    """The homography that takes the unit square, x right and y down, to four corners, (3, 3); unity where none does."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
-    ux, uy, vx, vy = bx - cx, by - cy, dx - cx, dy - cy
-    wx, wy = ax - bx + cx - dx, ay - by + cy - dy
-    area = ux * vy - uy * vx
-    if not abs(area) > 1e-9:
-        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    p, q = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
-    return [[bx - ax + p * bx, dx - ax + q * dx, ax], [by - ay + p * by, dy - ay + q * dy, ay], [p, q, 1.0]]
-
-
-def _adjugate(H: list[list[float]]) -> list[list[float]]:
-    """The homography back, (3, 3): the inverse but for a factor, which a homography does not feel."""
-    (a, b, c), (d, e, f), (g, h, i) = H
-    return [
-        [e * i - f * h, c * h - b * i, b * f - c * e],
-        [f * g - d * i, a * i - c * g, c * d - a * f],
-        [d * h - e * g, b * g - a * h, a * e - b * d],
-    ]
 
 
 # Where points in the water appear to a camera above a rippling surface, without drawing a picture.

@@ -15,7 +15,7 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection, best_detections
 from finssim.localization.detection.families import EDGES, bitmap, family_named, find_tags
 
-__all__ = ["REFINEMENTS", "Detector", "RegionTracker", "SearchCounts", "detector"]
+__all__ = ["REFINEMENTS", "Detector", "RegionTracker", "adjugate", "detector", "from_square"]
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -177,7 +177,7 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> TagFit | None
     patch, shift = _patch(image, corners, cell, smooth=(BLURS[0] * cell) ** 2 - LENS_BLUR**2)
     blur = nearest_blur(LENS_BLUR / cell)
     pattern = pattern_of(family, tag, blur)
-    sampled = _sample(patch, _through(_from_square(corners - shift), pattern.points))
+    sampled = _sample(patch, _through(np.array(from_square((corners - shift).tolist())), pattern.points))
     if sampled is None:
         return None
     limit = 1.0 + 0.5 * cell
@@ -226,7 +226,7 @@ def _settle(
     None where it moves a corner by more than the limit [px], or out of the patch, or does not come to rest.
     """
     solver = pattern.plain if plain else pattern.solver if solver is None else solver
-    H = _from_square(start)
+    H = np.array(from_square(start.tolist()))
     here = start
     for _ in range(STEPS):
         sampled = _sample(patch, _through(H, pattern.points))
@@ -237,7 +237,8 @@ def _settle(
         gain = float(solution[-1])
         if not gain > 0.0 or np.abs(solution[:8]).max() > 0.3 * gain:
             return None
-        H = H @ _undone((solution[:8] / gain).tolist())
+        a, b, c, d, e, f, g, h = (solution[:8] / gain).tolist()  # how far the pattern has moved
+        H = H @ adjugate([[1.0 + a, b, c], [d, 1.0 + e, f], [g, h, 1.0]])
         before, here = here, _through(H, _SQUARE).T
         if not np.abs(here - start).max() < limit:
             return None
@@ -312,30 +313,30 @@ def _sample(patch: Array, points: Array) -> Array | None:
     return np.asarray(upper + b * (lower - upper))
 
 
-def _from_square(corners: Array) -> Array:
-    """The homography that takes the unit square, x right and y down, to four corners, (3, 3)."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
-    # The last row (g, h, 1) solves g (b - c) + h (d - c) = a - b + c - d.
-    x, y = ax - bx + cx - dx, ay - by + cy - dy
-    determinant = (bx - cx) * (dy - cy) - (dx - cx) * (by - cy)
-    g = (x * (dy - cy) - y * (dx - cx)) / determinant
-    h = (y * (bx - cx) - x * (by - cy)) / determinant
-    return np.array(
-        [[bx - ax + g * bx, dx - ax + h * dx, ax], [by - ay + g * by, dy - ay + h * dy, ay], [g, h, 1.0]]
-    )
+def from_square(corners: list[list[float]]) -> list[list[float]]:
+    """Return the homography that takes the unit square, x right and y down, to four corners [px], (3, 3); the identity
+    where none does.
+
+    The last row (g, h, 1) solves g (b - c) + h (d - c) = a - b + c - d.
+    """
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
+    ux, uy, vx, vy = bx - cx, by - cy, dx - cx, dy - cy
+    wx, wy = ax - bx + cx - dx, ay - by + cy - dy
+    area = ux * vy - uy * vx
+    if not abs(area) > 1e-9:
+        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    g, h = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
+    return [[bx - ax + g * bx, dx - ax + h * dx, ax], [by - ay + g * by, dy - ay + h * dy, ay], [g, h, 1.0]]
 
 
-def _undone(motion: list[float]) -> Array:
-    """Inverse of the homography [1+m0 m1 m2; m3 1+m4 m5; m6 m7 1] but for a factor, by its adjugate, (3, 3)."""
-    a, b, c, d, e, f, g, h = motion
-    a, e = 1.0 + a, 1.0 + e
-    return np.array(
-        [
-            [e - f * h, c * h - b, b * f - c * e],
-            [f * g - d, a - c * g, c * d - a * f],
-            [d * h - e * g, b * g - a * h, a * e - b * d],
-        ]
-    )
+def adjugate(H: list[list[float]]) -> list[list[float]]:
+    """Return the inverse of a homography [-] but for a factor, which a homography does not feel, (3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = H
+    return [
+        [e * i - f * h, c * h - b * i, b * f - c * e],
+        [f * g - d * i, a * i - c * g, c * d - a * f],
+        [d * h - e * g, b * g - a * h, a * e - b * d],
+    ]
 
 
 def _through(H: Array, points: Array) -> Array:
@@ -465,30 +466,6 @@ AHEAD = 1.5
 
 
 @dataclass
-class SearchCounts:
-    """Counts of a tracker's searches."""
-
-    pictures: int = 0
-    regions: int = 0
-    """Parts of pictures that were searched."""
-    whole: int = 0
-    """Pictures that were searched entirely."""
-    found: int = 0
-    """Tags, summed over pictures."""
-    recovered: int = 0
-    """Tags that only the search of the complete picture found."""
-    pixels: int = 0
-    """Searched, summed over pictures."""
-    pixels_given: int = 0
-    """Pixels of all pictures."""
-
-    @property
-    def share(self) -> float:
-        """Return the searched share of all pixels; above 1 if complete pictures were searched after regions."""
-        return self.pixels / max(self.pixels_given, 1)
-
-
-@dataclass
 class _Remembered:
     """The last that is known of a tag."""
 
@@ -513,7 +490,6 @@ class RegionTracker:
             search_every: Pictures between searches of the whole one while a tag is missing (always, where `tags` is
                 None). If none is found at all, the whole picture is searched at once.
         """
-        self.counts = SearchCounts()
         self._detector = detector
         self._tags = None if tags is None else frozenset(tags)
         self._search_every = search_every
@@ -532,32 +508,19 @@ class RegionTracker:
             LocalizationError: The picture is not one of gray bytes.
         """
         now = time if math.isfinite(time) else (0.0 if math.isnan(self._last_time) else self._last_time + 1.0)
-        self.counts.pictures += 1
-        self.counts.pixels_given += image.size
         regions = merged(self._regions(now))
         detections = [d for region in regions for d in self._search(image, region)]
         here = {d.tag for d in detections}
         self._since_whole += 1
-        due = self._since_whole >= self._search_every and self._incomplete(here)
-        if not here or due:
+        missing = self._tags is None or not self._tags <= here
+        if not here or (missing and self._since_whole >= self._search_every):
             detections += self._search(image, None)
             self._since_whole = 0
-            self.counts.recovered += len({d.tag for d in detections} - here)
         best = best_detections(detections)
         self._remember(best, now)
-        self.counts.found += len(best)
         return best
 
-    def _incomplete(self, here: set[int]) -> bool:
-        return self._tags is None or not self._tags <= here
-
     def _search(self, image: npt.NDArray[np.uint8], region: Region | None) -> list[Detection]:
-        height, width = image.shape
-        left, top, right, bottom = region or (0, 0, width, height)
-        inside = max(min(right, width) - max(left, 0), 0) * max(min(bottom, height) - max(top, 0), 0)
-        self.counts.pixels += inside
-        self.counts.whole += region is None
-        self.counts.regions += region is not None
         detections = self._detector.detect(image, region)
         return [d for d in detections if self._tags is None or d.tag in self._tags]
 
