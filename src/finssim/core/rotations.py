@@ -118,6 +118,13 @@ def matrix_to_quat(R_ab: npt.ArrayLike) -> Array:
     return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
 
 
+def nearest_rotation(matrix: npt.ArrayLike) -> Array:
+    """Return the rotation matrix that is nearest to a matrix (3, 3), in any unit: R that maximises tr(Rᵀ M) (Kabsch
+    1976)."""
+    U, _, right = np.linalg.svd(np.asarray(matrix, float))
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ right)]) @ right)
+
+
 def quat_from_euler(roll: npt.ArrayLike, pitch: npt.ArrayLike, yaw: npt.ArrayLike) -> Array:
     """Quaternion of R_z(yaw) R_y(pitch) R_x(roll) [rad], (...) each -> (..., 4)."""
     r, p, y = (0.5 * np.asarray(angle, float) for angle in (roll, pitch, yaw))

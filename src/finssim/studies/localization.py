@@ -30,7 +30,8 @@ from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.detections import Detection, Frame, write_detections
 from finssim.localization.detection.families import bitmap, corners, tag_corners_b
 from finssim.localization.overhead_camera import Pool, write_pool
-from finssim.localization.poses.methods import METHODS, Constraints
+from finssim.localization.poses import Constraints
+from finssim.localization.poses.methods import METHODS
 from finssim.sim.overhead_camera import ObjectPose, OverheadCamera, Ripples, Scene, TagInScene, TiledBasin
 from finssim.survey.points import Observations, observe, read_survey
 from finssim.survey.pool import pool_record

@@ -22,7 +22,7 @@ from finssim.identification.uncertainty import (
     intervals,
     trial_covariance,
 )
-from finssim.localization.poses.methods import plane_pose, refine_pose, through_lens
+from finssim.localization.poses.refinement import plane_pose, refine_pose, through_lens
 from finssim.survey.boards import BoardView
 from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError, Finding, finding

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from finssim.core.least_squares import Block, Step, arrow_step, block_of, descend, huber_loss, huber_weight
 from finssim.core.optics import back_project, project, projection_jacobians
-from finssim.core.rotations import matrix_to_quat, quat_rotate, quat_to_matrix, quat_to_rotvec, skew
+from finssim.core.rotations import (
+    matrix_to_quat,
+    nearest_rotation,
+    quat_rotate,
+    quat_to_matrix,
+    quat_to_rotvec,
+    skew,
+)
 from finssim.identification.uncertainty import Covariance, arrow_evidence, intervals, trial_covariance
 from finssim.localization.detection.families import corners
 from finssim.localization.overhead_camera import Pool
@@ -207,8 +214,7 @@ def rotation_between(a: Array, b: Array) -> Array:
         Quaternion, xyzw, (4,).
     """
     B = a.T @ b
-    U, _, right = np.linalg.svd(B + 1e-6 * np.linalg.norm(B) * np.eye(3))
-    return matrix_to_quat(U @ np.diag([1.0, 1.0, np.linalg.det(U @ right)]) @ right)
+    return matrix_to_quat(nearest_rotation(B + 1e-6 * np.linalg.norm(B) * np.eye(3)))
 
 
 def start_state(

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.localization.poses.methods import pinhole, pinhole_depth, tag_poses
+from finssim.localization.poses.methods import pinhole, pinhole_depth
+from finssim.localization.poses.refinement import tag_poses
 from localization.poses.seen_vehicle import ABOVE, LENS, POOLS, TAGS, known, moved, rotation, seen
 
 AIR = replace(POOLS["level water"], interface=replace(POOLS["level water"].interface, index_far=1.0003))

@@ -9,7 +9,7 @@ from finssim.core.optics import Camera, Interface
 from finssim.core.rotations import matrix_to_quat, wrap_angle
 from finssim.localization.detection.detections import Detection
 from finssim.localization.poses import Constraints, tilt_matrix
-from finssim.localization.poses.methods import corner_points, planar_fit, rigid_fit
+from finssim.localization.poses.planar import corner_points, planar_fit, rigid_fit
 from localization.poses.seen_vehicle import POOLS, TAGS, known, moved, pose, rotation, seen
 
 POOL = POOLS["level water"]

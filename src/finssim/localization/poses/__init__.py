@@ -13,7 +13,8 @@ from finssim.core.rotations import matrix_to_quat
 from finssim.localization.detection.detections import Detection, best_detections
 
 __all__ = [
-    "Constraints", "Correspondences", "PoseMeasurement", "axes_of_up", "correspondences", "refused", "tilt_matrix",
+    "Constraints", "Correspondences", "PoseMeasurement", "about_up", "axes_of_up", "correspondences", "inflation",
+    "refused", "tilt_matrix",
 ]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
@@ -131,6 +132,12 @@ def tilt_matrix(roll: float, pitch: float) -> Array:
     return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
 
 
+def about_up(angle: float) -> Array:
+    """Return the rotation matrix of a turn about z by an angle [rad], (3, 3)."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
 def axes_of_up(up: npt.ArrayLike) -> Array:
     """Return the rotation matrix R_pg of a frame g with z along the vector `up`, (3, 3).
 
@@ -141,6 +148,22 @@ def axes_of_up(up: npt.ArrayLike) -> Array:
         return np.diag([1.0, -1.0, -1.0])
     k = 1.0 / (1.0 + z)
     return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
+
+
+def inflation(missed: Array, parameters: int, std: float) -> float:
+    """Return the factor [-] on a variance where misses are larger than noise explains.
+
+    It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to it beyond.
+
+    Args:
+        missed: Distance of each point from its place [px], (n,).
+        parameters: Number of parameters that were fitted.
+        std: Standard deviation of a point, per axis [px].
+    """
+    dof = max(2 * len(missed) - parameters, 1)
+    k = 2.0 / (9.0 * dof)
+    quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
+    return max(1.0, float(missed @ missed) / std**2 / quantile)
 
 
 # Which corner of the vehicle each corner in a picture is.
