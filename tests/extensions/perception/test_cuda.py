@@ -29,6 +29,9 @@ def test_every_kernel_compiles_for_cuda(tmp_path):
             compiled[name] = [file.stat().st_size > 0 for file in (tmp_path / name).glob("*.ptx")]
     assert compiled == {
         "finssim.extensions.perception.delivery": [True],
-        "finssim.extensions.perception.sensors": [True],
+        "finssim.extensions.perception.cameras": [True],
+        "finssim.extensions.perception.rangers": [True],
+        "finssim.extensions.perception.ray_batch": [True],
+        "finssim.extensions.perception.sonars": [True],
         "finssim.extensions.perception.sight": [True],
     }

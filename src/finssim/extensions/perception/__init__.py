@@ -10,19 +10,15 @@ from typing import TYPE_CHECKING
 from finssim.core.lazy import exports
 
 if TYPE_CHECKING:
+    from finssim.extensions.perception.cameras import CameraBatch, Headlight
     from finssim.extensions.perception.delivery import DelayedSensor
     from finssim.extensions.perception.description import World, WorldError, load_world, sites
     from finssim.extensions.perception.layout import WorldLayout
     from finssim.extensions.perception.model import WorldBatch
-    from finssim.extensions.perception.sensors import (
-        CameraBatch,
-        DopplerBatch,
-        Headlight,
-        RangeBatch,
-        SonarBatch,
-        poses_of,
-        sensor_of,
-    )
+    from finssim.extensions.perception.rangers import DopplerBatch, RangeBatch
+    from finssim.extensions.perception.ray_batch import poses_of
+    from finssim.extensions.perception.sensors import sensor_of
+    from finssim.extensions.perception.sonars import SonarBatch
 
 __all__ = [
     "CameraBatch",

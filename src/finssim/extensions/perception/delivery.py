@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from finssim.extensions.perception.description import WorldError
-from finssim.extensions.perception.sensors import RayBatch
+from finssim.extensions.perception.ray_batch import RayBatch
 from finssim.sim.sensors.sampling import (
     Sampling,
     arrival,

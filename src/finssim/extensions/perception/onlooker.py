@@ -44,8 +44,8 @@ class Onlooker:
         Raises:
             EnvironmentSetupError: Newton is not installed.
         """
+        from finssim.extensions.perception.cameras import CameraBatch
         from finssim.extensions.perception.model import WorldBatch
-        from finssim.extensions.perception.sensors import CameraBatch
 
         self._environment, self._index = environment, world
         sight, task = environment.sight, environment.task

@@ -21,18 +21,14 @@ ELEVATION_SPAN = 1.5
 """Vertical extent of a sonar's rays over its beam width: the two-way pattern is 17 dB down at its ends."""
 
 
-def camera_rays(lens: Lens, port: Port | None = None, samples: int = 1) -> Array:
-    """Rays of a picture, row 0 at the top, (height · samples, width · samples, 2, 3).
+def camera_rays(lens: Lens, port: Port | None = None) -> Array:
+    """Return the rays of a picture, row 0 at the top, (height, width, 2, 3).
 
     Args:
         lens: Pinhole, with distortion, or fisheye; in the water itself, or behind a dome centred on it.
         port: A flat window before it, at which the rays are refracted (Snell).
-        samples: Rays per pixel along each axis, evenly over it.
     """
-    u, v = (
-        (np.arange(n * samples) + 0.5) / samples - 0.5 for n in (lens.width, lens.height)
-    )  # pixel centres are integers
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
     if port is None:
         directions, valid = lens.rays(pixels)
         origins = np.zeros_like(directions)
