@@ -131,6 +131,7 @@ def seen(files):
     drawn = [camera.render(tags=tags_at(p), time=0.1 * i, seed=i) for i, p in enumerate(way)]
     for name, image in zip(("left.png", "right.png"), drawn, strict=False):
         write_picture(image, folder / "pictures" / name)
+    write_picture(drawn[0][:100], folder / "small.png")
     film = cv2.VideoWriter(
         str(folder / "dive.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (1280, 720), isColor=False
     )
@@ -275,6 +276,7 @@ def test_localize_takes_the_method(files, tmp_path, capsys, method):
     found = json.loads(capsys.readouterr().out)
     assert found["method"] == method and found["located"] > 8
     ok = np.array([row["status"] == "ok" for row in rows])
+    assert all(fine == bool(row["x"]) == (not row["reason"]) for fine, row in zip(ok, rows, strict=True))
     far = np.hypot(*(np.stack([column(rows, a) for a in "xy"]) - position(TIMES)[:, :2].T))[ok]
     refractive = method.startswith("refractive")
     assert far.max() < 1e-3 if refractive else far.max() > 1e-3
@@ -369,6 +371,7 @@ PLAIN = [*NO_DEPTH, "--depth", "0.5"]
         (["localize", "depth.csv", *PLAIN[2:]], "depth.csv: no column 'tag'"),
         (["localize", "pool.yaml", *PLAIN[2:]], "pool.yaml: expected a picture"),
         (["localize", "tags.csv", "seen/dive.avi", *PLAIN[2:]], "mixed"),
+        (["localize", "seen/small.png", *PLAIN[2:]], "1280 x 100 pixels, expected 1280 x 720"),
         (["localize", "seen/dive.avi", *PLAIN[2:], "--refine", "guess"], "unknown refinement 'guess'"),
         (["localize", "seen/dive.avi", *PLAIN[2:], "--gamma", "50"], "gamma is 50"),
         (["localize", "seen/pictures", *PLAIN[2:], "--times", "nowhere.csv"], "nowhere.csv: cannot be read"),
@@ -436,6 +439,9 @@ def test_fuse_as_json(files, tmp_path, capsys):
     assert found["rows"] == len(table(tmp_path / "fused.csv"))
     assert found["out"] == str(tmp_path / "fused.csv")
     assert found["accepted"]["vision"] > 20 and found["errors"]["fresh"]["rms_x"] < 0.02
+    assert sum(found["states"].values()) == pytest.approx(1.0)
+    assert 0.5 < found["nis_per_dimension"]["vision"] < 1.5
+    assert found["health"]["vision_mode"] == "fresh"
 
 
 @pytest.mark.parametrize("rate", [10, 250])
@@ -612,6 +618,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
         (["backproject", "uv.csv", "--pool", "pool.yaml"], "give a height z, a plane, or a column z"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--plane", "0,0,1,0"], "give one of them"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--plane", "0,0,1"], "expected four numbers a,b,c,d"),
+        (["backproject", "uv.csv", "--pool", "pool.yaml", "--plane", "0,0,0,1"], "not all zero"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "floor"], "Invalid value for '--z'"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "nan"], "'--z': nan is not a number"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--pixel-std", "0"], "positive number"),

@@ -14,8 +14,9 @@ from finssim.localization import LocalizationError
 from finssim.localization.camera_file import LensWarning, load_camera
 
 W, H, FX, FY, CX, CY = 1280, 720, 541.0, 541.2, 639.5, 359.5
-K1, K2, P1, P2, K3 = -0.21, 0.041, 0.0012, -0.0007, -0.003
+K1, K2, P1, P2, K3 = FIVE = -0.21, 0.041, 0.0012, -0.0007, -0.003
 T1, T2, T3, T4 = 0.11, -0.03, 0.02, -0.005
+STRAIGHT = (0.0,) * 5
 POINTS = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 1.0], [-0.5, 0.25, 0.9], [0.1, 0.4, 1.5]])
 MATRIX = [FX, 0.0, CX, 0.0, FY, CY, 0.0, 0.0, 1.0]
 
@@ -103,13 +104,16 @@ def ros(model, coefficients):
     )
 
 
+MESSAGE = f"width: {W}\nheight: {H}\ndistortion_model: plumb_bob\nD: {list(FIVE)}\nK: {MATRIX}\nP: {MATRIX}\n"
+"""A message of ROS 1, as `rostopic echo` prints it."""
+
 MESSAGE_2 = f"""header:
   stamp: {{sec: 17, nanosec: 5}}
   frame_id: camera
 height: {H}
 width: {W}
 distortion_model: plumb_bob
-d: {[K1, K2, P1, P2, K3]}
+d: {list(FIVE)}
 k: {MATRIX}
 r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 p: [541.0, 0.0, 639.5, 0.0, 0.0, 541.2, 359.5, 0.0, 0.0, 0.0, 1.0, 0.0]
@@ -118,6 +122,27 @@ binning_y: 0
 roi: {{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}}
 """
 """A message of ROS 2, as `ros2 topic echo` prints it."""
+
+
+KALIBR = f"""cam0:
+  camera_model: pinhole
+  distortion_coeffs: {[T1, T2, T3, T4]}
+  distortion_model: equidistant
+  intrinsics: {[FX, FY, CX, CY]}
+  resolution: {[W, H]}
+"""
+
+
+def opencv(coefficients, more=""):
+    """Return what OpenCV's FileStorage writes as YAML, under the names of its sample."""
+
+    def matrix(numbers):
+        return f"!!opencv-matrix\n   rows: {len(numbers)}\n   cols: 1\n   dt: d\n   data: {list(numbers)}\n"
+
+    return (
+        f'%YAML:1.0\n---\ncalibration_time: "Fri 20 Nov 2026"\nimage_width: {W}\nimage_height: {H}\nflags: 2\n{more}'
+        f"camera_matrix: {matrix(MATRIX)}distortion_coefficients: {matrix(coefficients)}"
+    )
 
 
 def colmap(model, *parameters):
@@ -159,24 +184,52 @@ def orb(kind, prefix="Camera", **lens):
 
 
 def matlab(**matrix):
-    """Return a .mat file with the struct of cameraParameters or cameraIntrinsics; the first pixel is 1."""
+    """Return a file with the struct of cameraParameters or cameraIntrinsics, .mat or .json; the first pixel is 1."""
     struct_ = {
         "RadialDistortion": [K1, K2, K3], "TangentialDistortion": [P1, P2], "ImageSize": [H, W],
         "WorldUnits": "mm", "NumRadialDistortionCoefficients": 3, **matrix,
     }  # fmt: skip
-    return lambda path: savemat(path, {"s": struct_}, do_compression=True)
+
+    def write(path):
+        if path.suffix == ".mat":
+            savemat(path, {"s": struct_}, do_compression=True)
+        else:
+            path.write_text(json.dumps({**struct_, "Version": {"major": 1}}))
+
+    return write
 
 
 ONE = np.array([[FX, 0, CX + 1], [0, FY, CY + 1], [0, 0, 1]])
 
+EIGHT = (*FIVE, 0.01, 0.002, -0.001)
+RATIONAL = {"below": EIGHT[5:]}
+OLDER = ONE.T.tolist()
+"""The camera matrix of older versions of MATLAB is transposed."""
+
 READ = {
+    "ROS": ("c.yaml", text(ros("plumb_bob", FIVE)), brown()),
+    "ROS rational_polynomial": ("c.yaml", text(ros("rational_polynomial", EIGHT)), brown(**RATIONAL)),
+    "ROS 1 message": ("c.yaml", text(MESSAGE), brown()),
+    "Kalibr": ("c.yaml", text(KALIBR), kannala()),
+    "Kalibr radtan": (
+        "c.yaml",
+        text(KALIBR.replace("equidistant", "radtan").replace(str([T1, T2, T3, T4]), str([K1, K2, P1, P2]))),
+        brown((K1, K2)),
+    ),
+    "OpenCV YAML": ("c.yaml", text(opencv(FIVE)), brown()),
+    "OpenCV YAML fisheye": ("c.yaml", text(opencv((T1, T2, T3, T4), "fisheye_model: 1\n")), kannala()),
+    "MATLAB as JSON": ("p.json", matlab(IntrinsicMatrix=OLDER, WorldPoints=[[0, 0], [25, 0]]), brown()),
+    "MATLAB of 2022 as JSON": ("p.json", matlab(K=ONE.tolist()), brown()),
+    "MATLAB with two radial coefficients": (
+        "p.json", matlab(K=ONE.tolist(), RadialDistortion=[K1, K2]), brown((K1, K2)),
+    ),
     "ROS equidistant": ("c.yaml", text(ros("equidistant", (T1, T2, T3, T4))), kannala()),
     "ROS kannala_brandt": ("c.yaml", text(ros("kannala_brandt", (T1, T2, T3, T4))), kannala()),
     "ROS opencv_fisheye": ("c.yaml", text(ros("opencv_fisheye", (T1, T2, T3, T4))), kannala()),
     "ROS ost.txt": ("ost.txt", text(OST), brown()),
     "ROS 2 message": ("c.yaml", text(MESSAGE_2), brown()),
     "OpenCV XML": (
-        "out.xml", text(xml(Distortion_Coefficients=xml_matrix([K1, K2, P1, P2, K3]), fisheye_model="0")), brown(),
+        "out.xml", text(xml(Distortion_Coefficients=xml_matrix(list(FIVE)), fisheye_model="0")), brown(),
     ),
     "OpenCV XML fisheye": (
         "out.xml", text(xml(distortion_coefficients=xml_matrix([T1, T2, T3, T4]), fisheye_model="1")), kannala(),
@@ -184,7 +237,7 @@ READ = {
     "OpenCV JSON": (
         "c.json",
         text(json.dumps({"image_width": W, "image_height": H, "mtx": np.reshape(MATRIX, (3, 3)).tolist(),
-                         "dist": [[K1, K2, P1, P2, K3]]})),
+                         "dist": [list(FIVE)]})),
         brown(),
     ),
     "OpenCV with the word of a model": (
@@ -193,8 +246,7 @@ READ = {
     "COLMAP OPENCV": ("cameras.txt", colmap("OPENCV", *FOCAL, K1, K2, P1, P2), brown((K1, K2))),
     "COLMAP OPENCV_FISHEYE": ("cameras.txt", colmap("OPENCV_FISHEYE", *FOCAL, T1, T2, T3, T4), kannala()),
     "COLMAP FULL_OPENCV": (
-        "cameras.txt", colmap("FULL_OPENCV", *FOCAL, K1, K2, P1, P2, K3, 0.01, 0.002, -0.001),
-        brown(below=(0.01, 0.002, -0.001)),
+        "cameras.txt", colmap("FULL_OPENCV", *FOCAL, *EIGHT), brown(**RATIONAL),
     ),
     "COLMAP binary": ("cameras.bin", colmap_binary(4, *FOCAL, K1, K2, P1, P2), brown((K1, K2))),
     "nerfstudio OPENCV": (
@@ -270,6 +322,46 @@ REFUSED = {
     "MATLAB, a great deal": (
         "p.mat", lambda path: savemat(path, {"s": {"K": np.zeros(1 << 23)}}, do_compression=True), "more than 64 MB",
     ),
+    "ROS without a size": (
+        "c.yaml", text(ros("plumb_bob", STRAIGHT).replace(f"image_height: {H}\n", "")), "add image_width and image_h",
+    ),
+    "ROS without distortion": (
+        "c.yaml", text(MESSAGE.replace(f"D: {list(FIVE)}\n", "")), "D is missing; zeros mean no distortion",
+    ),
+    "ROS of an unknown model": ("c.yaml", text(ros("eucm", (T1,) * 4)), "unknown lens model 'eucm'"),
+    "ROS with another number": (
+        "c.yaml", text(ros("plumb_bob", STRAIGHT) + "xi: 1.2\n"), "unknown key 'xi' holds numbers",
+    ),
+    "ROS, binned": ("c.yaml", text(ros("plumb_bob", STRAIGHT) + "binning_x: 2\n"), "binning_x is 2"),
+    "ROS, part of the picture": (
+        "c.yaml", text(ros("plumb_bob", STRAIGHT) + "roi: {x_offset: 8, width: 9}\n"), "roi is {",
+    ),
+    "skew": ("c.yaml", text(MESSAGE.replace(str(MATRIX), str([FX, 3.0, *MATRIX[2:]]))), "skew"),
+    "a transposed matrix": (
+        "c.yaml", text(MESSAGE.replace(str(MATRIX), str(np.reshape(MATRIX, (3, 3)).T.ravel().tolist()))),
+        "expected rows [fx, 0, cx]",
+    ),
+    "no camera matrix": (
+        "c.yaml", text(MESSAGE.replace(str(MATRIX), str([1.0, *MATRIX[1:8], 2.0]))), "expected rows [fx, 0, cx]",
+    ),
+    "eight numbers": ("c.yaml", text(MESSAGE.replace(str(MATRIX), str(MATRIX[:8]))), "K holds 8 numbers, expected 9"),
+    "Kalibr with one size": (
+        "c.yaml", text(KALIBR.replace(str([W, H]), str([W]))), "size of the image is missing: add resolution",
+    ),
+    "Kalibr of an unknown projection": ("c.yaml", text(KALIBR.replace("pinhole", "omni")), "camera_model 'omni'"),
+    "Kalibr with two cameras": (
+        "c.yaml", text(KALIBR + KALIBR.replace("cam0", "cam1")), "holds cam0, cam1, expected one camera",
+    ),
+    "MATLAB with one radial coefficient": (
+        "p.json", matlab(K=ONE.tolist(), RadialDistortion=[K1]), "RadialDistortion of 2 or 3 numbers",
+    ),
+    "MATLAB with one tangential coefficient": (
+        "p.json", matlab(K=ONE.tolist(), TangentialDistortion=[P1]), "TangentialDistortion of 2",
+    ),
+    "OpenCV with width and height, or rows and columns": (
+        "c.json", text(json.dumps({"mtx": np.reshape(MATRIX, (3, 3)).tolist(), "dist": [K1], "image_size": [W, H]})),
+        "give image_width and image_height",
+    ),
     "XML of something else": ("c.xml", text("<opencv_storage><a>1</a></opencv_storage>"), "camera_matrix is missing"),
 }  # fmt: skip
 
@@ -286,12 +378,12 @@ def test_what_is_no_lens_of_ours_is_refused_by_name(name, tmp_path):
 def test_a_principal_point_far_from_the_middle_is_questioned(tmp_path):
     """A quarter of the size away, as where width and height, or cx and cy, are exchanged; a little off is usual."""
     path, far = tmp_path / "c.yaml", f"{FX}, 0.0, 359.5, 0.0, {FY}, 639.5"
-    path.write_text(ros("plumb_bob", (0.0,) * 5).replace(f"{FX}, 0.0, {CX}, 0.0, {FY}, {CY}", far))
+    path.write_text(ros("plumb_bob", STRAIGHT).replace(f"{FX}, 0.0, {CX}, 0.0, {FY}, {CY}", far))
     with pytest.warns(
         LensWarning, match=r"principal point is .*outside the middle half of the picture of 1280 x 720"
     ):
         load_camera(path)
-    path.write_text(ros("plumb_bob", (0.0,) * 5).replace(f"{CX}", "900.0"))
+    path.write_text(ros("plumb_bob", STRAIGHT).replace(f"{CX}", "900.0"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_camera(path)

@@ -10,12 +10,10 @@ import pytest
 from finssim.core.rotations import quat_from_euler, wrap_angle
 from finssim.localization import LocalizationError, localize
 from finssim.localization.detection.detections import Frame, read_detections, write_detections
-from finssim.localization.detection.families import printable
 from finssim.localization.localize import prior_sources
 from finssim.localization.overhead_camera import write_pool
-from finssim.localization.poses.methods import METHODS, NEEDS_DEPTH
 from finssim.vehicles import load_vehicle
-from localization.poses.seen_vehicle import POOLS, TAGS, rotation, seen
+from localization.poses.seen_vehicle import POOLS, rotation, seen
 
 LATENCY = 0.05
 POOL = replace(POOLS["tilted water"], latency=LATENCY)
@@ -119,19 +117,6 @@ def test_reading_at_the_stamp_would_miss(files):
     assert errors(rows)[0] > 8e-4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_runs_from_files(files, method, capsys):
-    """A file of detections gives a row per picture with every method; those without need of depth work without."""
-    depth = 0.5 if method in NEEDS_DEPTH else None
-    found, rows = located(files, method=method, depth=depth, imu=files / "imu.csv")
-    assert len(rows) == 50
-    assert f"with method {method}" in capsys.readouterr().out
-    assert all((row["status"] == "ok") == bool(row["x"]) == (not row["reason"]) for row in rows)
-    if method == "refractive-6dof":
-        assert sum(row["status"] == "ok" for row in rows) > 40
-
-
 def test_a_constant_depth_needs_no_time(files, capsys):
     """Pictures without time stamps are located with one depth; without IMU as level, and it says so."""
     position, angles = np.array([0.3, -0.2, 0.4]), np.array([0.0, 0.0, 0.5])
@@ -147,37 +132,6 @@ def test_a_constant_depth_needs_no_time(files, capsys):
     assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a depth sensor's centimetre
     _, rows = located(files, depth=files / "depth.csv")
     assert "no time stamp" in rows[0]["reason"]
-
-
-def test_a_gap_in_the_depth_is_not_bridged(files):
-    """Between samples 3 s apart nothing is interpolated."""
-    lines = (files / "depth.csv").read_text().splitlines()
-    kept = [lines[0], *(line for line in lines[1:] if not 3.0 < float(line.split(",")[0]) < 6.0)]
-    (files / "depth.csv").write_text("\n".join(kept) + "\n")
-    _, rows = located(files, depth=files / "depth.csv", imu=files / "imu.csv")
-    refused = [row for row in rows if "apart" in row["reason"]]
-    assert len(refused) == 14
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "needs --depth"),
-        ({"method": "pinhole-depth"}, "needs --depth"),
-        ({"method": "snell"}, "unknown method 'snell'; available: refractive"),
-        ({"depth": "inf"}, "depth is inf"),
-        ({"depth": "missing.csv"}, "cannot be read"),
-        ({"depth": 0.5, "vehicle": "bluerov2"}, "has no tags"),
-        ({"depth": 0.5, "pixel_std": 0.0}, "pixel_std"),
-        ({"depth": 0.5, "tilt_std_deg": -1.0}, "tilt_std"),
-    ],
-)
-def test_what_cannot_be_used_is_said_in_one_sentence(files, options, words):
-    """Nothing is written then."""
-    with pytest.raises(LocalizationError, match=words) as refused:
-        located(files, **options)
-    assert "\n" not in str(refused.value)
-    assert not (files / "out.csv").exists()
 
 
 @pytest.mark.parametrize(
@@ -217,22 +171,6 @@ def test_tags_of_another_family_are_not_ours(files):
     assert rows[0]["reason"] == "no tag of family tag25h9 seen: tag36h11"
 
 
-def test_an_interrupt_keeps_the_rows_so_far(files, monkeypatch):
-    """After Ctrl-C the table holds what was measured until then, and the interrupt goes on."""
-    measured = []
-
-    def measure(*arguments):
-        if len(measured) == 7:
-            raise KeyboardInterrupt
-        measured.append(1)
-        return METHODS["pinhole"](*arguments)
-
-    monkeypatch.setitem(METHODS, "refractive", measure)
-    with pytest.raises(KeyboardInterrupt):
-        located(files, depth=0.5)
-    assert len((files / "out.csv").read_text().splitlines()) == 8
-
-
 def test_height_follows_from_pressure_behind_a_wall(tmp_path):
     """Where the plane is a wall, the surface is the world frame's origin."""
     pool = replace(POOLS["window wall"], world_position=(0.0, 0.0, 1.2))
@@ -240,55 +178,3 @@ def test_height_follows_from_pressure_behind_a_wall(tmp_path):
     found = known.at(0.0, needs_height=True)
     assert found.z_b == pytest.approx(1.2 - 0.5 + 0.115)
     assert found.up == (0.0, 0.0, 1.0)
-
-
-def drawn(position, angles, up):
-    """A picture of the two tags on gray."""
-    cv2 = pytest.importorskip("cv2")
-    image = np.full((POOL.camera.lens.height, POOL.camera.lens.width), 200, np.uint8)
-    for detection in seen(POOL, position, angles, up=up):
-        plate = printable("tag25h9", detection.tag, pixels_per_cell=20, margin=0.0)
-        size = len(plate) - 0.5
-        flat = np.array([[-0.5, -0.5], [size, -0.5], [size, size], [-0.5, size]], np.float32)
-        H = cv2.getPerspectiveTransform(flat, detection.corners.astype(np.float32))
-        shape = (image.shape[1], image.shape[0])
-        inside = cv2.warpPerspective(np.ones_like(plate), H, shape, flags=cv2.INTER_NEAREST) > 0
-        image[inside] = cv2.warpPerspective(plate, H, shape, flags=cv2.INTER_AREA)[inside]
-    return cv2.GaussianBlur(image, (0, 0), 0.8)
-
-
-UP = tuple(POOL.interface.normal)
-
-
-def test_pictures_give_what_their_detections_give(files):
-    """Tags drawn into a picture are located to 5 mm; a picture of another size than the lens is refused."""
-    cv2 = pytest.importorskip("cv2")
-    position, angles = np.array([0.2, -0.1, 0.8]), np.array([0.0, 0.0, 0.5])
-    image = drawn(position, angles, UP)
-    cv2.imwrite(str(files / "a_0.5.png"), image)
-    depth = -float(POOL.interface.distance(position + rotation(angles, UP) @ PORT))
-    ((frame, measured),) = localize.run([files / "a_0.5.png"], **given(files, depth=depth)).rows
-    assert frame.time == 0.5
-    assert measured.ok, measured.reason
-    assert measured.tags == tuple(TAGS)
-    assert np.abs(measured.position - position).max() < 0.005
-    cv2.imwrite(str(files / "small.png"), image[:100])
-    with pytest.raises(LocalizationError, match="1280 x 100 pixels, expected 1280 x 720"):
-        localize.run([files / "small.png"], **given(files, depth=depth))
-
-
-def test_a_video_is_followed(files):
-    """Every picture of a short video of a vehicle under way is located to 3 cm at a rough depth, with rising times."""
-    cv2 = pytest.importorskip("cv2")
-    path = files / "dive.avi"
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (1280, 720), isColor=False)
-    way = [np.array([0.2 + 0.03 * i, -0.1, 0.7]) for i in range(6)]
-    for position in way:
-        film.write(drawn(position, np.zeros(3), UP))
-    film.release()
-    found = localize.run(path, **given(files, depth=0.3))
-    assert [frame.image for frame, _ in found.rows] == [f"dive.avi#{i}" for i in range(6)]
-    assert (np.diff([frame.time for frame, _ in found.rows]) > 0.05).all()
-    for position, (_, measured) in zip(way, found.rows, strict=True):
-        assert measured.ok, measured.reason
-        assert np.abs(measured.position - position)[:2].max() < 0.03

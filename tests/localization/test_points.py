@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import sys
 from pathlib import Path
 
@@ -134,19 +133,6 @@ def test_the_error_of_a_pixel_becomes_one_of_the_point(tmp_path, pool, capsys):
     np.testing.assert_allclose(found, scatter, rtol=0.05)  # standard error of a standard deviation: 1.1 %
 
 
-def test_json(tmp_path, pool, capsys):
-    """The counts, and the table or where it is."""
-    run_project(given(tmp_path, POINTS), pool=pool, as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert (said["rows"], said["ok"]) == (3, 1)
-    assert said["rejected"] == {"wrong_side": 1, "outside_image": 1}
-    assert said["table"][0]["id"] == "near"
-    run_project(given(tmp_path, POINTS), pool=pool, as_json=True, out=tmp_path / "o.csv")
-    said = json.loads(capsys.readouterr().out)
-    assert said["out"] == str(tmp_path / "o.csv") and "table" not in said
-    assert len(table((tmp_path / "o.csv").read_text(encoding="utf-8"))) == 3
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -168,20 +154,3 @@ def test_wrong_tables_are_refused_by_line(tmp_path, pool, text, words):
         run_project(given(tmp_path, text), pool=pool, out=tmp_path / "out.csv")
     assert words in str(refused.value) and "points.csv" in str(refused.value)
     assert not (tmp_path / "out.csv").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, "the plane of the points is missing"),
-        ({"z": 0.1, "plane": "0,0,1,0"}, "give one of them"),
-        ({"plane": "0,0,1"}, "expected four numbers a,b,c,d"),
-        ({"plane": "0,0,0,1"}, "not all zero"),
-        ({"z": float("nan")}, "expected a finite height"),
-        ({"z": 0.1, "pixel_std": 0.0}, "expected a positive number of pixels"),
-    ],
-)
-def test_planes_that_are_none_are_refused(tmp_path, pool, options, words):
-    """One sentence says what to give."""
-    with pytest.raises(LocalizationError, match=words):
-        run_backproject(given(tmp_path, "u,v\n600,300\n"), pool=pool, **options)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from finssim.core.files import OutputError
 from finssim.core.optics import Interface, back_project
 from finssim.localization.camera_file import write_camera
 from finssim.localization.overhead_camera import load_pool
@@ -72,38 +71,6 @@ def test_the_lens_is_as_sure_as_its_file_remembers(pool):
 
 
 @pytest.mark.slow
-def test_json_holds_what_was_promised(pool, capsys):
-    calibrated(pool, "surface: {}", as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert said["kind"] == "pool" and said["out"] == str(pool / "pool.yaml")
-    assert said.keys() >= {
-        "parameters",
-        "residual",
-        "held_out",
-        "pinhole",
-        "findings",
-        "provenance",
-        "correlation",
-    }
-    assert said["parameters"]["camera_z"].keys() == {"estimate", "ci95", "unit", "identifiable", "note"}
-    assert said["held_out"]["rms_cm"] < said["pinhole"]["held_out"]["rms_cm"]
-
-
-@pytest.mark.slow
-def test_a_report_has_its_pictures(pool):
-    calibrated(pool, "surface: {}", report=pool / "report")
-    names = {path.name for path in (pool / "report").iterdir()}
-    assert names >= {
-        "report.html",
-        "fit.json",
-        "map.png",
-        "picture.png",
-    }
-    page = (pool / "report" / "report.html").read_text(encoding="utf-8")
-    assert "camera_height" in page and "finssim calibrate pool" in page and "http" not in page
-
-
-@pytest.mark.slow
 def test_a_tank_with_its_window_surveyed(tmp_path, capsys):
     camera, plane = before_tank(30.0), window()
     write_camera(tmp_path / "camera.yaml", TANK_LENS, {})
@@ -117,42 +84,27 @@ def test_a_tank_with_its_window_surveyed(tmp_path, capsys):
     assert "camera_distance" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_equal_inputs_write_equal_files(pool):
-    for name in ("a.yaml", "b.yaml"):
-        calibrated(pool, out=name)
-    assert (pool / "a.yaml").read_bytes() == (pool / "b.yaml").read_bytes()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"out": "pool.txt"}, "expected .yaml"),
-        ({"points": "nowhere.csv"}, "no such file"),
         ({"text": "surface: {height: -1.0}"}, "other side"),
         (
             {"text": "surface: {height: 100.0}"},
             "surface: height 100 puts the plane 100 m from the points.*unit",
         ),
         ({"text": "surface: {}\npoints: nowhere.csv"}, "nowhere.csv"),
-        ({"text": "fit: [pose, colour]\nsurface: {}"}, "survey.yaml: unknown 'colour'"),
     ],
 )
 def test_refusals_write_nothing(pool, options, words):
     with pytest.raises(CalibrationError, match=words):
         calibrated(pool, **options)
-    assert not (pool / options.get("out", "pool.yaml")).exists()
+    assert not (pool / "pool.yaml").exists()
 
 
 def test_pixels_of_another_resolution_are_refused(pool):
     write_camera(pool / "half.yaml", type(PLUMB_BOB)(640, 360, 270.0, 270.0, 341.0, 174.0), {})
     with pytest.raises(CalibrationError, match="another resolution"):
         calibrated(pool, camera=pool / "half.yaml")
-
-
-def test_a_folder_of_other_things_is_no_report(pool):
-    with pytest.raises(OutputError, match="already holds files"):
-        calibrated(pool, report=pool)
 
 
 def test_parts_of_the_picture_are_no_pixels(pool):
