@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from finssim.core.rotations import quat_from_euler, quat_rotate
@@ -32,31 +33,14 @@ LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
 WIDEST = 300.0
 """Spread of coordinates beyond which the file must state the unit [m]."""
 
-_ALIASES = {
-    "u": "u px pxx col column ximg ximage imagex imgx xpx upx pixelx xpixel pixelu upixel xpix pixx imgu "
-    "imageu uimg",
-    "v": "v py pxy row yimg yimage imagey imgy ypx vpx pixely ypixel pixelv vpixel ypix pixy imgv imagev "
-    "vimg",
-    "x": "x worldx floorx xworld xfloor objx objectx xobj xw wx poolx xpool xp tankx xtank realx xreal "
-    "easting",
-    "y": "y worldy floory yworld yfloor objy objecty yobj yw wy pooly ypool yp tanky ytank realy yreal "
-    "northing",
-    "z": "z worldz floorz zworld zfloor objz objectz zobj zw wz poolz zpool zp tankz ztank realz zreal "
-    "elevation",
-    "id": "id point pointid pt ptid name marker markerid label n no nr index",
-    "tag": "tag tagid",
-    "image": "image img file filename imagename picture photo frame",
-    "sigma": "sigma std error uncertainty survey_sigma surveysigma",
-    "edge": "edge size tagsize tagedge side",
-    "yaw": "yaw heading psi",
-    "roll": "roll phi",
-    "pitch": "pitch theta",
-    "group": "group location board target",
-    "dry": "dry above abovewater inair air",
+_BY_WORD = {
+    word: name
+    for name, words in yaml.safe_load(
+        Path(__file__).with_name("columns.yaml").read_text(encoding="utf-8")
+    ).items()
+    for word in words.split()
 }
-"""Standard name of a column -> what people call it, without case, blanks and signs."""
-
-_BY_WORD = {word: name for name, words in _ALIASES.items() for word in words.split()}
+"""What people call a column (`columns.yaml`) -> its standard name."""
 
 COMMENT = ("#", "%", "//")
 

@@ -15,6 +15,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import yaml
 
 from finssim.core.budget import read_bytes
 from finssim.core.importer import Importer
@@ -24,7 +25,7 @@ from finssim.core.yaml_file import read_mapping
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields, lens_of, model_of, only
 
-__all__ = ["KALIBR", "MATLAB", "OPENCV", "ROS", "key_in", "read_tree", "refuse_strange"]
+__all__ = ["KALIBR", "MATLAB", "OPENCV", "OTHER_KEYS", "ROS", "key_in", "read_tree", "refuse_strange"]
 
 LARGEST = 64 << 20
 """Greatest size of a MATLAB file, and of a variable in it once unpacked [bytes]."""
@@ -32,16 +33,13 @@ COMPRESSED = 15
 """Number of a packed variable in a MATLAB file."""
 PART_OF_PICTURE = ("binning_x", "binning_y", "roi")
 """Keys of ROS that change what a pixel is, unless their numbers are 0 or 1."""
-OF_ROS = {"camera_name", "rectification_matrix", "projection_matrix", "header", "R", "P", "r", "p"}
-"""Keys of ROS that are no part of the lens."""
-OF_KALIBR = {"rostopic", "cam_overlaps", "T_cam_imu", "T_cn_cnm1", "timeshift_cam_imu"}
-"""Keys of Kalibr that are no part of the lens."""
-OF_OPENCV = {
-    "nframes", "nrofframes", "boardwidth", "boardheight", "squaresize", "markersize", "aspectratio", "fixaspectratio",
-    "flags", "calibrationtime", "avgreprojectionerror", "perviewreprojectionerrors", "extrinsicparameters",
-    "imagepoints", "gridpoints", "rms", "reprojectionerror",
-}  # fmt: skip
-"""Keys of OpenCV's samples that are no part of the lens, as `_plain` writes them."""
+OTHER_KEYS: dict[str, list[str]] = {
+    program: keys.split()
+    for program, keys in yaml.safe_load(
+        Path(__file__).with_name("other_keys.yaml").read_text(encoding="utf-8")
+    ).items()
+}
+"""Program -> keys of its files that are no part of the lens (`other_keys.yaml`)."""
 OPENCV_WORDS = {
     "width": ("imagewidth", "width"), "height": ("imageheight", "height"),
     "matrix": ("cameramatrix", "k", "mtx", "intrinsicmatrix"),
@@ -49,13 +47,6 @@ OPENCV_WORDS = {
     "model": ("distortionmodel", "cameramodel", "lensmodel", "model"), "fisheye": ("fisheyemodel",),
 }  # fmt: skip
 """Part of a lens -> keys of files that programs write with OpenCV, as `_plain` writes them."""
-OF_MATLAB = {
-    "WorldPoints", "WorldUnits", "EstimateSkew", "NumRadialDistortionCoefficients", "EstimateTangentialDistortion",
-    "RotationVectors", "TranslationVectors", "ReprojectionErrors", "DetectedKeypoints", "Version", "NumPatterns",
-    "MeanReprojectionError", "PatternExtrinsics", "ReprojectedPoints", "IntrinsicMatrix", "K", "FocalLength",
-    "PrincipalPoint", "Skew", "ImageSize", "RadialDistortion", "TangentialDistortion",
-}  # fmt: skip
-"""Fields of MATLAB's cameraParameters and cameraIntrinsics."""
 
 
 # What the readers share.
@@ -179,7 +170,7 @@ def read_ros(path: Path) -> Lens:
     if "camera_matrix" not in tree:
         names = ("width", "height", *(("K", "D") if "K" in tree else ("k", "d")))
     width, height, matrix, distortion = names
-    refuse_strange(tree, {*names, "distortion_model", *OF_ROS}, label)
+    refuse_strange(tree, {*names, "distortion_model", *OTHER_KEYS["ros"]}, label)
     given = _flat(_required(tree, distortion, label, ZEROS), label)
     model = model_of(Fields(tree, label).word("distortion_model"), label)
     return lens_of(
@@ -255,7 +246,7 @@ def read_kalibr(path: Path) -> Lens:
             "calibrate with pinhole-radtan or pinhole-equi"
         )
     known = {"camera_model", "distortion_model", "distortion_coeffs", "intrinsics", "resolution"}
-    refuse_strange(tree, {*known, *OF_KALIBR}, label)
+    refuse_strange(tree, {*known, *OTHER_KEYS["kalibr"]}, label)
     word = fields.word("distortion_model")
     given = _flat(_required(tree, "distortion_coeffs", label, ZEROS), label)
     focal = _flat(_required(tree, "intrinsics", label), label)
@@ -292,7 +283,7 @@ def read_opencv(path: Path) -> Lens:
         raise LocalizationError(
             f"{label}: image_size may be width and height, or rows and columns: give image_width and image_height"
         )
-    refuse_strange(plain, {*found.values(), *OF_OPENCV}, label)
+    refuse_strange(plain, {*found.values(), *OTHER_KEYS["opencv"]}, label)
     size = (plain.get(found["width"]), plain.get(found["height"]))
     model = _model_of_opencv(plain, given, label)
     return lens_of(
@@ -358,7 +349,7 @@ def read_matlab(path: Path) -> Lens:
             f"{label}: MATLAB's fisheyeParameters have a model (Scaramuzza's) that is not read: calibrate with "
             "estimateCameraParameters, or with another program"
         )
-    refuse_strange(tree, OF_MATLAB, label)
+    refuse_strange(tree, OTHER_KEYS["matlab"], label)
     if tree.get("K") is not None:
         matrix = _flat(tree["K"], label)
     elif tree.get("IntrinsicMatrix") is not None:  # the older one is transposed

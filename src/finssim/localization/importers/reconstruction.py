@@ -15,7 +15,7 @@ from finssim.core.importer import Importer
 from finssim.core.optics import Lens
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields, lens_of
-from finssim.localization.importers.calibration import key_in, read_tree, refuse_strange
+from finssim.localization.importers.calibration import OTHER_KEYS, key_in, read_tree, refuse_strange
 
 __all__ = ["COLMAP", "NERFSTUDIO", "ORB_SLAM"]
 
@@ -150,12 +150,6 @@ def _binary(data: bytes, path: Path) -> Cameras:
 
 OF_ONE = ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")
 """Keys of nerfstudio that describe a lens."""
-OF_SCENE = (
-    "frames", "applied_transform", "applied_scale", "camera_angle_x", "camera_angle_y", "aabb_scale", "scale", "offset",
-    "ply_file_path", "orientation_override", "auto_scale_poses_override", "n_extra_learnable_dims", "train_filenames",
-    "val_filenames", "test_filenames", "up", "from_na",
-)  # fmt: skip
-"""Keys of nerfstudio and instant-ngp that are no part of the lens."""
 
 
 def read_nerfstudio(path: Path) -> Lens:
@@ -174,7 +168,7 @@ def read_nerfstudio(path: Path) -> Lens:
                 f"{label}: its frames have different lenses, expected one: keep one frame"
             )
     fields = Fields(given, label)
-    refuse_strange(tree, (*OF_ONE, *OF_SCENE), label)
+    refuse_strange(tree, (*OF_ONE, *OTHER_KEYS["nerfstudio"]), label)
     name = fields.word("camera_model", "OPENCV_FISHEYE" if tree.get("is_fisheye") is True else "OPENCV")
     model, _ = MODELS.get(name, ("", ""))
     if not model:
@@ -190,19 +184,6 @@ def read_nerfstudio(path: Path) -> Lens:
 
 TYPES = {"PinHole": "plumb_bob", "Rectified": "plumb_bob", "KannalaBrandt8": "fisheye"}
 """Camera.type of ORB-SLAM3 -> our lens model."""
-OF_CAMERA = {
-    "fps",
-    "RGB",
-    "bf",
-    "newWidth",
-    "newHeight",
-    "type",
-    "width",
-    "height",
-    "overlappingBegin",
-    "overlappingEnd",
-}
-"""Words after `Camera.` that are no number of the lens."""
 
 
 def read_orb_slam(path: Path) -> Lens:
@@ -217,7 +198,7 @@ def read_orb_slam(path: Path) -> Lens:
     of_lens, fields = {}, Fields(tree, label)
     for key in tree:
         prefix, _, name = str(key).partition(".")
-        if prefix in ("Camera", "Camera1") and name not in OF_CAMERA:
+        if prefix in ("Camera", "Camera1") and name not in OTHER_KEYS["orb_slam"]:
             if not re.fullmatch(r"fx|fy|cx|cy|k\d|p\d", name):
                 raise fields.error(f"unknown key '{key}': remove it if it is no part of the lens")
             of_lens[name] = fields.number(key)
