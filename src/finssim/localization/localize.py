@@ -61,15 +61,6 @@ class PriorSources:
     assumed: tuple[str, ...]
     """Sentences on what was assumed."""
 
-    @property
-    def settings(self) -> dict[str, float]:
-        """Standard deviations, as plain values. Units are in the names."""
-        return {
-            "depth_std": self.base.z_std,
-            "tilt_std_deg": math.degrees(self.base.tilt_std),
-            "shared_pixel_std": self.base.shared_pixel_std,
-        }
-
     def at(self, time: float, *, needs_height: bool) -> Constraints | str | None:
         """Height and tilt at a time [s], or why they are not known; None where nothing is known nor needed.
 
@@ -233,19 +224,14 @@ class Locator:
     def locate(self, frame: Frame) -> PoseMeasurement:
         """The pose in one picture, or why there is none."""
         locate = self._locate
-        of_family = [
-            detection for detection in frame.detections if _name(detection.family) in ("", self.family)
-        ]
-        constraints = None
-        if of_family:
-            prior = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
-            if isinstance(prior, str):
-                return refused(locate.method, prior)
-            constraints = prior
-        elif frame.detections:
-            other = ", ".join(sorted({detection.family for detection in frame.detections}))
+        of_family = [d for d in frame.detections if _name(d.family) in ("", self.family)]
+        if frame.detections and not of_family:
+            other = ", ".join(sorted({d.family for d in frame.detections}))
             return refused(locate.method, f"no tag of family {self.family} seen: {other}")
-        return locate(of_family, constraints)
+        if not of_family:
+            return locate([], None)
+        prior = self.known.at(frame.time - locate.pool.latency, needs_height=locate.needs_height)
+        return refused(locate.method, prior) if isinstance(prior, str) else locate(of_family, prior)
 
 
 @cache
@@ -285,17 +271,8 @@ def _cells(frame: Frame, measurement: PoseMeasurement) -> list[Any]:
     if not measurement.ok:
         return [time, frame.image, *[""] * (len(COLUMNS) - 7), tags, "", "", "refused", measurement.reason]
     C = measurement.covariance
-    numbers = [
-        measurement.x,
-        measurement.y,
-        measurement.z,
-        measurement.yaw,
-        *measurement.std,
-        measurement.roll,
-        measurement.pitch,
-        *measurement.quaternion,
-    ]
-    numbers += [C[0, 1], C[0, 2], C[1, 2], measurement.residual_px]
+    numbers = [*measurement.position, measurement.yaw, *measurement.std, measurement.roll, measurement.pitch]
+    numbers += [*measurement.quaternion, C[0, 1], C[0, 2], C[1, 2], measurement.residual_px]
     texts = [f"{float(x):.9g}" for x in numbers]
     return [time, frame.image, *texts, tags, measurement.corners, measurement.medium, "ok", ""]
 
@@ -444,14 +421,6 @@ class ImageTables:
     times: str | Path | None = None
     """(FILE) Table with columns image, time [s], if the image names contain none."""
 
-    @property
-    def sources(self) -> dict[str, str | None]:
-        """Sources of depth and tilt, as plain values."""
-        return {
-            "depth": None if self.depth is None else str(self.depth),
-            "imu": None if self.imu is None else str(self.imu),
-        }
-
 
 @dataclass(frozen=True, kw_only=True)
 class LocalizeSettings:
@@ -527,8 +496,21 @@ def run(
         "interrupted": result.interrupted,
     }
     if as_json:
-        about = {**tables.sources, "pixel_std": pixel_std, **prior.settings}
-        print(json.dumps(_document(result.summary, site, str(pool), body, about), allow_nan=False))
+        document = {
+            **result.summary,
+            "pool": {"file": str(pool), "sha256": site.sha256},
+            "vehicle": {"name": body.name, "sha256": body.sha256},
+            "settings": {
+                "depth": None if tables.depth is None else str(tables.depth),
+                "imu": None if tables.imu is None else str(tables.imu),
+                "pixel_std": pixel_std,
+                "depth_std": prior.base.z_std,
+                "tilt_std_deg": math.degrees(prior.base.tilt_std),
+                "shared_pixel_std": prior.base.shared_pixel_std,
+            },
+            "provenance": provenance(),
+        }
+        print(json.dumps(document, allow_nan=False))
     else:
         _print(result.summary)
     if result.interrupted:
@@ -556,19 +538,6 @@ def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> Lo
     except KeyboardInterrupt:
         result.interrupted = True
     return result
-
-
-def _document(
-    summary: dict[str, Any], pool: Pool, file: str, vehicle: Vehicle, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """The summary with what it rests on."""
-    return {
-        **summary,
-        "pool": {"file": file, "sha256": pool.sha256},
-        "vehicle": {"name": vehicle.name, "sha256": vehicle.sha256},
-        "settings": settings,
-        "provenance": provenance(),
-    }
 
 
 def _print(summary: dict[str, Any]) -> None:

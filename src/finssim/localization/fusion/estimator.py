@@ -224,14 +224,8 @@ def mode_of(age: float, settings: Settings) -> str:
     """The vision state at that age of vision [s]; NaN: there was none."""
     if math.isnan(age):
         return "uninitialized"
-    for mode, limit in (
-        ("fresh", settings.ages.fresh),
-        ("coast", settings.ages.coast),
-        ("hold", settings.ages.hold),
-    ):
-        if age <= limit + 1e-9:
-            return mode
-    return "lost"
+    limits = {mode: getattr(settings.ages, mode) for mode in MODES[1:4]}
+    return next((mode for mode, limit in limits.items() if age <= limit + 1e-9), MODES[-1])
 
 
 def health_of(

@@ -21,7 +21,7 @@ from finssim.localization.detection.detections import Frame
 from finssim.localization.fusion.estimator import MODES, Estimator, Fixes, Health
 from finssim.localization.fusion.fuse_log import Log, NoFix, StreamTable, load_log, series
 from finssim.localization.fusion.fuse_settings import settings_of, site_of
-from finssim.localization.fusion.streams import PoseEstimate, Sample
+from finssim.localization.fusion.streams import USED, PoseEstimate, Sample
 from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.localization.poses.methods import TagLocator, check_method
 from finssim.vehicles import Vehicle, load_vehicle
@@ -38,7 +38,6 @@ COLUMNS = (
 )
 """Metres, m/s, rad, rad/s; pool frame. `n_` count the samples taken in so far."""
 
-USED = ("accepted", "initialized", "reacquired")
 GAP = 0.25
 """Truth is not interpolated over longer gaps [s]."""
 

@@ -182,10 +182,9 @@ def read_stream_table(path: str | Path) -> StreamTable:
             table.words[name] = list(cells)
         else:
             table.numbers[name] = np.array(values, float)
-    if time is not None and time not in table.numbers:
+    if time not in table.numbers:
         raise LocalizationError(f"{path}: column '{time}' holds no numbers: write times in seconds")
-    if time is not None:
-        table.t = table.numbers.pop(time)
+    table.t = table.numbers.pop(time)
     return table
 
 

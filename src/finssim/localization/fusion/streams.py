@@ -150,6 +150,10 @@ def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
 # What comes out: what became of a sample, and where the vehicle is.
 
 
+USED = ("accepted", "initialized", "reacquired")
+"""Verdicts on samples that update the state."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Result of one sample."""
@@ -165,7 +169,7 @@ class Outcome:
     @property
     def used(self) -> bool:
         """Return whether the state was updated by it."""
-        return self.verdict in ("accepted", "initialized", "reacquired")
+        return self.verdict in USED
 
 
 @dataclass(frozen=True)

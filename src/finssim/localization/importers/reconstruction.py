@@ -12,7 +12,7 @@ from pathlib import Path
 
 from finssim.core.budget import read_bytes
 from finssim.core.importer import Importer
-from finssim.core.optics import Lens
+from finssim.core.optics import COEFFICIENTS, Lens
 from finssim.localization import LocalizationError
 from finssim.localization.camera_file import Fields, lens_of
 from finssim.localization.importers.calibration import OTHER_KEYS, key_in, read_tree, refuse_strange
@@ -37,12 +37,6 @@ MODELS = {
     "THIN_PRISM_FISHEYE": ("", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
 }  # fmt: skip
 """Model of COLMAP, in the order of its numbers -> ours, empty if there is none, and its parameters."""
-ORDER = {
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
-"""Model -> its coefficients, in the order of `Lens`."""
 
 
 def _lens(
@@ -57,7 +51,7 @@ def _lens(
         label: What a message calls the camera.
         first: Centre of the first pixel in the file [px].
     """
-    order = ORDER[model]
+    order = COEFFICIENTS[model]
     if strange := [
         name for name, x in values.items() if re.fullmatch(r"[kp]\d", name) and x and name not in order
     ]:
@@ -72,6 +66,15 @@ def _lens(
         },
         label,
     )  # fmt: skip
+
+
+def _model(name: str, refusal: str) -> tuple[str, str]:
+    """Return our model and the parameters of a model of COLMAP; a refusal begins with the text given."""
+    model, words = MODELS.get(name, ("", ""))
+    if not model:
+        readable = ", ".join(known for known, (ours, _) in MODELS.items() if ours)
+        raise LocalizationError(f"{refusal}, expected one of {readable}")
+    return model, words
 
 
 # COLMAP
@@ -92,10 +95,7 @@ def read_colmap(path: Path) -> Lens:
         )
     number, name, size, parameters = cameras[0]
     label = f"{path}: camera {number}"
-    model, words = MODELS.get(name, ("", ""))
-    if not model:
-        readable = ", ".join(known for known, (ours, _) in MODELS.items() if ours)
-        raise LocalizationError(f"{label}: its model is {name[:40]}, expected one of {readable}")
+    model, words = _model(name, f"{label}: its model is {name[:40]}")
     names = words.split()
     if len(parameters) != len(names):
         raise LocalizationError(f"{label}: {name} has {len(parameters)} numbers, expected {words}")
@@ -170,10 +170,7 @@ def read_nerfstudio(path: Path) -> Lens:
     fields = Fields(given, label)
     refuse_strange(tree, (*OF_ONE, *OTHER_KEYS["nerfstudio"]), label)
     name = fields.word("camera_model", "OPENCV_FISHEYE" if tree.get("is_fisheye") is True else "OPENCV")
-    model, _ = MODELS.get(name, ("", ""))
-    if not model:
-        readable = ", ".join(known for known, (ours, _) in MODELS.items() if ours)
-        raise fields.error(f"camera_model is '{name[:40]}', expected one of {readable}")
+    model, _ = _model(name, f"{label}: camera_model is '{name[:40]}'")
     values = {key: fields.number(key, 0.0) for key in OF_ONE if re.fullmatch(r"[kp]\d", key)}
     values |= {"fx": fields.number("fl_x"), "fy": fields.number("fl_y", fields.number("fl_x"))}
     values |= {key: fields.number(key) for key in ("cx", "cy")}
