@@ -131,77 +131,90 @@ def load_survey_file(path: str | Path) -> SurveyFile:
 
 
 def _survey_file(top: Fields, path: Path) -> SurveyFile:
-    kinds = [kind for kind in ("surface", "window") if top.given(kind)]
-    if len(kinds) != 1:
-        count = "both surface and window are" if kinds else "neither surface nor window is"
-        raise top.error(
-            f"{count} given, expected one: what the camera looks through (surface: {{}} is enough)"
-            + (
-                f"; give this file as points: {path.name} of a survey file"
-                if top.given("tag_bundles")
-                else ""
-            )
-        )
-    sections = {"": top, **{name: top.section(name) for name in ("tags", "water", "camera", *kinds)}}
-    tags, interface = sections["tags"], sections[kinds[0]]
-    options: dict[str, Any] = {}
-    for section, key, setting in _SETTINGS:
-        value = _number(sections[section], key) if section in sections else None
-        if value is not None:
-            options[setting] = math.radians(value) if key.endswith("_deg") else value
-    if options.get("folds", 2.0) % 1.0:
-        raise top.error(f"folds is {options['folds']:g}, expected an integer")
-    if "folds" in options:
-        options["folds"] = int(options["folds"])
-    window = kinds == ["window"]
-    if window:
-        try:
-            options["window"] = Layer(interface.number("thickness"), interface.number("index"))
-        except OpticsError as error:
-            raise interface.error(str(error)) from None
-        if interface.take("plane") is not None:
-            options["plane"] = interface.numbers("plane", 4)
-    place, sigmas = (
-        (("plane",), ("place_sigma", "tilt_sigma"))
-        if window
-        else (("water_height", "water_depth"), ("place_sigma",))
-    )
-    if options.keys() & {*sigmas} and not options.keys() & {*place}:
-        lack = "plane" if window else "height or depth"
-        raise interface.error(f"a standard deviation is given without {lack}: add what it is of")
+    kind = _interface_kind(top, path)
+    sections = {"": top, **{name: top.section(name) for name in ("tags", "water", "camera", kind)}}
+    tags, settings = sections["tags"], _numbers(sections) | _interface(sections[kind], kind)
+    _refuse_lone_sigma(sections[kind], kind, settings)
     names = top.take("fit")
     if names is not None:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise top.error(
                 f"fit is {names!r}, expected a list of names, such as [pose, height, tilt, index]"
             )
-        options["fit"] = tuple(names)
-    words = {"points": _word(top, "points"), "unit": _word(top, "unit"), "family": _word(tags, "family")}
-    sizes = _word(tags, "sizes")
+        settings["fit"] = tuple(names)
+    points, unit, sizes = _word(top, "points"), _word(top, "unit"), _word(tags, "sizes")
     layout = TagLayout({}) if sizes is None else _layout(path.parent / sizes)
-    words["family"] = words["family"] or layout.family or None
-    if words["unit"] is not None and words["unit"] not in METRES:
-        raise top.error(f"unknown unit '{words['unit']}'; available: {', '.join(METRES)}")
-    if words["family"] is not None:
-        family_named(words["family"])
+    family = _word(tags, "family") or layout.family or None
+    if unit is not None and unit not in METRES:
+        raise top.error(f"unknown unit '{unit}'; available: {', '.join(METRES)}")
+    if family is not None:
+        family_named(family)
     grid = _grid(top.section("grid")) if top.given("grid") else {}
-    if grid and words["points"] is not None:
+    if grid and points is not None:
         raise top.error("points and grid are given, expected one of them")
     file = SurveyFile(
         path=path,
-        settings=options,
-        points=None if words["points"] is None else path.parent / words["points"],
+        settings=settings,
+        points=None if points is None else path.parent / points,
         grid=grid,
-        unit=words["unit"],
+        unit=unit,
         z=_number(top, "z"),
         edge=_number(tags, "edge"),
         edges=layout.sizes,
-        family=words["family"],
+        family=family,
         latency=sections["camera"].number("latency", 0.0),
     )
     for section in sections.values():
         section.finish()
     return file
+
+
+def _interface_kind(top: Fields, path: Path) -> str:
+    """Return `surface` or `window`, of which the file has one."""
+    kinds = [kind for kind in ("surface", "window") if top.given(kind)]
+    if len(kinds) == 1:
+        return kinds[0]
+    count = "both surface and window are" if kinds else "neither surface nor window is"
+    bundle = f"; give this file as points: {path.name} of a survey file" if top.given("tag_bundles") else ""
+    raise top.error(
+        f"{count} given, expected one: what the camera looks through (surface: {{}} is enough){bundle}"
+    )
+
+
+def _numbers(sections: Mapping[str, Fields]) -> dict[str, Any]:
+    """Return the numbers that are arguments of `PoolFitSettings`, in SI."""
+    options: dict[str, Any] = {}
+    for section, key, setting in _SETTINGS:
+        value = _number(sections[section], key) if section in sections else None
+        if value is not None:
+            options[setting] = math.radians(value) if key.endswith("_deg") else value
+    if "folds" in options:
+        if options["folds"] % 1.0:
+            raise sections[""].error(f"folds is {options['folds']:g}, expected an integer")
+        options["folds"] = int(options["folds"])
+    return options
+
+
+def _interface(fields: Fields, kind: str) -> dict[str, Any]:
+    """Return the window and its plane, where the camera looks through one."""
+    if kind == "surface":
+        return {}
+    try:
+        options: dict[str, Any] = {"window": Layer(fields.number("thickness"), fields.number("index"))}
+    except OpticsError as error:
+        raise fields.error(str(error)) from None
+    if fields.take("plane") is not None:
+        options["plane"] = fields.numbers("plane", 4)
+    return options
+
+
+def _refuse_lone_sigma(fields: Fields, kind: str, options: Mapping[str, Any]) -> None:
+    """Refuse a standard deviation of a place that is not given."""
+    places, sigmas, lack = ("water_height", "water_depth"), ("place_sigma",), "height or depth"
+    if kind == "window":
+        places, sigmas, lack = ("plane",), ("place_sigma", "tilt_sigma"), "plane"
+    if options.keys() & {*sigmas} and not options.keys() & {*places}:
+        raise fields.error(f"a standard deviation is given without {lack}: add what it is of")
 
 
 def _layout(path: Path) -> TagLayout:
