@@ -538,6 +538,46 @@ FLOOR = 1e-4
 """Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
 
 
+class ParameterPrior:
+    """Knowledge of theta beforehand: of the parameters and of the lags of the streams.
+
+    Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a solution,
+    over short segments, nothing else keeps them finite. Streams agree on the time to hundredths of a second.
+    """
+
+    def __init__(self, parameters: Parameters, streams: int, released: bool) -> None:
+        """Set up for a number of streams, of segments that are driven or `released`."""
+        P, judged = len(parameters.names), len(parameters.names) - parameters.nuisances
+        none = np.zeros(streams)
+        self.mean = np.concatenate([parameters.expected, none])
+        size = np.array([VAGUE * c.scale if c.std is None else c.std for c in parameters.coordinates])
+        size[judged:] = parameters.scale[judged:]
+        rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[:judged]]
+        self.rigid = np.concatenate([rigid, np.full(parameters.nuisances + streams, np.nan)])
+        self.known = np.concatenate([size**-1.0, none])
+        clocks = LATE_STD**2 * np.eye(streams) + CLOCK_STD**2
+        if "thrust_delay" in parameters.names or released:
+            # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
+            clocks = np.diag(np.where(np.arange(streams) == 0, EXACT_CLOCK, CLOCK_STD) ** 2)
+        rows, target = parameters.prior_rows()
+        self.rows = np.zeros((len(rows) + streams, P + streams))
+        self.rows[: len(rows), :P] = rows
+        self.rows[len(rows) :, P:] = np.linalg.inv(np.linalg.cholesky(clocks))
+        self.target = np.concatenate([target, none])
+
+    def __call__(self, theta: Array, weight: float) -> tuple[Array, Array]:
+        """Return the whitened differences of vectors (..., P), (..., R), and the slopes of one vector, (R, P).
+
+        Both are multiplied by a weight [-].
+        """
+        logarithmic = np.isfinite(self.rigid)
+        whole, mean = theta + self.rigid, self.mean + self.rigid
+        whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
+        off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.mean)
+        off = weight * np.concatenate([off * self.known, theta @ self.rows.T - self.target], axis=-1)
+        return off, weight * np.concatenate([np.diag(np.atleast_2d(self.known / whole)[0]), self.rows])
+
+
 class Shooting:
     """Residuals of segments under parameters and initial states.
 
@@ -551,7 +591,6 @@ class Shooting:
         low: Least theta, (P,).
         high: Largest theta, (P,).
         prior_std: Of z around zero, (S, q).
-        prior_mean: What is known of theta beforehand, (P,).
         released: Whether nothing drives any segment.
         coasts: Whether, besides, the axes come to rest by drag alone.
         farthest: Greatest deviations of z, (q,): of the time of a change half the time between its samples.
@@ -587,94 +626,86 @@ class Shooting:
         self.segments, self.parameters = tuple(segments), parameters
         self.groups = np.array([s.index for s in segments])
         self.measured = Residuals(segments, channels)
-        names = self.measured.names
-        known = np.stack([s.start.known for s in segments])
-        # Heading and place are free where something that is compared depends on them.
-        flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
-        turned = flat or "yaw" in names or any(s.current.any() for s in segments)
-        felt = [turned, "x" in names, "y" in names, {"z", "depth"} & set(names) or not deep]
-        self.free = np.concatenate(
-            [np.arange(8), 8 + np.flatnonzero(known[:, 8:].any(axis=0) & [bool(x) for x in felt])]
-        )
-        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
-        unknown = UNKNOWN if swinging is None else np.where(swinging[:, None], UNMOVED, UNKNOWN)
-        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, self.free]
-        self.released = bool(swinging is not None and swinging.all())
+        self.edges = self.measured.edges
+        self.few, self._correlated, self.repeats = few, correlated, 1.0
+        self.judged = len(parameters.names) - parameters.nuisances
+        swings = np.zeros(len(segments), bool) if swinging is None else swinging
+        self.released = bool(swings.all())
         self.coasts = self.released and {AXES.index(a) for a in parameters.axes} <= set(COASTING)
-        pulls = self._pulls(np.zeros(len(segments), bool) if swinging is None else swinging, twisted)
-        pulled = np.flatnonzero(pulls.any(axis=0))
-        self.free = np.concatenate([self.free, 12 + pulled])  # unknowns 12 to 17
-        states_std = np.hstack([states_std, np.maximum(pulls[:, pulled], 1e-9)])
-        self._steps = np.append(STEPS, np.full(6, 0.1 * PULL * parameters.vehicle.weight))
+        self.lagged = np.array([s.drive.commanded for s in segments]) if lagged is None else lagged
         longest = LONGEST_DELAY if "thrust_delay" in parameters.names else 0.5
         self.rollouts = Rollouts(parameters.vehicle, segments, max_delay=longest)
-        changes = np.arange(self.rollouts.changes.max())
-        self.free = np.concatenate([self.free, 18 + changes])
-        states_std = np.hstack(
-            [states_std, np.where(changes < self.rollouts.changes[:, None], CHANGE_STD, 1e-9)]
-        )
-        self._steps = np.append(self._steps, np.full(len(changes), CHANGE_STEP))
-        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(names))
-        # The initial height already takes up an offset of the depth, unless z is measured too.
-        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
-        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
-        self._stream = np.array([stream_of[c] for c in names], int)[self.measured.channel]
-        rows = [names.index(name) for name in self.offsets]
-        self._offset = (self.measured.channel[:, None] == np.array(rows, int)).astype(float)
-        offsets_std = np.tile([OFFSETS[c] for c in self.offsets], (len(segments), 1))
-        for name, (angle, rate) in DRIFTING_REST.items() if swinging is not None and swinging.any() else ():
-            if angle in names:
-                channel = np.array(names)[self.measured.channel]
-                column = np.where(channel == angle, self.measured.time, channel == rate)
-                self.offsets += (name,)
-                self._offset = np.column_stack([self._offset, column])
-                offsets_std = np.column_stack([offsets_std, np.where(swinging, DRIFT_STD, 1e-9)])
-                offsets_std[swinging, self.offsets.index(angle)] = REST_STD
-        # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
-        vehicle, self._leverage = parameters.vehicle, np.zeros((len(segments), 6, MAX_THRUSTERS))
-        by_thruster, sideways = np.array([s.drive.thrusters for s in segments]), horizontal(vehicle)
-        self._by_thruster = by_thruster[:, None, None]
-        for j, (name, thruster) in enumerate(vehicle.thrusters.items()):
-            if name in sideways:
-                self._leverage[by_thruster, 3, j] = -thruster.axis[1]
-                self._leverage[by_thruster, 4, j] = thruster.axis[0]
-        self.edges = self.measured.edges
-        self.few = few
-        self.judged = len(parameters.names) - parameters.nuisances
+        self.streams = tuple(stream for stream, of in STREAMS.items() if set(of) & set(self.measured.names))
+        self.prior_std = np.concatenate([self._states(swings, twisted), self._sensors(swings)], axis=1)
+        self.farthest = np.full(self.prior_std.shape[1], np.inf)
+        self.farthest[np.flatnonzero(self.free >= 18)] = 0.5
         far = np.full(len(self.streams), LATEST)
         self.low = np.concatenate([parameters.low, -far])
         self.high = np.concatenate([parameters.high, far])
-        # Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a
-        # solution, over short segments, nothing else keeps them finite. Streams agree on the time to hundredths
-        # of a second.
-        self.prior_mean = np.concatenate([parameters.expected, 0.0 * far])
-        size = np.array([VAGUE * c.scale if c.std is None else c.std for c in parameters.coordinates])
-        size[self.judged :] = parameters.scale[self.judged :]
-        known = size**-1.0
-        rigid = [np.nan if c.rigid is None else c.rigid for c in parameters.coordinates[: self.judged]]
-        self._rigid = np.concatenate([rigid, np.full(parameters.nuisances + len(far), np.nan)])
-        self._known = np.concatenate([known, 0.0 * far])
-        forces = [name in ("heave.d1", "heave.d2", "buoyancy_excess") for name in parameters.names]
-        self._relative_step = np.where(np.array(forces) & self.released, FORCE_STEP, RELATIVE_STEP)
-        clocks = LATE_STD**2 * np.eye(len(far)) + CLOCK_STD**2
-        if "thrust_delay" in parameters.names or self.released:
-            # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
-            clocks = np.diag(np.where(np.arange(len(far)) == 0, EXACT_CLOCK, CLOCK_STD) ** 2)
-        self.prior_std = np.concatenate([states_std, offsets_std], axis=1)
-        self.farthest = np.full(self.prior_std.shape[1], np.inf)
-        self.farthest[np.flatnonzero(self.free >= 18)] = 0.5
-        self.lagged = np.array([s.drive.commanded for s in segments]) if lagged is None else lagged
+        self._prior = ParameterPrior(parameters, len(self.streams), self.released)
+        forces = np.isin(parameters.names, ("heave.d1", "heave.d2", "buoyancy_excess"))
+        self._relative_step = np.where(forces & self.released, FORCE_STEP, RELATIVE_STEP)
+        # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
+        by_thruster, sideways = (
+            np.array([s.drive.thrusters for s in segments]),
+            horizontal(parameters.vehicle),
+        )
+        self._by_thruster = by_thruster[:, None, None]
+        self._leverage = np.zeros((len(segments), 6, MAX_THRUSTERS))
+        for j, (name, thruster) in enumerate(parameters.vehicle.thrusters.items()):
+            if name in sideways:
+                self._leverage[by_thruster, 3, j] = -thruster.axis[1]
+                self._leverage[by_thruster, 4, j] = thruster.axis[0]
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
         self._grown = np.ones(len(segments))  # by how much changes of the start grew when last linearised
         self._latest: tuple[Point, Linearization, bool] | None = None
-        self.repeats, self._correlated = 1.0, correlated
-        rows, target = parameters.prior_rows()
-        P, clock = len(parameters.names), np.linalg.inv(np.linalg.cholesky(clocks))
-        self._rows = np.zeros((len(rows) + len(far), P + len(far)))
-        self._rows[: len(rows), :P], self._rows[len(rows) :, P:] = rows, clock
-        self._target = np.concatenate([target, 0.0 * far])
+
+    def _states(self, swinging: NDArray[np.bool_], twisted: bool) -> Array:
+        """Choose the initial states, pulls and times of changes that are free, and return their standard deviations.
+
+        `swinging` and `twisted` are those of the constructor.
+        """
+        segments, names, changes = self.segments, self.measured.names, self.rollouts.changes
+        known = np.stack([s.start.known for s in segments])
+        # Heading and place are free where something that is compared depends on them.
+        flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
+        turned = flat or "yaw" in names or any(s.current.any() for s in segments)
+        felt = [turned, "x" in names, "y" in names, {"z", "depth"} & set(names) or not deep]
+        somewhere = np.flatnonzero(known[:, 8:].any(axis=0) & [bool(x) for x in felt])
+        states = np.concatenate([np.arange(8), 8 + somewhere])
+        seen = np.array([[any(c in s.measured for c in columns) for columns in SHOWN_BY] for s in segments])
+        unknown = np.where(swinging[:, None], UNMOVED, UNKNOWN)
+        states_std = np.where(known, np.where(seen, LOOSE, TIGHT), unknown)[:, states]
+        pulls = self._pulls(swinging, twisted)
+        pulled = np.flatnonzero(pulls.any(axis=0))
+        times = np.arange(changes.max())
+        self.free = np.concatenate([states, 12 + pulled, 18 + times])
+        push = 0.1 * PULL * self.parameters.vehicle.weight
+        self._steps = np.concatenate([STEPS, np.full(6, push), np.full(len(times), CHANGE_STEP)])
+        times_std = np.where(times < changes[:, None], CHANGE_STD, 1e-9)
+        return np.hstack([states_std, np.maximum(pulls[:, pulled], 1e-9), times_std])
+
+    def _sensors(self, swinging: NDArray[np.bool_]) -> Array:
+        """Choose the errors of sensors that a fit allows for, and return the standard deviations of offsets."""
+        m, names = self.measured, self.measured.names
+        # The initial height already takes up an offset of the depth, unless z is measured too.
+        self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
+        stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
+        self._stream = np.array([stream_of[c] for c in names], int)[m.channel]
+        rows = [names.index(name) for name in self.offsets]
+        self._offset = (m.channel[:, None] == np.array(rows, int)).astype(float)
+        std = np.tile([OFFSETS[c] for c in self.offsets], (len(self.segments), 1))
+        for name, (angle, rate) in DRIFTING_REST.items() if swinging.any() else ():
+            if angle in names:
+                channel = np.array(names)[m.channel]
+                column = np.where(channel == angle, m.time, channel == rate)
+                self.offsets += (name,)
+                self._offset = np.column_stack([self._offset, column])
+                std = np.column_stack([std, np.where(swinging, DRIFT_STD, 1e-9)])
+                std[swinging, self.offsets.index(angle)] = REST_STD
+        return std
 
     def _pulls(self, swinging: NDArray[np.bool_], twisted: bool) -> Array:
         """Return the standard deviations of the constant pulls on the vehicle in each segment [N, N m], (S, 6).
@@ -707,13 +738,7 @@ class Shooting:
 
         Samples count as independent in a cost, so that what is known counts `repeats` times.
         """
-        whole, mean = theta + self._rigid, self.prior_mean + self._rigid
-        logarithmic = np.isfinite(self._rigid)
-        whole = np.where(logarithmic, np.maximum(whole, 1e-3 * np.abs(mean)), 1.0)
-        off = np.where(logarithmic, np.log(whole / np.where(logarithmic, mean, 1.0)), theta - self.prior_mean)
-        weight = np.sqrt(self.repeats)
-        off = weight * np.concatenate([off * self._known, theta @ self._rows.T - self._target], axis=-1)
-        return off, weight * np.concatenate([np.diag(np.atleast_2d(self._known / whole)[0]), self._rows])
+        return self._prior(theta, np.sqrt(self.repeats))
 
     @property
     def names(self) -> tuple[str, ...]:
