@@ -9,9 +9,9 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.autopilot import FRAMES
 
 pytest.importorskip("rosbags")
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.rosbag2 import StoragePlugin
+
+from trials.importers.bags import T0, Bag, xyz
 
 HEADER = "std_msgs/Header header\n"
 BEAM = "int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid\n"
@@ -32,181 +32,83 @@ TYPES = {
     + "float64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\nfloat64 altitude\n"
     "waterlinked_a50_ros_driver/DVLBeam[] beams\nbool velocity_valid\nint64 status\nstring form",
 }
-N, T0 = 100, 1_760_000_000
+N = 100
 TIMES = np.arange(N) * 0.1
 PULSES = np.stack([1500.0 + 20.0 * (i + 1) * np.sin(TIMES + i) for i in range(8)], axis=-1).round()
 
 
-def store(kind):
-    types = get_typestore(Stores.ROS2_HUMBLE if kind == 2 else Stores.ROS1_NOETIC)
-    for name, text in TYPES.items():
-        types.register(get_types_from_msg(text, name))
-    return types
-
-
-class Bag:
-    """Messages of one bag, in ROS 1 or ROS 2."""
+class VehicleBag(Bag):
+    """A bag of an ArduSub with MAVROS and a Doppler log."""
 
     def __init__(self, kind=2):
-        self.kind, self.types, self.queue = kind, store(kind), []
-
-    def __call__(self, name, **fields):
-        return self.types.types[name.replace("/", "/msg/", 1)](**fields)
-
-    def header(self, t, frame=""):
-        whole = int(T0 + t)
-        stamp = self("builtin_interfaces/Time", sec=whole, nanosec=round((T0 + t - whole) * 1e9))
-        more = {"seq": 0} if self.kind == 1 else {}
-        return self("std_msgs/Header", stamp=stamp, frame_id=frame, **more)
-
-    def vector(self, *values):
-        return self("geometry_msgs/Vector3", **dict(zip("xyz", values, strict=True)))
-
-    def add(self, topic, kind, make, rate=10.0, delay=0.003):
-        for i, t in enumerate(TIMES):
-            if i % round(10.0 / rate) == 0:
-                self.queue.append((round((T0 + t + delay) * 1e9), topic, kind, make(i, float(t))))
-        return self
+        super().__init__(kind, TYPES)
 
     def imu(self, topic="/mavros/imu/data", known=(True, True, True), scale=1.0):
-        covariances = [np.full(9, 0.0 if good else -1.0) for good in known]
         names = ("orientation", "angular_velocity", "linear_acceleration")
+        unknown = {
+            f"{name}_covariance": np.full(9, -1.0)
+            for name, good in zip(names, known, strict=True)
+            if not good
+        }
         return self.add(
             topic,
             "sensor_msgs/Imu",
-            lambda i, t: self(
-                "sensor_msgs/Imu",
-                header=self.header(t),
-                orientation=self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=np.sin(t / 2), w=np.cos(t / 2)),
-                angular_velocity=self.vector(
+            lambda i, t: {
+                "orientation": {"z": np.sin(t / 2), "w": np.cos(t / 2)},
+                "angular_velocity": xyz(
                     *(scale * np.array([0.1 * np.sin(t), 0.2 * np.sin(t), 1.0 + 0.1 * t]))
                 ),
-                linear_acceleration=self.vector(*(scale * np.array([0.1 * t, 0.1 * np.sin(t), 9.8 + t]))),
-                **{f"{name}_covariance": c for name, c in zip(names, covariances, strict=True)},
-            ),
+                "linear_acceleration": xyz(*(scale * np.array([0.1 * t, 0.1 * np.sin(t), 9.8 + t]))),
+                **unknown,
+            },
         )
 
-    def odom(self, topic="/mavros/local_position/odom", turn=True, bad=lambda i: False):
+    def odom(self, topic="/mavros/local_position/odom", bad=lambda i: False):
         def make(i, t):
             six = np.zeros(36)
             six[0] = -1.0 if bad(i) else 0.1
-            pose = self(
-                "geometry_msgs/Pose",
-                position=self("geometry_msgs/Point", x=np.sin(t), y=0.0, z=-1.0 - 0.1 * np.sin(t)),
-                orientation=self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            )
-            twist = self(
-                "geometry_msgs/Twist",
-                linear=self.vector(np.cos(t), 0.1 * t, 0.0),
-                angular=self.vector(9.0, 9.0, 9.0),
-            )
-            return self(
-                "nav_msgs/Odometry",
-                header=self.header(t, "map"),
-                child_frame_id="base_link",
-                pose=self("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
-                twist=self("geometry_msgs/TwistWithCovariance", twist=twist, covariance=six),
-            )
+            pose = {"position": xyz(np.sin(t), 0.0, -1.0 - 0.1 * np.sin(t)), "orientation": {"w": 1.0}}
+            twist = {"linear": xyz(np.cos(t), 0.1 * t, 0.0), "angular": xyz(9.0, 9.0, 9.0)}
+            return {"pose": {"pose": pose}, "twist": {"twist": twist, "covariance": six}}
 
         return self.add(topic, "nav_msgs/Odometry", make)
 
     def twist(self, topic, value=5.0):
-        return self.add(
-            topic,
-            "geometry_msgs/TwistStamped",
-            lambda i, t: self(
-                "geometry_msgs/TwistStamped",
-                header=self.header(t),
-                twist=self(
-                    "geometry_msgs/Twist", linear=self.vector(value, t, t), angular=self.vector(t, t, t)
-                ),
-            ),
-        )
+        make = lambda i, t: {"twist": {"linear": xyz(value, t, t), "angular": xyz(t, t, t)}}  # noqa: E731
+        return self.add(topic, "geometry_msgs/TwistStamped", make)
 
     def pressure(self, topic="/mavros/imu/static_pressure", scale=1.0):
-        return self.add(
-            topic,
-            "sensor_msgs/FluidPressure",
-            lambda i, t: self(
-                "sensor_msgs/FluidPressure",
-                header=self.header(t),
-                fluid_pressure=scale * (101325.0 + 9806.65 * (2.0 + np.sin(t))),
-                variance=0.0,
-            ),
-        )
+        make = lambda i, t: {"fluid_pressure": scale * (101325.0 + 9806.65 * (2.0 + np.sin(t)))}  # noqa: E731
+        return self.add(topic, "sensor_msgs/FluidPressure", make)
 
     def rel_alt(self, value=lambda t: -2.0 - np.sin(t)):
-        make = lambda i, t: self("std_msgs/Float64", data=float(value(t)))  # noqa: E731
+        make = lambda i, t: {"data": float(value(t))}  # noqa: E731
         return self.add("/mavros/global_position/rel_alt", "std_msgs/Float64", make)
 
     def outputs(self):
-        make = lambda i, t: self(  # noqa: E731
-            "mavros_msgs/RCOut", header=self.header(t), channels=np.r_[PULSES[i], [0] * 8].astype(np.uint16)
-        )
+        make = lambda i, t: {"channels": np.r_[PULSES[2 * i], [0] * 8].astype(np.uint16)}  # noqa: E731
         return self.add("/mavros/rc/out", "mavros_msgs/RCOut", make, rate=5.0)
 
     def pilot(self, sticks, kind="OverrideRCIn", topic="/mavros/rc/override"):
-        more = (lambda t: {}) if kind == "OverrideRCIn" else (lambda t: {"header": self.header(t), "rssi": 0})
-        make = lambda i, t: self(  # noqa: E731
-            f"mavros_msgs/{kind}", channels=np.r_[sticks(t), [65535] * 12].astype(np.uint16), **more(t)
-        )
+        make = lambda i, t: {"channels": np.r_[sticks(t), [65535] * 12].astype(np.uint16)}  # noqa: E731
         return self.add(topic, f"mavros_msgs/{kind}", make)
 
     def state(self, armed, mode=lambda t: "MANUAL"):
-        return self.add(
-            "/mavros/state",
-            "mavros_msgs/State",
-            lambda i, t: self(
-                "mavros_msgs/State",
-                header=self.header(t),
-                connected=True,
-                armed=bool(armed(t)),
-                guided=False,
-                manual_input=True,
-                mode=mode(t),
-                system_status=3,
-            ),
-        )
+        make = lambda i, t: {"connected": True, "armed": bool(armed(t)), "mode": mode(t)}  # noqa: E731
+        return self.add("/mavros/state", "mavros_msgs/State", make)
 
-    def dvl(self, topic="/dvl/data", valid=lambda i: True, package="waterlinked_a50_ros_driver"):
-        return self.add(
-            topic,
-            f"{package}/DVL",
-            lambda i, t: self(
-                f"{package}/DVL",
-                header=self.header(t),
-                time=100.0,
-                velocity=self.vector(np.sin(t), -np.cos(t), -0.1)
-                if valid(i)
-                else self.vector(0.56, 0.0, 0.0),
-                fom=0.002 if i % 10 else 2.0,
-                altitude=1.0,
-                beams=[],
-                velocity_valid=bool(valid(i)),
-                status=0,
-                form="json_v2",
-            ),
-        )
-
-    def write(self, path, broken=()):
-        """Write the bag; the messages of some topics are cut."""
-        path = path.with_suffix("" if self.kind == 2 else ".bag")
-        writer = (
-            Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) if self.kind == 2 else Writer1(path)
-        )
-        with writer:
-            names = {topic: kind.replace("/", "/msg/", 1) for _, topic, kind, _ in self.queue}
-            known = {t: writer.add_connection(t, kind, typestore=self.types) for t, kind in names.items()}
-            for ns, topic, _, message in sorted(self.queue, key=lambda item: item[0]):
-                pack = self.types.serialize_cdr if self.kind == 2 else self.types.serialize_ros1
-                raw = pack(message, names[topic])
-                writer.write(known[topic], ns, raw[:10] if topic in broken else raw)
-        return path
+    def dvl(self, topic="/dvl/data", valid=lambda i: True):
+        make = lambda i, t: {  # noqa: E731
+            "velocity": xyz(np.sin(t), -np.cos(t), -0.1) if valid(i) else xyz(0.56, 0.0, 0.0),
+            "fom": 0.002 if i % 10 else 2.0,
+            "velocity_valid": bool(valid(i)),
+        }
+        return self.add(topic, "waterlinked_a50_ros_driver/DVL", make)
 
 
 @pytest.fixture(params=[1, 2], ids=["ROS 1", "ROS 2"])
 def bag(request):
-    return Bag(request.param)
+    return VehicleBag(request.param)
 
 
 def one(path, **options):
@@ -225,11 +127,7 @@ def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
     bag.twist("/mavros/setpoint_velocity/cmd_vel").twist("/mavros/local_position/velocity_local").twist(
         "/cmd_vel"
     )
-    bag.add(
-        "/mavros/vfr_hud",
-        "mavros_msgs/VfrHud",
-        lambda i, t: bag("mavros_msgs/VfrHud", header=bag.header(t), airspeed=0.0),
-    )
+    bag.add("/mavros/vfr_hud", "mavros_msgs/VfrHud", lambda i, t: {"airspeed": 0.0})
     path = bag.write(tmp_path / "dive")
     trial = one(path)
     for i in range(8):
@@ -259,16 +157,13 @@ def test_fixes_become_metres_from_the_first(bag, tmp_path, topic):
     north, east = 20.0 * TIMES / TIMES[-1], 10.0 * np.sin(TIMES)
     lat = 45.0 + np.degrees(north / 6367381.8)  # radius of the meridian at 45°
     lon = 7.0 + np.degrees(east / (6388838.3 * np.cos(np.radians(45.0))))  # radius of the normal
-    kind = "sensor_msgs/NavSatFix"
-    nothing = {"position_covariance": np.zeros(9), "position_covariance_type": 0, "altitude": 51.0}
 
     def make(i, t):
         lost = i % 7 == 3
-        status = bag("sensor_msgs/NavSatStatus", status=-1 if lost else 0, service=1)
-        place = {"latitude": 0.0, "longitude": 0.0} if lost else {"latitude": lat[i], "longitude": lon[i]}
-        return bag(kind, header=bag.header(t), status=status, **place, **nothing)
+        place = {} if lost else {"latitude": lat[i], "longitude": lon[i]}
+        return {"status": {"status": -1 if lost else 0, "service": 1}, "altitude": 51.0, **place}
 
-    trial = one(bag.imu().add(topic, kind, make).write(tmp_path / "a"))
+    trial = one(bag.imu().add(topic, "sensor_msgs/NavSatFix", make).write(tmp_path / "a"))
     good = np.arange(N) % 7 != 3
     np.testing.assert_allclose(trial.series("x")[1], (east - east[0])[good], atol=1e-3)
     np.testing.assert_allclose(trial.series("y")[1], north[good], atol=1e-3)
@@ -286,17 +181,8 @@ def test_parameters_of_the_autopilot_give_the_directions_of_the_motors(bag, tmp_
 
     def make(i, t):
         name, value = told[i % len(told)]
-        if bag.kind == 1:
-            number = bag("mavros_msgs/ParamValue", integer=int(value), real=0.0)
-        else:
-            empty = {k: np.zeros(0) for k in ("byte_array_value", "bool_array_value", "integer_array_value")}
-            number = bag(
-                "rcl_interfaces/ParameterValue", type=2, bool_value=False, integer_value=int(value),
-                double_value=0.0, string_value="", double_array_value=np.zeros(0), string_array_value=[], **empty,
-            )  # fmt: skip
-        more = {"param_index": i % len(told), "param_count": len(told)}
-        kind = "mavros_msgs/Param" if bag.kind == 1 else "mavros_msgs/ParamEvent"
-        return bag(kind, header=bag.header(t), param_id=name, value=number, **more)
+        ros2 = {"type": 2, "integer_value": int(value)}
+        return {"param_id": name, "value": {"integer": int(value)} if bag.kind == 1 else ros2}
 
     bag.imu().outputs()
     plain = one(bag.write(tmp_path / "plain"))
@@ -311,13 +197,13 @@ def test_parameters_of_the_autopilot_give_the_directions_of_the_motors(bag, tmp_
 
 
 def test_without_a_vehicle_outputs_keep_their_numbers(tmp_path):
-    trial = one(Bag().outputs().imu().write(tmp_path / "a"), vehicle=None)
+    trial = one(VehicleBag().outputs().imu().write(tmp_path / "a"), vehicle=None)
     assert {f"pwm_C{i}" for i in range(1, 9)} <= set(trial.channels) and "pwm_C9" not in trial.channels
 
 
 def test_pressure_gives_the_depth_where_rel_alt_is_dead(tmp_path):
     """A column that never changes loses to one that moves; kilopascals are told from their size."""
-    trial = one(Bag().imu().rel_alt(lambda t: 0.0).pressure(scale=1e-3).write(tmp_path / "a"))
+    trial = one(VehicleBag().imu().rel_alt(lambda t: 0.0).pressure(scale=1e-3).write(tmp_path / "a"))
     density = load_vehicle("bluerov2_heavy").water.density
     np.testing.assert_allclose(
         trial.series("depth")[1],
@@ -329,7 +215,7 @@ def test_pressure_gives_the_depth_where_rel_alt_is_dead(tmp_path):
 
 def test_a_dead_sensor_loses_to_one_that_moves(tmp_path):
     """Two IMUs of one kind: the one whose rates are zero throughout is left out, with one sentence."""
-    trial = one(Bag().imu("/a/imu", scale=0.0).imu("/b/imu").write(tmp_path / "a"))
+    trial = one(VehicleBag().imu("/a/imu", scale=0.0).imu("/b/imu").write(tmp_path / "a"))
     np.testing.assert_allclose(trial.series("p")[1], 0.1 * np.sin(TIMES), atol=1e-12)
     (note,) = [item for item in trial.findings if item.code == "stream_dead"]
     assert note.values["topic"] == "/a/imu" and set(note.values["columns"]) == {
@@ -347,7 +233,7 @@ def test_pilots_channels_go_through_the_mixer_in_manual(tmp_path, kind):
     """Forward at half: by ArduSub's own factors. Disarmed nothing turns, and other modes are left out and counted."""
     forward, released = 1700.0, 65535.0
     sticks = lambda t: [1500, 1500, 1500, 1500, forward if t != 5.0 else released, 1500]  # noqa: E731
-    bag = Bag().imu().pilot(sticks, kind, "/mavros/rc/in" if kind == "RCIn" else "/mavros/rc/override")
+    bag = VehicleBag().imu().pilot(sticks, kind, "/mavros/rc/in" if kind == "RCIn" else "/mavros/rc/override")
     bag.state(lambda t: t >= 2.0, lambda t: "ALT_HOLD" if t >= 8.0 else "MANUAL")
     trial = one(bag.write(tmp_path / "a"))
     factors = np.array(dict(FRAMES.values())["VECTORED_6DOF"], float)[:, 4]
@@ -404,14 +290,14 @@ def test_one_unusable_topic_does_not_refuse_a_bag(bag, tmp_path):
     )
     assert "no sample is valid" in texts["/dvl/data"]
     with pytest.raises(CalibrationError, match="cannot be read"):
-        one(Bag().odom().write(tmp_path / "b", broken=("/mavros/local_position/odom",)))
+        one(VehicleBag().odom().write(tmp_path / "b", broken=("/mavros/local_position/odom",)))
 
 
 def test_a_topic_with_the_clock_of_another_computer_is_timed_by_receipt(tmp_path):
     """Stamps that count from the start of an autopilot beside Unix times."""
-    bag = Bag().imu().pressure()
+    bag = VehicleBag().imu().pressure()
     header = bag.header
-    bag.header = lambda t, frame="": header(t - T0 + 100.0, frame)
+    bag.header = lambda t: header(t - T0 + 100.0)
     bag.twist("/sensor/twist", 0.5)
     bag.header = header
     trial = one(bag.write(tmp_path / "a"))
@@ -421,13 +307,7 @@ def test_a_topic_with_the_clock_of_another_computer_is_timed_by_receipt(tmp_path
 
 def test_a_bag_without_definitions_of_mavros_is_read(tmp_path):
     """Recorders before ROS 2 Iron write none; those of an unknown type stop nothing."""
-    bag = Bag().outputs().imu()
-    bag.write(tmp_path / "full")
-    writer = Writer(tmp_path / "old", version=8, storage_plugin=StoragePlugin.SQLITE3)
-    with writer:
-        names = {topic: kind.replace("/", "/msg/", 1) for _, topic, kind, _ in bag.queue}
-        known = {t: writer.add_connection(t, kind, typestore=bag.types) for t, kind in names.items()}
-        for ns, topic, _, message in sorted(bag.queue, key=lambda item: item[0]):
-            writer.write(known[topic], ns, bag.types.serialize_cdr(message, names[topic]))
+    bag = VehicleBag().outputs().imu()
+    bag.write(tmp_path / "old", version=8, storage=StoragePlugin.SQLITE3)
     trial = one(tmp_path / "old")
     np.testing.assert_array_equal(trial.series("pwm_T3")[1], PULSES[::2, 2])

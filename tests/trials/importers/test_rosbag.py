@@ -10,111 +10,47 @@ from finssim.trials.importers.dispatch import read_trials
 
 pytest.importorskip("rosbags")
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE.register(
-    get_types_from_msg(
-        "std_msgs/Header header\nstring[] name\nfloat64[] speed\nstring state", "lab_msgs/msg/Motors"
-    )
-)
-T = STORE.types
-START = 1_700_000_000_000_000_000
-LATENCY = 30_000_000
-"""From the stamp of a message to its arrival [ns]."""
+from trials.importers.bags import T0, Bag, xyz
+
+MOTORS = "std_msgs/Header header\nstring[] name\nfloat64[] speed\nstring state"
+LATENCY = 0.03
+"""From the stamp of a message to its arrival [s]."""
 
 
-def header(ns):
-    stamp = T["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-    return T["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link")
+def odometry(i, t):
+    turned = {"z": np.sqrt(0.5), "w": np.sqrt(0.5)}
+    twist = {"linear": xyz(0.5, 0.02, -0.01), "angular": xyz(0.0, 0.0, 0.3)}
+    return {
+        "pose": {"pose": {"position": xyz(0.1 * i, 0.0, -1.0), "orientation": turned}},
+        "twist": {"twist": twist},
+    }
 
 
-def vector(x, y, z):
-    return T["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
-
-
-def quaternion(x, y, z, w):
-    return T["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
-
-
-def odometry(ns, i):
-    pose = T["geometry_msgs/msg/Pose"](
-        position=T["geometry_msgs/msg/Point"](x=0.1 * i, y=0.0, z=-1.0),
-        orientation=quaternion(0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)),
-    )
-    twist = T["geometry_msgs/msg/Twist"](linear=vector(0.5, 0.02, -0.01), angular=vector(0.0, 0.0, 0.3))
-    six = np.zeros(36)
-    return T["nav_msgs/msg/Odometry"](
-        header=header(ns),
-        child_frame_id="base_link",
-        pose=T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=six),
-        twist=T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=six),
-    )
-
-
-def imu(ns, i):
-    nine = np.zeros(9)
-    return T["sensor_msgs/msg/Imu"](
-        header=header(ns),
-        orientation=quaternion(0.0, 0.0, 0.0, 0.0),
-        orientation_covariance=nine,
-        angular_velocity=vector(0.01, 0.02, 0.3),
-        angular_velocity_covariance=nine,
-        linear_acceleration=vector(0.0, 0.0, 9.81),
-        linear_acceleration_covariance=nine,
-    )
-
-
-def wrench(ns, i):
-    inner = T["geometry_msgs/msg/Wrench"](force=vector(12.0, 0.0, 0.0), torque=vector(0.0, 0.0, 1.2))
-    return T["geometry_msgs/msg/WrenchStamped"](header=header(ns), wrench=inner)
-
-
-def pressure(ns, i):
-    return T["sensor_msgs/msg/FluidPressure"](
-        header=header(ns), fluid_pressure=101325.0 + 9806.65, variance=0.0
-    )
-
-
-def array(ns, i):
-    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
-    return T["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array([1.0, 2.0, 3.0 + i]))
-
-
-def motors(ns, i):
+def motors(i, t):
     state = "baseline" if i < 20 else "excitation"
-    return T["lab_msgs/msg/Motors"](
-        header=header(ns), name=["T1", "T2"], speed=np.array([100.0, 200.0 + i]), state=state
-    )
+    return {"name": ["T1", "T2"], "speed": np.array([100.0, 200.0 + i]), "state": state}
 
 
+RATES = {"angular_velocity": xyz(0.01, 0.02, 0.3), "linear_acceleration": xyz(0.0, 0.0, 9.81)}
+WRENCH = {"wrench": {"force": xyz(12.0, 0.0, 0.0), "torque": xyz(0.0, 0.0, 1.2)}}
 TOPICS = {
-    "/odom": ("nav_msgs/msg/Odometry", odometry, 20.0),
-    "/imu": ("sensor_msgs/msg/Imu", imu, 50.0),
-    "/wrench": ("geometry_msgs/msg/WrenchStamped", wrench, 10.0),
-    "/pressure": ("sensor_msgs/msg/FluidPressure", pressure, 5.0),
-    "/array": ("std_msgs/msg/Float64MultiArray", array, 10.0),
-    "/motors": ("lab_msgs/msg/Motors", motors, 10.0),
+    "/odom": ("nav_msgs/Odometry", odometry, 20.0),
+    "/imu": ("sensor_msgs/Imu", lambda i, t: RATES, 50.0),
+    "/wrench": ("geometry_msgs/WrenchStamped", lambda i, t: WRENCH, 10.0),
+    "/pressure": ("sensor_msgs/FluidPressure", lambda i, t: {"fluid_pressure": 101325.0 + 9806.65}, 5.0),
+    "/array": ("std_msgs/Float64MultiArray", lambda i, t: {"data": np.array([1.0, 2.0, 3.0 + i])}, 10.0),
+    "/motors": ("lab_msgs/Motors", motors, 10.0),
 }
 SECONDS = 4.0
 
 
 def written(folder, storage, topics=("/odom", "/imu", "/wrench", "/pressure"), mode=None):
     """A bag of 4 s, packed where a mode is given."""
-    queue = []
+    bag = Bag(types={"lab_msgs/msg/Motors": MOTORS})
     for topic in topics:
-        kind, make, rate = TOPICS[topic]
-        for i in range(int(SECONDS * rate)):
-            ns = START + int(i * 1e9 / rate)
-            queue.append((ns + LATENCY, topic, STORE.serialize_cdr(make(ns, i), kind)))
-    writer = Writer(folder, version=8, storage_plugin=storage)
-    if mode is not None:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connections = {t: writer.add_connection(t, TOPICS[t][0], typestore=STORE) for t in topics}
-        for ns, topic, raw in sorted(queue, key=lambda item: item[0]):
-            writer.write(connections[topic], ns, raw)
-    return folder
+        bag.add(topic, *TOPICS[topic], delay=LATENCY, seconds=SECONDS)
+    return bag.write(folder, storage=storage, mode=mode, version=8)
 
 
 @pytest.fixture(params=[StoragePlugin.SQLITE3, StoragePlugin.MCAP], ids=["sqlite3", "mcap"])
@@ -268,7 +204,9 @@ def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
     writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     with writer:
         writer.write(
-            writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=STORE), START, bytes(300 << 20)
+            writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=Bag().types),
+            T0 * 10**9,
+            bytes(300 << 20),
         )
     assert sum(file.stat().st_size for file in (tmp_path / "bomb").iterdir()) < 1 << 20
     monkeypatch.setattr(bag, "limited_memory", lambda: budget.limited_memory(128 << 20))
@@ -281,8 +219,8 @@ def packed_bag(folder, storage, size):
     writer = Writer(folder, version=8, storage_plugin=storage)
     writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with writer:
-        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=STORE)
-        writer.write(connection, START, bytes(size))
+        connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=Bag().types)
+        writer.write(connection, T0 * 10**9, bytes(size))
     return folder
 
 
