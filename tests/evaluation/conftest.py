@@ -1,9 +1,11 @@
 """Experiments of tests are small: they stay in one process, since another takes seconds to start."""
 
 import os
+from dataclasses import replace
 
 import pytest
 
+from finssim.control.trajectories import TRAJECTORIES, polyline
 from finssim.evaluation import metrics
 from finssim.evaluation.records import read_record
 from finssim.evaluation.robot_trials import RobotJob
@@ -19,10 +21,19 @@ def one_processor():
 
 @pytest.fixture(scope="module")
 def brief_t1():
-    """Trials of T1 last 20 s in place of 60, with the late errors from the last eight: where only what is made of a
+    """Trials of T1 last 16 s in place of 60, with the late errors from the last six: where only what is made of a
     trial is tested."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(metrics, "EVALUATION_WINDOW", (12.0, 20.0))
+        patch.setattr(metrics, "EVALUATION_WINDOW", (10.0, 16.0))
         for function in (RobotJob.__init__, read_record):
-            patch.setitem(function.__kwdefaults__, "duration", 20.0)
+            patch.setitem(function.__kwdefaults__, "duration", 16.0)
         yield
+
+
+@pytest.fixture
+def brief_straight(monkeypatch):
+    """The straight trajectory ends after the first third of its way, at the speed that it has."""
+    whole = TRAJECTORIES["straight"]
+    first, last = (whole.at(t).position for t in (0.0, whole.duration))
+    time, motion = polyline([first, first + (last - first) / 3.0], [whole.duration / 3.0])
+    monkeypatch.setitem(TRAJECTORIES, "straight", replace(whole, duration=time, motion=motion))

@@ -41,13 +41,13 @@ def held(brief_t1, tmp_path_factory):
     folder = tmp_path_factory.mktemp("t1")
     out, truth = folder / "out", folder / "truth"
     with lockstep_pool(
-        FINSROV, folder / "pool.yaml", position=(0.5, -0.2, -0.4), yaw=1.0, truth=truth
+        FINSROV, folder / "pool.yaml", position=(0.3, -0.1, -0.4), yaw=0.5, truth=truth
     ) as wiring:
         person = Person(("enter:", "\r"), ("enter:", "q"))
         with pytest.raises(KeyboardInterrupt):
             experiment(T1, out, wiring, SETPOINTS, person)
     first = {path: path.stat().st_mtime_ns for path in (out / "trials").glob("*.json")}
-    with lockstep_pool(FINSROV, folder / "pool.yaml", position=(-0.5, 0.2, -0.4)) as wiring:
+    with lockstep_pool(FINSROV, folder / "pool.yaml", position=(-0.3, 0.1, -0.4)) as wiring:
         result = experiment(T1, out, wiring, SETPOINTS)
     return out, result, truth, first
 
@@ -90,7 +90,7 @@ def test_when_all_is_played_the_robot_is_not_opened(held):
     assert again["rows"] == result["rows"]
 
 
-def test_a_trajectory_is_followed_from_its_first_pose(tmp_path):
+def test_a_trajectory_is_followed_from_its_first_pose(brief_straight, tmp_path):
     """T2 straight by the tuned PID: the whole way, and an error of centimetres."""
     with lockstep_pool(FINSROV, tmp_path / "pool.yaml") as wiring:
         result = experiment(T2, tmp_path / "out", wiring, ("straight",))

@@ -140,6 +140,12 @@ def test_a_user_can_locate_the_tag_again(done):
         assert np.hypot(*(points.mean(axis=0)[:2] - places[frame.image])) < 0.015
 
 
+@pytest.fixture
+def published_alone(monkeypatch):
+    """The published conditions in place of all three."""
+    monkeypatch.setattr(module, "CONDITIONS", {"published": CONDITIONS["published"]})
+
+
 def interrupting(words):
     """Progress that is Ctrl-C at its first mention of something."""
 
@@ -158,7 +164,7 @@ def test_an_interruption_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_method_that_locates_nothing_is_no_error(tmp_path, monkeypatch):
+def test_a_method_that_locates_nothing_is_no_error(published_alone, tmp_path, monkeypatch):
     """Tags that are never found at the other depth: no figure, the count says so, and the folder is written."""
     draw = module.pictures
 
@@ -203,7 +209,7 @@ def tiny(monkeypatch):
 COMMAND = ["experiment", "localization", "--renderer", "geometry"]
 
 
-def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, tmp_path, capfd):
+def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, published_alone, tmp_path, capfd):
     """A table, where it was written, and one JSON object with --json; standard error has lines of progress alone.
 
     Equal seeds give the function's results, number by number, and its pool; other seeds give others.

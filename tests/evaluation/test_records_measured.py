@@ -26,6 +26,7 @@ from finssim.robot.pilots import make_pilot
 from finssim.robot.recorder import Recorder
 from finssim.robot.runtime import Runtime
 from finssim.tasks import task_named
+from finssim.tasks.moving_target import MovingTarget
 from finssim.vehicles import load_vehicle
 from reference.policies import linear, written
 from studies.stack import site_of
@@ -52,18 +53,19 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FI
     )
     pilot = make_pilot("pid", vehicle, task=task)
     about = {"command": "finssim run", "pilot": pilot.describe()}
-    guide_end = 0.0 if isinstance(guide, Station) else guide.duration
+    end = 16.5 if isinstance(guide, Station) else guide.duration + 0.5
     with Recorder(record, vehicle, about, pictures="none", epoch=1e9) as recorder:
         runtime = Runtime(vehicle, Perception(vehicle, known_site), pilot, guide, arm=True, recorder=recorder)
-        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= max(20.0, guide_end) + 0.5)
+        run_lockstep(runtime, pool, seconds, until=lambda r: r.t >= end)
     pool.close()
     return record, truth, runtime.started
 
 
 @pytest.fixture(scope="module")
 def held(brief_t1, tmp_path_factory):
-    """P03, held for 20 s."""
-    return driven(tmp_path_factory.mktemp("held"), Station((X, Y, Z), YAW, name="P03"), 30.0)
+    """P03, from nearby and held for 16 s."""
+    guide = Station((X, Y, Z), YAW, name="P03")
+    return driven(tmp_path_factory.mktemp("held"), guide, 30.0, start=(X + 0.3, Y + 0.1, Z))
 
 
 def captured(path, truth, late):
@@ -153,7 +155,7 @@ def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps
     assert "name the file that was driven with --vehicle" in capsys.readouterr().err
 
 
-def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
+def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_path, capsys):
     """The way is whole, the errors are a PID's; a truth of another run, t1 and a task of several are refused."""
     guide = load_trajectory("straight")
     first = tuple(guide.at(0.0).position.tolist())
@@ -179,18 +181,22 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("task", ["t3", "own/task/keep_depth"])
-def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys):
+def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys, monkeypatch):
     """By the same referee, of the truth that the site wrote: the live score, but for the clock that is found again.
 
     The truth's clock is found to 10 ms, and at 0.5 m/s that is 5 mm; the return is a mean over hundreds of steps.
     """
     if task.startswith("own"):
-        task = f"{EXAMPLES / task}.py:KeepDepth"
+        text = (EXAMPLES / f"{task}.py").read_text()
+        brief = "hold: float = 2.0\n    time_limit: float = 10.0"
+        (tmp_path / "keep_depth.py").write_text(text.replace("hold: float = 5.0", brief))
+        task = f"{tmp_path / 'keep_depth.py'}:KeepDepth"
         gain = np.zeros((6, 2), np.float32)
         gain[2] = 5.0, -2.0
         who = str(written(linear(gain), tmp_path / "depth", task_named(task), 6))
     else:
         who = next(iter(baselines_of(task)))
+        monkeypatch.setitem(MovingTarget.__init__.__kwdefaults__, "time_limit", 15.0)
     live = site_of(task, who, [FINSROV], seed=3, record=tmp_path / "episode").run()
     record, truth = (tmp_path / "episode" / f"vehicle.{kind}" for kind in ("mcap", "truth"))
     assert boundary.run(app, ["evaluate", str(record), "--task", task, "--truth", str(truth), "--json"]) == 0
