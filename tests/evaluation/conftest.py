@@ -9,6 +9,9 @@ from finssim.control.trajectories import TRAJECTORIES, polyline
 from finssim.evaluation import metrics
 from finssim.evaluation.records import read_record
 from finssim.evaluation.robot_trials import RobotJob
+from finssim.identification import programme
+
+BRIEF_STEPS = (("rest", 0.5), ("baseline", 1.0), ("excitation", 4.0), ("coast", 2.0), ("rest", 0.5))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,6 +30,14 @@ def brief_t1():
         patch.setattr(metrics, "EVALUATION_WINDOW", (10.0, 16.0))
         for function in (RobotJob.__init__, read_record):
             patch.setitem(function.__kwdefaults__, "duration", 16.0)
+        yield
+
+
+@pytest.fixture(scope="module")
+def brief_steps():
+    """Steps of force last 4 s in place of 9: where the fits that they are made for are not tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programme, "STEP_SEQUENCE", BRIEF_STEPS)
         yield
 
 

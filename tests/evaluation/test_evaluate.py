@@ -154,8 +154,9 @@ def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
 
 
 @pytest.mark.slow
-def test_a_directory_holds_result_figure_and_trajectories(tmp_path):
+def test_a_directory_holds_result_figure_and_trajectories(tmp_path, monkeypatch):
     """All open, agree with each other, and may be replaced by the next evaluation."""
+    monkeypatch.setattr(trials_module, "DURATION", 5.0)
     for _ in range(2):
         result = evaluate("pid", out=tmp_path / "e")
     stored = json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
@@ -169,7 +170,7 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path):
 
 
 @pytest.mark.slow
-def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys):
+def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys, monkeypatch):
     """A row for each plant; under `plants` the object that each gives alone; trajectories in folders of their names."""
     plants = ["nominal", "simplified"]
     words = ["evaluate", "pid", *(word for name in plants for word in ("--plant", name))]
@@ -181,7 +182,8 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
     assert len(read_run(tmp_path / "e" / "trajectories" / "simplified")) > 0
     assert (tmp_path / "e" / "error_envelope.png").stat().st_size > 0
 
-    assert boundary.run(app, [*words, "--json"]) == 0
+    monkeypatch.setattr(trials_module, "DURATION", 5.0)
+    assert boundary.run(app, [*words, "--out", str(tmp_path / "e"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "e" / "evaluation.json").read_text(encoding="utf-8"))
     assert list(printed) == ["plants"]

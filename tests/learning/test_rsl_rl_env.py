@@ -1,4 +1,4 @@
-"""The RSL-RL environment: groups, rows, ages and ends; and its runner takes every task."""
+"""The RSL-RL environment: groups, rows, ages and ends; and its runner trains."""
 
 import numpy as np
 import pytest
@@ -6,18 +6,16 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from finssim.learning.rsl_rl_env import RslRlVecEnv
-from finssim.tasks import StationKeeping, make, numeric_tasks
+from finssim.tasks import StationKeeping, make
 from reference.learners import rsl_rl_settings
-from reference.pair import Pair
-
-NUMERIC = numeric_tasks()
+from reference.pair import KINDS, Pair
 
 SHORT = StationKeeping(time_limit=0.5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [*NUMERIC, Pair()], ids=[*NUMERIC, "pair"])
-def test_the_runner_trains_on_every_task(task, tmp_path, capsys):
+@KINDS
+def test_the_runner_trains(task, tmp_path, capsys):
     """RSL-RL's own runner, with its checks of every number, and its log of the task's metrics."""
     env = RslRlVecEnv(task, worlds=4)
     runner = OnPolicyRunner(env, rsl_rl_settings(), str(tmp_path))

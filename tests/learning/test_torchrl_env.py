@@ -9,18 +9,16 @@ from torchrl.envs.utils import check_env_specs
 
 from finssim.learning.gymnasium_env import VectorEnv
 from finssim.learning.torchrl_env import TorchRlEnv
-from finssim.tasks import EnvironmentSetupError, StationKeeping, make, numeric_tasks
-from reference.pair import Pair
-
-NUMERIC = numeric_tasks()
+from finssim.tasks import EnvironmentSetupError, StationKeeping, make
+from reference.pair import KINDS, Pair
 
 SHORT = StationKeeping(time_limit=0.5)
 APART = {"port": ["right"], "starboard": ["left"]}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [*NUMERIC, Pair()], ids=[*NUMERIC, "pair"])
-def test_torchrls_checker_passes_for_every_task(task):
+@KINDS
+def test_torchrls_checker_passes(task):
     check_env_specs(TorchRlEnv(task, worlds=3), seed=1)
     check_env_specs(TorchRlEnv(task, worlds=3), break_when_any_done="both")
 

@@ -30,8 +30,8 @@ FINSROV = load_vehicle("finsrov")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHORT = {"t1": 14.0, "t2": 14.0, "t3": 12.0, "docking": 25.0}
 """Time limits that are long enough for a success of the baseline [s]."""
-SMALL = {"path": {"legs": 30}, "waypoints": {"legs": 2}, "terrain": {"line": 40.0}}
-"""A third, half and less of the way."""
+SMALL = {"path": {"legs": 20}, "waypoints": {"legs": 1}, "terrain": {"line": 25.0}}
+"""Less than a third of the way."""
 SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4}
 """Of an episode in which the baseline succeeds; that of a task that sees does not in all."""
 

@@ -6,6 +6,7 @@ Reward of agent a: (a + 1) `bonus` - `slope` · distance to its place. No term i
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import pytest
 import warp as wp
 
 from finssim.sim.state import State
@@ -97,3 +98,7 @@ class Pair(Task):
 def constant(**settings: Any) -> Pair:
     """Every step gives agent a the reward a + 1: after any policy its value is (a + 1) / (1 - γ)."""
     return Pair(bonus=1.0, slope=0.0, bound=1e9, **settings)
+
+
+KINDS = pytest.mark.parametrize("task", ["t1", "team-pursuit", Pair()], ids=["t1", "team-pursuit", "pair"])
+"""For adapters: a vehicle alone, a team and a prey that the task drives, and a pair."""

@@ -1,4 +1,4 @@
-"""Claims about every task and every vehicle of the catalogue: the same again, bounded, reset, counted."""
+"""Claims about every task and every vehicle of the catalogue, beside those of `check_task`: bounded, reset, drawn."""
 
 from dataclasses import replace
 
@@ -20,11 +20,11 @@ PAIRS = [
     (name, vehicle)
     for name in NAMES
     for vehicle in catalogue()
-    if vehicle in ("finsrov", "bluerov2", "torpedo") or name in ("t1", "path")
+    if vehicle in ("finsrov", "bluerov2", "torpedo") or name == "path"
 ]
 PAIRS.remove((OWN().name, "torpedo"))  # whose kernel with the walls of a pool no other task has
-"""Every task with a vehicle that is pushed every way, one that cannot pitch and one with fins, and every vehicle in the
-pool and in open water: the others repeat the kernels of these, or compile theirs for one case."""
+"""Every task with a vehicle that is pushed every way, one that cannot pitch and one with fins, and every vehicle in
+open water: the others repeat the kernels of these, or compile theirs for one case."""
 SHORT = 1.0
 """Length of an episode [s]: several end in a test."""
 
@@ -60,16 +60,6 @@ def played(env, steps=25, given=None):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_equal_seeds_give_equal_runs(name):
-    """Bit for bit, over several episodes; another seed gives another run."""
-    first, again, other = (played(environment(name, seed=seed)) for seed in (3, 3, 4))
-    for a, b in zip(first, again, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(first[0], other[0])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
 def test_the_number_of_worlds_changes_nothing(name):
     """The first worlds of many, on two threads, are those of few, bit for bit."""
     few, many = environment(name, worlds=3, seed=5), environment(name, worlds=130, threads=2, seed=5)
@@ -81,7 +71,7 @@ def test_the_number_of_worlds_changes_nothing(name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "vehicle"), PAIRS)
 def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):
-    """Full thrusts this way and that: every number finite and of order one, rewards finite, episodes end.
+    """Full thrusts this way and that: numbers finite and of order one, rewards finite, episodes end, success 0 or 1.
 
     A task may refuse a vehicle that cannot push every way, or that its autopilot cannot steer, with a sentence that
     says so.
@@ -102,41 +92,22 @@ def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):
     assert np.isfinite(observation).all() and np.abs(observation).max() < 12.0
     assert np.isfinite(reward).all()
     assert (terminated | truncated).any(axis=0).all() and not (terminated & truncated).any()
+    assert set(env.task.metrics(env.arrays)["success"].tolist()) <= {0.0, 1.0}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_reset_starts_over_and_leaves_the_others_alone(name):
-    """With a seed, everything as it was; with a mask, only the masked worlds."""
+    """With a seed, everything as it was, with another one not; with a mask, only the masked worlds."""
     env = environment(name, seed=1)
     first = env.reset(seed=1).copy()
     played(env, 5)
+    assert not np.array_equal(env.reset(seed=2), first)
     np.testing.assert_array_equal(env.reset(seed=1), first)
     played(env, 5)
     before = env.arrays.observation.numpy().copy()
     after = env.reset(mask=[True, False, True, False]).reshape(4, -1)
     np.testing.assert_array_equal(after[[1, 3]], before[[1, 3]])
     assert np.all(np.any(after[[0, 2]] != before[[0, 2]], axis=1))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_metrics_tell_how_the_last_episode_went(name):
-    """Return and length are those of the steps, success is 0 or 1, all by world."""
-    env = environment(name)
-    total, length = np.zeros(4), np.zeros(4)
-    last = {}
-    for action in actions(env, 12):
-        step = env.step(action)
-        total += step.reward.reshape(4, -1).mean(axis=1)
-        length += 1
-        for w in np.flatnonzero(step.terminated | step.truncated):
-            last[w] = (total[w], length[w])
-            total[w] = length[w] = 0.0
-    measured = env.task.metrics(env.arrays)
-    assert sorted(last) == [0, 1, 2, 3]
-    np.testing.assert_allclose(measured["return"], [last[w][0] for w in range(4)], atol=1e-3)
-    np.testing.assert_array_equal(measured["length"], [last[w][1] for w in range(4)])
-    assert all(values.shape == (4,) for values in measured.values())
-    assert set(measured["success"].tolist()) <= {0.0, 1.0}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -174,7 +174,7 @@ def test_cloning_learns_from_pictures(tmp_path):
     changes = {
         "demonstrations": place,
         "worlds": 2,
-        "steps": 24_000,
+        "steps": 16_000,
         "rollout": 4000,
         "batch": 64,
         "colour": 0.1,

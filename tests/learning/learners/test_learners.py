@@ -74,8 +74,8 @@ def same(first, second):
 @pytest.mark.parametrize(("name", "task"), PAIRS)
 def test_it_finds_the_best_action(name, task):
     """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
-    steps = 10_000
-    changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "discount": 0.5}
+    steps, batch = 10_000, 64 * len(task.agents)
+    changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "batch": batch, "discount": 0.5}
     learner = made(name, task(), **changes)
     before = learner.update()
     while learner.steps < steps:
