@@ -577,7 +577,7 @@ def test_a_session_by_the_commands_of_the_page(tmp_path, capsys):
                "--exec", "./ardusub", "--dvl", "127.0.0.1:0", "--bind", f"127.0.0.1:{udp}",
                "--mavlink", f"127.0.0.1:{tcp + 2}"]  # fmt: skip
     drive = [*finssim, "run", "--robot", f"mavlink://tcp:127.0.0.1:{tcp}", "--vehicle", "bluerov2_heavy",
-             *"--site tank --pool-file none --let-in 0,0 --policy pid --goal 0.4,0,-0.6,0 --arm --duration 10".split(),
+             *"--site tank --pool-file none --let-in 0,0 --policy pid --goal 0.4,0,-0.6,0 --arm --duration 7".split(),
              "--record", "run.mcap"]  # fmt: skip
     process = subprocess.Popen(physics, cwd=tmp_path, env=slowly, stdout=subprocess.PIPE, text=True)
     try:

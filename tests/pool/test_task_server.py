@@ -117,7 +117,7 @@ def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path, slow_cloc
         lines = iter(site.stdout.readline, "")
         goal = next(line for line in lines if line.startswith("goal: ")).removeprefix("goal: ").strip()
         assert any(line.startswith("messages") for line in lines)
-        words = f"run --team consensus --task formation --goal={goal} --duration 12 --arm --json --record {tmp_path}"
+        words = f"run --team consensus --task formation --goal={goal} --duration 8 --arm --json --record {tmp_path}"
         ends = ["--robot", f"udp://127.0.0.1:{port}", "--bind", f"127.0.0.1:{port + 100}"]
         team = subprocess.Popen([*finssim, *words.split(), *ends], stdout=subprocess.PIPE, text=True)
         lost = process_of(team, "corner_2", tmp_path / "corner_2.mcap")
@@ -128,17 +128,17 @@ def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path, slow_cloc
         site.wait(30)
     assert told["corner_2"] is None and team.returncode == 9
     for name in ("corner_1", "corner_3"):
-        assert told[name]["faults"] == [] and told[name]["duration_s"] > 11.9
-        assert told[name]["decisions"] > 80
+        assert told[name]["faults"] == [] and told[name]["duration_s"] > 7.9
+        assert told[name]["decisions"] > 50
         with open_record(tmp_path / f"{name}.mcap") as record:
             fixes = sum(1 for _ in record.messages(("positioning/pose",)))
-        assert fixes > 50
+        assert fixes > 30
 
 
 def process_of(team, name, record):
     """Process of an agent, once it has recorded for some seconds."""
     end = time.monotonic() + 120.0
-    while not (record.exists() and record.stat().st_size > 200_000):
+    while not (record.exists() and record.stat().st_size > 100_000):
         assert time.monotonic() < end and team.poll() is None
         time.sleep(0.2)
     listed = subprocess.run(
@@ -161,7 +161,7 @@ def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task,
             assert any(line.startswith("messages") for line in iter(site.stdout.readline, ""))
             words = f"run --policy {policy} --task {task} --site open-water --pool-file none".split()
             ends = ["--robot", f"udp://127.0.0.1:{port}", "--bind", f"127.0.0.1:{port + 100}"]
-            more = ["--team", f"127.0.0.1:{port + 5}", "--duration", "8", "--arm", "--json"]
+            more = ["--team", f"127.0.0.1:{port + 5}", "--duration", "5", "--arm", "--json"]
             run = subprocess.run(
                 [*finssim, *words, *ends, *more], stdout=subprocess.PIPE, text=True, timeout=120
             )
@@ -169,6 +169,6 @@ def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task,
             site.terminate()
             said = site.stdout.read()
     told = json.loads(run.stdout)
-    assert run.returncode == 0 and told["state"] != "fault" and told["decisions"] > 30
+    assert run.returncode == 0 and told["state"] != "fault" and told["decisions"] > 20
     assert "episode: not ended after" in said or "captured 1" in said
     assert task != "t3" or (told["goal"] == "target" and told["position_rms_m"] < 2.0)
