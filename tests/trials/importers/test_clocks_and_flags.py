@@ -11,24 +11,10 @@ from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.trial import Trial
 from finssim.trials.trial_files import load_trial
+from trials.importers.tables import codes, read
 
 N = 200
 T = np.arange(N) * 0.1
-
-
-def read(tmp_path, columns, text=None, name="log.csv"):
-    """The trial of a table of columns, with a map where a text is given."""
-    cells = [[str(value) for value in values] for values in columns.values()]
-    lines = [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
-    (tmp_path / name).write_text("\n".join(lines) + "\n")
-    if text is not None:
-        (tmp_path / "map.yaml").write_text(text)
-    (trial,) = read_trials([tmp_path / name], column_map=None if text is None else tmp_path / "map.yaml")
-    return trial
-
-
-def codes(trial):
-    return {item.code for item in trial.findings}
 
 
 # Flags of invalid samples.

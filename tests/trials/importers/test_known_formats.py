@@ -14,6 +14,7 @@ from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.importers.log import importer_of
 from finssim.vehicles import load_vehicle
+from trials.importers.tables import csv
 
 N = 200
 T = np.arange(N) * 0.1
@@ -439,14 +440,6 @@ def test_known_formats_take_the_keys_of_a_map(tmp_path):
 
 
 # Closed words: what a log has and a trial has not is named, in every format; and so is what is invalid or dead.
-
-
-def csv(path, **columns):
-    cells = [[str(value) for value in values] for values in columns.values()]
-    path.write_text(
-        "\n".join([",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]) + "\n"
-    )
-    return path
 
 
 def npz(path, **columns):

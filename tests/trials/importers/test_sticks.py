@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from finssim.trials.findings import CalibrationError
-from finssim.trials.importers.dispatch import read_trials
 from finssim.trials.inputs import drive
 from finssim.vehicles import load_vehicle
+from trials.importers.tables import read
 
 FRAMES = {"VECTORED": "bluerov2", "VECTORED_6DOF": "bluerov2_heavy"}
 PUSHES = {
@@ -22,16 +22,8 @@ PUSHES = {
 
 def trial(tmp_path, text, **columns):
     """A log of sticks under a map."""
-    n = 20
-    rows = [",".join(["t", *columns])] + [
-        ",".join(str(v) for v in [0.1 * k, *columns.values()]) for k in range(n)
-    ]
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    (tmp_path / "map.yaml").write_text(
-        text + "time: t\ncolumns: {" + ", ".join(f"{c}: {c}" for c in columns) + "}\n"
-    )
-    (found,) = read_trials([tmp_path / "log.csv"], column_map=tmp_path / "map.yaml")
-    return found
+    table = {"t": [0.1 * k for k in range(20)], **{name: [value] * 20 for name, value in columns.items()}}
+    return read(tmp_path, table, f"{text}time: t\ncolumns: [{', '.join(columns)}]\n")
 
 
 @pytest.mark.parametrize("frame", FRAMES)
