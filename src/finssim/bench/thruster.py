@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -120,21 +120,14 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
     if not measured and (times := _times_the_file(fastest, thruster, chosen, pulse_range)):
         findings.append(finding("another_thruster", label, times=times))
     rows, esc = _stack(at), None
-    if any(np.isfinite(table.pulse).any() for table in tables):
-        if math.isnan(chosen):
-            findings.append(finding("law_without_voltage", label))
-        else:
-            good = np.isfinite(rows.pulse) & np.isfinite(rows.speed) & (rows.pulse > 0.0)
-            volts = np.where(np.isfinite(rows.voltage), rows.voltage, chosen)[good]
-            speed = rows.speed[good]
-            # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
-            weight = None if measured else np.abs(speed) / np.max(np.abs(speed))
-            try:
-                esc = fit_esc(
-                    rows.pulse[good], speed, volts, pulse_range=pulse_range, weight=weight, at=chosen
-                )
-            except CalibrationError as error:
-                findings.append(finding("law_refused", label, reason=str(error)))
+    pulses = any(np.isfinite(table.pulse).any() for table in tables)
+    if pulses and math.isnan(chosen):
+        findings.append(finding("law_without_voltage", label))
+    elif pulses:
+        try:
+            esc = _speed_controller(rows, chosen, pulse_range, measured)
+        except CalibrationError as error:
+            findings.append(finding("law_refused", label, reason=str(error)))
     if not sides and esc is None:
         reasons = "; ".join(sentences(findings)) or f"{label}: no row turns the shaft"
         raise CalibrationError(f"{reasons}: nothing could be fitted")
@@ -147,6 +140,18 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
         sides=sides, dead=dead, fastest=fastest, esc=esc, speeds_measured=measured, before=thruster,
         findings=tuple(dict.fromkeys(findings)),
     )  # fmt: skip
+
+
+def _speed_controller(
+    rows: ThrustTable, voltage: float, pulse_range: tuple[float, float, float], measured: bool
+) -> EscFit:
+    """Fit the law of the speed controller to the rows with pulses, at a voltage [V]."""
+    good = np.isfinite(rows.pulse) & np.isfinite(rows.speed) & (rows.pulse > 0.0)
+    volts = np.where(np.isfinite(rows.voltage), rows.voltage, voltage)[good]
+    speed = rows.speed[good]
+    # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
+    weight = None if measured else np.abs(speed) / np.max(np.abs(speed))
+    return fit_esc(rows.pulse[good], speed, volts, pulse_range=pulse_range, weight=weight, at=voltage)
 
 
 def _times_the_file(
@@ -376,31 +381,52 @@ def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
         path: Path of its numbers in the vehicle file; those of a group are in `thruster_groups`.
         result: Results of its tables.
     """
-    before, rows = result.before, list[Estimate]()
-    volts = f"{result.voltage:g} V" if math.isfinite(result.voltage) else ""
+    rows = (*_of_curves(result), *_of_limits(result), *_of_law(result))
+    return [
+        Estimate(
+            f"{name}.{key}",
+            float(value),
+            ends,
+            unit,
+            sure,
+            note,
+            None if key == "reverse_ratio" else f"{path}.{key}",
+        )
+        for key, value, ends, unit, sure, note in rows
+    ]
 
-    def add(key: str, value: float, ends: tuple[float, float], unit: str, sure: bool, note: str = "") -> None:
-        target = None if key == "reverse_ratio" else f"{path}.{key}"
-        rows.append(Estimate(f"{name}.{key}", float(value), ends, unit, sure, note, target))
 
+Row = tuple[str, float, tuple[float, float], str, bool, str]
+"""Key, value, interval, unit, whether the data determine it, and note."""
+
+
+def _of_curves(result: Bench) -> Iterator[Row]:
+    """Yield the coefficients, dead zones and their ratio."""
+    volts = f", {result.voltage:g} V" if math.isfinite(result.voltage) else ""
     for direction, sign in SIDES:
         side, zone = result.sides.get(direction), result.dead.get(direction)
         if side is None:
             continue
         sure = math.isfinite(side.half_width) and side.c > side.half_width
-        note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts and ', '}{volts}"
+        note = f"{side.samples} rows, R² {side.r2:.4f}, rms {side.rmse:.2g} N{volts}"
         note += "" if sure else ": too few or too scattered"
-        add(f"c_{direction}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note)
+        yield f"c_{direction}", side.c, _around(side.c, side.half_width), "N s²/rad²", sure, note
         if zone is not None:
             low, high = sorted(sign * TO_RPM * end for end in zone.interval)
             note = zone.note or f"slowest speed that turns; {side.c * zone.speed**2:.2g} N there"
             speed = sign * TO_RPM * zone.speed + 0.0
-            add(f"dead_rpm_{direction}", speed, (low, high), "rpm", zone.measured, note)
+            yield f"dead_rpm_{direction}", speed, (low, high), "rpm", zone.measured, note
     if len(result.sides) == 2:
         plus, minus = result.sides["plus"], result.sides["minus"]
         ratio = minus.c / plus.c
         half = ratio * math.hypot(plus.half_width / plus.c, minus.half_width / minus.c)
-        add("reverse_ratio", ratio, _around(ratio, half), "-", math.isfinite(half))
+        yield "reverse_ratio", ratio, _around(ratio, half), "-", math.isfinite(half), ""
+
+
+def _of_limits(result: Bench) -> Iterator[Row]:
+    """Yield the limits of speed and force."""
+    before = result.before
+    volts = f" at {result.voltage:g} V" if math.isfinite(result.voltage) else ""
     for direction, sign in SIDES:
         end, side = "max" if sign > 0.0 else "min", result.sides.get(direction)
         old_c = getattr(before, f"c_{direction}")
@@ -412,27 +438,31 @@ def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
             continue
         moves = at_end or speed > old_speed
         note = "beyond the vehicle file's" if moves else "the table ends here; the vehicle file's stays"
-        note = f"full pulse{volts and ' at '}{volts}" if at_end else note
+        note = f"full pulse{volts}" if at_end else note
         note = note if result.speeds_measured else NOMINAL
         rpm = sign * speed * TO_RPM
         known = moves and result.speeds_measured
-        add(f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", known, note)
+        yield f"rpm_{end}", rpm, _around(rpm, scatter * TO_RPM), "rpm", known, note
         force = c * (speed if moves else old_speed) ** 2
         half = force * side.half_width / side.c if side else 0.0
         sure, note = math.isfinite(half), f"c_{direction} at the speed limit"
         if old_force < (1.0 - CHOSEN_LIMIT) * old_c * old_speed**2 and old_force < force:
             force, half, sure, note = old_force, 0.0, False, "the vehicle file's own, below the curve"
-        add(f"force_{end}", sign * force, _around(sign * force, half), "N", sure, note)
-    if result.esc is not None:
-        units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
-        caution = "zero, emf and load of a direction vary together: the speed they give is surer than each"
-        for key, ends in result.esc.intervals.items():
-            note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
-            value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
-            if not (result.speeds_measured or key.startswith("dead")):
-                note, sure = NOMINAL, False
-            add(f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note)
-    return rows
+        yield f"force_{end}", sign * force, _around(sign * force, half), "N", sure, note
+
+
+def _of_law(result: Bench) -> Iterator[Row]:
+    """Yield the numbers of the speed controller."""
+    if result.esc is None:
+        return
+    units = {"dead": "µs", "zero": "µs", "emf": "V s/rad", "load": "V s²/rad²"}
+    caution = "zero, emf and load of a direction vary together: the speed they give is surer than each"
+    for key, ends in result.esc.intervals.items():
+        note = result.esc.unsure.get(key, "" if key.startswith("dead") else caution)
+        value, sure = float(getattr(result.esc.esc, key)), key not in result.esc.unsure
+        if not (result.speeds_measured or key.startswith("dead")):
+            note, sure = NOMINAL, False
+        yield f"esc.{key}", value, ends, units[key.partition("_")[0]], sure, note
 
 
 NOMINAL = "nominal: no shaft speed was measured, the vehicle file's curve gives it from the force"

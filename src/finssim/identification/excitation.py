@@ -97,10 +97,8 @@ def excites(s: Streams, vehicle: Vehicle) -> set[str]:
     those that were driven, or swing."""
     if s.drive.source == "passive":
         return set(s.released)
-    return set(s.trial.header.axis) or _moved(s, vehicle)
-
-
-def _moved(s: Streams, vehicle: Vehicle) -> set[str]:
+    if s.trial.header.axis:
+        return set(s.trial.header.axis)
     try:
         limits = vehicle.wrench_limits
     except VehicleError:

@@ -40,7 +40,7 @@ from finssim.vehicles.part import did_you_mean
 Rows = NDArray[np.bool_]
 
 
-def split_table(name: str, table: MergedStreams, rule: SplitRule | None) -> dict[str, MergedStreams]:
+def split_table(name: str, table: Stream, rule: SplitRule | None) -> dict[str, Stream]:
     """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
 
     Raises:
@@ -63,16 +63,9 @@ def split_table(name: str, table: MergedStreams, rule: SplitRule | None) -> dict
     return {piece: _part(table, rows) for piece, rows in long_enough.items()}
 
 
-def _part(table: MergedStreams, rows: Rows) -> MergedStreams:
+def _part(table: Stream, rows: Rows) -> Stream:
     t = table.t[rows]
-    return replace(
-        table,
-        start=table.start + float(t[0]),
-        t=np.round(t - t[0], 6),
-        channels={column: values[rows] for column, values in table.channels.items()},
-        words={column: spoken[rows] for column, spoken in table.words.items()},
-        findings=(*table.findings, finding("log_cut", start=t[0], end=t[-1])),
-    )
+    return table.selected(rows, np.round(t - t[0], 6)).noting(finding("log_cut", start=t[0], end=t[-1]))
 
 
 WORDED = {
@@ -83,7 +76,7 @@ WORDED = {
 """Rule -> the words that it uses, and the message if there are none."""
 
 
-def _labels(name: str, table: MergedStreams, rule: SplitRule) -> NDArray[np.int64]:
+def _labels(name: str, table: Stream, rule: SplitRule) -> NDArray[np.int64]:
     """Number of the piece that each row belongs to, -1 for none, (n,).
 
     A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
@@ -107,7 +100,7 @@ def _numbered(name: str, labels: NDArray[np.int64]) -> dict[str, Rows]:
     return {f"{name}_{i + 1:0{len(str(count))}d}": labels == i for i in range(count)}
 
 
-def _windows(name: str, table: MergedStreams, rule: SplitRule) -> dict[str, Rows]:
+def _windows(name: str, table: Stream, rule: SplitRule) -> dict[str, Rows]:
     pieces = {window: (table.t >= low) & (table.t <= high) for window, (low, high) in rule.windows.items()}
     empty = [window for window, rows in pieces.items() if not rows.any()]
     if empty:
@@ -149,21 +142,6 @@ class Stream:
     def noting(self, *findings: Finding) -> Stream:
         """Return the stream with more findings."""
         return replace(self, findings=(*self.findings, *findings))
-
-
-@dataclass(frozen=True, kw_only=True)
-class MergedStreams:
-    """Several streams on the union of their times."""
-
-    start: float
-    """Time of the log's clock at t = 0 [s]."""
-    t: Array
-    """Strictly increasing from 0 [s], (n,)."""
-    channels: dict[str, Array]
-    """Canonical column -> values in the units of a trial, NaN where a stream has no sample, (n,) each."""
-    words: dict[str, Texts]
-    """(n,) each."""
-    findings: tuple[Finding, ...]
 
 
 def in_order(stream: Stream, *, alone: bool) -> Stream:
@@ -236,7 +214,7 @@ def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> li
     return out
 
 
-def merge(streams: Sequence[Stream]) -> MergedStreams:
+def merge(streams: Sequence[Stream]) -> Stream:
     """All streams on the union of their times, which start at 0.
 
     Raises:
@@ -257,9 +235,8 @@ def merge(streams: Sequence[Stream]) -> MergedStreams:
     findings = [item for stream in each for item in stream.findings]
     if start > 1e8:
         findings.append(finding("clock_origin", start=start))
-    return MergedStreams(
-        start=start, t=t, channels=channels, words=texts, findings=tuple(dict.fromkeys(findings))
-    )
+    found = tuple(dict.fromkeys(findings))
+    return Stream(source="the log", t=t, channels=channels, words=texts, findings=found)
 
 
 def without_doubles(streams: Sequence[Stream]) -> list[Stream]:
@@ -340,7 +317,7 @@ def in_our_axes(stream: Stream, frame: LogFrame, *, radians: bool = True) -> Str
     return replace(stream, channels=channels)
 
 
-def trial_of(name: str, table: MergedStreams, header: Header, column_map: ColumnMap) -> Trial:
+def trial_of(name: str, table: Stream, header: Header, column_map: ColumnMap) -> Trial:
     """The trial that a table makes, with u v w and depth in place of world velocities and pressure.
 
     Raises:
@@ -391,7 +368,7 @@ def _without_empty(channels: dict[str, Array]) -> list[Finding]:
     return [finding("column_empty", column=column) for column in empty]
 
 
-def _phase(table: MergedStreams) -> np.ndarray | None:
+def _phase(table: Stream) -> np.ndarray | None:
     if "phase" not in table.words:
         return None
     labels = table.words["phase"]
