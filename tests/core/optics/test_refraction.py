@@ -102,16 +102,17 @@ def test_the_surface_point_obeys_snell(interface):
     """Where the ray crosses the near face, the sine before and the sine in the first medium behind keep n sin equal."""
     eye, there = camera(LENSES["pinhole"], interface), points(interface)
     seen = project(eye, interface, there)
-    assert np.allclose(interface.distance(seen.surface_p), 0.0, atol=1e-12)
+    before = eye.lens.rays(seen.pixels)[0] @ eye.R_pc.T
+    before *= -(interface.distance(eye.position) / (before @ interface.normal))[:, None]
+    surface = eye.position + before
     first = [*(layer.index for layer in interface.window), interface.index_far][0]
-    before = seen.surface_p - eye.position
     thickness = interface.window[0].thickness if interface.window else None
     rays = back_project(eye, interface, seen.pixels)
     if thickness is None:
-        behind = there - seen.surface_p
-        np.testing.assert_allclose(rays.origin, seen.surface_p, atol=1e-9)
+        behind = there - surface
+        np.testing.assert_allclose(rays.origin, surface, atol=1e-9)
     elif len(interface.window) == 1:
-        behind = rays.origin - seen.surface_p
+        behind = rays.origin - surface
     else:
         return
     before, behind = (d / np.linalg.norm(d, axis=-1, keepdims=True) for d in (before, behind))

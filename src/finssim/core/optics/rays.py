@@ -168,8 +168,6 @@ class Projection:
     """(..., 2), NaN where the status is neither OK nor OUTSIDE_IMAGE."""
     status: StatusArray
     """(...)"""
-    surface_p: Array
-    """Point where the ray crosses the near face, pool frame [m], (..., 3); NaN for WRONG_SIDE."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,19 +224,17 @@ def project(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Pr
 def refracted_pixels(camera: Camera, refraction: Refraction) -> Projection:
     """Pixels of rays that are already found."""
     with np.errstate(all="ignore"):
-        surface = camera.position + refraction.height * refraction.direction
         direction_c = refraction.direction @ camera.R_pc
         pixels, visible = camera.lens.project(direction_c)
         inside = camera.lens.inside(pixels)
         if inside.all() and refraction.right_side.all():
-            return Projection(pixels, np.zeros(inside.shape, np.int8), surface)
+            return Projection(pixels, np.zeros(inside.shape, np.int8))
         status = np.where(inside, np.int8(Status.OK), np.int8(Status.OUTSIDE_IMAGE))
         behind = np.where(direction_c[..., 2] <= 0.0, np.int8(Status.BEHIND_CAMERA), np.int8(Status.NO_RAY))
         status = np.where(visible, status, behind)
         status = np.asarray(np.where(refraction.right_side, status, np.int8(Status.WRONG_SIDE)), np.int8)
-    wrong = status == Status.WRONG_SIDE
-    surface[wrong] = pixels[wrong] = np.nan
-    return Projection(pixels, status, surface)
+    pixels[status == Status.WRONG_SIDE] = np.nan
+    return Projection(pixels, status)
 
 
 # From pixels to rays in the water, and to points on a plane (paper, eq. 7-12).
