@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from finssim.core.optics import COEFFICIENTS
 from finssim.identification.uncertainty import intervals, trial_covariance
 from finssim.localization.camera_file import load_camera
 from finssim.survey.camera_fit import (
-    MODELS,
     adjust,
     calibrate_camera,
     evidence,
@@ -21,7 +21,7 @@ from survey.board_views import LENSES, PHOTOGRAPHS, photographed, views
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", COEFFICIENTS)
 def test_a_lens_comes_back_from_its_pictures(model):
     """Of every model: pixels over the whole picture to a fraction of the noise of a corner."""
     lens = LENSES[model]

@@ -33,8 +33,6 @@ __all__ = [
 Array = npt.NDArray[np.float64]
 
 
-# Tag corners as a detector reports them, computed from the optics without drawing a picture.
-
 # Result of a detector that fits the known tag to the picture when ripples bend the tag's image.
 #
 # The fit of `localization.detection` moves a homography until the edges of all cells agree with the picture, so its
@@ -490,8 +488,7 @@ def camera_of(
     """
     if severity not in ERRORS:
         raise PlantSpecError(f"unknown severity '{severity}'; available: {', '.join(ERRORS)}")
-    if vehicle.tags is None:
-        raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
+    tags = _tags_of(vehicle)
     errors, random = ERRORS[severity], np.random.default_rng([seed, 0x517E])
     nominal = basin_of(vehicle)
     true = true_site(basin or nominal, finer=max(_height(basin or nominal) / _height(nominal), 1.0))
@@ -501,9 +498,15 @@ def camera_of(
         jitter=errors.jitter,
         dropout=errors.dropout,
         ripples=errors.ripples,
-        mounts={tag: _moved(mount, errors, random) for tag, mount in vehicle.tags.mounts.items()},
+        mounts={tag: _moved(mount, errors, random) for tag, mount in tags.mounts.items()},
     )
     return replace(true, latency=settings.latency), _calibrated(true, errors, random, severity), settings
+
+
+def _tags_of(vehicle: Vehicle) -> Tags:
+    if vehicle.tags is None:
+        raise PlantSpecError(f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one")
+    return vehicle.tags
 
 
 def _calibrated(true: Pool, errors: _Errors, random: np.random.Generator, severity: str) -> Pool:
@@ -614,15 +617,15 @@ class PictureCamera:
             edge=self._tags.edge_of(tag),
             border_cells=family.border,
             margin=MARGIN * self._tags.edge_of(tag),
-            pose=_placed(start, mount.position, mount.orientation),
-            end=None if end is None else _placed(end, mount.position, mount.orientation),
+            pose=_placed(start, mount),
+            end=None if end is None else _placed(end, mount),
         )
 
 
-def _placed(body: tuple[Array, Array], position: npt.ArrayLike, orientation: npt.ArrayLike) -> oc.ObjectPose:
-    """Pose of a thing fixed to the body, pool frame."""
-    x, y, z = (body[0] + quat_rotate(body[1], np.asarray(position))).tolist()
-    q = np.asarray(quat_multiply(body[1], orientation))
+def _placed(body: tuple[Array, Array], mount: TagMount) -> oc.ObjectPose:
+    """Pose of a tag on the body, pool frame."""
+    x, y, z = (body[0] + quat_rotate(body[1], np.asarray(mount.position))).tolist()
+    q = np.asarray(quat_multiply(body[1], mount.orientation))
     a, b, c, d = (q / np.linalg.norm(q)).tolist()
     return oc.ObjectPose(position=(x, y, z), orientation=(a, b, c, d))
 
@@ -656,13 +659,10 @@ class PoolCamera:
             PlantSpecError: The vehicle has no tags, or there is no such mode.
         """
         s = settings or CameraSettings(latency=site.latency)
-        if vehicle.tags is None:
-            raise PlantSpecError(
-                f"vehicle {vehicle.name} has no tags: a camera cannot find it, run without one"
-            )
+        tags = _tags_of(vehicle)
         if mode not in ("pictures", "corners"):
             raise PlantSpecError(f"unknown camera mode '{mode}'; available: pictures, corners")
-        tags = vehicle.tags.model_copy(update={"mounts": {**vehicle.tags.mounts, **s.mounts}})
+        tags = tags.model_copy(update={"mounts": {**tags.mounts, **s.mounts}})
         ripples = Ripples(rms_slope=s.ripples, seed=seed) if s.ripples else None
         self._view: CornerCamera | PictureCamera
         if mode == "corners":

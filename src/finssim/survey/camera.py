@@ -33,9 +33,9 @@ from finssim.localization.camera_file import write_camera
 from finssim.localization.detection.pictures import pictures
 from finssim.survey.boards import Board, BoardView, parse_size, see_board
 from finssim.survey.camera_fit import (
-    MODELS,
     CameraFit,
     calibrate_camera,
+    check_model,
     empty_edges,
     picture_grid,
     pixel_error,
@@ -276,8 +276,7 @@ def run(
     Raises:
         CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
     """
-    if model not in MODELS:
-        raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(MODELS)}")
+    check_model(model)
     refuse_places(out, report, "camera")
     screen = Console(stderr=True)
     chosen = board.made()

@@ -28,19 +28,17 @@ from finssim.survey.pose import Pose
 from finssim.trials.findings import CalibrationError, Finding, finding
 
 __all__ = [
-    "MODELS",
     "CameraFit",
     "FittedView",
     "adjust",
     "calibrate_camera",
+    "check_model",
     "evidence",
     "lens_names",
     "lens_vector",
 ]
 
 Array = NDArray[np.float64]
-
-MODELS = tuple(COEFFICIENTS)
 
 FOCAL_SHARES = (1.0 / math.pi, 0.6, 1.2)
 """Focal lengths from which a fisheye is fitted, in widths of the image."""
@@ -268,7 +266,8 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
         CalibrationError: Unknown model, fewer than four views, pictures of several sizes, which are named, or corners
             that no lens explains.
     """
-    _check(views, model)
+    check_model(model)
+    _check(views)
     bundle = adjust(views, model)
     _refuse_nonsense(bundle, views)
     used, bundle = _without_outliers(views, bundle)
@@ -298,9 +297,13 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
     )
 
 
-def _check(views: Sequence[BoardView], model: str) -> None:
-    if model not in MODELS:
-        raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(MODELS)}")
+def check_model(model: str) -> None:
+    """Refuse a lens model that is not known with a CalibrationError."""
+    if model not in COEFFICIENTS:
+        raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(COEFFICIENTS)}")
+
+
+def _check(views: Sequence[BoardView]) -> None:
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(
             f"{len(views)} pictures show the board, expected at least {FEWEST_VIEWS}: take 15 to 30, the board tilted "
@@ -387,19 +390,10 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
     """Return estimates by name, from half widths of the 95 % intervals in the order of `lens_names`."""
     estimates = {}
     for name, value, width in zip(lens_names(lens.model), lens_vector(lens), half, strict=True):
-        unit, limit, note = "-", math.inf, "not told"
-        if name.startswith("f"):
-            unit, limit, note = (
-                "px",
-                UNSURE_FOCAL * value,
-                "not distinguishable from the distance of the board",
-            )
-        elif name.startswith("c"):
-            unit, limit, note = (
-                "px",
-                UNSURE_CENTRE * lens.width,
-                "not distinguishable from a rotation of the board",
-            )
+        unit, limit, note = {
+            "f": ("px", UNSURE_FOCAL * value, "not distinguishable from the distance of the board"),
+            "c": ("px", UNSURE_CENTRE * lens.width, "not distinguishable from a rotation of the board"),
+        }.get(name[0], ("-", math.inf, "not told"))
         estimate = Estimate.within(name, value, width, unit, width < limit, note)
         if unit == "-" and abs(value) < width < limit:
             estimate = replace(estimate, note="not distinguishable from 0")
