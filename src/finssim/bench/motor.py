@@ -105,11 +105,8 @@ def log_of(trial: Trial, name: str, thruster: Thruster) -> MotorLog | None:
         latest = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
         raw = np.abs(raw) * _last_sign(command)[latest]
         findings.append(finding("sign_of_command", column=measured))
-    response = (
-        _converted(raw * RPM, "speed", thruster)
-        if measured.startswith("rpm_")
-        else _converted(raw, "force", thruster)
-    )
+    unit, size = ("speed", RPM) if measured.startswith("rpm_") else ("force", 1.0)
+    response = _converted(raw * size, unit, thruster)
     steps, levels = find_steps(times, held), []
     for step in steps:
         rows = (t >= step.end - SETTLED * (step.end - step.time)) & (t <= step.end)

@@ -167,10 +167,8 @@ def _average(
     density = {name: np.exp(log - highest) for name, log in logs.items()}
     weights = {name: float(w.sum()) for name, w in density.items()}
     total = sum(weights.values())
-    grid, density_of = (
-        np.concatenate([g for g, _ in parts.values()]),
-        np.concatenate([density[n] for n in parts]) / total,
-    )
+    grid = np.concatenate([g for g, _ in parts.values()])
+    density_of = np.concatenate([density[n] for n in parts]) / total
     ends = []
     for j in range(2):  # no one knows that a term is absent: the intervals of both terms are in them too
         some = [_quantiles(grid[:, j], density_of)]

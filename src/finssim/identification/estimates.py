@@ -319,14 +319,11 @@ def other_estimates(
                 alone = variance * (value / known**2.0 - coordinate.start / std**2.0)
                 span = 1.96 * float(np.sqrt(variance))
                 if abs(alone - coordinate.start) > span:
-                    what = (
-                        f"height of {', '.join(horizontal(p.vehicle))}"
-                        if name == PLACES[0]
-                        else f"{name[-1]} of the centre of gravity"
-                    )
-                    bounds.append(
-                        finding("place_contradicted", what, value=alone, half=span, file=coordinate.start)
-                    )
+                    what = f"{name[-1]} of the centre of gravity"
+                    if name == PLACES[0]:
+                        what = f"height of {', '.join(horizontal(p.vehicle))}"
+                    fields = {"value": alone, "half": span, "file": coordinate.start}
+                    bounds.append(finding("place_contradicted", what, **fields))
         elif half > limit:
             note = f"uncertain by ±{half:.2g} {unit}"
         path = f"{SET}.{name}" if name in p.terms else paths.get(name)

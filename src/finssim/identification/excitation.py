@@ -121,11 +121,8 @@ def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
     values = np.concatenate([np.abs(m.nu[:, i]) for m in motions] or [np.empty(0)])
     values = values[np.isfinite(values)]
     moving = values[values > max(0.02 * values.max(initial=0.0), 1e-9)]
-    return (
-        (float(np.percentile(moving, 20.0)), float(np.percentile(moving, 99.0)))
-        if len(moving)
-        else (0.0, 0.0)
-    )
+    low, high = np.percentile(moving, [20.0, 99.0]).tolist() if len(moving) else (0.0, 0.0)
+    return low, high
 
 
 def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) -> float:

@@ -279,23 +279,18 @@ class Parameters:
             out += [self._of_axis(axis, kind) for kind in kinds[self.damping[axis]]]
         w, inf = self.vehicle, np.inf
         weight, B = w.weight, w.buoyancy
-        z = self.r_h[2]
-        k = B * (w.body.center_of_buoyancy[2] - z) - weight * (w.body.center_of_gravity[2] - z)
+        k = float(matrices(w).arm[2])
         tc = float(np.mean([t.time_constant for t in w.thrusters.values()] or [0.0]))  # a glider has none
         late = float(np.mean([t.delay for t in w.thrusters.values()] or [0.0]))
+        scale = (
+            (LIKELY_SCALE, 0.05, 20.0, 1.0, SCALE_STD, 0.0) if self.likely else (1.0, 0.05, 20.0, 1.0, inf)
+        )
         table = {
-            "thrust_scale": (
-                "-",
-                *(
-                    (LIKELY_SCALE, 0.05, 20.0, 1.0, SCALE_STD, 0.0)
-                    if self.likely
-                    else (1.0, 0.05, 20.0, 1.0, inf)
-                ),
-            ),
+            "thrust_scale": ("-", *scale),
             "thrust_lag": ("s", max(tc, 0.02), SHORTEST_LAG, 5.0, 2.0),
             "thrust_delay": ("s", late, 0.0, LONGEST_DELAY, 0.2),
             "buoyancy_excess": ("N", B - weight, -0.9 * weight, 10.0 * weight, 0.02 * weight),
-            "k": ("N m/rad", max(float(k), 1e-3), 0.0, inf, max(float(k), 0.02 * B)),
+            "k": ("N m/rad", max(k, 1e-3), 0.0, inf, max(k, 0.02 * B)),
         }
         for name, path in places(w).items():
             table[name] = ("m", float(number_in(w, path) or 0.0), -inf, inf, 0.2, PLACE_STD[origin(w, path)])

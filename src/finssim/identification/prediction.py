@@ -221,11 +221,8 @@ def _add(
                 values[name][inside] = np.interp(since - late, t, x)
         return values
 
-    late = (
-        _late(pair, at)
-        if all(segment.drive.commanded for segment in segments) and model not in pair.diverged
-        else 0.0
-    )
+    commanded = all(segment.drive.commanded for segment in segments)
+    late = _late(pair, at) if commanded and model not in pair.diverged else 0.0
     if late:
         pair.late[model] = late
     pair.simulated[model] = at(late)

@@ -523,12 +523,8 @@ def _remarks(replay: Replay) -> list[str]:
                 findings.append(finding("velocity_derived", pair.name, axis=str(axis), source=source))
             top = np.nanpercentile(np.abs(pair.measured.get(pair.response(axis), np.zeros(1))), 99.0)
             if 0.0 < BEYOND * fitted.get(axis, 0.0) < top:
-                unit = UNITS[pair.response(axis)]
-                findings.append(
-                    finding(
-                        "extrapolates", pair.name, axis=axis, top=float(top), fitted=fitted[axis], unit=unit
-                    )
-                )
+                fields = {"top": float(top), "fitted": fitted[axis], "unit": UNITS[pair.response(axis)]}
+                findings.append(finding("extrapolates", pair.name, axis=axis, **fields))
         if not scores:
             findings.append(finding("no_axis", pair.name))
         for model, late in pair.late.items():

@@ -472,12 +472,10 @@ class Rollouts:
             CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
         """
         steps = {round(s.step, 9) for s in segments}
-        if len(steps) != 1:
-            raise CalibrationError(
-                "nothing to simulate: no trial has a usable interval"
-                if not steps
-                else f"segments have steps of {sorted(steps)} s, expected one step for all"
-            )
+        if not steps:
+            raise CalibrationError("nothing to simulate: no trial has a usable interval")
+        if len(steps) > 1:
+            raise CalibrationError(f"segments have steps of {sorted(steps)} s, expected one step for all")
         wide = [s.trial for s in segments if s.drive.B.shape[1] > MAX_THRUSTERS]
         if wide:
             raise CalibrationError(f"{wide[0]}: more than {MAX_THRUSTERS} input channels cannot be simulated")

@@ -646,10 +646,8 @@ class Shooting:
         forces = np.isin(parameters.names, ("heave.d1", "heave.d2", "buoyancy_excess"))
         self._relative_step = np.where(forces & self.released, FORCE_STEP, RELATIVE_STEP)
         # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
-        by_thruster, sideways = (
-            np.array([s.drive.thrusters for s in segments]),
-            horizontal(parameters.vehicle),
-        )
+        by_thruster = np.array([s.drive.thrusters for s in segments])
+        sideways = horizontal(parameters.vehicle)
         self._by_thruster = by_thruster[:, None, None]
         self._leverage = np.zeros((len(segments), 6, MAX_THRUSTERS))
         for j, (name, thruster) in enumerate(parameters.vehicle.thrusters.items()):

@@ -548,9 +548,8 @@ def _end(programme: Programme, recording: Recording, world: int) -> float:
         return programme.duration
     t = np.arange(len(recording.position)) * recording.step
     coasting = np.flatnonzero(programme.phase == "coast") / programme.rate
-    rising = (
-        np.gradient(recording.position[:, world, 2].astype(float), recording.step) > programme.ascent_speed
-    )
+    height = recording.position[:, world, 2].astype(float)
+    rising = np.gradient(height, recording.step) > programme.ascent_speed
     since = np.where((t >= coasting[0]) & rising, t, np.inf)
     settled = float(since.min()) + programme.ascent_time
     return min(programme.duration, settled)

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
 from finssim.trials.free_motion import FEWEST_SPEEDS, compared_columns, free_motion
-from finssim.trials.inputs import InputForces, drive, implausible, no_input, within_reach
+from finssim.trials.inputs import InputForces, drive, implausible, no_input, widest_step, within_reach
 from finssim.trials.motion import Motion, answers, motion, up_in_body
 from finssim.trials.significance import Relation, relation
 from finssim.trials.trial import COLUMNS, NU, TAU, Array, Trial, column_of
@@ -88,8 +88,7 @@ def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
 def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
     t, _ = trial.series(names[0])
     steps = np.diff(t)
-    usual = float(np.median(steps))
-    longest = max(0.5, 4.0 * usual)
+    longest = widest_step(t)
     within = steps[steps <= longest]  # half of them at least
     column = column_of(names[0])
     silent = float(steps[steps > longest].sum()) + (t[0] - trial.t[0]) + (trial.t[-1] - t[-1])
@@ -134,9 +133,9 @@ def _values(trial: Trial, name: str) -> list[Finding]:
     if np.ptp(y) == 0.0:
         return [finding("constant", value=y[0])]
     wild = ~within_reach(name, y)
-    findings = (
-        [finding("wild", samples=wild.sum(), value=np.abs(y).max(), unit=column.unit)] if wild.any() else []
-    )
+    findings = []
+    if wild.any():
+        findings.append(finding("wild", samples=wild.sum(), value=np.abs(y).max(), unit=column.unit))
     if _coarse(y):
         return findings
     if name in ("z", "depth") and (above := float(np.percentile(y if name == "z" else -y, 99.0))) > FLYING:
@@ -347,13 +346,10 @@ def _driven_identifiability(
     impulse = float(vehicle.rigid_body_mass_matrix()[i, i]) * fastest
     turns = impulse >= LEAST_INERTIA * report.strongest * SHORT and fastest >= 3.0 * report.noise
     valid = np.isfinite(q).all(axis=1)
-    # Small angles about the mean.
-    angle = 2.0 * float(np.std(q[valid, 0 if report.axis == "roll" else 1])) if valid.sum() >= 10 else 0.0
-    k = (
-        f"{report.axis} angle varies by {np.degrees(angle):.2g}°"
-        if valid.sum() >= 10
-        else "no roll and pitch"
-    )
+    angle, k = 0.0, "no roll and pitch"
+    if valid.sum() >= 10:  # small angles about the mean
+        angle = 2.0 * float(np.std(q[valid, 0 if report.axis == "roll" else 1]))
+        k = f"{report.axis} angle varies by {np.degrees(angle):.2g}°"
     floats = report.coasts >= 1.0 or report.rests >= 1.0 or report.both_directions
     buoyancy = "one direction and no coast: goes with d1; dive and coast"
     if floats:
@@ -479,18 +475,14 @@ def work_findings(
         if answer.chance < UNLIKELY and answer.correlation < AGAINST:
             held = np.abs(tau[both]) > QUIET * report.strongest
             sure = report.axis in named or (not named and held.sum() / motion.rate > LONG_PUSH)
-            findings.append(
-                finding(
-                    "energy_taken",
-                    severity="refused"
-                    if sure and work < -0.6 * effort and report.axis != "heave"
-                    else "care",
-                    work=-work / motion.rate,
-                    axis=str(report.axis),
-                    wrench=TAU[i],
-                    velocity=NU[i],
-                )
-            )
+            against = sure and work < -0.6 * effort and report.axis != "heave"
+            fields = {
+                "work": -work / motion.rate,
+                "axis": str(report.axis),
+                "wrench": TAU[i],
+                "velocity": NU[i],
+            }
+            findings.append(finding("energy_taken", severity="refused" if against else "care", **fields))
     return findings
 
 

@@ -167,15 +167,9 @@ def _keep(table: ColumnTable, name: str, column: list[Any]) -> None:
         table.words[name] = [cell if isinstance(cell, str) else "" for cell in column]
         return
     if text_rows:
-        table.findings.append(
-            finding(
-                "not_numbers",
-                column=name,
-                cells=len(text_rows),
-                cell=column[text_rows[0]][:40],
-                row=text_rows[0] + 1,
-            )
-        )
+        first = text_rows[0]
+        about = {"column": name, "cells": len(text_rows), "cell": column[first][:40], "row": first + 1}
+        table.findings.append(finding("not_numbers", **about))
         for i in text_rows:
             column[i] = math.nan
     table.numbers[name] = np.array(column, dtype=float)
@@ -362,15 +356,8 @@ def _phases(texts: list[str] | None, findings: list[Finding]) -> NDArray[np.str_
     table = {word: word.strip().lower() for word in set(texts)}
     unknown = sorted(word for word in table.values() if word not in PHASES and word)
     if unknown:
-        findings.append(
-            finding(
-                "unknown_phases",
-                word=unknown[0],
-                hint=did_you_mean(unknown[0], list(PHASES)),
-                known=PHASES,
-                count=len(unknown),
-            )
-        )
+        first, hint = unknown[0], did_you_mean(unknown[0], list(PHASES))
+        findings.append(finding("unknown_phases", word=first, hint=hint, known=PHASES, count=len(unknown)))
     return np.array([table[w] if table[w] in PHASES else "" for w in texts], dtype=np.str_)
 
 

@@ -182,11 +182,10 @@ def _messages(
     complaints = io.StringIO()  # pymavlink prints what it skips at a cut
     with contextlib.redirect_stderr(complaints), contextlib.redirect_stdout(complaints):
         try:
-            log = (
-                DFReader.DFReader_binary(str(path))
-                if dataflash
-                else mavutil.mavlogfile(str(path), robust_parsing=True)
-            )
+            if dataflash:
+                log = DFReader.DFReader_binary(str(path))
+            else:
+                log = mavutil.mavlogfile(str(path), robust_parsing=True)
         except Exception as error:  # pymavlink raises whatever it stumbles over
             raise CalibrationError(f"{path}: not an ArduPilot log: {error}") from None
         systems: set[int] = set()

@@ -133,11 +133,9 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
     way_out = "say it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
     config = parameters.get("FRAME_CONFIG")
     if config is None or int(config) not in FRAMES:
-        lack = (
-            "does not name its frame"
-            if config is None
-            else f"has FRAME_CONFIG {int(config)}, which is not known here"
-        )
+        lack = "does not name its frame"
+        if config is not None:
+            lack = f"has FRAME_CONFIG {int(config)}, which is not known here"
         raise CalibrationError(
             f"the log {lack}, so it is unknown which output drives which thruster: {way_out}"
         )
@@ -187,9 +185,6 @@ def _likeness(motor: np.ndarray, column: np.ndarray) -> float:
     """Cosine between the forces, plus the mean agreement of the signs of the moments that the motor is used for."""
     force = motor[:3] @ column[:3] / np.linalg.norm(motor[:3])
     used = motor[3:] != 0.0
-    moments = (
-        float(np.mean(np.sign(motor[3:][used]) * np.sign(np.round(column[3:][used], 3))))
-        if used.any()
-        else 0.0
-    )
-    return float(force + (moments if used.any() else np.sign(force)))
+    if not used.any():
+        return float(force + np.sign(force))
+    return float(force + np.mean(np.sign(motor[3:][used]) * np.sign(np.round(column[3:][used], 3))))

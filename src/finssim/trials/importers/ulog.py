@@ -88,11 +88,9 @@ def _outputs(data: dict[str, Any], t: Array, request: Request, parameters: Mappi
     }
     outputs = {i: (f"C{i}", 1) for i, values in pulses.items() if np.isfinite(values).any()}
     vehicle, stated = request.vehicle, request.mapped.ardusub.outputs
-    note = (
-        finding("outputs_unassigned", vehicle=vehicle.name)
-        if vehicle is not None
-        else finding("pulses_unnamed")
-    )
+    note = finding("pulses_unnamed")
+    if vehicle is not None:
+        note = finding("outputs_unassigned", vehicle=vehicle.name)
     if vehicle is not None and (stated or all(t.motor_index is not None for t in vehicle.thrusters.values())):
         outputs, note = outputs_of(vehicle, {}, stated)
         notes = [note]
