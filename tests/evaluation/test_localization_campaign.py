@@ -111,10 +111,6 @@ def test_errors_of_a_campaign_have_the_stated_spread():
     assert all(one.truth.camera.lens == lens for one in drawn)  # the camera is what it is; its file is wrong
 
 
-ONCE = {"lens", "tape", "level"}
-"""Errors of a campaign, which no visit shows."""
-
-
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(Conditions)])
 def test_each_condition_alone_does_what_it_says(name):
     """With all others zero, only its own error is there."""

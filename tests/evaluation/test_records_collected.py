@@ -27,7 +27,6 @@ from tests.reference.observed import published_t1
 pytestmark = pytest.mark.slow
 
 FINSROV = load_vehicle("finsrov")
-LIMITS = np.asarray(FINSROV.wrench_limits)
 STATIONS = (Station((0.6, 0.25, -0.4), 0.5), Station((-0.6, -0.25, -0.6), -0.5))
 SECONDS = 6.0
 

@@ -23,8 +23,6 @@ from reference import gz_sim
 from reference.gz_sim import BASE, EXPLICIT, HEAVY, TETHYS, Origin, element, euler, tree, write
 from reference.imported import adding, assert_moves_alike, setting, simulated, unnoticed
 
-COLLISION = "world/model/link/collision"
-
 
 def imported(folder, model):
     return read_foreign(write(folder / f"{model.name}.sdf", model)).vehicle(folder)
