@@ -130,7 +130,7 @@ class Arrays:
         return (gain * (q if rows >= columns else q.T)).astype(np.float32)
 
     def recorded(self, function: Callable[..., None]) -> Callable[..., None]:
-        """Return a function that does the same; on a GPU it repeats a recording, see `Recording`.
+        """Return a function that does the same; on a GPU it repeats a recording, see `CudaGraph`.
 
         Args:
             function: It takes arrays, and writes its results into arrays that stay where they are.
@@ -138,7 +138,7 @@ class Arrays:
         if self.device is None or self.group is not None or not self.device.startswith("cuda"):
             return function
         self._pool = self._pool or self.xp.cuda.graph_pool_handle()
-        return Recording(function, self._pool)
+        return CudaGraph(function, self._pool)
 
     def state(self) -> dict[str, Any]:
         """The random streams, for `load`."""
@@ -154,7 +154,7 @@ class Arrays:
             self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
 
 
-class Recording:
+class CudaGraph:
     """A function of torch tensors, repeated on a GPU as one CUDA graph for each shape of its arguments.
 
     Launching the kernels of a small network one by one takes longer than they run. A graph repeats the same kernels at
