@@ -9,6 +9,7 @@ from finssim.trials.conversion import factor
 from finssim.trials.findings import CalibrationError
 from finssim.trials.importers.assemble import Stream, merge, moved_in_time
 from finssim.trials.importers.dispatch import read_trials
+from trials.importers.tables import read
 
 NED = "frame: {body: FRD, world: NED}"
 
@@ -18,12 +19,8 @@ def log(folder, columns, how=NED):
     n = 3
     filled = {"t": [0.0, 1.0, 2.0]} | {k: np.broadcast_to(v, n).tolist() for k, v in columns.items()}
     folder.mkdir(exist_ok=True)
-    lines = [",".join(filled), *(",".join(map(repr, row)) for row in zip(*filled.values(), strict=True))]
-    (folder / "data.csv").write_text("\n".join(lines) + "\n")
     named = "" if "columns" in how else f"columns: [{', '.join(columns)}]\n"
-    (folder / "map.yaml").write_text(f"time: t\n{named}{how}")
-    (trial,) = read_trials([folder / "data.csv"], column_map=folder / "map.yaml")
-    return trial
+    return read(folder, filled, f"time: t\n{named}{how}", "data.csv")
 
 
 def test_a_dive_with_the_nose_down_in_ned(tmp_path):

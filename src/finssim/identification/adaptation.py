@@ -173,9 +173,7 @@ class Adaptation:
             x: Vectors of estimates, in the units of `names`, (W, P).
         """
         v, W = self.vehicle, len(x)
-        drag, weight, first, gains, push = (
-            x[:, :1], x[:, 1], x[:, 2:5], x[:, 5:-2], x[:, -2:],
-        )  # fmt: skip
+        drag, weight, first, gains, push = x[:, :1], x[:, 1], x[:, 2:5], x[:, 5:-2], x[:, -2:]
         gravity = v.water.density * v.water.gravity
         before = v.body.displaced_volume
         volume = np.maximum(before - weight / gravity, 0.1 * before)
