@@ -429,6 +429,9 @@ WORLD = 6000.0
 LONGEST_STEP = 0.025
 """Physics step above which a simulation step is divided [s]."""
 
+MOTION = ("nu", "position", "quaternion", "tau", "pull", "earlier")
+"""Arguments of a rollout that are no fields of the plant."""
+
 OPEN = 1.0e6
 """Force limit of an actuator that has none [N]."""
 
@@ -578,11 +581,10 @@ class Rollouts:
         Returns:
             Responses of all of them.
         """
-        arrays = {f"plant.{k}": np.asarray(v) for k, v in (plant or {}).items()}
-        arrays |= {f"initial.{k}": np.asarray(v) for k, v in (initial or {}).items()}
-        arrays |= {} if disturbance is None else {"tau": np.asarray(disturbance)}
-        arrays |= {} if pull is None or not pull.any() else {"pull": pull}
-        arrays |= {} if earlier is None else {"earlier": earlier}
+        given = {**(plant or {}), **(initial or {}), "tau": disturbance, "earlier": earlier}
+        if pull is not None and pull.any():
+            given["pull"] = pull
+        arrays = {name: np.asarray(values) for name, values in given.items() if values is not None}
         C = candidates or max([1, *(a.shape[0] for a in arrays.values())])
         n, S = self._force.shape[:2]
         out = {
@@ -621,16 +623,15 @@ class Rollouts:
             view = target.numpy().reshape(*shape, *target.numpy().shape[target.ndim :])
             view[...] = values
 
-        plant = {k.removeprefix("plant."): a for k, a in given.items() if k.startswith("plant.")}
         fields = {k: np.asarray(v)[None, None] for k, v in self.nominal.items()}
-        fields |= {k: v[None] for k, v in self.own.items()} | plant
+        fields |= {k: v[None] for k, v in self.own.items()}
+        fields |= {k: v for k, v in given.items() if k not in MOTION}
         density = np.array([s.density for s in self.segments]) / self.vehicle.water.density
         for name in ("volume", "form_drag", "skin_drag"):
             fields[name] = fields[name] * density
         if self._current.any():
             write(sim.water.current, self._current)
         write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
-        start = {k.removeprefix("initial."): a for k, a in given.items() if k.startswith("initial.")}
         self._place(sim, write, {})
         sim.reset()
         # Motors without lag come to the first command in one step; with theirs they then follow the others.
@@ -649,7 +650,7 @@ class Rollouts:
             if own is swift:
                 ring = sim.state.commands.numpy().reshape(C, S, -1, MAX_THRUSTERS)
                 ring[...] = sim.state.actuator.numpy().reshape(C, S, 1, MAX_THRUSTERS)
-        self._place(sim, write, start)
+        self._place(sim, write, given)
         return self._march(sim, C, out, given)
 
     def _place(
