@@ -121,8 +121,7 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
 
 def time_blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
     """Block of every sample: each trial in equal spans of time, the longer the trial the more of them."""
-    start = np.array([s.t0 for s in problem.segments])[problem.measured.segment]
-    t = start + problem.measured.time
+    t = problem.measured.clock
     present = np.unique(trial)
     span = {g: (float(t[trial == g].min()), float(np.ptp(t[trial == g]))) for g in present}
     total = sum(length for _, length in span.values())

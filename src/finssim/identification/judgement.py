@@ -36,8 +36,7 @@ def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
     Others are those that the fit rejects and that stand alone among the residuals of their channel and trial, at most a
     twentieth of these: the errors of a wrong model last, or are many, and count.
     """
-    m = problem.measured
-    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    m, clock = problem.measured, problem.measured.clock
     residual = solution.linear.residual
     series = len(m.names) * problem.groups[m.segment] + m.channel
     out = np.abs(residual) <= 2.0 * CUT * solution.std
@@ -234,8 +233,7 @@ def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> t
     how = "simulated from the inputs alone" if error is None else "each stretch predicted without it"
     error = solution.linear.residual if error is None else error
     m, out, good = problem.measured, [], believed(problem, solution)
-    names = channels(problem, solution)
-    clock = m.time + np.array([s.t0 for s in problem.segments])[m.segment]
+    names, clock = channels(problem, solution), m.clock
     for axis in axes:
         name, parts = names[axis], []
         rows, trial, spans = _shown_by(problem, name, good)

@@ -272,6 +272,7 @@ class Residuals:
         edges: First sample of each segment, and N, (S + 1,).
         value: Measured, (N,).
         time: Since the segment's start [s], (N,).
+        clock: On the trial's clock [s], (N,).
     """
 
     def __init__(self, segments: Sequence[Segment], channels: Sequence[str]) -> None:
@@ -290,6 +291,7 @@ class Residuals:
         self.segment, self.channel = joined["segment"].astype(int), joined["channel"].astype(int)
         self.value, time = joined["value"], joined["time"]
         self.time = time * segments[0].step
+        self.clock = self.time + np.array([s.t0 for s in segments])[self.segment]
         self._steps = np.array([s.steps for s in segments])[self.segment]
         self.edges = np.searchsorted(self.segment, np.arange(len(segments) + 1))
         aside = np.array([[c in s.aside for c in self.names] for s in segments])

@@ -425,7 +425,7 @@ LONGEST = 1.0
 NEAR = 0.15
 """Distance from the most shared motion within which the peak is refined [s]."""
 
-BLOCKS = 10
+PARTS = 10
 """Parts of a recording, each left out in turn to see how far the offset rests on it."""
 
 LEAST = 0.6
@@ -473,7 +473,7 @@ def offset(fixed: Array, moved: Array) -> Offset | None:
     x, y = _centred(fixed[:, both]), _centred(moved[:, both])
     longest = min(int(LONGEST * RATE), len(x) // 3)
     lags = np.arange(-longest, longest + 1)
-    edges = np.linspace(0, len(x), BLOCKS + 1).astype(int)[:-1]
+    edges = np.linspace(0, len(x), PARTS + 1).astype(int)[:-1]
     sums = np.array([_sums(x, y, int(k), edges) for k in lags])  # (lags, blocks, xx yy xy)
     energy = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
     if not energy > 0.0:
@@ -483,8 +483,8 @@ def offset(fixed: Array, moved: Array) -> Offset | None:
     place, height = _peak(_correlation(sums.sum(axis=1)), near)
     if not height >= LEAST:
         return None
-    parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(BLOCKS)]
-    spread = float(np.sqrt((BLOCKS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
+    parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(PARTS)]
+    spread = float(np.sqrt((PARTS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
     if not np.isfinite(spread):  # without one part there is no peak
         return None
     return Offset(-float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
