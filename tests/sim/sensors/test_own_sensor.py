@@ -116,32 +116,40 @@ def test_a_kind_is_taken_once_and_needs_a_schema():
         add_sensor(type("Bare", (PingerBatch,), {"schema": None, "kind": "bare"}))
 
 
+COMMANDS = """
+import sys
+from finssim.cli import boundary
+from finssim.cli.commands import app
+
+for line in sys.argv[1:]:
+    if status := boundary.run(app, line.split()):
+        sys.exit(status)
+"""
+
+
 @pytest.mark.slow
 def test_commands_accept_a_vehicle_file_with_the_sensor_of_a_package(tmp_path, monkeypatch):
-    """Show, simulate and train, in processes of their own; without the package one sentence."""
+    """Show, simulate and train, in a process of their own; without the package, in another one, one sentence."""
     source = (EXAMPLES / "own/sensor/pinger.py").read_text(encoding="utf-8")
     install(tmp_path, monkeypatch, "acoustics", source, {"sensors": {"pinger": "acoustics:PingerBatch"}})
     (tmp_path / "mine.yaml").write_text(FILE, encoding="utf-8")
 
-    def run(*words, path=(str(tmp_path / "site_acoustics"),)):
+    def run(*lines, path=(str(tmp_path / "site_acoustics"),)):
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*path, str(SOURCE)])}
         return subprocess.run(
-            [sys.executable, "-m", "finssim", *words], capture_output=True, text=True, env=environment, cwd=tmp_path,
+            [sys.executable, "-c", COMMANDS, *lines], capture_output=True, text=True, env=environment, cwd=tmp_path,
             timeout=600,
         )  # fmt: skip
 
-    shown = run("vehicles", "show", "mine.yaml")
-    assert shown.returncode == 0 and "pinger" in shown.stdout, shown.stderr
-    simulated = run(
-        "simulate", "--vehicle", "mine.yaml", "--command", "surge=5", "--duration", "1", "--out", "run.csv"
+    small = "--steps 64 --worlds 8 --set rollout=8 --set batch=32"
+    done = run(
+        "vehicles show mine.yaml",
+        "simulate --vehicle mine.yaml --command surge=5 --duration 1 --out run.csv",
+        f"train t1 --vehicle mine.yaml {small} --out policy",
     )
-    assert simulated.returncode == 0, simulated.stderr
-    trained = run(
-        "train", "t1", "--vehicle", "mine.yaml", "--steps", "64", "--worlds", "8", "--set", "rollout=8",
-        "--set", "batch=32", "--out", "policy",
-    )  # fmt: skip
-    assert trained.returncode == 0, trained.stderr
-    refused = run("vehicles", "show", "mine.yaml", path=())
+    assert done.returncode == 0 and "pinger" in done.stdout, done.stderr
+    assert (tmp_path / "run.csv").is_file() and (tmp_path / "policy" / "policy.onnx").is_file()
+    refused = run("vehicles show mine.yaml", path=())
     assert refused.returncode == 2 and "unknown key 'pinger'" in refused.stderr
 
 
