@@ -106,7 +106,7 @@ def test_a_fit_finds_what_is_true(monkeypatch):
 
     It begins with the file: the weak form does not know the forces of fins.
     """
-    monkeypatch.delattr("finssim.identification.simulation_error.weak_form")
+    monkeypatch.delattr("finssim.identification.stages.weak_form")
     base = "hydrodynamics.calibrated"
     file = TORPEDO.replace(
         {
