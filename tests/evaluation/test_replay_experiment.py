@@ -33,11 +33,12 @@ def small(tmp_path_factory):
 
 
 def test_the_calibrated_model_is_the_best_and_within_the_target(small):
+    """Sway 0.014 and yaw 0.020; an offset of the gyroscope in each segment took up errors of the yaw's drag: 0.047."""
     result, _ = small
     for levels in ("same_levels", "other_levels"):
         models = result[levels]["models"]
         assert result[levels]["best"] == "calibrated"
-        assert models["calibrated"]["aggregate"] <= 0.15
+        assert models["calibrated"]["aggregate"] <= 0.025
         assert models["calibrated"]["by_axis"].keys() == set(AXES)
         for model in MODELS:
             low, high = models[model]["ci95"]

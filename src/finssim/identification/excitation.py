@@ -36,7 +36,7 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: boo
     Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
     wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift. An
     axis whose motion does not stand out of its noise is simulated instead, for the noise would shake the others; but
-    not in a free motion, where nothing drives it. Rates move it without the bias of the gyroscope: what they add up to
+    not in a free motion, where nothing drives it. The bias of the gyroscope is taken off the rates: what they add up to
     is an attitude.
     """
     held = np.full((segment.steps + 1, 6), np.nan)
@@ -52,7 +52,8 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: boo
             drop |= {DETERMINED_BY[axis][0]}
     if not np.isnan(held[:, 3:5]).any():
         drop |= {"roll", "pitch"}
-    measured = {c: pair for c, pair in segment.measured.items() if c not in drop}
+    offsets = dict(zip("pqr", bias[3:], strict=True))
+    measured = {c: (t, x - offsets.get(c, 0.0)) for c, (t, x) in segment.measured.items() if c not in drop}
     return replace(segment, measured=measured, held=held)
 
 

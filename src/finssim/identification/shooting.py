@@ -451,8 +451,8 @@ STREAMS = {
 """Channels that share a clock."""
 
 OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
-"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes [rad/s],
-levels that were mounted askew [rad], pressure at the surface [m]."""
+"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes in free
+motions [rad/s], levels that were mounted askew [rad], pressure at the surface [m]."""
 
 DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
 """Angle and rate of an equilibrium that moves at a constant speed within a segment, as while a manipulator moves."""
@@ -697,6 +697,8 @@ class Shooting:
         rows = [names.index(name) for name in self.offsets]
         self._offset = (m.channel[:, None] == np.array(rows, int)).astype(float)
         std = np.tile([OFFSETS[c] for c in self.offsets], (len(self.segments), 1))
+        # A vehicle that is driven turns steadily, and an offset of its gyroscope would take up errors of its drag.
+        std[np.ix_(~swinging, np.isin(self.offsets, STREAMS["rates"]))] = 1e-9
         for name, (angle, rate) in DRIFTING_REST.items() if swinging.any() else ():
             if angle in names:
                 channel = np.array(names)[m.channel]
