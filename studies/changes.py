@@ -30,8 +30,8 @@ from finssim.identification.adaptation import Adaptation, Follower
 from finssim.identification.vehicle_file import write_vehicle
 from finssim.learning.train import TrainingSettings, train
 from finssim.pool import read_truth
+from finssim.pool.plan import PoolPlan, make_plan
 from finssim.pool.plant_spec import PlantSpec, Severity
-from finssim.pool.run import PoolPlan, make_plan
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime
 from finssim.vehicles import Vehicle, load_vehicle

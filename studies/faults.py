@@ -35,7 +35,7 @@ from finssim.evaluation.robot_trials import PoolJob, noise_seed
 from finssim.evaluation.tables import Table
 from finssim.pool import TruthError, VirtualPool, read_truth
 from finssim.pool.firmware import Firmware
-from finssim.pool.run import PoolPlan
+from finssim.pool.plan import PoolPlan
 from finssim.robot.bridge import Bridge, BridgeSettings
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import MCU, Decoder, encode_telemetry

@@ -28,8 +28,8 @@ from finssim.evaluation.tables import Columns, Table, cells
 from finssim.evaluation.trials import interpolated
 from finssim.pool import read_truth
 from finssim.pool.drawn_plant import positioning_of
+from finssim.pool.plan import make_plan
 from finssim.pool.plant_spec import Severity
-from finssim.pool.run import make_plan
 from finssim.robot.perception import LET_IN_STD
 from finssim.robot.pilots import make_pilot
 from finssim.robot.runtime import Runtime

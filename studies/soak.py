@@ -18,7 +18,7 @@ from finssim.core.provenance import provenance
 from finssim.core.system import peak_memory
 from finssim.evaluation.campaign import write_json
 from finssim.evaluation.tables import Table
-from finssim.pool.run import make_plan
+from finssim.pool.plan import make_plan
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception

@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from finssim.pool import VirtualPool, draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import GroundLinks, SiteWires, serve_realtime, whole_frames
+from finssim.pool.real_time import SiteWires, serve_realtime
+from finssim.pool.servers import GroundLinks, whole_frames
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.water_linked import DvlClient, decode_line
 from finssim.vehicles import load_vehicle

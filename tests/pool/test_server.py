@@ -16,7 +16,9 @@ from finssim.core import realtime
 from finssim.localization.overhead_camera import load_pool
 from finssim.pool.drawn_plant import draw_plant
 from finssim.pool.fleet import Fleet
-from finssim.pool.run import LockstepServer, SiteWires, make_plan, serve_realtime
+from finssim.pool.plan import make_plan
+from finssim.pool.real_time import SiteWires, serve_realtime
+from finssim.pool.servers import LockstepServer
 from finssim.pool.virtual_pool import VirtualPool, read_truth
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import Decoder, LinkError

@@ -7,9 +7,10 @@ import pytest
 
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import OPEN, draw_plant, positioning_of, site_of
+from finssim.pool.plan import make_plan
 from finssim.pool.plant_spec import PlantSpec, PlantSpecError, load_plant_spec
 from finssim.pool.positioning import POSITIONING, Positioning
-from finssim.pool.run import SiteChoice, make_plan
+from finssim.pool.run import SiteChoice
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.links.frames import Decoder
 from finssim.robot.messages import HEADING, POSE, POSITION, VELOCITY, NavigationAid

@@ -14,7 +14,8 @@ from finssim.cli import boundary
 from finssim.cli.commands import app
 from finssim.control.guidance import Station, Track
 from finssim.pool.fleet import Medium, one_picture
-from finssim.pool.run import MediumServer, SiteChoice, swimming
+from finssim.pool.run import SiteChoice, swimming
+from finssim.pool.servers import MediumServer
 from finssim.robot.perception import Perception
 from finssim.robot.pilots import make_pilot
 from finssim.robot.record_reader import open_record

@@ -10,7 +10,7 @@ from finssim.core.rotations import quat_from_yaw
 from finssim.localization.overhead_camera import write_pool
 from finssim.pool.camera import PoolCamera, camera_of
 from finssim.pool.drawn_plant import draw_plant, positioning_of, site_of
-from finssim.pool.run import LockstepServer
+from finssim.pool.servers import LockstepServer
 from finssim.pool.virtual_pool import VirtualPool
 from finssim.robot.wiring import Wiring
 from finssim.vehicles.defaults import vehicle_at

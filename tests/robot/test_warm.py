@@ -11,7 +11,7 @@ import json, sys
 from warp._src.context import user_modules
 
 from finssim.control.guidance import Station
-from finssim.pool.run import make_plan
+from finssim.pool.plan import make_plan
 from finssim.robot.goals import station_of
 from finssim.robot.lockstep import run_lockstep
 from finssim.robot.perception import Perception

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finssim.pool import draw_plant
-from finssim.pool.run import make_plan
+from finssim.pool.plan import make_plan
 from finssim.vehicles import load_vehicle
 from studies import changes as study
 

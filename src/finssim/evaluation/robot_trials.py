@@ -33,8 +33,8 @@ from finssim.evaluation.records import DriveError, read_record
 from finssim.evaluation.trials import PERIOD, GoalTrial, VehicleMotion, guide_of, localization_errors
 from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.pool import read_truth
+from finssim.pool.plan import PoolPlan, make_plan
 from finssim.pool.plant_spec import HOME
-from finssim.pool.run import PoolPlan, make_plan
 from finssim.robot.goals import check_reachable, place_of
 from finssim.robot.links.transports import DEFAULT_BIND
 from finssim.robot.lockstep import run_lockstep

@@ -27,11 +27,7 @@ from finssim.pool.positioning import Exposure, PoseAt, Shutter
 from finssim.robot.links.frames import LinkError
 from finssim.robot.links.transports import bound_socket
 from finssim.robot.messages import Picture
-from finssim.robot.pictures import (
-    LONGEST_FRAGMENT,
-    encode_picture,
-    fragments,
-)
+from finssim.robot.pictures import LONGEST_FRAGMENT, encode_picture, fragments
 from finssim.vehicles import Vehicle
 
 Address = tuple[str, int]

@@ -12,8 +12,10 @@ pytest.importorskip("newton", reason="finssim[perception] is not installed")
 
 from finssim.core.rotations import quat_from_yaw
 from finssim.extensions.perception.onboard import OnboardSensors
+from finssim.pool.plan import make_plan
 from finssim.pool.plant_spec import PlantSpecError
-from finssim.pool.run import Ends, LockstepServer, SiteChoice, make_plan, run
+from finssim.pool.run import Ends, SiteChoice, run
+from finssim.pool.servers import LockstepServer
 from finssim.robot.goals import station_of
 from finssim.robot.links.frames import encode_command
 from finssim.robot.lockstep import LockstepClient

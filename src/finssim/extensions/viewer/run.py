@@ -183,8 +183,8 @@ def _check(choice: SourceChoice) -> str:
 def _pool(choice: SourceChoice) -> Source:
     from finssim.extensions.perception import load_world
     from finssim.extensions.viewer.sources import PoolSource, guide_for
+    from finssim.pool.plan import make_plan
     from finssim.pool.plant_spec import PlantSpecError
-    from finssim.pool.run import make_plan
     from finssim.vehicles.defaults import vehicle_at
 
     name = choice.vehicle or "finsrov"

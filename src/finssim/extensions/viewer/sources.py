@@ -41,7 +41,7 @@ from finssim.extensions.viewer.series import (
 )
 from finssim.extensions.viewer.shapes import shown_of, world_bodies
 from finssim.localization.detection.detector import RegionTracker, detector
-from finssim.pool.run import PoolPlan
+from finssim.pool.plan import PoolPlan
 from finssim.pool.virtual_pool import Truth, read_truth
 from finssim.robot.bridge import Bridge
 from finssim.robot.goals import check_reachable, guide_of

@@ -16,7 +16,8 @@ from finssim.extensions.ros2.topics import TOPICS, quality_profile
 from finssim.extensions.ros2.up import DVL_AFTER, STATIONS_AFTER
 from finssim.extensions.ros2.worlds.clock import PacedClock
 from finssim.pool.fleet import Fleet, Medium
-from finssim.pool.run import MCU_PORT, Ends, PoolFiles, PoolTiming, SiteChoice
+from finssim.pool.real_time import PoolTiming
+from finssim.pool.run import MCU_PORT, Ends, PoolFiles, SiteChoice
 from finssim.pool.run import run as serve
 from finssim.robot.links.transports import DEFAULT_BIND
 from finssim.tasks.communication import Communication
