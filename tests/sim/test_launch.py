@@ -50,7 +50,7 @@ def test_the_environment_limits_the_threads_of_who_names_none(monkeypatch) -> No
         assert slices() == expected and slices(threads=2) == 2
     for given in ("0", "-1", "many"):
         monkeypatch.setenv("FINSSIM_THREADS", given)
-        with pytest.raises(SimulatorError, match=f"FINSSIM_THREADS is '{given}', expected a whole number"):
+        with pytest.raises(SimulatorError, match=f"FINSSIM_THREADS is '{given}', expected an integer"):
             slices()
 
 

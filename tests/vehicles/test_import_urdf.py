@@ -133,7 +133,7 @@ def test_fins_act_as_in_uuv_simulator(tmp_path):
     [
         ("Quadratic", "Cubic", "liftdrag: type is 'Cubic', expected Quadratic or TwoLines"),
         ("<lift_constant>9.87", "<lift_constant>-9.87", "expected a lift_constant above 0"),
-        ("<fin_id>0", "<fin_id>one", "expected fins of different whole numbers"),
+        ("<fin_id>0", "<fin_id>one", "expected fins of different integers"),
         ("<joint_name>lauv/fin0_joint", "<joint_name>none", "fin 0: no joint 'none'"),
     ],
 )
@@ -448,7 +448,7 @@ def test_a_collision_mesh_of_the_displaced_volume_is_the_hull(tmp_path):
         ("<volume>", "<metacentric_width>1</metacentric_width><volume>", "floats as a ship does"),
         ("<volume>", "<volme>1</volme><volume>", "unknown element 'volme'"),
         ("<type>fossen</type>", "", "type is ''"),
-        ("<thrusterID>${id}</thrusterID>", "<thrusterID>1</thrusterID>", "expected different whole numbers"),
+        ("<thrusterID>${id}</thrusterID>", "<thrusterID>1</thrusterID>", "expected different integers"),
         ("FirstOrder", "Second", "type is 'Second'"),
         ("<type>Basic</type>", "<type>Cubic</type>", "type is 'Cubic'"),
         ('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/>', "expected a direction"),

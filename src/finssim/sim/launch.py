@@ -73,7 +73,7 @@ def default_threads() -> int:
     """Number of threads of a simulator that names none: FINSSIM_THREADS, else the processors this process may use."""
     if given := os.environ.get("FINSSIM_THREADS"):
         if not given.isdecimal() or int(given) < 1:
-            raise SimulatorError(f"FINSSIM_THREADS is '{given}', expected a whole number from 1 on")
+            raise SimulatorError(f"FINSSIM_THREADS is '{given}', expected an integer of 1 or more")
         return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 

@@ -147,7 +147,7 @@ def _ros_1(tree: Mapping[Any, Any], path: Path) -> TagLayout:
     bundles = _list(tree.get("tag_bundles") or [], f"{path}: tag_bundles")
     if len(bundles) > 1:
         names = ", ".join(str(_mapping(b, f"{path}: tag_bundles").get("name", "?"))[:40] for b in bundles)
-        raise VehicleError(f"{path}: has the bundles {names}, each in a frame of its own: keep one of them")
+        raise VehicleError(f"{path}: has the bundles {names}, each in a separate frame: keep one of them")
     poses: dict[int, LaidTag] = {}
     for bundle in bundles:
         content = _mapping(bundle, f"{path}: tag_bundles")

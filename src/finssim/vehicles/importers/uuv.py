@@ -262,7 +262,7 @@ def _put_fin(model: Model, plugin: Element, draft: Draft) -> str:
     name = f"fin_{(plugin.findtext('fin_id') or '').strip()}"
     where, path = f"{model.label}: {name.replace('_', ' ')}", f"actuators.{name}"
     if not re.fullmatch(r"fin_\d{1,9}", name) or name in draft.values.get("actuators", {}):
-        raise VehicleError(f"{where}: expected fins of different whole numbers as fin_id: correct it")
+        raise VehicleError(f"{where}: expected fins of different integers as fin_id: correct it")
     refuse_unknown(plugin, WORDS["fin"], where)
     dynamics, law = plugin.find("dynamics"), plugin.find("liftdrag")
     if dynamics is None or law is None:
@@ -458,7 +458,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
     names = [f"thruster_{(plugin.findtext('thrusterID') or '').strip()}" for plugin in thrusters]
     if len(set(names)) < len(names) or not all(n[9:].isdigit() and len(n) < 20 for n in names):
         raise VehicleError(
-            f"{path}: thrusterID are {', '.join(n[9:] for n in names)}, expected different whole numbers"
+            f"{path}: thrusterID are {', '.join(n[9:] for n in names)}, expected different integers"
         )
     turning = {_put_thruster(model, p, n, managed, draft) for p, n in zip(thrusters, names, strict=True)}
     turning |= {_put_fin(model, plugin, draft) for plugin in plugins.get(FIN, [])}
