@@ -117,7 +117,7 @@ def main() -> None:
         print(
             f"{name}: {len(values)} times, {100.0 * distance:.2f} cm and {math.degrees(turn):.2f} degrees rms"
         )
-    print(f"searched {100.0 * tracker.counts.share:.1f} % of the pixels; {estimator.counts['vision']}")
+    print(f"fixes of the filter: {estimator.counts['vision']}")
 
 
 def off(x: float, y: float, heading: float, position: NDArray[np.float64], yaw: float) -> tuple[float, float]:

@@ -37,7 +37,7 @@ def brief_t1():
 def brief_steps():
     """Steps of force last 4 s in place of 9: where the fits that they are made for are not tested."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programme, "STEP_SEQUENCE", BRIEF_STEPS)
+        patch.setitem(programme.PLANS, "step", BRIEF_STEPS)
         yield
 
 

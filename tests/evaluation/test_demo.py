@@ -234,7 +234,7 @@ def test_a_wheel_demonstrates_itself_without_any_extra(installed, folder, tmp_pa
     shutil.copy(folder / "demo.yaml", tmp_path / "demo")
     settings = DemoSettings(steps=8192, scope=replace(SMALL, duration=1.0))
     program = (
-        f"from finssim.identification import programme; programme.STEP_SEQUENCE = {programme.STEP_SEQUENCE}; "
+        f"from finssim.identification import programme; programme.PLANS['step'] = {programme.PLANS['step']}; "
         f"from finssim.studies.demo import DemoSettings, Scope, demo; demo('demo', settings={settings!r})"
     )
     run = subprocess.run(
