@@ -257,7 +257,7 @@ def test_a_replay_allows_for_two_clocks(lead):
 
 @pytest.mark.slow
 def test_unequal_thrusters_are_found_in_a_slow_log():
-    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1.6 %, and in the file."""
+    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1.5 %, and in the file."""
     vehicle, axes = load_vehicle("bluerov2_heavy"), ("surge", "sway", "heave", "yaw")
     gains = np.array([1.06, 0.95, 1.0, 0.97, 1.03, 0.98, 1.05, 0.96])
     levels = {a: [part * vehicle.wrench_limits[AXES.index(a)] for part in (0.12, 0.25)] for a in axes}
@@ -272,7 +272,7 @@ def test_unequal_thrusters_are_found_in_a_slow_log():
     after = calibrated(fit)
     for (name, thruster), gain in zip(vehicle.thrusters.items(), gains, strict=True):
         found = fit.estimates[f"gain.{name}"]
-        assert found.ci95[0] < gain < found.ci95[1] < found.ci95[0] + 0.032 and found.identifiable
+        assert found.ci95[0] < gain < found.ci95[1] < found.ci95[0] + 0.03 and found.identifiable
         assert after.thrusters[name].c_plus == pytest.approx(found.estimate * thruster.c_plus, rel=1e-6)
     true = vehicle.hydrodynamic_set("calibrated")
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == pytest.approx(

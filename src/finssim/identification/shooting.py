@@ -452,7 +452,7 @@ STREAMS = {
 
 OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
 """Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes in free
-motions [rad/s], levels that were mounted askew [rad], pressure at the surface [m]."""
+motions and slow logs [rad/s], levels that were mounted askew [rad], pressure at the surface [m]."""
 
 DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
 """Angle and rate of an equilibrium that moves at a constant speed within a segment, as while a manipulator moves."""
@@ -627,6 +627,7 @@ class Shooting:
         """
         self.segments, self.parameters = tuple(segments), parameters
         self.groups = np.array([s.index for s in segments])
+        self._slow = np.isin(self.groups, [s.index for s in segments if s.drive.changes is not None])
         self.measured = Residuals(segments, channels)
         self.edges = self.measured.edges
         self.few, self._correlated, self.repeats = few, correlated, 1.0
@@ -697,8 +698,8 @@ class Shooting:
         rows = [names.index(name) for name in self.offsets]
         self._offset = (m.channel[:, None] == np.array(rows, int)).astype(float)
         std = np.tile([OFFSETS[c] for c in self.offsets], (len(self.segments), 1))
-        # A vehicle that is driven turns steadily, and an offset of its gyroscope would take up errors of its drag.
-        std[np.ix_(~swinging, np.isin(self.offsets, STREAMS["rates"]))] = 1e-9
+        # In fast logs of a driven vehicle, errors of its drag would be taken for an offset of its gyroscope.
+        std[np.ix_(~swinging & ~self._slow, np.isin(self.offsets, STREAMS["rates"]))] = 1e-9
         for name, (angle, rate) in DRIFTING_REST.items() if swinging.any() else ():
             if angle in names:
                 channel = np.array(names)[m.channel]
@@ -717,9 +718,8 @@ class Shooting:
         p, out = self.parameters, np.zeros((len(self.segments), 6))
         body, weight = p.vehicle.body, p.vehicle.weight
         # In fast logs, which show the motion well, errors of the model would be taken for pulls.
-        slow = np.isin(self.groups, [s.index for s in self.segments if s.drive.changes is not None])
         if {"surge", "sway"} & set(p.axes):
-            out[slow & ~swinging, :2] = TETHER * weight
+            out[self._slow & ~swinging, :2] = TETHER * weight
         coasting = set(p.axes).difference(p.biases)
         for i in COASTING:
             if AXES[i] in coasting and (i < 3 or twisted or not self.coasts):
