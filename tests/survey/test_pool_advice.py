@@ -141,6 +141,29 @@ def test_a_guessed_focal_length_is_enough(factor):
     assert "focal_pulled" in codes(unsaid)
 
 
+def rim(camera, count=8):
+    """Marks above the water as `survey` gives those under it, seen in straight lines."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (count, 3))
+    pixels, ok = camera.lens.project((points - camera.position) @ camera.R_pc)
+    assert ok.all()
+    return points, pixels + 0.25 * rng.standard_normal((count, 2))
+
+
+@pytest.mark.slow
+def test_marks_above_the_water_are_told_from_wrong_rows():
+    """Eight marks on the rim whose flag was forgotten, and one mark under water that is 20 cm off."""
+    wet = survey(overhead(), WATER, FLOOR, 40)
+    points, pixels = rim(overhead())
+    wrong = wet.points.copy()
+    wrong[7, 0] += 0.2
+    seen = observations(np.concatenate([wrong, points]), np.concatenate([wet.pixels, pixels]))
+    fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0))
+    of = {one.code: one.values for one in fit.findings}
+    assert of["marks_dry"]["marks"] == tuple(f"p{i}" for i in range(40, 48))
+    assert of["rows_wrong"] == {"rows": 1}
+
+
 def test_points_without_water_are_noticed():
     """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
     camera = before_tank(30.0)

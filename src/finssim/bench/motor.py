@@ -33,6 +33,9 @@ RPM = math.pi / 30.0
 UNIT = {"force": "N", "speed": "rad/s"}
 """Domain of a thruster's lag -> unit of the response there."""
 
+OTHER = {"force": "speed", "speed": "force"}
+"""Domain -> the other one."""
+
 BEFORE = 0.3
 """Longest part of the level before a step that is fitted together with the step [s]."""
 
@@ -352,6 +355,8 @@ class Study:
     """The thruster of the vehicle file, whose curve converts between thrust and speed."""
     logs: tuple[MotorLog, ...]
     response: MotorResponse
+    other_error: float
+    """Error of the same fit in the other domain, as a share of the steps' height; NaN if it could not be made."""
 
     @property
     def same_unit(self) -> bool:
@@ -395,9 +400,16 @@ def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | Non
         trials: All trials.
         thruster: The thruster of the vehicle file.
     """
-    logs = [log for trial in trials if (log := log_of(trial, name, thruster)) is not None]
-    records = [record for log in logs for record in log.records]
-    return Study(name, thruster, tuple(logs), fit_response(records)) if records else None
+    swapped = thruster.model_copy(update={"domain": OTHER[thruster.domain]})
+    logs, others = (
+        [log for trial in trials if (log := log_of(trial, name, one)) is not None]
+        for one in (thruster, swapped)
+    )
+    records, other = ([record for log in some for record in log.records] for some in (logs, others))
+    if not records:
+        return None
+    other_error = fit_response(other).error if other else math.nan
+    return Study(name, thruster, tuple(logs), fit_response(records), other_error)
 
 
 def estimates_of(result: Study) -> list[Estimate]:
@@ -471,6 +483,7 @@ def quality_of(result: Study) -> dict[str, float]:
         "steps": float(len(response.nrmse)),
         "accepted": float(response.accepted.sum()),
         "sample": response.sample,
+        "nrmse_other_domain": result.other_error,
     }
 
 
@@ -485,6 +498,11 @@ def findings_of(result: Study) -> list[Finding]:
         out.append(finding("steps_refused", result.name, limit=NRMSE, error=response.error))
     elif accepted < moved:
         out.append(finding("steps_left_out", result.name, steps=moved - accepted, total=moved, limit=NRMSE))
+    if result.other_error < 0.5 * response.error and response.error > 0.02:
+        other = OTHER[result.thruster.domain]
+        out.append(
+            finding("other_domain", result.name, domain=other, other=result.other_error, error=response.error)
+        )
     if result.same_unit and abs(gain - 1.0) > 0.1 + half:
         out.append(finding("steady_gain", result.name, gain=gain))
     return out

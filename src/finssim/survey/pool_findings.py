@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from finssim.core.least_squares import unit_diagonal
 from finssim.identification.fit import Estimate
 from finssim.survey.points import Observations
 from finssim.survey.pool_model import NAMES, PoolFitSettings, clearances, normal_equations
-from finssim.survey.pool_refine import Refined
+from finssim.survey.pool_refine import Refined, squared_distance
 from finssim.trials.findings import Finding, finding
 
 NARROW = np.radians(20.0)
@@ -24,6 +27,9 @@ TOUCHING = 0.0001
 
 PRESSED = 9.0
 """Fall of chi² that a plane held by a point or the camera would gain beyond it, from which that is no chance."""
+
+CERTAIN = 0.999
+"""Share of the marks above the water that are taken for such."""
 
 CAMERA = "the camera"
 
@@ -116,7 +122,7 @@ def conflicts(fit: Refined, settings: PoolFitSettings) -> Iterator[Finding]:
 
 
 def numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
-    """Yield findings on few places, large errors of pixels and survey, and rows that were left out.
+    """Yield findings on few places and large errors of pixels and survey.
 
     Args:
         fit: The fit.
@@ -130,5 +136,29 @@ def numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
     if fit.noise.scale > 2.0:
         error = 1000.0 * fit.noise.survey * fit.noise.scale
         yield finding("survey_rough", times=fit.noise.scale, error=error)
-    if wrong := int((~fit.used).sum()):
+
+
+def excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
+    """Yield findings on rows that were left out: marks above the water that are not flagged as dry, and others.
+
+    Args:
+        fit: The fit.
+        observed: All rows.
+        surface: True if the plane is the water's surface, False if a window.
+    """
+    above = _above(fit, observed)
+    if above.any():
+        place = "above the water found" if surface else "on the camera's side of the plane found"
+        yield finding("marks_dry", marks=tuple(np.array(observed.names)[above].tolist()), place=place)
+    if wrong := int((~fit.used & ~above).sum()):
         yield finding("rows_wrong", rows=wrong)
+
+
+def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
+    """Return which rows were left out although straight lines from the camera meet them on its side of the plane,
+    (N,)."""
+    side = observed.points @ fit.model.interface.normal + fit.model.interface.offset > 0.0
+    side &= ~fit.used & ~observed.dry
+    dry = replace(observed, dry=np.ones(len(observed), bool))
+    met = side & (squared_distance(fit.model, dry, fit.noise, fit.covariance) < float(chi2.ppf(CERTAIN, 2)))
+    return met & (2 * met.sum() > side.sum())  # some are met by chance

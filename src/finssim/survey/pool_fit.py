@@ -15,7 +15,7 @@ from finssim.identification.fit import Correlation, Estimate
 from finssim.identification.report import AS_STATED
 from finssim.identification.uncertainty import correlation
 from finssim.survey.points import Observations
-from finssim.survey.pool_findings import conflicts, numbers, separability, touched
+from finssim.survey.pool_findings import conflicts, excluded_rows, numbers, separability, touched
 from finssim.survey.pool_model import (
     LENS_NAMES,
     NAMES,
@@ -225,6 +225,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: PoolFitSettings
             *separability(fit, observed, settings, table),
             *conflicts(fit, settings),
             *numbers(fit, observed),
+            *excluded_rows(fit, observed, settings.surface),
             *notes,
         ),
     )

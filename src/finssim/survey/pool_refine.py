@@ -228,13 +228,31 @@ def refine(
 
 def _plausible(model: PoolModel, observed: Observations, noise: StandardErrors) -> NDArray[np.bool_]:
     """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
-    r, ok = residuals(model, observed)
-    J_point = np.where(ok[:, None, None], model.jacobians(observed.points, observed.dry)[1], 0.0)
-    modes = noise.survey_modes(J_point, observed)
-    V = modes @ modes.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
-    d2 = np.where(ok, np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r), np.inf)
+    d2 = squared_distance(model, observed, noise)
     inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
     return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(observed), 2))
+
+
+def squared_distance(
+    model: PoolModel, observed: Observations, noise: StandardErrors, covariance: Array | None = None
+) -> Array:
+    """Return squared residuals over their variance by errors of pixel and survey [-], (N,); infinite without residual.
+
+    Args:
+        model: Predicts the pixels.
+        observed: The rows.
+        noise: Standard errors.
+        covariance: That of the model's parameters in their units, if their errors count too, (18, 18).
+    """
+    r, ok = residuals(model, observed)
+    J, J_point = (
+        np.where(ok[:, None, None], part, 0.0) for part in model.jacobians(observed.points, observed.dry)
+    )
+    modes = noise.survey_modes(J_point, observed)
+    V = modes @ modes.transpose(0, 2, 1) + noise.pixel**2 * np.eye(2)
+    if covariance is not None:
+        V = V + J @ covariance @ J.transpose(0, 2, 1)
+    return np.where(ok, np.einsum("ni,nij,nj->n", r, np.linalg.inv(V), r), np.inf)
 
 
 def _refuse_few(used: NDArray[np.bool_], observed: Observations, parameters: int) -> None:
