@@ -66,6 +66,17 @@ def test_trials_are_made_one_after_the_other_and_an_interrupted_session_goes_on(
     assert yaml.safe_load((out / "programmes.yaml").read_text())["robot"] is True
 
 
+def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
+    """Surge steps of both directions tell the damping of the plant, 39.1 N s/m, within 5 %."""
+    out, file = tmp_path / "trials", tmp_path / "pool.yaml"
+    with lockstep_pool(FINSROV, file) as wiring:
+        excite(out, robot(wiring, unattended=True), "surge", level=12.0)
+    words = f"calibrate hydrodynamics {out} --axes surge --damping linear --vehicle finsrov".split()
+    assert boundary.run(app, [*map(str, words), "--out", str(tmp_path / "new.yaml")]) == 0
+    found = load_vehicle(tmp_path / "new.yaml").hydrodynamics["calibrated"].linear_damping
+    assert found[0, 0] == pytest.approx(39.07, rel=0.05)
+
+
 def test_a_robot_that_no_camera_sees_is_excited_by_its_position_fixes(tmp_path):
     """In open water, with log and compass aboard: rates are the IMU's, and no pool file is in the record."""
     heavy, out = load_vehicle("bluerov2_heavy"), tmp_path / "trials"

@@ -1,6 +1,7 @@
 """`finssim fuse`: logs in, table out; on real motion capture and IMU recordings, and on streams known exactly."""
 
 import csv
+import json
 import math
 from dataclasses import replace
 
@@ -90,6 +91,17 @@ def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
     assert (columns["std_x"][late] < 0.03).all() and columns["ready"][late].all()
     shown = capsys.readouterr().out
     assert "against the truth, fresh" in shown and "NIS per dimension" in shown and "fresh 9" in shown
+
+
+def test_json_holds_the_summary(tmp_path, pool, capsys):
+    """One object, without NaN, with states, refusals by reason, NIS, errors and the health at the end."""
+    log = write_log(tmp_path / "log", samples(3.0))
+    run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", as_json=True)
+    summary = json.loads(capsys.readouterr().out)
+    assert sum(summary["states"].values()) == pytest.approx(1.0)
+    assert 0.5 < summary["nis_per_dimension"]["vision"] < 1.5
+    assert summary["errors"]["fresh"]["rms_x"] < 0.02
+    assert summary["health"]["vision_mode"] == "fresh"
 
 
 def test_one_table_of_all_columns_is_the_same_log(tmp_path, pool):
