@@ -77,7 +77,7 @@ def test_scalars_are_those_of_yaml_1_2_and_of_64_bits(tmp_path, text, value):
         ("a: " + "[" * 100_000, "inside one another"),
         ("a: " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1), "inside one another"),
         (BOMB, "line 6: not valid YAML: more than 200000 values, repeated ones included"),
-        ("a: &a [*a]", "'*a' stands for nothing that is complete"),
+        ("a: &a [*a]", "'*a' refers to no anchor that is complete"),
         ("? [1, 2]\n: 3", "a key is a list, expected a word"),
         ("mass: 1\nmass: 2", "line 2: not valid YAML: key 'mass' is given twice"),
         ("a: \0", "not a text file"),

@@ -7,7 +7,7 @@
     policy = fs.train("t1", vehicle=fit.vehicle)
     result = fs.evaluate(policy, "t1")
 
-Names are imported when they are first used, so that each costs only what it needs.
+Names are imported when they are first used, so that a program loads only the packages that it needs.
 """
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,7 @@
 """The steps of a study as functions: identify a vehicle, train a policy, evaluate it, and run it in the virtual pool.
 
-They return objects, print nothing, and are what `finssim` exports. Each does what the command of its name does.
+They return objects and print nothing, and `finssim` exports them. Each corresponds to the command of the same
+name.
 """
 
 from __future__ import annotations
@@ -37,21 +38,21 @@ def identify(
     """Fit a vehicle's added mass, damping, buoyancy and stiffness to trials.
 
     Args:
-        vehicle: The vehicle to start from, the name of one in the catalogue, or the path of a vehicle file. It gives
-            the rigid body, the thrusters and what is not fitted.
-        trials: Trials, or paths of trial folders, of folders of them, or of tables with a trial's columns. Trials whose
-            `role` is held-out are not fitted; the fit is judged by them.
+        vehicle: The vehicle to start from, the name of one in the catalogue, or the path of a vehicle file.
+            It provides the rigid body, the thrusters and every parameter that is not fitted.
+        trials: Trials, or paths of trial folders, of folders of them, or of tables with a trial's columns.
+            Trials with the `role` held-out are not fitted; they validate the fit.
         axes: Axes to fit, of surge, sway, heave, roll, pitch and yaw; those that the trials excite if None.
         estimate: Further parameters to fit: thrust_scale, thrust_lag, thrust_delay, buoyancy_excess, k,
             or a parameter of one of the vehicle's terms.
-        damping: Drag: linear, quadratic, both, or auto, which chooses.
+        damping: Drag: linear, quadratic, both, or auto, which selects one of them.
         progress: Whether progress is shown on standard error.
 
     Returns:
         The fit: `vehicle`, `estimates` and their 95 % `intervals`, `findings`, `quality` and `plot()`.
 
     Raises:
-        CalibrationError: No trial can be used, or an argument is not known.
+        CalibrationError: No trial can be used, or an argument is unknown.
         VehicleError: There is no such vehicle.
     """
     from finssim.identification.hydrodynamics import fit_hydrodynamics
@@ -97,20 +98,20 @@ def train(
         task: Task to learn: its name, FILE.py:CLASS, or a `Task`.
         vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file.
         seed: Seed of every random number; equal seeds give equal results.
-        out: Directory of the policy; if None, the policy is kept until the object is gone (see `Policy.save`).
+        out: Directory of the policy; if None, the policy is deleted with the object (see `Policy.save`).
         learner: Learner; ppo if None, and distill for tasks with images.
         steps: Control steps of the training, summed over all worlds; the task's default if None.
-        worlds: Worlds simulated at once; the learner's default if None.
+        worlds: Number of worlds simulated in parallel; the learner's default if None.
         randomize: Ranges of vehicle and water parameters: a name or a file.
         settings: Settings of the learner, such as {"learning_rate": 1e-3}.
         progress: Whether progress is shown on standard error.
         options: Further fields of `finssim.learning.train.TrainingSettings`, and `resume`.
 
     Returns:
-        The policy, which `evaluate` and `run_in_pool` take.
+        The policy, for `evaluate` and `run_in_pool`.
 
     Raises:
-        TrainingError, LearningError, EnvironmentSetupError, VehicleError, OutputError: As they say.
+        TrainingError, LearningError, EnvironmentSetupError, VehicleError, OutputError: See these classes.
     """
     from rich.console import Console
 
@@ -147,13 +148,15 @@ def evaluate(
     """Evaluate a controller in simulated trials of a task.
 
     Args:
-        controller: A policy, the path of its directory, the name of a baseline of the task such as pid, or the path of
-            a record of one on a robot (.mcap).
-        task: Name of the task, or FILE.py:CLASS; the policy's own if None, and t1 of a controller that has none.
-        vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file; the policy's own if None.
+        controller: A policy, the path of its directory, the name of a baseline of the task such as pid, or
+            the path of a record (.mcap) of a controller on a robot.
+        task: Name of the task, or FILE.py:CLASS; if None, that of the policy, or t1 for a controller without
+            one.
+        vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file; the policy's if
+            None.
         plant: How the simulated vehicle and water differ from the vehicle file: a name, a file, or several.
-        trials: Trials in each plant; if None the eight setpoints of t1, the four trajectories of t2, or the task's own
-            number of episodes.
+        trials: Number of trials in each plant; if None the eight setpoints of t1, the four trajectories of
+            t2, or the task's own number of episodes.
         seed: Seed of every random number.
         progress: Whether progress is shown on standard error.
         options: Further arguments of `finssim.evaluation.evaluate.evaluate`.
@@ -162,7 +165,7 @@ def evaluate(
         The result: `table`, `metrics`, `plot()`, and `each` with the trials of every plant.
 
     Raises:
-        EvaluationError, PolicyError, ControlError, PlantError, VehicleError: As they say.
+        EvaluationError, PolicyError, ControlError, PlantError, VehicleError: See these classes.
     """
     from finssim.control.policy import Policy
     from finssim.evaluation.evaluate import evaluate_in_plants
@@ -197,19 +200,23 @@ def run_in_pool(
     seed: int = 1,
     progress: bool = False,
 ) -> Evaluations:
-    """Run the robot's complete software against the virtual pool in lock-step, as fast as both compute.
+    """Run the robot's complete software against the virtual pool in lock-step, faster than real time where
+    possible.
 
-    The pool holds a vehicle that the controller does not know: mass, drag, thrusters, sensors and delays are drawn
-    around the vehicle file. The controller sees only what localization and the fusion filter give it.
+    The vehicle in the pool differs from the controller's model: mass, drag, thrusters, sensors and delays are
+    drawn around the vehicle file. The controller observes only the estimates of localization and the fusion
+    filter.
 
     Args:
         controller: A policy, the path of its directory, or pid or pid-paper.
         task: t1 (station keeping) or t2 (trajectory tracking).
         plant: Seed from which the pool's vehicle is drawn.
-        vehicle: The vehicle as the robot's software knows it: a vehicle, a name or a file; the policy's own if None.
+        vehicle: The vehicle that the robot's software assumes: a vehicle, a name or a file; the policy's if
+            None.
         targets: Names of setpoints (t1) or of trajectories (t2); all of the paper's if None.
-        severity: How far the drawn vehicle is from the vehicle file: nominal, realistic or hard.
-        camera: What the overhead camera gives: corners of the tags with noise, or pictures that are drawn and searched.
+        severity: Difference between the drawn vehicle and the vehicle file: nominal, realistic or hard.
+        camera: Output of the overhead camera: tag corners with noise, or rendered pictures in which tags are
+            detected.
         site: Where the vehicle is: pool, tank or open-water.
         firmware: mcu (a motor controller), or ardusub: the emulated autopilot, with a Doppler log and a compass instead
             of the camera.
@@ -218,11 +225,11 @@ def run_in_pool(
         progress: Whether progress is shown on standard error.
 
     Returns:
-        The result by the true motion: `table`, `metrics`, `plot()`.
+        The result, computed from the true motion: `table`, `metrics`, `plot()`.
 
     Raises:
         EvaluationError: Another task, or unknown firmware or site.
-        PolicyError, ControlError, PlantSpecError, VehicleError: As they say.
+        PolicyError, ControlError, PlantSpecError, VehicleError: See these classes.
     """
     from finssim.control.policy import Policy
     from finssim.evaluation.evaluate import FORMS, EvaluationError, Evaluations, evaluation
@@ -258,7 +265,7 @@ def run_in_pool(
 
 
 def _vehicle_of(policy: Policy) -> Vehicle:
-    """Return the vehicle that a policy was trained for, if it is known or in the catalogue.
+    """Return the vehicle that a policy was trained for, if the policy contains it or the catalogue does.
 
     Raises:
         EvaluationError: The policy was trained for another vehicle.
@@ -272,6 +279,6 @@ def _vehicle_of(policy: Policy) -> Vehicle:
     vehicle = load_vehicle(trained.name) if trained.name in catalogue() else None
     if vehicle is None or vehicle.sha256 != trained.sha256:
         raise EvaluationError(
-            f"the policy was trained for a vehicle '{trained.name}' that is not the catalogue's: give it with vehicle="
+            f"the policy was trained for a vehicle '{trained.name}' that is not in the catalogue: pass it as vehicle="
         )
     return vehicle

@@ -1,4 +1,5 @@
-"""Budget of everything that is read from outside: bytes, pixels, nodes, seconds; and a child process for models."""
+"""Limits for all data read from outside: bytes, pixels, nodes, seconds; and a child process for reading
+models."""
 
 from __future__ import annotations
 
@@ -20,25 +21,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 FILE = 256 << 20
-"""Model, mesh, network or picture [bytes]."""
+"""Largest model, mesh, network or picture [bytes]."""
 TEXT = 512 << 20
-"""Table in a text file, such as a log [bytes]."""
+"""Largest table in a text file, such as a log [bytes]."""
 CHUNK = 64 << 20
-"""Chunk of a log after it is unpacked [bytes]."""
+"""Largest chunk of a log after decompression [bytes]."""
 UNPACKED = 4 << 30
-"""Log that is packed as whole files, after it is unpacked to the disk [bytes]."""
+"""Largest log that is compressed as whole files, after decompression to disk [bytes]."""
 CELLS = 1 << 27
-"""Numbers in a table that is packed."""
+"""Largest number of values in a compressed table."""
 PIXELS = 1 << 26
-"""Pixels of a picture."""
+"""Largest number of pixels of a picture."""
 NODES = 100_000
-"""Elements of a model, included files counted each time."""
+"""Largest number of elements of a model; an included file counts each time that it is included."""
 DEPTH = 50
-"""Files of a model that include one another."""
+"""Largest depth of files of a model that include one another."""
 MEMORY = 3 << 30
-"""Address space of a child process, and what a network may add to ours [bytes]."""
+"""Address space of a child process, and additional memory that a network may use in this process [bytes]."""
 SECONDS = 60
-"""Processor time of a child process [s]; ten times as long may pass by the clock."""
+"""Processor time of a child process [s]; its wall-clock time may be ten times as long."""
 
 
 def read_bytes(path: Path, refuse: type[Exception], name: str | None = None, limit: int = FILE) -> bytes:
@@ -46,12 +47,12 @@ def read_bytes(path: Path, refuse: type[Exception], name: str | None = None, lim
 
     Args:
         path: The file.
-        refuse: Class of the error, made from one sentence.
-        name: What the sentence calls the file; its path if None.
+        refuse: Class of the error, constructed with one sentence.
+        name: Name of the file in the sentence; its path if None.
         limit: Largest size [bytes].
 
     Raises:
-        refuse: The file cannot be read, or is larger.
+        refuse: The file cannot be read, or exceeds the limit.
     """
     try:
         with path.open("rb") as file:
@@ -63,11 +64,11 @@ def read_bytes(path: Path, refuse: type[Exception], name: str | None = None, lim
     return data
 
 
-# Zstandard: a file does not have to say how much it unpacks to, so it is unpacked to nowhere first.
+# Zstandard: a file need not state its uncompressed size, so it is first decompressed without storing the output.
 
 
 def zstd() -> Any:
-    """Return the module that unpacks Zstandard."""
+    """Return the module that decompresses Zstandard."""
     try:
         from compression import zstd  # since Python 3.14
     except ImportError:
@@ -76,7 +77,7 @@ def zstd() -> Any:
 
 
 def packed_with_zstd(file: Path) -> bool:
-    """Return whether a file begins as Zstandard begins: with a frame, or with one that is skipped."""
+    """Return whether a file begins with a Zstandard frame or a skippable frame."""
     try:
         with file.open("rb") as stream:
             begins = stream.read(4)
@@ -86,16 +87,16 @@ def packed_with_zstd(file: Path) -> bool:
 
 
 def check_unpacked(files: Iterable[Path], refuse: type[Exception], name: str, remedy: str) -> None:
-    """Refuse files that unpack to more than `UNPACKED` together; one that is damaged counts up to its damage.
+    """Refuse files that decompress to more than `UNPACKED` in total; a damaged file counts up to the damage.
 
     Args:
-        files: Packed with Zstandard.
-        refuse: Class of the error, made from one sentence.
-        name: What the sentence calls the files.
-        remedy: What the sentence says to do.
+        files: Files compressed with Zstandard.
+        refuse: Class of the error, constructed with one sentence.
+        name: Name of the files in the sentence.
+        remedy: Remedy that the sentence states.
 
     Raises:
-        refuse: They unpack to more.
+        refuse: The total is larger.
     """
     module, room = zstd(), UNPACKED
     for file in files:
@@ -106,11 +107,11 @@ def check_unpacked(files: Iterable[Path], refuse: type[Exception], name: str, re
                     raise refuse(f"{name}: unpacks to more than {UNPACKED >> 20} MiB: {remedy}")
 
 
-# Pictures: their size is in their first bytes, and is read before anything is decoded.
+# Pictures: their size is in their header, and is checked before anything is decoded.
 
 
 def picture_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a picture's header announces [px]; None where the format is not one of ours.
+    """Return the width and height in a picture's header [px]; None if the format is not supported.
 
     Args:
         data: PNG, JPEG, BMP, WebP, TIFF or portable (P2, P3, P5, P6) picture.
@@ -173,10 +174,10 @@ def decoded_picture(data: bytes, flags: int) -> NDArray[np.uint8] | str:
 
     Args:
         data: The file.
-        flags: Of OpenCV's `imdecode`.
+        flags: Flags of OpenCV's `imdecode`.
 
     Returns:
-        As OpenCV returns it; or why there is none, as the end of a sentence.
+        The picture as OpenCV returns it, or the reason why it cannot be decoded, as the end of a sentence.
     """
     import cv2
 
@@ -192,22 +193,23 @@ def decoded_picture(data: bytes, flags: int) -> NDArray[np.uint8] | str:
     return "is no picture that can be read" if image is None else np.asarray(image, np.uint8)
 
 
-# Models: read by libraries of other people, in a process that may use so much memory and time and no more.
+# Models are read by third-party libraries in a process whose memory and time are limited.
 
 
 def in_child(function: Callable[[Any], Any], argument: Any, refuse: type[Exception]) -> Any:
     """Call a function in a process of bounded memory and time.
 
     Args:
-        function: Of a module that is imported quickly: it is loaded from its file, without its package.
+        function: Function of a module that imports quickly: the module is loaded from its file, without its
+            package.
         argument: Plain data.
-        refuse: Class of the error, made from a sentence without a subject.
+        refuse: Class of the error, constructed with a sentence without a subject.
 
     Returns:
         What the function returns: plain data and arrays.
 
     Raises:
-        refuse: The function raised an error, whose words these are; or it needed more than `MEMORY` or `SECONDS`.
+        refuse: The function raised an error (its message is used), or it exceeded `MEMORY` or `SECONDS`.
     """
     code = function.__code__
     given = pickle.dumps((sys.path, function.__module__, code.co_filename, code.co_name, argument))
@@ -234,7 +236,7 @@ def in_child(function: Callable[[Any], Any], argument: Any, refuse: type[Excepti
 
 
 def _serve() -> None:
-    """Answer one call of `in_child`, in the child."""
+    """Execute one call of `in_child`, in the child process."""
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries print
     paths, module, file, name, argument = pickle.load(sys.stdin.buffer)
@@ -264,7 +266,8 @@ def _serve() -> None:
 
 @contextmanager
 def limited_memory(extra: int = MEMORY) -> Iterator[None]:
-    """Let this process take so much more memory for a while [bytes], where the system can limit it."""
+    """Allow this process that much additional memory within the block [bytes], where the system can limit
+    memory."""
     try:
         import resource
 

@@ -1,6 +1,6 @@
-"""Output that is either complete or absent: written beside its target under another name, then renamed into place.
+"""Complete or absent outputs: each is written under a temporary name beside its target and then renamed.
 
-And names that may become part of a path: one that came from data is never a path itself.
+Also names from data that become part of a path: such a name is never accepted as a path.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 LONGEST_NAME = 200
-"""Longest name of a file or folder that data gives [bytes]: 255 are possible, and suffixes, seeds and digests are
-added."""
+"""Longest name of a file or folder that is taken from data [bytes]: file systems allow 255, and suffixes, seeds and
+digests are appended."""
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space or write elsewhere",
@@ -41,12 +41,13 @@ class OutputError(OSError):
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write one file so that a reader sees either the old or the new file, never a part.
+    """Write one file so that a reader sees either the complete old file or the complete new one.
 
-    Yields the path of an empty temporary file beside the target, with the target's suffix (libraries that choose a
-    format by suffix work). When the block ends well, the file is flushed to disk and renamed over the target; when it
-    raises, is interrupted or the disk fills, the temporary file is removed and the target stays as it was. Missing
-    parent directories are made. A place that cannot be written is refused on entry, before any work is done.
+    Yields the path of an empty temporary file beside the target, with the target's suffix (libraries that
+    choose a format by suffix work). If the block ends without an error, the file is flushed to disk and
+    renamed to the target; if it raises, is interrupted or the disk is full, the temporary file is removed and
+    the target remains unchanged. Missing parent directories are created. A path that cannot be written is
+    refused on entry, before any work is done.
 
         with atomic_write("run/report.html") as temporary:
             temporary.write_text(html, encoding="utf-8")
@@ -80,19 +81,19 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = None) -> Iterator[Path]:
     """Fill a directory so that it appears complete or not at all.
 
-    Yields an empty temporary directory beside the target. When the block ends well its files are flushed to disk and it
-    takes the target's name; when it raises or is interrupted it is removed with all it holds.
+    Yields an empty temporary directory beside the target. If the block ends without an error, its files are flushed
+    to disk and it is renamed to the target; if it raises or is interrupted, it is removed with its contents.
 
         with atomic_directory("runs/hold", replaces="policy.yaml") as temporary:
             save_network(temporary / "policy.onnx")
 
     Args:
-        path: Directory to make. It may exist if it is empty.
-        replaces: Name of a file that marks an earlier output of the same kind. A directory holding it is replaced as a
-            whole; any other directory with files in it is refused, so that nobody's files are lost.
+        path: Directory to create. It may exist if it is empty.
+        replaces: Name of a file that marks an earlier output of the same kind. A directory that contains it is
+            replaced completely; any other directory with files in it is refused, so that no foreign files are lost.
 
     Raises:
-        OutputError: The target is a file or holds other files, or the system refused to write.
+        OutputError: The target is a file or contains other files, or the system refused to write.
     """
     target = Path(os.path.realpath(path))
     with _as_output_error(target, label=path):
@@ -114,9 +115,9 @@ def atomic_directory(path: str | os.PathLike[str], *, replaces: str | None = Non
 
 @contextmanager
 def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Refuse a directory that another process writes into, and keep others out while the block lasts.
+    """Refuse a directory that another process is writing to, and lock it for other processes within the block.
 
-    A hidden file beside the directory names the process. One that a killed process left behind is replaced.
+    A hidden lock file beside the directory identifies the process. The lock of a process that was killed is replaced.
 
         with sole_writer("runs/hold"):
             train(...)
@@ -125,7 +126,7 @@ def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
         path: Directory, which need not exist.
 
     Raises:
-        OutputError: Another process writes there, or there is no place beside the directory.
+        OutputError: Another process is writing there, or the lock file cannot be created beside the directory.
     """
     target = Path(os.path.realpath(path))
     lock = target.with_name(f".{target.name[:100]}.lock")
@@ -138,7 +139,7 @@ def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
     finally:
         os.close(file)
         lock.unlink(missing_ok=True)
-        for folder in made:  # of a refused command nothing stays
+        for folder in made:  # a refused command leaves no folders behind
             try:
                 folder.rmdir()
             except OSError:
@@ -146,7 +147,7 @@ def sole_writer(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _locked(lock: Path, label: str | os.PathLike[str]) -> int:
-    """Make the lock file and return its descriptor, which stays open: Windows removes no open file."""
+    """Create the lock file and return its descriptor, which stays open: Windows cannot remove an open file."""
     about = {
         "pid": os.getpid(),
         "host": socket.gethostname(),
@@ -167,7 +168,7 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
     """Remove the lock of a process that has ended.
 
     Raises:
-        OutputError: The process may still run.
+        OutputError: The process may still be running.
     """
     try:
         text = lock.read_text(encoding="utf-8")
@@ -176,7 +177,7 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
     try:
         about = json.loads(text)
         pid, host, command = int(about["pid"]), str(about["host"]), str(about["command"])
-    except (ValueError, KeyError, TypeError):  # killed, or seen, before it was written
+    except (ValueError, KeyError, TypeError):  # killed, or read, before the lock was written
         pid, host, command = 0, "", "another process"
     if host == socket.gethostname() and not _runs(pid):
         aside = _beside(lock)
@@ -187,7 +188,9 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
         except PermissionError:
             pass  # Windows: it is open
         else:
-            if aside.read_text(encoding="utf-8") != text:  # another process made it in between
+            if (
+                aside.read_text(encoding="utf-8") != text
+            ):  # another process created a new lock in the meantime
                 os.rename(aside, lock)
             else:
                 aside.unlink()
@@ -199,7 +202,8 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
 
 
 def _runs(pid: int) -> bool:
-    """Return whether a process of this computer runs; not asked on Windows, where its open file cannot be renamed."""
+    """Return whether a process of this computer is running; True on Windows, where its open lock cannot be
+    renamed."""
     if os.name == "nt":
         return False
     try:
@@ -208,7 +212,7 @@ def _runs(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    try:  # one that ended, but for its parent to notice
+    try:  # a process that has ended but that its parent has not yet reaped
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
         return True
@@ -220,23 +224,23 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def plain_name(name: str, subject: str, error: type[Exception]) -> str:
-    """Return a name from data that becomes part of a path, if it names one file or folder in one place.
+    """Return a name from data that becomes part of a path, if it is the plain name of one file or folder.
 
         file = folder / f"{plain_name(name, 'run.mcap: vehicle', ViewError)}.yaml"
 
-    Refused are names that any system reads as a path or not at all: empty, `.`, `..`, absolute, with a separator, a
-    drive letter or a control character, too long, or in no encoding of files.
+    Names that some system interprets as a path or cannot represent are refused: empty, `.`, `..`, absolute,
+    with a separator, a drive letter or a control character, too long, or not encodable as a file name.
 
     Args:
-        name: From a file, a record, a message or another machine.
-        subject: What is named and by whom; the message begins with it.
-        error: Class of the refusal.
+        name: Name from a file, a record, a message or another machine.
+        subject: Subject of the error message: the source and the kind of the name.
+        error: Class of the error.
 
     Returns:
-        The name as it is.
+        The unchanged name.
 
     Raises:
-        error: The name is refused, in one sentence.
+        error: The name is refused; the message is one sentence.
     """
     reason = _no_plain_name(name)
     if reason:
@@ -246,7 +250,7 @@ def plain_name(name: str, subject: str, error: type[Exception]) -> str:
 
 
 def _no_plain_name(name: str) -> str:
-    """Return why a name is refused; empty if it is accepted."""
+    """Return the reason why a name is refused; empty if it is accepted."""
     if not name.strip():
         return "is empty"
     if name in (".", ".."):
@@ -265,11 +269,11 @@ def _no_plain_name(name: str) -> str:
 
 
 class _Probe(Exception):
-    """Leaves an atomic output without making it."""
+    """Exception that leaves an atomic output without creating it."""
 
 
 def refuse_unwritable(writer: AbstractContextManager[Path]) -> None:
-    """Refuse a place that cannot be written before long work, not after it; nothing is written.
+    """Refuse an output path that cannot be written before long work instead of after it; nothing is written.
 
         refuse_unwritable(atomic_directory("runs/hold", replaces="policy.yaml"))
 
@@ -277,7 +281,7 @@ def refuse_unwritable(writer: AbstractContextManager[Path]) -> None:
         writer: An `atomic_write` or `atomic_directory` that has not been entered.
 
     Raises:
-        OutputError: As the place says.
+        OutputError: The output cannot be written.
     """
     try:
         with writer:
@@ -297,7 +301,8 @@ def _refuse_foreign(target: Path, label: str | os.PathLike[str], replaces: str |
 
 
 def _swap_in(target: Path, temporary: Path) -> None:
-    """Rename `temporary` to `target`; an earlier output steps aside first and returns if the rename fails."""
+    """Rename `temporary` to `target`; an earlier output is moved aside first and restored if the rename
+    fails."""
     if not target.exists():
         os.rename(temporary, target)
         return
@@ -312,16 +317,16 @@ def _swap_in(target: Path, temporary: Path) -> None:
 
 
 def _beside(target: Path) -> Path:
-    """A hidden, unused name in the target's directory (a rename never crosses file systems)."""
+    """Return a hidden, unused name in the target's directory (a rename never crosses file systems)."""
     return target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}.partial{target.suffix}")
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file's or directory's data is on disk, as far as the system can flush it."""
+    """Wait until the data of a file or directory is on disk, as far as the system can flush it."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:
-        if path.is_dir():  # Windows opens no directories
+        if path.is_dir():  # Windows cannot open directories
             return
         raise
     try:
@@ -335,7 +340,7 @@ def _flush(path: Path) -> None:
 
 @contextmanager
 def _as_output_error(target: Path, *, label: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn the system's refusals to write under the target's directory into one `OutputError`."""
+    """Convert the system's errors when writing under the target's directory to one `OutputError`."""
     try:
         yield
     except OutputError:
@@ -347,8 +352,8 @@ def _as_output_error(target: Path, *, label: str | os.PathLike[str]) -> Iterator
 
 
 def _about_output(error: OSError, target: Path) -> bool:
-    """Return whether the error concerns the output: its file is under the target's directory or above it, or has no
-    name."""
+    """Return whether the error concerns the output: its file is under the target's directory or above it, or it
+    names no file."""
     if error.filename is None:
         return True
     named = Path(os.path.abspath(os.fsdecode(error.filename)))

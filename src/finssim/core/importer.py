@@ -1,4 +1,4 @@
-"""Importers of other programs' files: the class of the members of `IMPORTERS`, and the choice of one by content.
+"""Importers of other programs' files: the class of the members of `IMPORTERS`, and the selection by content.
 
 An importer is one file with an `Importer`, registered as `KIND.FORMAT`.
 """
@@ -15,42 +15,44 @@ from finssim.core.registry import IMPORTERS, RegistryError
 __all__ = ["Importer", "check_registered", "first_bytes", "importers", "recognised"]
 
 KINDS = ("vehicle", "trial", "lens")
-"""Kinds of contents that are imported."""
+"""Kinds of content that can be imported."""
 HEAD = 1 << 20
-"""Bytes from which an importer recognises its format."""
+"""Number of bytes from which an importer recognises its format."""
 
 
 @dataclass(frozen=True)
 class Importer:
-    """An importer of the files of one format."""
+    """Importer of the files of one format."""
 
     kind: str
     """Kind of content: vehicle, trial or lens."""
     title: str
     """Name of the format."""
     recognises: Callable[[Path, bytes], bool]
-    """Function of a path and the first bytes of its file (none of a folder): whether it is of this format."""
+    """Function of a path and the first bytes of its file (none for a folder) that returns whether it has this
+    format."""
     read: Callable[..., Any]
-    """Function that reads a file; it refuses by one sentence.
+    """Function that reads a file; it reports errors in one sentence.
 
-    Of a path, and of a list of folders if `folders`, for a vehicle (returns a `Draft`); of a path and a `Request` for a
-    log (`TrialStreams`); of a path for a lens (`Lens`).
+    Its arguments are a path, and a list of folders if `folders`, for a vehicle (returns a `Draft`); a path
+    and a `Request` for a log (`TrialStreams`); a path for a lens (`Lens`).
     """
     folders: bool = False
-    """True if its files name others by the name of a package or below a folder that is not in the file."""
+    """True if its files refer to other files by a package name or relative to a folder that is not in the
+    file."""
     general: bool = False
-    """True if more special formats are tried before."""
+    """True if more specific formats are tried first."""
 
 
 def check_registered(name: str, member: Any) -> None:
-    """Refuse what is no importer.
+    """Refuse an object that is not an importer.
 
     Args:
-        name: Name in the family: what is imported, a dot, and the format.
-        member: The object that is registered under it.
+        name: Name in the family: the kind of content, a dot, and the format.
+        member: Object that is registered under this name.
 
     Raises:
-        RegistryError: The name or the object does not fit.
+        RegistryError: The name or the object is not valid.
     """
     kind, _, format = name.partition(".")
     if kind not in KINDS or not format:
@@ -62,7 +64,7 @@ def check_registered(name: str, member: Any) -> None:
 
 
 def importers(kind: str) -> dict[str, Importer]:
-    """Return the importers of a kind by format, the general ones last."""
+    """Return the importers of a kind by format; general ones come last."""
     usable = {
         name.partition(".")[2]: member
         for name, member in IMPORTERS.usable().items()
@@ -72,7 +74,7 @@ def importers(kind: str) -> dict[str, Importer]:
 
 
 def first_bytes(path: Path) -> bytes:
-    """Return the bytes of a file from which its format is recognised; none of a folder."""
+    """Return the bytes of a file from which its format is recognised; none for a folder."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:

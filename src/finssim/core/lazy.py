@@ -6,8 +6,8 @@
     __all__ = ["Simulator"]
     __getattr__, __dir__ = exports(__name__)
 
-Editors and type checkers read the imports; a program pays for a module only when it uses a name of it, and two packages
-can import each other's modules.
+Editors and type checkers read the imports; a program loads a module only when it uses a name of it, and two
+packages can import each other's modules.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["exports", "imported_lazily"]
 
 
 def exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package for the names that it imports where `TYPE_CHECKING` holds.
+    """Return `__getattr__` and `__dir__` of a package for the names that it imports under `TYPE_CHECKING`.
 
     Args:
         package: Dotted name of the package, which is being imported.
@@ -44,7 +44,7 @@ def exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]
 
 
 def imported_lazily(file: str) -> Iterator[tuple[str, str]]:
-    """Yield name and module of each import of a file where `TYPE_CHECKING` holds."""
+    """Yield the name and the module of each import under `TYPE_CHECKING` in a file."""
     with open(file, encoding="utf-8") as source:
         nodes = ast.parse(source.read()).body
     for node in nodes:

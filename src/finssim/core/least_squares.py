@@ -1,8 +1,8 @@
-"""Levenberg and Marquardt's method, robust weights, bounds, and unknowns that belong to one group of rows.
+"""Levenberg-Marquardt method, robust weights, bounds, and unknowns that belong to one group of rows.
 
-`descend` is the one kernel for every least-squares problem with a state or steps of its own.
+`descend` solves every least-squares problem whose state is not a plain vector or whose steps are specific to it.
 
-Problems with a plain vector of parameters and no time limit use `scipy.optimize.least_squares`.
+Problems with a plain parameter vector and no time limit use `scipy.optimize.least_squares`.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ Array = NDArray[np.float64]
 
 State = TypeVar("State")
 Step = Callable[[float], tuple[State | None, float]]
-"""Function of the damping -> state a damped step away, None where there is none, and the decrease of the cost that the
-linearisation promises for it."""
+"""Function of the damping -> the state after a damped step (None if there is none), and the decrease of the cost that
+the linearisation predicts for it."""
 
 STEADIEST = 1e12
-"""Damping at which the search gives up."""
+"""Damping at which the search stops."""
 
 
 class Descent(NamedTuple, Generic[State]):
-    """End of a search."""
+    """Result of a search."""
 
     state: State
     """Best state found."""
     cost: float
     """Its cost, in the unit of the cost function."""
     steps: int
-    """Number of steps tried."""
+    """Number of attempted steps."""
     converged: bool
-    """True if the last step promised a negligible decrease."""
+    """True if the predicted decrease of the last step was negligible."""
 
 
 def descend(
@@ -50,17 +50,17 @@ def descend(
 ) -> Descent[State]:
     """Minimise a cost by damped Gauss-Newton steps (Levenberg and Marquardt).
 
-    The damping follows Nielsen (1999), "Damping parameter in Marquardt's method": it stays where a step keeps half of
-    what it promised, as in a flat valley.
+    The damping follows Nielsen (1999), "Damping parameter in Marquardt's method": it is unchanged where a
+    step achieves half of its predicted decrease, as in a flat valley.
 
     Args:
-        state: Start.
-        cost: Function to be minimised; infinite where a state is impossible.
-        linearise: State -> its steps.
+        state: Initial state.
+        cost: Function to minimise; infinite where a state is impossible.
+        linearise: Function that returns the damped steps of a state.
         steps: Largest number of steps.
-        still: Promised decrease at or below which a step is the last, in the unit of the cost.
-        share: The same, as a share of the cost [-].
-        damping: First damping [-].
+        still: Predicted decrease at or below which the search ends, in the unit of the cost.
+        share: The same limit as a fraction of the cost [-].
+        damping: Initial damping [-].
     """
     value, growth, tried, converged = cost(state), 2.0, 0, False
     step = linearise(state)
@@ -81,7 +81,7 @@ def descend(
 
 
 def rms(errors: Array) -> float:
-    """Return the root mean square length of vectors (K, n); NaN without any. The unit is kept."""
+    """Return the root mean square length of vectors (K, n); NaN if there are none. The unit is unchanged."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else float("nan")
 
 
@@ -91,34 +91,35 @@ def huber_weight(size: Array, limit: float) -> Array:
 
 
 def huber_loss(size: Array, limit: float) -> Array:
-    """Return the squares of sizes within a limit, which grow linearly beyond.
+    """Return the squares of sizes up to a limit, continued linearly beyond it.
 
-    Sizes and limit have one unit.
+    Sizes and limit have the same unit.
     """
     return np.asarray(np.where(size <= limit, size**2, limit * (2.0 * size - limit)))
 
 
 def unit_diagonal(normal: Array) -> tuple[Array, Array]:
-    """Return a normal matrix (P, P) with each unknown in a unit of its own, so that its diagonal is 1, and the factors
-    (P,) by which steps in these units are larger.
+    """Return a normal matrix (P, P) rescaled to unit diagonal, and the factors (P,) by which steps in the
+    rescaled unknowns are larger.
 
     Args:
-        normal: In any units [-] and frame, (P, P).
+        normal: Normal matrix in any units [-] and frame, (P, P).
     """
     scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
     return normal / np.outer(scale, scale), scale
 
 
 def boxed(normal: Array, right: Array, low: Array, high: Array) -> Array:
-    """Return the minimum of ½ xᵀ N x - gᵀ x in a box, by bounded-variable least squares; on a bound exactly.
+    """Return the minimum of ½ xᵀ N x - gᵀ x within bounds, by bounded-variable least squares; active bounds
+    are exact.
 
     Bounds and x have the unit of the unknowns.
 
     Args:
         normal: N, positive definite, in any units [-] and frame, (P, P).
         right: g, (P,), in the unit of N x.
-        low: In the unit of x, below `high`, (P,).
-        high: In the unit of x, (P,).
+        low: Lower bounds in the unit of x, below `high`, (P,).
+        high: Upper bounds in the unit of x, (P,).
     """
     from scipy.optimize import lsq_linear
 
@@ -137,25 +138,25 @@ class Block(NamedTuple):
     """Weighted normal equations of one group, such as a picture with its pose."""
 
     aa: Array
-    """Shared by shared, per product of the units of the unknowns, (P, P)."""
+    """Shared-shared block, per product of the units of the unknowns, (P, P)."""
     ab: Array
-    """Shared by own, per product of the units of the unknowns, (P, Q)."""
+    """Shared-own block, per product of the units of the unknowns, (P, Q)."""
     bb: Array
-    """Own by own, per product of the units of the unknowns, (Q, Q)."""
+    """Own-own block, per product of the units of the unknowns, (Q, Q)."""
     a: Array
-    """Right side of the shared, per unit of the unknown, (P,)."""
+    """Right-hand side of the shared unknowns, per unit of the unknown, (P,)."""
     b: Array
-    """Right side of the own, per unit of the unknown, (Q,)."""
+    """Right-hand side of the own unknowns, per unit of the unknown, (Q,)."""
 
 
 def block_of(shared: Array, local: Array, residual: Array) -> Block:
-    """Return a block from whitened rows.
+    """Return the normal equations of a group from whitened rows.
 
     Args:
         shared: Derivatives of the prediction, over its standard error, with respect to the shared unknowns, per unit of
             these, (n, P).
-        local: And to the group's own, per unit of these, (n, Q).
-        residual: Measured less predicted, over its standard error [-], (n,).
+        local: Derivatives with respect to the group's own unknowns, per unit of these, (n, Q).
+        residual: Measured minus predicted value, over its standard error [-], (n,).
     """
     return Block(
         shared.T @ shared, shared.T @ local, local.T @ local, shared.T @ residual, local.T @ residual
@@ -163,15 +164,15 @@ def block_of(shared: Array, local: Array, residual: Array) -> Block:
 
 
 def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array], float]:
-    """Return one damped Gauss-Newton step (Marquardt), (P,) and (Q,) each, and the decrease it promises.
+    """Return one damped Gauss-Newton step (Marquardt), (P,) and (Q,) each, and its predicted decrease.
 
-    A shared direction that no row determines gets no step. The decrease is that of the sum of squares.
+    A shared direction that no row determines is not changed. The decrease is that of the sum of squares.
 
     Steps are in the units of the unknowns.
 
     Args:
         blocks: Normal equations of the groups.
-        damping: What the diagonals grow by, as a part of themselves [-].
+        damping: Relative increase of the diagonals [-].
     """
     total, right, inners = arrow_reduced(blocks, damping)
     scaled, scale = unit_diagonal(total)
@@ -186,21 +187,22 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
 
 
 def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array, list[Array]]:
-    """Return normal matrix (P, P) and right side (P,) of the shared unknowns alone, and [abᵀ b] over bb of each group.
+    """Return the reduced normal matrix (P, P) and right side (P,) of the shared unknowns, and [abᵀ b] over bb
+    of each group.
 
     Args:
         blocks: Normal equations of the groups.
-        damping: What the diagonals grow by, as a part of themselves [-].
+        damping: Relative increase of the diagonals [-].
     """
     reduced, right, inners = zip(*(eliminated(block, damping) for block in blocks), strict=True)
     return np.sum(reduced, axis=0), np.sum(right, axis=0), list(inners)
 
 
 def eliminated(block: Block, damping: float) -> tuple[Array, Array, Array]:
-    """Return the damped normal matrix (P, P) and right side (P,) of the shared unknowns alone, and (bb + damping)⁻¹
+    """Return the reduced, damped normal matrix (P, P) and right side (P,) of the shared unknowns, and (bb + damping)⁻¹
     [abᵀ b], (Q, P + 1)."""
     diagonal = np.diagonal(block.bb)
-    # Each unknown in a unit of its own, so that one that a prior holds does not stiffen the others.
+    # Scale each unknown, so that one with a tight prior does not stiffen the others.
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     bb = block.bb / np.outer(scale, scale) + np.diag(damping * (diagonal > 0.0) + 1e-14)
     right = np.column_stack([block.ab.T, block.b]) / scale[:, None]

@@ -1,4 +1,4 @@
-"""MCAP files by the `mcap` library, and the intact part of files that were cut off or damaged."""
+"""Reading and repairing of MCAP files with the `mcap` library: intact parts of truncated or damaged files."""
 
 from __future__ import annotations
 
@@ -30,17 +30,18 @@ CHUNK_BEGINS = re.compile(rb"\x06.{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd)
 
 
 def without_profile(head: bytes) -> bool:
-    """Return whether an MCAP file, by its first bytes, names no profile, as those of BlueOS' recorder."""
+    """Return whether an MCAP file, by its first bytes, has an empty profile, as files of BlueOS' recorder do."""
     return head.startswith(MAGIC + b"\x01") and head[len(MAGIC) + 9 :][:4] == bytes(4)
 
 
 @contextmanager
 def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
-    """Yield the file; or, of an MCAP file that is cut, damaged or without an index, a temporary copy with one.
+    """Yield the file, or a temporary indexed copy if it is an MCAP file that is truncated, damaged or without
+    an index.
 
     Args:
-        path: Any file; others than MCAP files are yielded.
-        notes: List to which a sentence about damage is added.
+        path: Any file; files of other formats are yielded unchanged.
+        notes: List to which a sentence about damage is appended.
     """
     if not path.is_file() or path.stat().st_size <= len(MAGIC):
         yield path
@@ -55,12 +56,12 @@ def intact_mcap(path: Path, notes: list[str]) -> Iterator[Path]:
 
 
 def write_intact(path: Path, target: Path, notes: list[str]) -> None:
-    """Write a complete MCAP file from the intact records of one.
+    """Write a complete MCAP file from the intact records of another one.
 
     Args:
         path: An MCAP file.
         target: File to write.
-        notes: List to which a sentence about damage is added.
+        notes: List to which a sentence about damage is appended.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         _examined(path, data, notes)
@@ -68,10 +69,10 @@ def write_intact(path: Path, target: Path, notes: list[str]) -> None:
 
 
 def mcap_metadata(path: Path, name: str) -> dict[str, str]:
-    """Return a metadata record from before the first chunk; empty if there is none, or the file is no MCAP file.
+    """Return a metadata record that precedes the first chunk; empty if there is none or the file is not an MCAP file.
 
     Args:
-        path: A file, complete or cut.
+        path: A file, complete or truncated.
         name: Name of the metadata record.
     """
     from mcap.records import Chunk, Message, Metadata
@@ -88,7 +89,7 @@ def mcap_metadata(path: Path, name: str) -> dict[str, str]:
 
 
 def _examined(path: Path, data: mmap.mmap, notes: list[str]) -> bool:
-    """Return True if a file is complete and has an index; a note names the damage."""
+    """Return True if a file is complete and has an index; otherwise append a note about the damage."""
     lost: list[int] = []
     for _ in _intact_records(data, lost):
         pass
@@ -109,7 +110,7 @@ def _examined(path: Path, data: mmap.mmap, notes: list[str]) -> bool:
 
 
 def _summary(data: mmap.mmap) -> Any:
-    """Return the summary at the end of a file, False without one, None if it is broken."""
+    """Return the summary at the end of a file, False if there is none, None if it is broken."""
     from mcap.reader import SeekingReader
 
     footer = len(data) - TAIL
@@ -122,22 +123,22 @@ def _summary(data: mmap.mmap) -> Any:
     stream: Any = data
     try:
         return SeekingReader(stream).get_summary() or False
-    except Exception:  # what is damaged shows in whatever layer of the library meets it
+    except Exception:  # depending on the damage, any layer of the library may raise
         return None
 
 
 def _copy(data: mmap.mmap, target: Path) -> None:
-    """Write the intact records of a file into one with an index."""
+    """Write the intact records of a file to a file with an index."""
     from mcap import records
     from mcap.writer import CompressionType, Writer
 
     intact = _intact_records(data, [])
     first = next(intact, None)
     header = first if isinstance(first, records.Header) else records.Header("", "")
-    # A damaged chunk may have announced schemas and channels, which the summary repeats.
+    # A damaged chunk may have contained schemas and channels, which the summary repeats.
     summary = _summary(data)
     announced = (*summary.schemas.values(), *summary.channels.values()) if summary else ()
-    schemas, channels = {0: 0}, dict[int, int]()  # numbered again
+    schemas, channels = {0: 0}, dict[int, int]()  # renumbered
     with target.open("wb") as file:
         writer: Any = Writer(file, compression=CompressionType.LZ4)
         writer.start(header.profile, header.library)
@@ -163,11 +164,11 @@ def _copy(data: mmap.mmap, target: Path) -> None:
 
 
 def _intact_records(data: mmap.mmap, lost: list[int]) -> Iterator[Any]:
-    """Yield the records of a file up to the end of its data, chunks unpacked; of a chunk that is cut what is inside it.
+    """Yield the records up to the end of the data, with chunks unpacked; for a truncated chunk, its intact records.
 
     Args:
         data: The file.
-        lost: List to which the lengths of damaged parts are added [bytes].
+        lost: List to which the lengths of damaged parts are appended [bytes].
     """
     at = len(MAGIC)
     while at < len(data) and data[at] not in (DATA_END, FOOTER):
@@ -189,7 +190,7 @@ def _intact_records(data: mmap.mmap, lost: list[int]) -> Iterator[Any]:
 
 
 def _resumed(data: mmap.mmap, at: int) -> int | None:
-    """Return where the next intact record begins after a damaged one: at its stated end, or else at the next chunk."""
+    """Return the start of the next intact record after a damaged one: its stated end, or else the next chunk."""
     end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
     if end < len(data) and _record(data, end) is not None:
         return end
@@ -199,7 +200,8 @@ def _resumed(data: mmap.mmap, at: int) -> int | None:
 
 @cache
 def _readers() -> dict[int, Any]:
-    """Return the library's readers of records by kind; others are indices, which a copy has anew."""
+    """Return the library's readers of records by kind; records of other kinds are indices, which the copy
+    writes again."""
     from mcap import records as r
 
     return {
@@ -209,7 +211,7 @@ def _readers() -> dict[int, Any]:
 
 
 def _record(data: bytes | mmap.mmap, at: int) -> tuple[Any, int] | None:
-    """Return the record that begins there, None for an index, and its end; None if it is broken or cut."""
+    """Return the record at an offset (None for an index) and its end; None if it is broken or truncated."""
     from mcap.records import Message
 
     if at + 9 > len(data):
@@ -218,7 +220,9 @@ def _record(data: bytes | mmap.mmap, at: int) -> tuple[Any, int] | None:
     end: int = at + 9 + length
     if not 0x01 <= kind <= DATA_END or end > len(data):
         return None
-    if kind == MESSAGE:  # many: without the library's stream, which takes three times as long
+    if (
+        kind == MESSAGE
+    ):  # the most frequent kind: parsed without the library's stream, which takes three times as long
         if length < 22:
             return None
         channel, sequence, log_time, publish_time = struct.unpack("<HIQQ", data[at + 9 : at + 31])
@@ -230,7 +234,7 @@ def _record(data: bytes | mmap.mmap, at: int) -> tuple[Any, int] | None:
         record = _readers()[kind](_exact()(BytesIO(body)))
         if kind == CHUNK:
             record = _unpacked_chunk(record)
-    except Exception:  # as above; and each compression raises different errors
+    except Exception:  # as above; each compression also raises different errors
         return None
     sound = kind != ATTACHMENT or zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little")
     return (record, end) if sound else None
@@ -238,7 +242,8 @@ def _record(data: bytes | mmap.mmap, at: int) -> tuple[Any, int] | None:
 
 @cache
 def _exact() -> Any:
-    """Return the library's stream, made to refuse what is shorter than its stated length."""
+    """Return the library's stream class, changed so that it refuses data that are shorter than their stated
+    length."""
     from mcap.data_stream import ReadDataStream
 
     class Exact(ReadDataStream):
@@ -252,7 +257,7 @@ def _exact() -> Any:
 
 
 def _inside(records: bytes) -> Iterator[Any]:
-    """Yield the records of an unpacked chunk up to the first broken one."""
+    """Yield the records of an unpacked chunk up to the first broken record."""
     at = 0
     while (found := _record(records, at)) is not None:
         record, at = found
@@ -260,7 +265,7 @@ def _inside(records: bytes) -> Iterator[Any]:
 
 
 def _last_record_end(records: bytes) -> int:
-    """Return where the last intact record of an unpacked chunk ends."""
+    """Return the end of the last intact record of an unpacked chunk."""
     at = 0
     while (found := _record(records, at)) is not None:
         at = found[1]
@@ -268,7 +273,8 @@ def _last_record_end(records: bytes) -> int:
 
 
 def _unpacked_chunk(chunk: Any) -> Any:
-    """Return a chunk without compression; ValueError if it does not match its checksum or, without one, is broken."""
+    """Return a chunk without compression; ValueError if it does not match its checksum or, without one, is
+    broken."""
     if chunk.uncompressed_size > CHUNK_BYTES:
         raise ValueError("too large")
     records, crc = _unpacked(chunk.compression, chunk.data), chunk.uncompressed_crc
@@ -281,10 +287,10 @@ def _unpacked_chunk(chunk: Any) -> Any:
 
 
 def _of_cut_chunk(data: bytes) -> bytes:
-    """Return what can be unpacked of a chunk that is cut."""
+    """Return the data that can be decompressed from a truncated chunk."""
     if len(data) < 49 or data[0] != CHUNK:
         return b""
-    # Kind, length; first and last time, size, checksum; then the compression's name and the length of what follows.
+    # Kind, length; first and last time, size, checksum; then the name of the compression and the length of the data.
     length = struct.unpack_from("<I", data, 37)[0]
     try:
         return _unpacked(data[41 : 41 + length].decode("ascii"), data[41 + length + 8 :])
@@ -293,7 +299,7 @@ def _of_cut_chunk(data: bytes) -> bytes:
 
 
 def _unpacked(compression: str, packed: bytes) -> bytes:
-    """Return as much as can be unpacked of the beginning of a chunk, up to the limit of its size."""
+    """Return the decompressed beginning of a chunk, as far as it is intact, up to the limit of its size."""
     if compression == "":
         return packed
     if compression == "zstd":

@@ -1,7 +1,7 @@
-"""Closed triangle meshes: reading, checking, volume integrals, and a plain hull made from a few numbers.
+"""Closed triangle meshes: reading, checking, volume integrals, and a simple hull defined by a few numbers.
 
-A mesh is a pair `(vertices (n, 3) float64 [m], faces (m, 3) int)`; seen from outside, a face runs
-counter-clockwise.
+A mesh is a pair `(vertices (n, 3) float64 [m], faces (m, 3) int)`; seen from outside, the vertices of a face
+run counter-clockwise.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _ROUND = 0.5  # reciprocal exponent of a circle
 
 
 def unit_hull(fill: float) -> tuple[Vertices, Faces]:
-    """Rounded box, tube or open frame that reaches all sides of the cube and takes a share of its volume.
+    """Return a rounded box, tube or open frame that touches all sides of the cube and fills a fraction of its volume.
 
     Args:
-        fill: The share, above 0 and up to 1.
+        fill: The fraction, above 0 and up to 1.
 
     Returns:
         Vertices in a cube of unit size, (n, 3), and outward faces (m, 3).
     """
-    from scipy.optimize import brentq  # here and below: a robot that needs no hull starts without them
+    from scipy.optimize import brentq  # imported late: a robot that needs no hull starts without it
 
     cells = (8, 4, 4)
 
@@ -47,11 +47,10 @@ def unit_hull(fill: float) -> tuple[Vertices, Faces]:
 
 
 def _open_frame(fill: float, gap: float = 0.02) -> tuple[Vertices, Faces]:
-    """Two floats and the deck between them in [-1, 1]³.
+    """Return two floats and the deck between them in [-1, 1]³.
 
-    At thickness t a float takes t/3 of the width and the deck t of the height, with `gap`, a share of the
-    width, open on either side: fill / k = 2t/3 + t (1 - 2t/3 - 2 gap), where k is the fill of one body in its
-    own box.
+    At thickness t a float takes t/3 of the width and the deck t of the height, with `gap`, a fraction of the width,
+    open on either side: fill / k = 2t/3 + t (1 - 2t/3 - 2 gap), where k is the fill of one body in its own box.
     """
     body, faces = _superellipsoid((4, 2, 2), 0.15, 0.15)
     k = _volume(body, faces) / 8.0
@@ -65,10 +64,10 @@ def _open_frame(fill: float, gap: float = 0.02) -> tuple[Vertices, Faces]:
 
 
 def _superellipsoid(cells: tuple[int, int, int], along: float, across: float) -> tuple[Vertices, Faces]:
-    """Surface in [-1, 1]³: |x|ⁿ + rⁿ = 1 with rᵐ = |y|ᵐ + |z|ᵐ.
+    """Return the surface in [-1, 1]³: |x|ⁿ + rⁿ = 1 with rᵐ = |y|ᵐ + |z|ᵐ.
 
     Args:
-        cells: Even numbers of cells along x, y and z of the cube whose grid is drawn in to the surface.
+        cells: Even numbers of cells along x, y and z of the cube whose grid is projected onto the surface.
         along: 1/n, from 0 (flat ends) to 0.5 (elliptic).
         across: 1/m, from 0 (a rectangular section) to 0.5 (a round one).
 
@@ -83,7 +82,7 @@ def _superellipsoid(cells: tuple[int, int, int], along: float, across: float) ->
 
 
 def _norm(x: NDArray[np.float64], s: float) -> NDArray[np.float64]:
-    """Norm (sum of |x|^(1/s))^s over the last axis, the greatest |x| for s = 0."""
+    """Return the norm (sum of |x|^(1/s))^s over the last axis, the greatest |x| for s = 0."""
     greatest = np.abs(x).max(axis=-1)
     if s == 0.0:
         return np.asarray(greatest)
@@ -92,7 +91,8 @@ def _norm(x: NDArray[np.float64], s: float) -> NDArray[np.float64]:
 
 
 def _cube(cells: tuple[int, int, int]) -> tuple[Vertices, Faces]:
-    """Surface of the cube [-1, 1]³ with even `cells` along x, y, z, two triangles to each."""
+    """Return the surface of the cube [-1, 1]³ with even numbers of `cells` along x, y, z, two triangles per
+    cell."""
     corners = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -101,7 +101,7 @@ def _cube(cells: tuple[int, int, int]) -> tuple[Vertices, Faces]:
                 quad = np.ones((4, 3))
                 quad[:, u] = np.array([i, i + 1, i + 1, i]) * 2.0 / cells[u] - 1.0
                 quad[:, v] = np.array([j, j, j + 1, j + 1]) * 2.0 / cells[v] - 1.0
-                # The diagonal that does not point at the middle of the side keeps the rounded body convex.
+                # The diagonal that does not point to the centre of the side keeps the rounded body convex.
                 first = 1 if (2 * i < cells[u]) == (2 * j < cells[v]) else 0
                 a, b, c, d = np.roll(quad, -first, axis=0)
                 front = np.stack([[a, b, c], [a, c, d]])
@@ -121,24 +121,24 @@ Faces = NDArray[np.int64]
 
 
 class MeshError(ValueError):
-    """A mesh file, or the surface it holds, that cannot serve as a hull."""
+    """Error in a mesh file, or in a surface that cannot be used as a hull."""
 
 
 FARTHEST = 1e5
-"""Coordinate in a file, of a hull in millimetres too; what is farther is a wrong number [m]."""
+"""Largest plausible coordinate in a file, also for a hull in millimetres; a larger one is an error [m]."""
 
 
 def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
     """Read a binary or ASCII STL file.
 
     Args:
-        path: The file; its lengths are taken to be metres.
+        path: The file; its lengths are assumed to be in metres.
 
     Returns:
         Vertices (n, 3) [m], equal corners merged into one, and faces (m, 3).
 
     Raises:
-        MeshError: The file is neither form of STL, is cut short, holds no triangle, or a number beyond reason.
+        MeshError: The file is not an STL file, is truncated, contains no triangle, or contains an implausible number.
     """
     data = read_bytes(Path(path), MeshError)
     triangles = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
@@ -172,16 +172,16 @@ def load_stl(path: str | Path) -> tuple[Vertices, Faces]:
 
 
 def load_obj(path: str | Path) -> tuple[Vertices, Faces]:
-    """Read the polygons of a Wavefront OBJ file, all its objects together.
+    """Read the polygons of a Wavefront OBJ file, with all its objects combined.
 
     Args:
-        path: The file; its lengths are taken to be metres.
+        path: The file; its lengths are assumed to be in metres.
 
     Returns:
-        Vertices (n, 3) [m] and faces (m, 3): a polygon becomes a fan.
+        Vertices (n, 3) [m] and faces (m, 3): a polygon is split into a fan of triangles.
 
     Raises:
-        MeshError: It has no polygon, one of vertices that are not there, or a number beyond reason.
+        MeshError: The file contains no polygon, a polygon with missing vertices, or an implausible number.
     """
     corners: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
@@ -201,7 +201,7 @@ def load_obj(path: str | Path) -> tuple[Vertices, Faces]:
     except ValueError as error:
         raise MeshError(f"{path}: cannot be read as OBJ: {error}") from None
     if index.size == 0 or index.min() < 0 or index.max() >= len(vertices):
-        raise MeshError(f"{path}: has no polygon, or one of vertices that it does not have: export it again")
+        raise MeshError(f"{path}: contains no polygon, or a polygon with missing vertices: export it again")
     if not np.abs(vertices).max() <= FARTHEST:
         raise MeshError(
             f"{path}: a coordinate is not a number up to {FARTHEST:g} m: save the mesh again, in metres"
@@ -225,7 +225,7 @@ def write_stl(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 
 
 def face_geometry(vertices: ArrayLike, faces: ArrayLike) -> tuple[Vertices, NDArray[np.float64], Vertices]:
-    """Normals, areas and centroids of the faces.
+    """Return the normals, areas and centroids of the faces.
 
     Args:
         vertices: Vertices (n, 3) [m].
@@ -242,38 +242,39 @@ def face_geometry(vertices: ArrayLike, faces: ArrayLike) -> tuple[Vertices, NDAr
 
 
 def mesh_volume(vertices: ArrayLike, faces: ArrayLike) -> float:
-    """Enclosed volume [m³], by the divergence theorem; negative where the faces look inward."""
+    """Return the enclosed volume [m³], by the divergence theorem; negative if the faces point inward."""
     return float(_tetrahedra(vertices, faces)[0].sum())
 
 
 def mesh_centroid(vertices: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
-    """Centroid (3,) [m] of the enclosed volume, in the mesh's own frame."""
+    """Return the centroid (3,) [m] of the enclosed volume, in the mesh's own frame."""
     volume, corners, origin = _tetrahedra(vertices, faces)
     # Tetrahedron (origin, a, b, c): its centroid is a quarter of a + b + c away from the origin.
     return np.asarray(origin + (volume @ corners.sum(axis=1)) / (4.0 * volume.sum()))
 
 
 def _tetrahedra(vertices: ArrayLike, faces: ArrayLike) -> tuple[NDArray[np.float64], Vertices, Vertices]:
-    """Signed volumes (m,) of tetrahedra on the faces, corners (m, 3, 3) about their apex, the apex (3,)."""
+    """Return the signed volumes (m,) of tetrahedra on the faces, corners (m, 3, 3) relative to their apex, and the apex
+    (3,)."""
     points = np.asarray(vertices, np.float64)
-    # Apex amid the vertices: a hull far from its own origin would otherwise lose digits by cancellation.
+    # Apex in the middle of the vertices: a hull far from its origin would otherwise lose digits by cancellation.
     origin = points.mean(axis=0)
     corners = (points - origin)[np.asarray(faces)]
     return np.linalg.det(corners) / 6.0, corners, origin
 
 
 def check_closed(vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Refuse a surface that does not enclose volumes with its faces outward.
+    """Refuse a surface that does not enclose volumes with its faces pointing outward.
 
-    Each edge must be run once in each direction for every two faces at it, no face may be degenerate, and
-    every connected part must have a positive volume (a cavity is refused: water does not reach its walls).
+    Each edge must be traversed equally often in both directions, no face may be degenerate, and every
+    connected part must have a positive volume (a cavity is refused: water does not reach its walls).
 
     Args:
         vertices: Vertices (n, 3) [m], shared between neighbouring faces.
         faces: Faces (m, 3).
 
     Raises:
-        MeshError: Saying what is wrong, how many times, and what to do.
+        MeshError: The surface is invalid; the message states the error, the number of occurrences and the remedy.
     """
     points, triangles = np.asarray(vertices, np.float64), np.asarray(faces)
     if points.shape[1:] != (3,) or triangles.shape[1:] != (3,) or not len(triangles):
@@ -297,7 +298,7 @@ def check_closed(vertices: ArrayLike, faces: ArrayLike) -> None:
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     n = len(points)
     edge = (np.minimum(start, end), np.maximum(start, end))
-    # +1 along the edge, -1 against it: balanced if closed, doubled where a neighbour is turned over.
+    # +1 along the edge, -1 against it: balanced if closed, doubled where a neighbour has the opposite orientation.
     balance = coo_matrix((np.where(start < end, 1, -1), edge), (n, n)).tocsr()
     uses = coo_matrix((np.ones(len(start), int), edge), (n, n)).tocsr()
     opened = int((uses.data % 2 == 1).sum())
@@ -322,14 +323,14 @@ def check_closed(vertices: ArrayLike, faces: ArrayLike) -> None:
 
 
 def outward(vertices: ArrayLike, faces: ArrayLike) -> Faces:
-    """Turn over the connected parts that enclose a negative volume, which some modelling tools export.
+    """Flip the faces of connected parts that enclose a negative volume, which some modelling tools export.
 
     Args:
         vertices: Vertices (n, 3) [m], shared between neighbouring faces.
         faces: Faces (m, 3), consistent within each part.
 
     Returns:
-        Faces (m, 3), those of every part outward. A cavity is turned into a body: remove it first.
+        Faces (m, 3), those of every part pointing outward. A cavity becomes a body: remove it first.
     """
     triangles = np.array(faces, np.int64)
     part, volume = _parts(vertices, triangles)
@@ -339,7 +340,7 @@ def outward(vertices: ArrayLike, faces: ArrayLike) -> Faces:
 
 
 def _parts(vertices: ArrayLike, faces: Faces) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Number of the connected part each face (m,) belongs to, and the volume (parts,) [m³] of each."""
+    """Return the index of the connected part of each face (m,), and the volume (parts,) [m³] of each part."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -353,23 +354,23 @@ def _parts(vertices: ArrayLike, faces: Faces) -> tuple[NDArray[np.int64], NDArra
 def parametric_hull(
     size: ArrayLike, volume: float, center: ArrayLike = (0.0, 0.0, 0.0)
 ) -> tuple[Vertices, Faces]:
-    """A plain closed hull with a given envelope, volume and centroid, of 240 or 320 triangles.
+    """Return a simple closed hull with a given envelope, volume and centroid, of 240 or 320 triangles.
 
     With f = volume / envelope volume:
 
     - f above about 0.77: a rounded box, the superellipsoid |x|ⁿ + |y|ⁿ + |z|ⁿ = 1;
-    - f from about 0.5, an ellipsoid, to there: a tube along x with a round section and rounded ends,
+    - f from about 0.5, an ellipsoid, up to that value: a tube along x with a round section and rounded ends,
       |x|ⁿ + rⁿ = 1 with r = |(y, z)|;
     - below: the open frame of a small ROV: two upright floats and, a gap away from each, a level deck between
       them; three bodies of full length with rounded corners.
 
-    The exponent n, or the thickness of floats and deck, is solved for the exact volume. The hull mirrors on
-    all three planes through its centre, triangles included.
+    The exponent n, or the thickness of floats and deck, is solved for the exact volume. The hull, including
+    its triangles, is symmetric about all three planes through its centre.
 
     Args:
         size: Envelope along x, y, z (3,) [m].
         volume: Enclosed volume [m³].
-        center: Centre of the envelope, which is the volume's centroid too (3,) [m].
+        center: Centre of the envelope, which is also the volume's centroid (3,) [m].
 
     Returns:
         Vertices (n, 3) [m] and faces (m, 3), closed and outward.

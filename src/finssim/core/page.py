@@ -1,4 +1,4 @@
-"""Reports: one HTML file that holds its pictures and loads nothing."""
+"""Reports: one self-contained HTML file with embedded pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = [
 REPORT_FILE, RECORD_FILE = "report.html", "fit.json"
 
 Pictures = Mapping[str, tuple[str, bytes]]
-"""File name -> what the picture shows, and the PNG."""
+"""File name -> caption of the picture, and the PNG."""
 
 STYLE = """
 :root { color-scheme: light; }
@@ -57,31 +57,31 @@ def html_page(title: str, sections: Sequence[str]) -> str:
 
 
 def html_picture(png: bytes, text: str) -> str:
-    """Return a picture inside the page with its caption, plain text."""
+    """Return an embedded picture with its caption, plain text."""
     data = base64.b64encode(png).decode("ascii")
     image = f'<img alt="{escape(text)}" src="data:image/png;base64,{data}">'
     return f"<figure>{image}<figcaption>{escape(text)}</figcaption></figure>"
 
 
 def html_section(title: str, parts: Sequence[str], *, shown: bool = True) -> str:
-    """Return a section that folds at its title.
+    """Return a section that can be folded at its title.
 
     Args:
         title: Plain text.
         parts: HTML.
-        shown: Whether it is unfolded at first.
+        shown: True if it is unfolded initially.
     """
     head = f"<summary><h2>{escape(title)}</h2></summary>"
     return f"<details{' open' if shown else ''}>{head}{''.join(parts)}</details>"
 
 
 def html_code(lines: Sequence[str]) -> str:
-    """Return lines as they are."""
+    """Return preformatted lines."""
     return f"<pre>{escape(chr(10).join(lines))}</pre>"
 
 
 def html_table(heads: Sequence[str], rows: Sequence[str]) -> str:
-    """A table of rows that are HTML already."""
+    """Return a table whose rows are HTML already."""
     cells = "".join(f"<th>{escape(head)}</th>" for head in heads)
     table = f"<table><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     return f'<div class="table">{table}</div>'
@@ -94,22 +94,22 @@ def notebook_html(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]
 
 
 class Page:
-    """A report that is written section by section, as one HTML file beside its pictures."""
+    """Report that is written section by section, as one HTML file with its pictures beside it."""
 
     def __init__(self, title: str) -> None:
-        """Begin with a title, plain text."""
+        """Create a page with a title, plain text."""
         self.title = title
         self._html = [f"<h1>{escape(title)}</h1>"]
         self._folded = False
 
     def _close(self) -> None:
-        """End the section that is open."""
+        """End the open section."""
         if self._folded:
             self._html.append("</details>")
         self._folded = False
 
     def heading(self, text: str) -> None:
-        """Begin a section, which folds at its heading."""
+        """Begin a section that can be folded at its heading."""
         self._close()
         self._folded = True
         self._html.append(f"<details open><summary><h2>{escape(text)}</h2></summary>")
@@ -119,12 +119,12 @@ class Page:
         self._html.append(f'<p class="lead">{escape(text)}</p>')
 
     def note(self, text: str) -> None:
-        """Add a paragraph in small print; nothing for no text."""
+        """Add a paragraph in small print; nothing if the text is empty."""
         if text:
             self._html.append(f'<p class="note">{escape(text.replace("`", ""))}</p>')
 
     def items(self, heading: str, sentences: Sequence[str]) -> None:
-        """Add a section of warnings; nothing where there are none."""
+        """Add a section of warnings; nothing if there are none."""
         if sentences:
             self.heading(heading)
             items = "".join(f'<li class="warning">{escape(sentence)}</li>' for sentence in sentences)
@@ -133,7 +133,7 @@ class Page:
     def table(
         self, heads: Sequence[str], rows: Sequence[Sequence[str]], kinds: Sequence[str] = (), last: str = ""
     ) -> None:
-        """Add a table; `kinds` are classes of the style for its rows, `last` is that of its last cells."""
+        """Add a table; `kinds` are CSS classes of its rows, `last` is the class of the last cell of each row."""
         html = []
         for k, row in enumerate(rows):
             cells = "".join(f"<td>{escape(cell)}</td>" for cell in row[:-1])
@@ -142,7 +142,7 @@ class Page:
         self._html.append(html_table(heads, html))
 
     def pictures(self, pictures: Pictures) -> None:
-        """Add every picture below what it shows."""
+        """Add every picture below its caption as a heading."""
         last_text = ""
         for text, data in pictures.values():
             if text != last_text:
@@ -155,7 +155,7 @@ class Page:
         self._html.append(html_picture(png, text))
 
     def code(self, heading: str, lines: Sequence[str]) -> None:
-        """Add a section of lines as they are."""
+        """Add a section of preformatted lines."""
         self.heading(heading)
         self._html.append(html_code(lines))
 
@@ -163,12 +163,12 @@ class Page:
         """Write `report.html`, the pictures as PNG and `fit.json`.
 
         Args:
-            folder: Directory to make; an earlier report there is replaced.
-            record: What `fit.json` holds.
-            pictures: Those that the page names.
+            folder: Directory to create; an earlier report there is replaced.
+            record: Content of `fit.json`.
+            pictures: Pictures that the page refers to.
 
         Raises:
-            OutputError: The folder holds other files, or cannot be written.
+            OutputError: The folder contains other files, or cannot be written.
         """
         self._close()
         with atomic_directory(folder, replaces=RECORD_FILE) as temporary:

@@ -5,7 +5,7 @@ __all__ = ["BLACK", "BLUE", "COLORS", "GREEN", "ORANGE", "PINK", "SKY", "VERMILI
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
 PINK, ORANGE, SKY, BLACK = "#CC79A7", "#E69F00", "#56B4E9", "#000000"
 COLORS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
-"""Okabe and Ito's palette, which the colour-blind can distinguish too."""
+"""Okabe and Ito's palette, which is also distinguishable with colour-vision deficiency."""
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

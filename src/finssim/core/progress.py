@@ -10,9 +10,9 @@ from contextvars import ContextVar
 from rich.console import Console
 
 Progress = Callable[..., None]
-"""Takes the share that is done, 0 to 1, and, perhaps, what comes next."""
+"""Function of the completed fraction, 0 to 1, and optionally the name of the next step."""
 EVERY = 10.0
-"""Time between two lines of progress where there is no terminal [s]."""
+"""Time between two lines of progress without a terminal [s]."""
 
 
 _SHOWN: ContextVar[bool] = ContextVar("progress_shown", default=True)
@@ -33,11 +33,11 @@ def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
     """Show progress on standard error: a bar on a terminal, otherwise a line immediately and one every ten seconds.
 
     Args:
-        name: Of the work.
-        visible: False: nothing is shown.
+        name: Name of the work.
+        visible: False to show nothing.
 
     Yields:
-        A function of the share that is done and, perhaps, of what comes next.
+        A function of the completed fraction and, optionally, the name of the next step.
     """
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
@@ -56,7 +56,7 @@ def progress_bar(name: str, *, visible: bool = True) -> Iterator[Progress]:
 
 
 def _lines(name: str, screen: Console) -> Progress:
-    """Return a progress that prints what it is first given, and then a line every `EVERY` seconds."""
+    """Return a progress function that prints its first call, and then a line every `EVERY` seconds."""
     began = time.monotonic()
     last = -EVERY
 

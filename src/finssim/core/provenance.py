@@ -1,4 +1,5 @@
-"""Origin of an artefact: source revision, package versions, machine. Stored in every policy, report and result."""
+"""Provenance of an artefact: source revision, package versions, machine. Stored in every policy, report and
+result."""
 
 from __future__ import annotations
 
@@ -22,17 +23,17 @@ PACKAGES = (
     "onnxruntime",
     "mujoco",
 )
-"""Distributions whose version can change a result."""
+"""Distributions whose version can affect a result."""
 
 
 def provenance() -> dict[str, Any]:
-    """Origin of a saved artefact, as plain values for JSON or YAML.
+    """Return the provenance of a saved artefact, as plain values for JSON or YAML.
 
-    There is no clock time in it, so that equal runs write equal files.
+    It contains no timestamp, so that equal runs write equal files.
 
     Returns:
-        `finssim` (version), `revision` (git commit of the source, or None outside a checkout), `python`, `packages`
-        (name -> version of what is installed) and `platform` (system, machine).
+        `finssim` (version), `revision` (git commit of the source, or None outside a checkout), `python`,
+        `packages` (name -> installed version) and `platform` (system, machine).
     """
     return {
         "finssim": finssim.__version__,
@@ -45,10 +46,10 @@ def provenance() -> dict[str, Any]:
 
 @cache
 def revision() -> str | None:
-    """Git commit of the FinsSim source in use, with `+modified` if its files differ from it.
+    """Return the git commit of the FinsSim source in use, with `+modified` if its files differ from the commit.
 
-    None where the package is not run from its own checkout (installed from a wheel, perhaps inside some other
-    project's repository) or git is not there.
+    None if the package is not run from its own checkout (for example installed from a wheel inside another
+    project's repository) or git is not available.
     """
     package = Path(finssim.__file__).resolve().parent
     top = _git(package, "rev-parse", "--show-toplevel")
@@ -61,7 +62,7 @@ def revision() -> str | None:
 
 
 def package_versions(names: tuple[str, ...]) -> dict[str, str]:
-    """Versions of those of the named distributions that are installed, without importing any."""
+    """Return the versions of those named distributions that are installed, without importing any."""
     versions = {}
     for name in names:
         try:

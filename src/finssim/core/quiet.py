@@ -1,4 +1,4 @@
-"""Start Warp without its usual output, and report kernels that are being compiled."""
+"""Start Warp without its usual output, and report when kernels are compiled."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _COMPILED = re.compile(r"Module (?P<name>\S+) .* took (?P<ms>[\d.]+) ms +\(compi
 
 @cache  # searching for the driver's library starts six processes
 def start_warp() -> None:
-    """Initialise Warp silently, once a process; afterwards it reports warnings, errors, and on standard error what it
-    compiles.
+    """Initialise Warp silently, once per process; afterwards it reports warnings and errors, and compilations
+    on standard error.
 
-    Its banner goes to standard output, where it would spoil JSON. Its native library warns on standard error
-    where there is no NVIDIA driver: on a laptop that is no news (`finssim doctor` says it), so it is kept back there.
+    Its banner goes to standard output, where it would corrupt JSON. Its native library warns on standard error if
+    there is no NVIDIA driver: this is expected on a laptop (`finssim doctor` reports it), so it is suppressed.
     """
     import warp as wp
 
@@ -40,7 +40,7 @@ def start_warp() -> None:
 
 
 class _Compilations:
-    """Warp's log without its notes, of which one line becomes of each module of kernels that was compiled."""
+    """Warp's logger without its notes; each compiled module of kernels is reported in one line."""
 
     def __init__(self, log: Any) -> None:
         self.debug, self.warning, self.error = log.debug, log.warning, log.error
@@ -53,14 +53,15 @@ class _Compilations:
 
 
 def _tell(line: str) -> None:
-    """A line on standard error, from the command's own process: those that it starts would mix theirs with its."""
+    """Print a line on standard error, only in the command's main process: lines of child processes would
+    interleave."""
     if multiprocessing.parent_process() is None:
         print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Nothing written to the process's standard error, by native code either, while the block runs."""
+    """Discard output on the process's standard error, also by native code, within the block."""
     saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)

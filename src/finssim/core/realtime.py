@@ -1,4 +1,5 @@
-"""Clock of everything that runs in real time: the machine's monotonic clock, slowed down where the environment asks.
+"""Clock of everything that runs in real time: the machine's monotonic clock, slowed down by a rate from the
+environment.
 
 With `FINSSIM_CLOCK_RATE=0.25` the virtual pool and the robot's software run at a quarter of real time, so that a slow
 or busy machine keeps up: both read the same slower clock, and rates, delays and watchdogs keep their meaning. Every
@@ -11,15 +12,15 @@ import os
 import time
 
 RATE = "FINSSIM_CLOCK_RATE"
-"""Environment variable: seconds of the session per second of this machine; 1 if it is not set."""
+"""Environment variable: session time per second of this machine; 1 if it is not set."""
 
 
 class ClockRateError(ValueError):
-    """A rate of the clock that cannot be used."""
+    """Invalid clock rate."""
 
 
 def clock_rate() -> float:
-    """Return how many seconds of the session pass in one second of this machine [-].
+    """Return the session time that passes per second of this machine [-].
 
     Raises:
         ClockRateError: The environment variable is not a number between 0.01 and 1.
@@ -35,10 +36,10 @@ def clock_rate() -> float:
 
 
 def now() -> float:
-    """Return the session's time [s], which all processes of this machine share."""
+    """Return the session time [s], which all processes of this machine share."""
     return time.monotonic() * clock_rate()
 
 
 def wait(duration: float) -> None:
-    """Wait for a duration of the session's time [s]."""
+    """Wait for a duration of session time [s]."""
     time.sleep(max(duration, 0.0) / clock_rate())

@@ -1,11 +1,11 @@
-"""Registry of everything that can be added to FinsSim: one dictionary for each family.
+"""Registries of everything that can be added to FinsSim: one dictionary per family.
 
 An installed package adds members by entry points, and FinsSim's own members are references of the same form:
 
     [project.entry-points."finssim.sensors"]
     pinger = "acoustics.pinger:PingerBatch"
 
-A member is imported and checked when it is first used, so that a broken package stops only what needs it.
+A member is imported and checked when it is first used, so that a broken package affects only its own users.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class RegistryError(ValueError):
 
 
 class RegistryWarning(UserWarning):
-    """A member of a family is left out, since it cannot be used."""
+    """A member of a family is omitted because it cannot be used."""
 
 
 class Family(MutableMapping[str, Any]):
-    """Members of one family by name: those of FinsSim, those of installed packages, those that a program adds.
+    """Members of one family by name: those of FinsSim, of installed packages, and those added by the program.
 
-    Iteration gives all names and imports nothing; an item is imported when it is read.
+    Iteration yields all names without importing anything; an item is imported when it is accessed.
     """
 
     def __init__(self, noun: str, shipped: Mapping[str, Any], check: str | None = None) -> None:
@@ -55,7 +55,7 @@ class Family(MutableMapping[str, Any]):
         Args:
             noun: Name of one member in messages; its plural is the group of entry points.
             shipped: Name -> `module:object`, or the object itself, of FinsSim's own members.
-            check: `module:function` of (name, member) that raises a ValueError for what is no member.
+            check: `module:function` of (name, member) that raises a ValueError for an invalid member.
         """
         self.noun = noun
         self.group = f"finssim.{noun}s"
@@ -65,11 +65,11 @@ class Family(MutableMapping[str, Any]):
         self._imported: dict[tuple[str, str], Any] = {}
 
     def __getitem__(self, name: str) -> Any:
-        """Return a member, which is imported now if it was not.
+        """Return a member, importing it if necessary.
 
         Raises:
-            KeyError: There is none of that name.
-            RegistryError: Its package cannot be imported, it is no member, or several packages register that name.
+            KeyError: There is no member of that name.
+            RegistryError: Its package cannot be imported, the object is invalid, or several packages register the name.
         """
         if name in self._added:
             return self._added[name]
@@ -91,10 +91,10 @@ class Family(MutableMapping[str, Any]):
         return self._imported[key]
 
     def __setitem__(self, name: str, member: Any) -> None:
-        """Add a member for this program; a class or function that is defined again replaces the earlier one.
+        """Add a member for this program; a class or function that is redefined replaces the earlier one.
 
         Raises:
-            RegistryError: FinsSim, a package, or another object of this program has that name already.
+            RegistryError: FinsSim, a package, or another object of this program already uses that name.
         """
         known = self._added.get(name)
         again = known is member or (_identity(known) is not None and _identity(known) == _identity(member))
@@ -123,7 +123,7 @@ class Family(MutableMapping[str, Any]):
         self._shipped |= members
 
     def of_packages(self) -> list[str]:
-        """Return the names that other packages register and FinsSim does not have."""
+        """Return the names that only other packages register."""
         return [name for name in self._points() if name not in self._shipped]
 
     def packages(self) -> dict[str, str]:
@@ -136,7 +136,7 @@ class Family(MutableMapping[str, Any]):
         )
 
     def failures(self) -> dict[str, str]:
-        """Import the members of other packages, and return name -> sentence of each that cannot be used."""
+        """Import the members of other packages, and return name -> error message of each that cannot be used."""
         sentences = {}
         for name, points in self._points().items():
             if name in self._shipped:
@@ -152,18 +152,18 @@ class Family(MutableMapping[str, Any]):
         return sentences
 
     def usable(self) -> dict[str, Any]:
-        """Return all members but those of packages that cannot be used, of which a warning says why."""
+        """Return all members, except unusable ones of other packages, for which a warning states the reason."""
         failed = self.failures()
         for sentence in failed.values():
             warnings.warn(sentence, RegistryWarning, stacklevel=2)
         return {name: self[name] for name in self if name in self._shipped or name not in failed}
 
     def reference(self, name: str) -> str:
-        """Return `module:object` of a member of another package, which is not imported.
+        """Return `module:object` of a member of another package, without importing it.
 
         Raises:
             KeyError: No package registers that name.
-            RegistryError: Several packages do.
+            RegistryError: Several packages register it.
         """
         return str(self._point(name)[0].value)
 
@@ -187,7 +187,8 @@ class Family(MutableMapping[str, Any]):
 
 @cache
 def _entry_points(group: str, path: tuple[str, ...]) -> dict[str, list[tuple[Any, str]]]:
-    """Return name -> entry points of a group with their packages; `path` is the search path that they are found on."""
+    """Return name -> entry points of a group with their packages; `path` is the search path, part of the
+    cache key."""
     from importlib.metadata import entry_points  # slow to import
 
     points: dict[str, list[tuple[Any, str]]] = {}
@@ -209,13 +210,13 @@ def object_at(reference: str) -> Any:
 
 
 def _identity(member: Any) -> tuple[str, str] | None:
-    """Return module and qualified name of a class or function; None of other objects."""
+    """Return module and qualified name of a class or function; None for other objects."""
     name = getattr(member, "__qualname__", None)
     return None if name is None else (str(member.__module__), name)
 
 
 CATALOGUE = Path(__file__).parents[1] / "vehicles/catalogue"
-"""Directory of the vehicle files of FinsSim."""
+"""Directory of FinsSim's vehicle files."""
 
 VEHICLES = Family(
     "vehicle",
@@ -239,7 +240,7 @@ TASKS = Family(
     },
     check="finssim.tasks.catalogue:check_registered",
 )
-"""Name -> class of the task, or another callable; called without arguments, it returns the task as it ships."""
+"""Name -> class of the task, or another callable; called without arguments, it returns the task with its defaults."""
 
 SENSORS = Family(
     "sensor",
@@ -271,8 +272,8 @@ ACTUATORS = Family(
     },
     check="finssim.physics.terms.composed:check_actuator",
 )
-"""`kind` of a section under `actuators` in a vehicle file -> its `finssim.vehicles.actuators.ActuatorKind`; `propeller`
-is that of the sections under `thrusters`."""
+"""`kind` of a section under `actuators` in a vehicle file -> its `finssim.vehicles.actuators.ActuatorKind`;
+`propeller` applies to the sections under `thrusters`."""
 
 LEARNERS = Family(
     "learner",
@@ -284,13 +285,13 @@ LEARNERS = Family(
     },
     check="finssim.learning.learners.catalogue:check_registered",
 )  # fmt: skip
-"""Name -> the `LearnerKind`; of other packages, a class derived from `ActingLearner`."""
+"""Name -> the `LearnerKind`; for other packages, a class derived from `ActingLearner`."""
 
 COMMANDS = Family("command", {})
-"""First word after `finssim` -> function; `finssim.cli` adds those of FinsSim."""
+"""First word after `finssim` -> function; `finssim.cli` adds FinsSim's own commands."""
 
 WORLDS = Family("world", {})
-"""Kind of a described world -> function of a name or path that returns the world; `described` is that of perception."""
+"""Kind of a described world -> function of a name or path that returns the world; perception adds `described`."""
 
 IMPORTERS = Family(
     "importer",
@@ -320,7 +321,7 @@ IMPORTERS = Family(
     },
     check="finssim.core.importer:check_registered",
 )
-"""What is imported, a dot, and the format -> the `Importer` of `finssim.core.importer`."""
+"""Kind of content, a dot, and the format -> the `Importer` of `finssim.core.importer`."""
 
 FAMILIES: tuple[Family, ...] = (
     VEHICLES,

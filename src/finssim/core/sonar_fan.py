@@ -1,4 +1,4 @@
-"""Pictures of sonars as fans seen from above."""
+"""Rendering of sonar pictures as fans seen from above."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 
 def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray[Any]:
-    """A sonar's picture as a fan seen from above, the sonar at the bottom, ahead upwards; NaN outside.
+    """Return a sonar's picture as a fan seen from above, with the sonar at the bottom and ahead pointing up;
+    NaN outside.
 
     Args:
-        levels: Levels of a picture, by beam, 0 at the left, and range cell, (beams, bins).
+        levels: Levels of a picture by beam, starting at the left, and range cell, (beams, bins).
         sector: Field of view [rad].
-        side: Rows of the result, one range long [-].
+        side: Number of rows of the result, which span the range [-].
 
     Returns:
         The picture, (side, columns).
@@ -27,7 +28,8 @@ def fan_picture(levels: NDArray[Any], sector: float, side: int = 720) -> NDArray
 
 @cache
 def _fan_cells(beams: int, bins: int, sector: float, side: int) -> tuple[NDArray[Any], ...]:
-    """Beam and range cell of each pixel of a fan, and whether it lies in it, (side, columns) each."""
+    """Return the beam and range cell of each pixel of a fan, and whether the pixel lies inside it, (side,
+    columns) each."""
     half = min(1.0, math.sin(min(0.5 * sector, 0.5 * math.pi)))
     x = np.linspace(-half, half, round(2.0 * half * side))
     y = np.linspace(1.0, 0.0, side)[:, None]

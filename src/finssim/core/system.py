@@ -1,7 +1,7 @@
 """Differences between Linux, macOS and Windows: signals between processes, their parents, peak memory, text streams.
 
-The branches for Windows and macOS are written from their documentation and run in tests only where these take away what
-the other systems lack; no one has run them on such a machine.
+The branches for Windows and macOS follow their documentation; tests run them only by removing what these
+systems lack. They have not been run on such a machine.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 PARENT = "FINSSIM_PARENT"
-"""Environment variable: the process without which this one ends too."""
+"""Environment variable: process id of the parent; this process ends when the parent does."""
 COUNT = 1.0, 10.0
-"""Time between two signs of life of a silent command, on a terminal and elsewhere [s]."""
+"""Time between two progress lines of a silent command, on a terminal and elsewhere [s]."""
 ORPHANED = 0.5
-"""Time between two checks whether the parent is running [s]."""
+"""Time between two checks that the parent is running [s]."""
 AGAIN = 0.05
-"""Time from a lost KeyboardInterrupt to the next [s]."""
+"""Delay before a lost KeyboardInterrupt is repeated [s]."""
 SEPARATE: dict[str, Any] = (
     {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     if os.name == "nt"
@@ -35,9 +35,9 @@ SEPARATE: dict[str, Any] = (
 
 
 def stop_signals() -> list[int]:
-    """Return the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP or Windows' SIGBREAK where there is one.
+    """Return the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP or Windows' SIGBREAK where it exists.
 
-    SIGHUP stays ignored where it is, as under nohup.
+    SIGHUP is excluded if it is ignored, as under nohup.
     """
     numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
     for name in ("SIGHUP", "SIGBREAK"):
@@ -49,7 +49,7 @@ def stop_signals() -> list[int]:
 
 @contextmanager
 def handled(handler: Any) -> Iterator[None]:
-    """Give all stop signals a handler for a while; only the main thread may call this."""
+    """Install a handler for all stop signals within the block; only the main thread may call this."""
     before = {number: signal.signal(number, handler) for number in stop_signals()}
     try:
         yield
@@ -60,10 +60,10 @@ def handled(handler: Any) -> Iterator[None]:
 
 @contextmanager
 def lost_interrupts_repeated() -> Iterator[None]:
-    """Interrupt again after each KeyboardInterrupt that Python had to drop.
+    """Repeat each KeyboardInterrupt that Python discarded.
 
-    An exception goes no further than a finalizer, or a function that C code calls and whose errors it ignores. Python
-    prints "Exception ignored in …" instead, and a command goes on as if nobody had pressed Ctrl-C.
+    Python discards an exception in a finalizer or in a callback whose errors C code ignores. It prints
+    "Exception ignored in …", and the command continues as if Ctrl-C had not been pressed.
     """
     report = sys.unraisablehook
     pending: threading.Timer | None = None
@@ -78,7 +78,9 @@ def lost_interrupts_repeated() -> Iterator[None]:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             report(lost)
         elif pending is None:
-            pending = threading.Timer(AGAIN, again)  # sent from here, it would be dropped again
+            pending = threading.Timer(
+                AGAIN, again
+            )  # delayed: a signal sent from here would be discarded again
             pending.daemon = True
             pending.start()
 
@@ -92,7 +94,8 @@ def lost_interrupts_repeated() -> Iterator[None]:
 
 
 def caused_by_interrupt(error: BaseException | None) -> bool:
-    """Return whether a KeyboardInterrupt caused an error, as where one stops the creation of a class (Python 3.11)."""
+    """Return whether a KeyboardInterrupt caused an error, as when it interrupts the creation of a class
+    (Python 3.11)."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error is not None
@@ -104,7 +107,7 @@ def interrupt(process: subprocess.Popen[Any]) -> None:
 
 
 def follow_parent() -> None:
-    """End with the process that started this one, even if that was killed."""
+    """End this process when the process that started it ends, even if that is killed."""
     parent = os.environ.get(PARENT, "")
     if parent.isdecimal():
         _end_with(int(parent))
@@ -127,8 +130,8 @@ def _follow(parent: int) -> None:
 
 
 def _interrupt(number: signal.Signals) -> None:
-    """Send this process a signal, from any of its threads."""
-    if os.name == "nt":  # where os.kill ends the process immediately
+    """Send a signal to this process, from any of its threads."""
+    if os.name == "nt":  # where os.kill would end the process immediately
         _thread.interrupt_main(number)
     else:
         os.kill(os.getpid(), number)
@@ -152,7 +155,7 @@ def parent_runs(pid: int) -> bool:
 
 
 def processor_name() -> str:
-    """Return the model of this machine's processor, or its architecture where the system names none."""
+    """Return the model of this machine's processor, or its architecture if the system does not report the model."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
@@ -173,16 +176,16 @@ def peak_memory() -> float:
 
 
 def announce(text: str, after: float = 1.0) -> Callable[[], None]:
-    """Print a line with the seconds that have passed on standard error until something else is printed.
+    """Print a line with the elapsed seconds on standard error until something else is printed.
 
-    On a terminal it counts every second and is then erased; elsewhere it is printed again every 10 s.
+    On a terminal it is updated every second and finally erased; elsewhere it is printed again every 10 s.
 
     Args:
         text: The line.
-        after: Time of the first one, from now [s].
+        after: Delay of the first line [s].
 
     Returns:
-        A function that ends it.
+        A function that stops the printing.
     """
     error, lock, printed, began = sys.stderr, threading.Lock(), threading.Event(), time.monotonic()
     own, terminal, shown = error.write, error.isatty(), False

@@ -1,4 +1,4 @@
-"""Tables in text files as people and programs write them: one reader for all layers, with the line of each cell."""
+"""Tables in text files: one reader for all layers, which keeps the line number of each row."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from finssim.core.budget import TEXT, read_bytes
 from finssim.core.files import atomic_write
 
 EMPTY = re.compile(r"nan|none|null|n/?a|[-.:]*")
-"""Words for "no value", in lower case: `--.--` is how ground stations write it."""
+"""Tokens that mean "no value", in lower case; ground stations write `--.--`."""
 
 QUOTED_COMMA = re.compile(r'"-?\d+,(?!\d{3}")\d+"')
-"""Number with a decimal comma among cells that commas separate; with three decimals it may be thousands."""
+"""Number with a decimal comma in a comma-separated table; with three decimals it may be a thousands separator."""
 
 COMMENT = ("#",)
-"""Beginnings of lines that are no rows."""
+"""Prefixes of comment lines."""
 
 
 @dataclass
 class TextTable:
-    """One table as text."""
+    """Table as text."""
 
     names: list[str]
     """Names of the columns."""
     texts: list[str]
-    """Lines below the names."""
+    """Lines below the header."""
     lines: list[int]
-    """Line number of each of them in the file, from 1."""
+    """Line number of each text in the file, from 1."""
     split: Callable[[str], list[str]]
-    """The cells of a line, without the blanks around them; there may be fewer or more than names."""
+    """Function that splits a line into stripped cells; there may be fewer or more cells than names."""
     decimal_comma: bool
-    """True if a comma in a number is its decimal point, because something else separates the cells."""
+    """True if a comma in a number is its decimal point, because another character separates the cells."""
     comments: list[str] = field(default_factory=list)
-    """Lines that are no rows."""
+    """Comment lines."""
     zeros: bool = False
-    """True if the file ends in zero bytes, as after a crash; it was read up to them."""
+    """True if the file ends in zero bytes, as after a crash; they are ignored."""
     unfinished: bool = False
-    """True if the last line has no end, so that its last cell may be cut."""
+    """True if the last line has no line ending, so that its last cell may be truncated."""
 
     @property
     def rows(self) -> list[list[str]]:
@@ -53,17 +53,17 @@ class TextTable:
         return [self.split(text) for text in self.texts]
 
     def number(self, cell: str) -> float | None:
-        """Return the number in a cell, in the unit of its column; NaN for a word of `EMPTY`, None for another word."""
+        """Return the number in a cell, in the unit of its column; NaN for a token of `EMPTY`, None for other text."""
         return number(cell, decimal_comma=self.decimal_comma)
 
     def place(self, names: Sequence[str]) -> int | None:
-        """Index of the first of some columns that is there, whatever its case."""
+        """Return the index of the first of several names that is a column, ignoring case."""
         lower = [name.lower() for name in self.names]
         return next((lower.index(name) for name in names if name in lower), None)
 
 
 def number(cell: str, *, decimal_comma: bool = False) -> float | None:
-    """Return the number in a cell, in the unit of its column; NaN for a word of `EMPTY`, None for another word."""
+    """Return the number in a cell, in the unit of its column; NaN for a token of `EMPTY`, None for other text."""
     cell = cell.strip().replace("−", "-")
     try:
         return float(cell.replace(",", ".") if decimal_comma else cell)
@@ -72,17 +72,17 @@ def number(cell: str, *, decimal_comma: bool = False) -> float | None:
 
 
 def read_text(path: str | os.PathLike[str], error: type[Exception]) -> tuple[str, bool]:
-    """The text of a file up to the zero bytes that a crash may leave, and whether there were any.
+    """Return the text of a file up to the zero bytes that a crash may leave, and whether there were any.
 
     Args:
         path: The file.
-        error: What is raised where it cannot be read.
+        error: Class of the error if the file cannot be read.
     """
     return decoded(read_bytes(Path(path), error, limit=TEXT))
 
 
 def decoded(raw: bytes) -> tuple[str, bool]:
-    """Return the text of some bytes up to the zero bytes that a crash may leave, and whether there were any."""
+    """Return decoded bytes up to the zero bytes that a crash may leave, and whether there were any."""
     marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if marked or (len(raw) > 8 and not any(raw[1:9:2])):
         text, _, rest = raw.decode("utf-16" if marked else "utf-16-le", errors="replace").partition("\0")
@@ -90,7 +90,9 @@ def decoded(raw: bytes) -> tuple[str, bool]:
     intact = raw.split(b"\0", 1)[0]
     try:
         text = intact.decode("utf-8-sig")
-    except UnicodeDecodeError:  # spreadsheets write µ and ± in one byte; what holds control bytes is no text
+    except (
+        UnicodeDecodeError
+    ):  # spreadsheets write µ and ± as one byte; control bytes indicate that it is not text
         codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "cp1252"
         text = intact.decode(codec, errors="replace")
     return text, len(intact) < len(raw)
@@ -105,15 +107,15 @@ def read_text_table(
     spaces: bool | None = False,
     comment: tuple[str, ...] = COMMENT,
 ) -> TextTable:
-    """Read a table with a line of names; see `text_table`.
+    """Read a table with a header line; see `text_table`.
 
     Args:
         path: The file.
-        error: What is raised where it cannot be read.
-        skip: Lines before the table.
-        names: Of the columns, where the file has no line of names.
-        spaces: Whether blanks separate the cells; None: where nothing else does.
-        comment: Beginnings of lines that are no rows.
+        error: Class of the error if the file cannot be read.
+        skip: Number of lines before the table.
+        names: Names of the columns, if the file has no header line.
+        spaces: Whether blanks separate the cells; None: only if no other separator occurs.
+        comment: Prefixes of comment lines.
     """
     text, zeros = read_text(path, error)
     table = text_table(text, skip=skip, names=names, spaces=spaces, comment=comment)
@@ -129,16 +131,16 @@ def text_table(
     spaces: bool | None = False,
     comment: tuple[str, ...] = COMMENT,
 ) -> TextTable:
-    """The cells of a text: separated by whichever of comma, semicolon and tab the first line has most of.
+    """Split a text into a table; the separator is the most frequent of comma, semicolon and tab in the first line.
 
-    A line such as `sep=;` before the names gives the separator.
+    A line such as `sep=;` before the header sets the separator.
 
     Args:
-        text: Of the whole file; blank lines are passed over.
-        skip: Lines before the table.
-        names: Of the columns, where there is no line of names.
-        spaces: Whether blanks separate the cells; None: where nothing else does.
-        comment: Beginnings of lines that are no rows.
+        text: Content of the complete file; blank lines are skipped.
+        skip: Number of lines before the table.
+        names: Names of the columns, if there is no header line.
+        spaces: Whether blanks separate the cells; None: only if no other separator occurs.
+        comment: Prefixes of comment lines.
     """
     every = [(i, line) for i, line in enumerate(text.splitlines(), start=1) if i > skip and line.strip()]
     held = [(i, line) for i, line in every if not line.lstrip().startswith(comment)]
@@ -170,14 +172,14 @@ def text_table(
 
 
 def csv_text(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table as CSV with a line of names."""
+    """Return a table as CSV with a header line."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([names, *rows])
     return text.getvalue()
 
 
 def write_csv(path: str | os.PathLike[str], names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table as CSV with a line of names.
+    """Write a table as CSV with a header line.
 
     Raises:
         OutputError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""Reader of XML from outside: an element of bounded size."""
+"""Reader of untrusted XML files of bounded size."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from finssim.core.budget import NODES, read_bytes
 __all__ = ["parse_xml", "read_xml"]
 
 LARGEST = 32 << 20
-"""Greatest size of an XML file [bytes]."""
+"""Largest size of an XML file [bytes]."""
 
 
 def read_xml(path: Path, refuse: type[Exception]) -> Element:
-    """Return the root of a file.
+    """Return the root element of a file.
 
     Args:
         path: The file.
-        refuse: Class of the error, made from one sentence.
+        refuse: Class of the error, constructed with one sentence.
 
     Raises:
-        refuse: It is no XML, too large, or defines words of its own.
+        refuse: The file is not XML, is too large, or has a DOCTYPE.
     """
     return parse_xml(read_bytes(path, refuse, limit=LARGEST), path, refuse)
 
 
 def parse_xml(data: bytes, path: Path, refuse: type[Exception]) -> Element:
-    """Return the root of the content of a file; see `read_xml`."""
+    """Return the root element of the content of a file; see `read_xml`."""
 
     def refuse_doctype(*_: object) -> None:
         raise refuse(f"{path}: has a DOCTYPE, which may name other files: remove it")
 
-    # As other programs read these files, a prefix such as gz: needs no namespace.
+    # Like other readers of these files, accept a prefix such as gz: without a declared namespace.
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     parser.StartDoctypeDeclHandler = refuse_doctype
     parser.StartElementHandler = builder.start

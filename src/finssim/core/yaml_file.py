@@ -1,5 +1,4 @@
-"""Reader of YAML and JSON from outside, which returns values of bounded size or one sentence that names the error; and
-writer of YAML."""
+"""Reader of untrusted YAML and JSON of bounded size, which reports errors in one sentence, and writer of YAML."""
 
 import json
 import re
@@ -12,15 +11,15 @@ import yaml
 from finssim.core.budget import read_bytes
 
 LONGEST = 32 << 20
-"""Greatest size of a YAML file [bytes]."""
+"""Largest size of a YAML file [bytes]."""
 LARGEST = 200_000
-"""Values in a YAML file, those that its aliases repeat among them."""
+"""Largest number of values in a YAML file, including those repeated by aliases."""
 DEEPEST = 100
-"""Lists and mappings inside one another."""
+"""Largest nesting depth of lists and mappings."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """YAML 1.2 scalars (`1e-5` is a number, `on` is a word) and no silently repeated keys."""
+    """Loader of YAML 1.2 scalars (`1e-5` is a number, `on` is a string) that refuses repeated keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
     yaml_constructors = {
@@ -29,7 +28,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     }
 
     def construct_scalar_of(self, node: yaml.Node) -> bool | int | float:
-        """A number or truth value, which an explicit tag such as `!!int` may claim of any text."""
+        """Return a number or Boolean; an explicit tag such as `!!int` may occur with any text."""
         kind, text = node.tag.rpartition(":")[2], node.value if isinstance(node, yaml.ScalarNode) else ""
         if self.resolve(yaml.ScalarNode, text, (True, False)) not in (node.tag, INTEGER):
             raise yaml.constructor.ConstructorError(
@@ -69,7 +68,7 @@ _Loader.add_implicit_resolver(
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the words that the reader takes for numbers, such as the digest 12e34, besides those that PyYAML does."""
+    """Dumper that also quotes strings that the reader would parse as numbers, such as the digest 12e34."""
 
     yaml_implicit_resolvers = {
         first: yaml.SafeDumper.yaml_implicit_resolvers.get(first, [])
@@ -79,11 +78,11 @@ class _Dumper(yaml.SafeDumper):
 
 
 def yaml_text(tree: Any, **options: Any) -> str:
-    """Plain data as YAML, keys in their order, that `read_mapping` reads back as they are.
+    """Return plain data as YAML, with keys in their order, such that `read_mapping` restores the data.
 
     Args:
-        tree: Dictionaries, lists, texts, numbers.
-        options: Of `yaml.dump`, such as width.
+        tree: Dictionaries, lists, strings, numbers.
+        options: Options of `yaml.dump`, such as width.
     """
     return str(yaml.dump(tree, Dumper=_Dumper, **{"sort_keys": False, "allow_unicode": True, **options}))
 
@@ -94,16 +93,16 @@ for _kind in ("bool", "int", "float"):
 
 
 def whole_number(text: str) -> int | float:
-    """Return the number of some digits; a float if 64 bits do not hold it."""
+    """Return the value of an integer in text, in its own unit; a float if it exceeds 64 bits."""
     value = int(text) if len(text) < 30 else 2**64
     return value if -(2**63) <= value < 2**63 else float(text)
 
 
 def _refuse_bombs(text: str) -> None:
-    """Refuse what would be too deep or too large, before anything is built of it.
+    """Refuse YAML that is nested too deeply or too large, before anything is constructed from it.
 
     Raises:
-        MarkedYAMLError: It is, or a value contains itself.
+        MarkedYAMLError: The text exceeds a limit, or a value contains itself.
     """
     sizes: dict[str, int] = {}
     opened: list[tuple[str | None, int]] = []
@@ -111,7 +110,7 @@ def _refuse_bombs(text: str) -> None:
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
-                problem = f"'*{event.anchor}' stands for nothing that is complete before it"
+                problem = f"alias '*{event.anchor}' refers to no anchor that is complete before it"
             count += sizes.get(str(event.anchor), 0)
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, begin = opened.pop()
@@ -137,11 +136,11 @@ def json_value(text: str | bytes, refuse: type[Exception], name: str) -> Any:
 
     Args:
         text: The JSON.
-        refuse: Class of the error, made from one sentence.
-        name: What the sentence calls it.
+        refuse: Class of the error, constructed with one sentence.
+        name: Name of the text in the sentence.
 
     Raises:
-        refuse: It is not JSON, or too deep.
+        refuse: The text is not JSON, or is nested too deeply.
     """
     try:
         value = json.loads(text, parse_int=whole_number)
@@ -164,15 +163,15 @@ def _deeper(value: Any, depth: int) -> bool:
 
 
 def read_json(path: Path, refuse: type[Exception], *, such_as: str) -> dict[str, Any]:
-    """The mapping that a JSON file holds.
+    """Return the mapping in a JSON file.
 
     Args:
         path: The file.
-        refuse: Class of the error, made from one sentence.
-        such_as: A key that the file should hold, for that sentence.
+        refuse: Class of the error, constructed with one sentence.
+        such_as: A key that the file must contain, for the sentence.
 
     Raises:
-        refuse: The file is missing or unreadable, no JSON, or holds no mapping with that key.
+        refuse: The file is missing or unreadable, is not JSON, or contains no mapping with that key.
     """
     tree = json_value(read_bytes(path, refuse), refuse, str(path))
     if not isinstance(tree, dict) or such_as not in tree:
@@ -188,17 +187,17 @@ def read_mapping(
     label: str | None = None,
     cleaned: Callable[[str], str] = str,
 ) -> dict[Any, Any]:
-    """The mapping that a YAML file holds.
+    """Return the mapping in a YAML file.
 
     Args:
         path: The file.
-        refuse: Class of the error, made from one sentence.
-        such_as: An example of what the file should hold, for that sentence.
-        label: How the sentence calls the file; its path where not given.
-        cleaned: Makes standard YAML of the text of a dialect.
+        refuse: Class of the error, constructed with one sentence.
+        such_as: An example of an expected key, for the sentence.
+        label: Name of the file in the sentence; its path if None.
+        cleaned: Function that converts the text of a YAML dialect to standard YAML.
 
     Raises:
-        refuse: The file is missing or unreadable, not text, malformed, or holds no mapping.
+        refuse: The file is missing or unreadable, not text, malformed, or contains no mapping.
     """
     name = str(path) if label is None else label
     try:
@@ -225,13 +224,13 @@ def read_mapping(
 
 
 def first_problem(error: Any) -> str:
-    """Return the first error that Pydantic found in data from a file, as `place: error`.
+    """Return the first error that Pydantic found in data from a file, as `location: error`.
 
     Args:
         error: A `pydantic.ValidationError`.
     """
     problem = error.errors()[0]
-    # Names of alternatives, which begin with a bracket, are no part of a place.
+    # Names of alternatives, which begin with a bracket, are not part of the location.
     parts = [str(part) for part in problem["loc"] if not str(part).startswith("(")]
     location, message = ".".join(parts), str(problem["msg"]).removeprefix("Value error, ")
     if problem["type"] == "literal_error":

@@ -1,4 +1,5 @@
-"""Camera optics: lenses, planar refracting interfaces with or without a window, and both ways through them."""
+"""Camera optics: lenses, planar refracting interfaces with or without a window, and projection and back-projection
+through them."""
 
 from typing import TYPE_CHECKING
 

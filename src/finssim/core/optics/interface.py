@@ -16,10 +16,10 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Layer:
-    """A solid sheet between the two media, such as the glass of a window."""
+    """Solid sheet between the two media, such as the glass of a window."""
 
     thickness: float
-    """[m]"""
+    """Thickness [m]."""
     index: float
     """Refractive index."""
 
@@ -33,17 +33,17 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Interface:
-    """The plane Pi: n . X + b = 0 in the pool frame, and what lies before and behind it (paper, eq. 8).
+    """Interface plane Pi: n . X + b = 0 in the pool frame, with the media before and behind it (paper, eq. 8).
 
-    Any orientation: a water surface, level or tilted, or a wall. Any two indices: a camera in the air above water, or
-    in the water looking out.
+    The plane may have any orientation (a water surface, level or tilted, or a wall) and the media any two
+    indices: a camera in the air above water, or in the water looking out.
 
     Raises:
-        OpticsError: The normal is not of unit length, or a number is not finite or an index not positive.
+        OpticsError: The normal is not of unit length, a number is not finite, or an index is not positive.
     """
 
     normal: Array
-    """n: unit vector that points into the camera's side, pool frame, (3,)."""
+    """n: unit vector that points to the camera's side, pool frame, (3,)."""
     offset: float
     """b [m]."""
     index_near: float = 1.0003
@@ -51,7 +51,8 @@ class Interface:
     index_far: float = 1.333
     """Refractive index on the side of the points."""
     window: tuple[Layer, ...] = ()
-    """Layers between the two, the first one next to the camera; the plane is the camera-side face of the first."""
+    """Layers between the media, starting next to the camera; the plane is the camera-side face of the first
+    layer."""
 
     def __post_init__(self) -> None:
         normal = np.array(self.normal, float)
@@ -78,12 +79,12 @@ class Interface:
         n_air: float = 1.0003,
         n_water: float = 1.333,
     ) -> Interface:
-        """A water surface seen from the air, in a frame with z up.
+        """Return a water surface seen from the air, in a frame with z up.
 
         Args:
             height: z of the surface at x = y = 0 [m].
-            tilt_x: How far the normal leans towards +x [rad].
-            tilt_y: How far it leans towards +y [rad].
+            tilt_x: Tilt of the normal towards +x [rad].
+            tilt_y: Tilt of the normal towards +y [rad].
             n_air: Refractive index of the air.
             n_water: Refractive index of the water.
         """
@@ -100,14 +101,14 @@ class Interface:
         index_far: float = 1.333,
         window: tuple[Layer, ...] = (),
     ) -> Interface:
-        """The plane through a point, with a normal.
+        """Return the plane through a point with a given normal.
 
         Args:
-            point: Of the plane, pool frame [m], (3,).
-            normal: Of any length [-], into the camera's side, pool frame, (3,).
+            point: Point on the plane, pool frame [m], (3,).
+            normal: Vector of any length [-] to the camera's side, pool frame, (3,).
             index_near: Refractive index on the camera's side.
             index_far: Refractive index on the side of the points.
-            window: Layers between the two, the first one next to the camera.
+            window: Layers between the media, starting next to the camera.
 
         Raises:
             OpticsError: The normal is zero or not finite.
@@ -118,7 +119,7 @@ class Interface:
         return cls(n / length, -float(n @ np.asarray(point, float)) / length, index_near, index_far, window)
 
     def height(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
-        """z of the plane above (x, y) [m], (...).
+        """Return z of the plane above (x, y) [m], (...).
 
         Raises:
             OpticsError: The plane is vertical.
@@ -129,15 +130,18 @@ class Interface:
         return np.asarray(-(a * np.asarray(x, float) + b * np.asarray(y, float) + self.offset) / c)
 
     def distance(self, points_p: npt.ArrayLike) -> Array:
-        """Signed distance of points from the plane, positive on the camera's side [m], (..., 3) -> (...)."""
+        """Return the signed distance of points from the plane, positive on the camera's side [m], (..., 3) ->
+        (...)."""
         return np.asarray(np.asarray(points_p, float) @ self.normal + self.offset)
 
     def tangents(self) -> tuple[Array, Array]:
-        """Unit vectors e1, e2 in the plane with e1 x e2 = n: x and y of the pool for level water, (3,) each."""
+        """Return unit vectors e1, e2 in the plane with e1 x e2 = n: x and y of the pool for level water, (3,)
+        each."""
         return self._tangents
 
     def tilted(self, tilt_x: float, tilt_y: float, offset: float = 0.0) -> Interface:
-        """The interface with its normal turned by tilt_x e1 + tilt_y e2 [rad] and b changed by `offset` [m]."""
+        """Return the interface with its normal turned by tilt_x e1 + tilt_y e2 [rad] and `offset` [m] added
+        to b."""
         angle = math.hypot(tilt_x, tilt_y)
         e1, e2 = self._tangents
         lean = np.sinc(angle / np.pi) * (tilt_x * e1 + tilt_y * e2)

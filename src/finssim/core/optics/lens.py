@@ -1,7 +1,7 @@
-"""A lens: from a direction in the optical frame to a pixel and back, with derivatives.
+"""Lens models: mapping from a direction in the optical frame to a pixel and back, with derivatives.
 
-Optical frame: x right, y down, z along the view. Pixels: u right, v down, integer coordinates at pixel centres, as
-OpenCV. All functions take a leading `...` batch.
+Optical frame: x right, y down, z along the view. Pixels: u right, v down, integer coordinates at pixel
+centres, as in OpenCV. All functions accept leading batch dimensions `...`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from finssim.core.rotations import quat_to_matrix
 
-# The refusal of impossible optics.
+# Error for impossible optics.
 
 
 class OpticsError(ValueError):
-    """A lens, camera or interface that is not possible; the message is one sentence that states what was expected."""
+    """Invalid lens, camera or interface; the message is one sentence that states the expected values."""
 
 
 # OpenCV's radial and tangential distortion (plumb bob and rational), in complex image coordinates.
@@ -35,15 +35,15 @@ class OpticsError(ValueError):
 Complex = npt.NDArray[np.complex128]
 
 _WIDEST = np.radians(89.9)
-"""Half angle up to which a lens that maps onto a plane is looked at: it never reaches 90 degrees."""
+"""Largest half angle that is considered for a lens that maps onto a plane: it never reaches 90 degrees."""
 
 _STEPS = 40
 _CLOSE = 2e-8
-"""A Newton step this small is the last one: the error after it is its square."""
+"""Newton step below which the iteration stops: the error after a step is the square of the step."""
 
 
 class RadialTangential:
-    """A perspective lens with distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; none means a pinhole."""
+    """Perspective lens with distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; without coefficients a pinhole."""
 
     def __init__(self, distortion: tuple[float, ...]) -> None:
         k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
@@ -53,7 +53,8 @@ class RadialTangential:
         self._straight = not any(distortion)
 
     def project(self, points_c: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Distorted image coordinates (..., 2) at unit focal length, and which points have any, (...)."""
+        """Return distorted image coordinates (..., 2) at unit focal length, and whether each point has a
+        projection, (...)."""
         z = _plane(points_c)
         ok = points_c[..., 2] > 0.0
         if self.fold < np.inf:
@@ -61,7 +62,7 @@ class RadialTangential:
         return _pairs(z if self._straight else self._distort(z)), ok
 
     def jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the point [1/m], (..., 2, 3)."""
+        """Return the derivative of `project` with respect to the point [1/m], (..., 2, 3)."""
         z = _plane(points_c)
         _, A, B = self._evaluate(z)
         # dz = (dX + i dY - z dZ) / Z; columns of df = A dz + B conj(dz).
@@ -72,7 +73,7 @@ class RadialTangential:
         return np.moveaxis(columns.view(float).reshape(3, *z.shape, 2), 0, -1)
 
     def parameter_jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k) [-]."""
+        """Return the derivative of `project` with respect to the coefficients of the lens, (..., 2, k) [-]."""
         z = _plane(points_c)
         s = (z * z.conj()).real
         R, _, denominator = self._radial(s)
@@ -87,7 +88,8 @@ class RadialTangential:
         return out
 
     def rays(self, image: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Unit rays (..., 3) of distorted coordinates (..., 2), and which of them have one, (...)."""
+        """Return unit rays (..., 3) of distorted coordinates (..., 2), and whether each pixel has a ray,
+        (...)."""
         z, ok = self._undistort(_complex(image))
         out = np.empty((*z.shape, 3))
         out[..., 2] = 1.0 / np.sqrt(1.0 + (z * z.conj()).real)
@@ -99,7 +101,7 @@ class RadialTangential:
         """Return the undistorted radius, at unit focal length, within which the distortion maps one to one; inf if
         everywhere.
 
-        Beyond it the image runs back towards the centre: a point there would appear where another one is seen.
+        Beyond it the image folds back towards the centre: two points would appear at the same pixel.
         """
         low, high = 0.0, float(np.tan(_WIDEST))
         if self._straight:
@@ -116,10 +118,11 @@ class RadialTangential:
         return low
 
     def _least_determinant(self, r: Array) -> Array:
-        """The smallest A² - |B|² on a circle of radius r, over all directions; negative past a pole, (...)."""
+        """Return the smallest A² - |B|² on a circle of radius r, over all directions; negative beyond a pole,
+        (...)."""
         s, P = r * r, abs(self._P)
         R, slope, denominator = self._radial(s)
-        # In the cosine of the angle between z and P it is a convex quadratic: its vertex, kept in [-1, 1].
+        # It is a convex quadratic in the cosine of the angle between z and P: its vertex, limited to [-1, 1].
         vertex = -(2.0 * R + s * slope)
         cosine = np.clip(np.divide(vertex, 8.0 * P * r, out=-np.ones_like(r), where=P * r > 0.0), -1.0, 1.0)
         A = R + s * slope + 4.0 * P * r * cosine
@@ -128,7 +131,8 @@ class RadialTangential:
 
     @cached_property
     def _table(self) -> tuple[Array, Array, float]:
-        """Distorted radius -> undistorted over distorted, of the radial part; and the largest radius in the image."""
+        """Return a table of distorted radius -> undistorted over distorted radius of the radial part, and the largest
+        radius in the image."""
         r = np.tan(np.linspace(0.0, min(_WIDEST, np.arctan(self.fold)), 1025)[1:])
         R, _, _ = self._radial(r * r)
         distorted = r * R
@@ -138,12 +142,12 @@ class RadialTangential:
         return np.concatenate([[0.0], distorted]), np.concatenate([[1.0], 1.0 / R]), reach
 
     def _undistort(self, image: Complex) -> tuple[Complex, npt.NDArray[np.bool_]]:
-        """Solve f(z) = image by Newton from a table of the radial part."""
+        """Solve f(z) = image by Newton's method, started from a table of the radial part."""
         if self._straight:
             return image, np.isfinite(image)
         radius, ratio, reach = self._table
         length = np.abs(image)
-        if reach < np.inf:  # the iteration does not wait for pixels that no ray reaches
+        if reach < np.inf:  # pixels that no ray reaches would delay the end of the iteration
             image = np.where(length <= reach, image, np.nan)
         shrink = np.interp(length, radius, ratio)
         z = image * shrink
@@ -160,7 +164,7 @@ class RadialTangential:
         return z, (np.abs(z) < self.fold) & (size <= _CLOSE)
 
     def _distort(self, z: Complex) -> Complex:
-        """f(z)."""
+        """Return f(z)."""
         s = (z * z.conj()).real
         k1, k2, k3 = self._numerator
         R = 1.0 + s * (k1 + s * (k2 + s * k3 if k3 else k2))
@@ -172,7 +176,7 @@ class RadialTangential:
         return np.asarray(z * R + (2.0 * self._P) * s + self._P.conjugate() * (z * z))
 
     def _evaluate(self, z: Complex) -> tuple[Complex, Array, Complex]:
-        """f(z), and A and B of df = A dz + B conj(dz)."""
+        """Return f(z), and A and B of df = A dz + B conj(dz)."""
         s, z2 = (z * z.conj()).real, z * z
         R, slope, _ = self._radial(s)
         f, A, B = z * R, R + s * slope, z2 * slope
@@ -183,7 +187,7 @@ class RadialTangential:
         return f, A, B
 
     def _radial(self, s: Array) -> tuple[Array, Array, Array | float]:
-        """R(s), dR/ds and the denominator of R."""
+        """Return R(s), dR/ds and the denominator of R."""
         k1, k2, k3 = self._numerator
         R = 1.0 + s * (k1 + s * (k2 + s * k3 if k3 else k2))
         slope = k1 + s * (2.0 * k2 + (3.0 * k3) * s if k3 else 2.0 * k2)
@@ -204,7 +208,7 @@ def _pairs(z: Complex) -> Array:
 
 
 def _plane(points_c: Array) -> Complex:
-    """The point seen at unit distance, X/Z + i Y/Z."""
+    """Return the point projected to unit distance, X/Z + i Y/Z."""
     return np.asarray(_complex(points_c[..., :2]) / points_c[..., 2])
 
 
@@ -213,24 +217,25 @@ def _plane(points_c: Array) -> Complex:
 #     theta = angle between the ray and the optical axis
 #     d(theta) = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸),   image = d(theta) (X, Y) / |(X, Y)|
 #
-# (docs.opencv.org, "Fisheye camera model"). OpenCV itself takes points in front of the lens only; here a lens sees as
-# far round as its polynomial rises.
+# (docs.opencv.org, "Fisheye camera model"). OpenCV itself accepts only points in front of the lens; here the field of
+# view extends as far as the polynomial rises.
 
 
 class Fisheye:
-    """Describe a fisheye lens with distortion k1, k2, k3, k4 [-]; none means exactly equidistant."""
+    """Fisheye lens with distortion k1, k2, k3, k4 [-]; without coefficients exactly equidistant."""
 
     def __init__(self, distortion: tuple[float, ...]) -> None:
         self._k = (*distortion, *(0.0,) * (4 - len(distortion)))
         self._count = len(distortion)
 
     def project(self, points_c: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Distorted image coordinates (..., 2) at unit focal length, and which points have any, (...)."""
+        """Return distorted image coordinates (..., 2) at unit focal length, and whether each point has a
+        projection, (...)."""
         _, theta, scale = self._angle(points_c)
         return points_c[..., :2] * (scale * self._ratio(theta * theta))[..., None], theta < self.fold
 
     def jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the point [1/m], (..., 2, 3)."""
+        """Return the derivative of `project` with respect to the point [1/m], (..., 2, 3)."""
         rho, theta, scale = self._angle(points_c)
         t2 = theta * theta
         ratio, slope = self._ratio(t2), self._slope(t2)
@@ -249,16 +254,17 @@ class Fisheye:
         return out
 
     def parameter_jacobian(self, points_c: Array) -> Array:
-        """Derivative of `project` with respect to the coefficients that were given, (..., 2, k) [-]."""
+        """Return the derivative of `project` with respect to the coefficients of the lens, (..., 2, k) [-]."""
         _, theta, scale = self._angle(points_c)
         powers = (theta[..., None] ** 2) ** np.arange(1, self._count + 1)
         return np.asarray((points_c[..., :2] * scale[..., None])[..., :, None] * powers[..., None, :])
 
     def rays(self, image: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Unit rays (..., 3) of distorted coordinates (..., 2), and which of them have one, (...)."""
+        """Return unit rays (..., 3) of distorted coordinates (..., 2), and whether each pixel has a ray,
+        (...)."""
         angles, distances = self._table
         d = np.hypot(image[..., 0], image[..., 1])
-        # Beyond the fold there is no angle: NaN from the start, so that the iteration does not wait for it.
+        # Beyond the fold there is no angle: NaN from the start, so that it does not delay the end of the iteration.
         d = np.where(d < distances[-1], d, np.nan)
         theta = np.interp(d, distances, angles)
         for _ in range(40):
@@ -275,7 +281,7 @@ class Fisheye:
 
     @cached_property
     def fold(self) -> float:
-        """Angle from the axis up to which the polynomial rises [rad], at most pi."""
+        """Return the angle from the axis up to which the polynomial rises [rad], at most pi."""
         k1, k2, k3, k4 = self._k
         roots = np.roots([9.0 * k4, 7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
         real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
@@ -287,7 +293,8 @@ class Fisheye:
         return theta, theta * self._ratio(theta * theta)
 
     def _angle(self, points_c: Array) -> tuple[Array, Array, Array]:
-        """Distance from the axis [m], angle from it [rad], and angle over distance [rad/m]: finite on the axis."""
+        """Return the distance from the axis [m], the angle from it [rad], and angle over distance [rad/m],
+        finite on the axis."""
         Z = points_c[..., 2]
         rho = np.hypot(points_c[..., 0], points_c[..., 1])
         theta = np.arctan2(rho, Z)
@@ -295,12 +302,12 @@ class Fisheye:
         return rho, theta, np.where(near, 1.0 / Z, theta / np.where(near, 1.0, rho))
 
     def _ratio(self, t2: Array) -> Array:
-        """d(theta)/theta."""
+        """Return d(theta)/theta."""
         k1, k2, k3, k4 = self._k
         return np.asarray(1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
     def _slope(self, t2: Array) -> Array:
-        """The derivative of d(theta)."""
+        """Return the derivative of d(theta)."""
         k1, k2, k3, k4 = self._k
         return np.asarray(1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * (9.0 * k4)))))
 
@@ -313,7 +320,7 @@ LENS_MODELS: dict[str, tuple[type[RadialTangential] | type[Fisheye], tuple[int, 
     "rational": (RadialTangential, (0, 8)),
     "fisheye": (Fisheye, (0, 4)),
 }
-"""Model -> its distortion, and how many coefficients it takes."""
+"""Model -> its distortion class and the allowed numbers of coefficients."""
 COEFFICIENTS = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
@@ -332,20 +339,20 @@ _WORDS = {
     "opencv": "plumb_bob",
     "brown_conrady": "plumb_bob",
 }
-"""Words of our files and of other programs -> model."""
+"""Names of models in our files and in other programs -> model."""
 
 
 def lens_model(word: str) -> str:
-    """Return the lens model of a word in a camera file: ours, or one of another program.
+    """Return the lens model for a name in a camera file, ours or that of another program.
 
     Args:
-        word: Word such as `plumb_bob`, `radtan` or `equidistant`, which is `fisheye`.
+        word: Name such as `plumb_bob`, `radtan` or `equidistant` (an alias of `fisheye`).
 
     Returns:
         Key of `LENS_MODELS`.
 
     Raises:
-        OpticsError: The word is unknown.
+        OpticsError: The name is unknown.
     """
     try:
         return _WORDS[word]
@@ -358,8 +365,8 @@ class Lens:
     """Intrinsics of a camera.
 
     Raises:
-        OpticsError: A number is not finite, a size or focal length not positive, the model unknown, or it takes another
-            number of coefficients.
+        OpticsError: A number is not finite, a size or focal length is not positive, the model is unknown, or
+            the number of coefficients is wrong for the model.
     """
 
     width: int
@@ -375,7 +382,8 @@ class Lens:
     cy: float
     """Principal point, v [px]."""
     model: str = "plumb_bob"
-    """plumb_bob (k1 k2 p1 p2 [k3]), rational (k1 k2 p1 p2 k3 k4 k5 k6) or fisheye (k1 k2 k3 k4), as OpenCV."""
+    """plumb_bob (k1 k2 p1 p2 [k3]), rational (k1 k2 p1 p2 k3 k4 k5 k6) or fisheye (k1 k2 k3 k4), as in
+    OpenCV."""
     distortion: tuple[float, ...] = ()
     """Coefficients [-] in OpenCV's order; none for a lens without distortion."""
 
@@ -399,18 +407,18 @@ class Lens:
 
     @property
     def K(self) -> Array:
-        """Camera matrix [px], (3, 3)."""
+        """Return the camera matrix [px], (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points_c: npt.ArrayLike) -> tuple[Array, Flags]:
-        """Pixels of points or directions of any length.
+        """Return the pixels of points, or of directions of any length.
 
         Args:
             points_c: Optical frame [m], (..., 3).
 
         Returns:
-            Pixels (..., 2), and whether the lens sees the point, (...): NaN where it is behind the camera or beyond the
-            range in which the distortion maps one to one. The pixel may lie outside the image.
+            Pixels (..., 2), and whether the lens sees each point, (...). A pixel is NaN if the point is behind the
+            camera or beyond the range in which the distortion maps one to one. A pixel may lie outside the image.
         """
         points = np.asarray(points_c, float)
         with np.errstate(all="ignore"):
@@ -421,12 +429,13 @@ class Lens:
         return pixels, ok
 
     def project_jacobian(self, points_c: npt.ArrayLike) -> Array:
-        """Derivative of the pixel with respect to the point [px/m], (..., 2, 3)."""
+        """Return the derivative of the pixel with respect to the point [px/m], (..., 2, 3)."""
         with np.errstate(all="ignore"):
             return np.asarray(self._optics.jacobian(np.asarray(points_c, float)) * self._focal[:, None])
 
     def parameter_jacobian(self, points_c: npt.ArrayLike) -> Array:
-        """Derivative of the pixel with respect to fx, fy, cx, cy and the coefficients, (..., 2, 4 + k)."""
+        """Return the derivative of the pixel with respect to fx, fy, cx, cy and the coefficients, (..., 2, 4
+        + k)."""
         points = np.asarray(points_c, float)
         with np.errstate(all="ignore"):
             image, _ = self._optics.project(points)
@@ -437,14 +446,14 @@ class Lens:
         return out
 
     def rays(self, pixels: npt.ArrayLike) -> tuple[Array, Flags]:
-        """Directions that pixels look in.
+        """Return the viewing directions of pixels.
 
         Args:
             pixels: (..., 2), inside the image or not.
 
         Returns:
-            Unit rays in the optical frame (..., 3), and whether there is one, (...): NaN for a pixel that no ray within
-            the one-to-one range of the distortion reaches.
+            Unit rays in the optical frame (..., 3), and whether each pixel has one, (...). A ray is NaN if no
+            ray within the one-to-one range of the distortion reaches the pixel.
         """
         with np.errstate(all="ignore"):
             rays, ok = self._optics.rays((np.asarray(pixels, float) - self._centre) / self._focal)
@@ -453,13 +462,14 @@ class Lens:
         return rays, ok
 
     def inside(self, pixels: npt.ArrayLike) -> Flags:
-        """Return whether pixels lie within the image, including half a pixel around its outer pixel centres, (...)."""
+        """Return whether pixels lie within the image, including half a pixel around the outermost pixel
+        centres, (...)."""
         scaled = np.abs((np.asarray(pixels, float) - self._middle) / self._half)
         return np.asarray((scaled[..., 0] <= 1.0) & (scaled[..., 1] <= 1.0))
 
     @property
     def field_of_view(self) -> float:
-        """Largest angle from the optical axis at which the distortion still maps one to one [rad]."""
+        """Return the largest angle from the optical axis at which the distortion still maps one to one [rad]."""
         fold = self._optics.fold
         return fold if self.model == "fisheye" else math.atan(fold)
 
@@ -489,7 +499,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A lens at a pose T_pc = [R_pc, C_p] in the pool frame.
+    """Camera: a lens at a pose T_pc = [R_pc, C_p] in the pool frame.
 
     Raises:
         OpticsError: Position or orientation is not finite or of the wrong shape, or the quaternion not of unit length.

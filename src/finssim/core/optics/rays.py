@@ -1,4 +1,5 @@
-"""Rays through a planar interface: from points to pixels, from pixels to points, and the derivatives of both."""
+"""Rays through a planar interface: projection of points, back-projection of pixels, and the derivatives of
+both."""
 
 from __future__ import annotations
 
@@ -14,33 +15,34 @@ import numpy.typing as npt
 from finssim.core.optics.interface import Interface
 from finssim.core.optics.lens import Camera, OpticsError
 
-# Why a pixel has no ray in the water, or a point no pixel.
+# Reasons why a pixel has no ray in the water, or a point has no pixel.
 
 StatusArray = npt.NDArray[np.int8]
 
 
 class Status(IntEnum):
-    """Result of a pixel or a point; numbers are given with OK and OUTSIDE_IMAGE only, and NaN with the others."""
+    """Status of a pixel or a point; the numbers are valid for OK and OUTSIDE_IMAGE, and NaN otherwise."""
 
     OK = 0
     NO_RAY = 1
-    """The lens has no ray for the pixel, or no pixel for the ray: beyond the range in which it maps one to one."""
+    """The lens has no ray for the pixel, or no pixel for the ray: it lies beyond the one-to-one range of the
+    distortion."""
     PARALLEL = 2
-    """The ray runs along the plane that it should meet."""
+    """The ray is parallel to the plane."""
     TOTAL_REFLECTION = 3
-    """The ray is thrown back at a face."""
+    """The ray is totally reflected at a face."""
     AWAY = 4
-    """The ray heads away from the plane that it should meet."""
+    """The ray points away from the plane."""
     BEHIND_CAMERA = 5
     """The light arrives from behind the camera."""
     WRONG_SIDE = 6
     """The point is not on the far side of the interface, or the camera not on the near side."""
     OUTSIDE_IMAGE = 7
-    """The pixel, which is given, lies outside the image."""
+    """The pixel, which is returned, lies outside the image."""
 
 
 def count_rejections(status: npt.ArrayLike) -> dict[str, int]:
-    """Count the reasons other than OK by name; reasons that do not occur are left out."""
+    """Count the statuses other than OK by name; those that do not occur are omitted."""
     counts = np.bincount(np.ravel(np.asarray(status, int)), minlength=len(Status))
     return {Status(i).name: int(n) for i, n in enumerate(counts) if n and i != Status.OK}
 
@@ -49,35 +51,35 @@ def count_rejections(status: npt.ArrayLike) -> dict[str, int]:
 
 # The ray between two points across a stack of plane-parallel layers.
 #
-# Snell's law keeps n_i sin(theta_i) along the ray. With u = tan(theta) in the medium of least index n_m and
-# a_i = n_i/n_m, layer i of thickness t_i moves the ray sideways by t_i u / s_i, s_i = sqrt(a_i² + (a_i² - 1) u²). The
-# ray that moves by r in all is found from g = u/r:
+# Snell's law conserves n_i sin(theta_i) along the ray. With u = tan(theta) in the medium of least index n_m and
+# a_i = n_i/n_m, layer i of thickness t_i shifts the ray sideways by t_i u / s_i, s_i = sqrt(a_i² + (a_i² - 1) u²). The
+# ray with the total shift r follows from g = u/r:
 #
 #     phi(g) = sum_i t_i g / s_i - 1 = 0
 #
-# phi rises and is concave in g >= 0, so Newton's method started left of the root walks to it without ever passing it,
-# from anywhere and for any indices; and as only r² enters, nothing happens at r = 0.
+# phi is increasing and concave for g >= 0, so Newton's method converges monotonically from any start left of the root,
+# for any indices; as only r² occurs, there is no singularity at r = 0.
 
 _STEPS = 100
 _THINNEST = 1e-15
-"""Least thickness of a layer [m]: with none at all a grazing ray would have no angle."""
+"""Least thickness of a layer [m]: at zero thickness the angle of a grazing ray would be undefined."""
 
 
 @dataclass(frozen=True, eq=False)
 class LayerRays:
-    """The solution: thicknesses, indices, and the ray through them."""
+    """Solution of Snell's law: thicknesses, indices, and the ray through the layers."""
 
     thickness: list[Array | float]
-    """t_i [m], (...) each."""
+    """Thickness t_i of each layer [m], (...) each."""
     index: list[float]
     r2: Array
-    """Squared sideways distance [m²], (...)."""
+    """Squared lateral distance [m²], (...)."""
     g: Array
     """u/r [1/m], (...)."""
 
     @property
     def near_slope(self) -> Array:
-        """k_0 = tan(theta)/r next to the camera [1/m], (...)."""
+        """Return k_0 = tan(theta)/r next to the camera [1/m], (...)."""
         return self.g if self.index[0] == min(self.index) else self.g / self._s(self.index[0])
 
     def _s(self, index: float) -> Array:
@@ -109,7 +111,7 @@ class LayerRays:
 
 @dataclass(frozen=True, eq=False)
 class StackDerivatives:
-    """k = tan(theta)/r next to the camera, and its derivatives, (...) each."""
+    """Slope k = tan(theta)/r next to the camera, and its derivatives, (...) each."""
 
     k: Array
     """tan(theta)/r next to the camera [1/m]."""
@@ -124,11 +126,12 @@ class StackDerivatives:
 
 
 def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float]) -> LayerRays:
-    """Find the ray that crosses all layers and moves sideways by r in all.
+    """Find the ray that crosses all layers with the total lateral shift r.
 
     Args:
-        r2: Squared sideways distance [m²], (...).
-        thickness: Of each layer, from the camera to the point [m], (...) each or one number; negative counts as none.
+        r2: Squared lateral distance [m²], (...).
+        thickness: Thickness of each layer, from the camera to the point [m], (...) each or one number; negative values
+            count as zero.
         index: Refractive index of each layer.
     """
     least = min(index)
@@ -136,7 +139,7 @@ def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float
     square = [(n / least) ** 2 for n in index]
     thin = sum(t for t, a2 in zip(layers, square, strict=True) if a2 == 1.0)
     denser = [(t, a2, (a2 - 1.0) * r2) for t, a2 in zip(layers, square, strict=True) if a2 != 1.0]
-    # All angles small: phi is concave, so the step from zero stops left of the root.
+    # Small-angle start: phi is concave, so the step from zero ends left of the root.
     g = lowest = 1.0 / (thin + sum(t / math.sqrt(a2) for t, a2, _ in denser) + 0.0 * r2)
     for _ in range(_STEPS if denser else 0):
         g2 = g * g
@@ -148,7 +151,7 @@ def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float
             slope = slope + part * (a2 / s2)
         step = (moved * g - 1.0) / slope
         g = np.maximum(g - step, lowest)
-        # The error after a step is at most 1.5 times the square of the step: nothing is left to gain.
+        # The error after a step is at most 1.5 times its square: further steps would not reduce it.
         if not (np.abs(step) > 3e-8 * g).any():
             break
     return LayerRays(layers, index, r2, g)
@@ -157,7 +160,7 @@ def solve_stack(r2: Array, thickness: Sequence[Array | float], index: list[float
 Array = npt.NDArray[np.float64]
 
 _ON_THE_FACE = -1e-9
-"""A point this little on the wrong side of the far face [m] lies on it."""
+"""Largest distance of a point on the wrong side of the far face that still counts as on the face [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,26 +168,27 @@ class Projection:
     """Image points of points under water."""
 
     pixels: Array
-    """(..., 2), NaN where the status is neither OK nor OUTSIDE_IMAGE."""
+    """Pixels (..., 2), NaN where the status is neither OK nor OUTSIDE_IMAGE."""
     status: StatusArray
-    """(...)"""
+    """Status of each point, (...)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Refraction:
-    """The rays from a camera to points, before they meet the lens."""
+    """Rays from a camera to points, before their projection by the lens."""
 
     across: Array
-    """Point minus camera, without its part along the normal, pool frame [m], (..., 3)."""
+    """Point minus camera, without its component along the normal, pool frame [m], (..., 3)."""
     height: float
     """Distance of the camera from the near face [m]."""
     stack: LayerRays
     slope: Array
     """k: tangent of the incidence angle over |across| [1/m], (...)."""
     direction: Array
-    """Direction from the camera to the surface, pool frame, (..., 3); its part along the unit normal is -1."""
+    """Direction from the camera to the surface, pool frame, (..., 3); its component along the unit normal is
+    -1."""
     right_side: npt.NDArray[np.bool_]
-    """True if camera and point are on their sides of the interface, (...)."""
+    """True if camera and point are on the correct sides of the interface, (...)."""
 
 
 def refract(camera: Camera, interface: Interface, points_p: Array) -> Refraction:
@@ -207,22 +211,22 @@ def refract(camera: Camera, interface: Interface, points_p: Array) -> Refraction
 
 
 def project(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Projection:
-    """Pixels at which points on the far side of the interface appear.
+    """Return the pixels of points on the far side of the interface.
 
     Args:
-        camera: On the near side.
-        interface: With or without a window.
-        points_p: Pool frame [m], (..., 3), on the far side or on the far face itself.
+        camera: Camera on the near side.
+        interface: Interface with or without a window.
+        points_p: Points in the pool frame [m], (..., 3), on the far side or on the far face.
 
     Returns:
-        Pixels with a status each: WRONG_SIDE, BEHIND_CAMERA and NO_RAY have none, OUTSIDE_IMAGE has.
+        Pixels with a status each: pixels are NaN for WRONG_SIDE, BEHIND_CAMERA and NO_RAY, but not for OUTSIDE_IMAGE.
     """
     with np.errstate(all="ignore"):
         return refracted_pixels(camera, refract(camera, interface, np.asarray(points_p, float)))
 
 
 def refracted_pixels(camera: Camera, refraction: Refraction) -> Projection:
-    """Pixels of rays that are already found."""
+    """Return the pixels of rays that are already computed."""
     with np.errstate(all="ignore"):
         direction_c = refraction.direction @ camera.R_pc
         pixels, visible = camera.lens.project(direction_c)
@@ -240,9 +244,10 @@ def refracted_pixels(camera: Camera, refraction: Refraction) -> Projection:
 # From pixels to rays in the water, and to points on a plane (paper, eq. 7-12).
 
 PARALLEL_COSINE = 1e-6
-"""A ray is parallel to a plane when it makes less than this angle with it [rad]."""
+"""Angle below which a ray counts as parallel to a plane [rad]."""
 _BEHIND = -1e-9
-"""A plane this little behind the start of a ray [m] still counts as met: points may lie on the interface itself."""
+"""Smallest distance along a ray [m] that still counts as an intersection: points may lie on the interface
+itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,17 +255,17 @@ class WaterRays:
     """Rays X(lambda) = S_p + lambda r_p on the far side; NaN where the status is not OK."""
 
     origin: Array
-    """S_p: where the ray leaves the far face, pool frame [m], (..., 3)."""
+    """S_p: point at which the ray leaves the far face, pool frame [m], (..., 3)."""
     direction: Array
     """r_p: unit vector away from the camera, pool frame, (..., 3)."""
     status: StatusArray
-    """(...)"""
+    """Status of each ray, (...)."""
 
     def at_z(self, z: npt.ArrayLike) -> tuple[Array, StatusArray]:
-        """Return the points where the rays meet a horizontal plane (paper, eq. 12).
+        """Return the intersections of the rays with a horizontal plane (paper, eq. 12).
 
         Args:
-            z: Height of the plane, pool frame [m], one for all or (...).
+            z: Height of the plane, pool frame [m], one for all rays or (...).
 
         Returns:
             Points, pool frame [m], (..., 3), NaN where the status (...) is not OK.
@@ -269,15 +274,15 @@ class WaterRays:
         with np.errstate(all="ignore"):
             length = (height - self.origin[..., 2]) / self.direction[..., 2]
             points, status = self._at(length, self.direction[..., 2])
-            points[..., 2] = np.where(status == 0, height, np.nan)  # exactly, not but for rounding
+            points[..., 2] = np.where(status == 0, height, np.nan)  # exact, without rounding
         return points, status
 
     def at_plane(self, normal: npt.ArrayLike, offset: npt.ArrayLike) -> tuple[Array, StatusArray]:
-        """Return the points where the rays meet a plane normal . X + offset = 0.
+        """Return the intersections of the rays with a plane normal . X + offset = 0.
 
         Args:
-            normal: Of any length [-], pool frame, (3,) or (..., 3).
-            offset: [m], times the length of the normal, scalar or (...).
+            normal: Normal of any length [-], pool frame, (3,) or (..., 3).
+            offset: Offset [m], times the length of the normal, scalar or (...).
 
         Returns:
             Points, pool frame [m], (..., 3), NaN where the status (...) is not OK.
@@ -307,15 +312,15 @@ class WaterRays:
 
 
 def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) -> WaterRays:
-    """The rays on the far side of the interface that pixels see (paper, eq. 7-11).
+    """Return the rays on the far side of the interface that belong to pixels (paper, eq. 7-11).
 
     Args:
-        camera: On the near side.
-        interface: With or without a window; each layer bends the ray in its turn.
-        pixels: (..., 2), distorted, as the detector found them.
+        camera: Camera on the near side.
+        interface: Interface with or without a window; each layer refracts the ray.
+        pixels: Distorted pixels, as detected, (..., 2).
 
     Returns:
-        Rays with a status each: NO_RAY, PARALLEL, TOTAL_REFLECTION and AWAY have none.
+        Rays with a status each: rays are NaN for NO_RAY, PARALLEL, TOTAL_REFLECTION and AWAY.
     """
     rays_c, valid = camera.lens.rays(pixels)
     n = interface.normal
@@ -325,7 +330,7 @@ def back_project(camera: Camera, interface: Interface, pixels: npt.ArrayLike) ->
         cosine = -(ray @ n)
         sine2 = 1.0 - cosine * cosine
         along = ray + cosine[..., None] * n
-        reach = height / cosine  # eq. 8: s; its part along the plane is s times `along`
+        reach = height / cosine  # eq. 8: s; the component along the plane is s times `along`
         worst: Array | float = np.inf
         depth = height
         for layer in interface.window:
@@ -359,15 +364,16 @@ def _rejected(valid: npt.NDArray[np.bool_], cosine: Array, kappa: Array, height:
 
 
 def projection_jacobians(camera: Camera, interface: Interface, points_p: npt.ArrayLike) -> Jacobians:
-    """Derivatives of the pixels of points, (..., 3) [m] in the pool frame, with respect to all they depend on."""
+    """Return the derivatives of the pixels of points, (..., 3) [m] in the pool frame, with respect to all
+    parameters."""
     return Jacobians(camera, interface, np.asarray(points_p, float))
 
 
 class Jacobians:
-    """Derivatives of the pixels of points, each computed when it is asked for; meaningless where a point is not seen.
+    """Derivatives of the pixels of points, computed on access; meaningless where a point is not visible.
 
-    The ray leaves the camera along v = k rho - n, where rho is the point minus the camera, less its part along the
-    normal n, and k(rho², camera's distance h, point's distance d, indices) solves Snell's law.
+    The ray leaves the camera along v = k rho - n, where rho is the point minus the camera without its component along
+    the normal n, and k(rho², camera's distance h, point's distance d, indices) solves Snell's law.
     """
 
     def __init__(self, camera: Camera, interface: Interface, points_p: Array) -> None:
@@ -382,7 +388,7 @@ class Jacobians:
 
     @cached_property
     def projection(self) -> Projection:
-        """Return the result of `project`, from the rays that are known already."""
+        """Return the result of `project`, from the rays that are already computed."""
         return refracted_pixels(self._camera, self._found)
 
     @cached_property
@@ -394,7 +400,7 @@ class Jacobians:
 
     @cached_property
     def pose(self) -> Array:
-        """Return the derivative with respect to C_p [px/m] and a turn delta of the camera about pool axes, R_pc <-
+        """Return the derivative with respect to C_p [px/m] and a rotation delta of the camera about pool axes, R_pc <-
         exp([delta]x) R_pc [px/rad], (..., 2, 6)."""
         with np.errstate(all="ignore"):
             out = np.empty((*self._by_v.shape[:-1], 6))
@@ -440,12 +446,12 @@ class Jacobians:
 
     @cached_property
     def _outward(self) -> Array:
-        """dk/d(rho), (..., 3)."""
+        """Return dk/d(rho), (..., 3)."""
         return np.asarray((2.0 * self._change.by_r2)[..., None] * self._rho)
 
     @cached_property
     def _flat(self) -> Array:
-        """Derivative of the pixel with respect to rho where k stays, (..., 2, 3)."""
+        """Return the derivative of the pixel with respect to rho at constant k, (..., 2, 3)."""
         n = self._interface.normal
         return np.asarray(self._change.k[..., None, None] * (self._by_v - (self._by_v @ n)[..., None] * n))
 
@@ -453,17 +459,18 @@ class Jacobians:
 def plane_jacobian(
     camera: Camera, interface: Interface, points_p: npt.ArrayLike, normal: npt.ArrayLike
 ) -> Array:
-    """Return the derivatives of the point that a pixel sees on a plane, by the pixel and by the plane.
+    """Return the derivatives of the point at which a pixel's ray meets a plane, with respect to the pixel and
+    the plane.
 
-    Pixel and plane fix the point, so this is the inverse of the three derivatives that a point's move has on them.
+    Pixel and plane determine the point, so this is the inverse of their derivatives with respect to the point.
 
     Args:
-        points_p: Points on the plane, as back-projection found them, pool frame [m], (..., 3).
-        normal: Of the plane, of any length [-], pool frame, (3,).
+        points_p: Points on the plane, from back-projection, pool frame [m], (..., 3).
+        normal: Normal of the plane, of any length [-], pool frame, (3,).
 
     Returns:
-        dX/d(u, v, shift), (..., 3, 3) [m/px, m/px, m/m]: the shift moves the plane along its normal; NaN where the
-        point is, or where the plane is seen edge on.
+        dX/d(u, v, shift), (..., 3, 3) [m/px, m/px, m/m]; the shift moves the plane along its normal. NaN
+        where the point is NaN or the plane is seen edge on.
 
     Raises:
         OpticsError: The normal is zero or not finite.
@@ -473,7 +480,7 @@ def plane_jacobian(
     if not (np.isfinite(size) and size > 0.0):
         raise OpticsError(f"plane has normal {n}, expected a direction")
     by_point = projection_jacobians(camera, interface, points_p).point
-    # The inverse by cross products of its rows: no exception where it is singular, but NaN.
+    # The inverse by cross products of its rows: NaN instead of an exception where it is singular.
     a, b, c = by_point[..., 0, :], by_point[..., 1, :], n / size
     out = np.empty((*by_point.shape[:-2], 3, 3))
     out[..., 0], out[..., 1], out[..., 2] = _cross(b, c), _cross(c, a), _cross(a, b)
@@ -483,7 +490,7 @@ def plane_jacobian(
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """a x b, as numpy.cross, which takes several times longer for a few vectors."""
+    """Return a x b, as numpy.cross, which takes several times longer for a few vectors."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
