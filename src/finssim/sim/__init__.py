@@ -1,4 +1,4 @@
-"""The batched simulator and what surrounds its vehicles."""
+"""The batched simulator and the surroundings of its vehicles."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Distributions of what is drawn, as a ranges file writes them."""
+"""Probability distributions that a ranges file gives for randomised parameters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS = ("uniform", "log_uniform", "normal", "choice")
 MAX_CHOICES = 32
 
 CUT = 4.0
-"""Number of standard deviations at which a normal distribution is cut, unless `within` is given."""
+"""Number of standard deviations at which a normal distribution is truncated, unless `within` is given."""
 
 EXAMPLE = "{normal: [1.0, 0.1]}"
 
@@ -30,13 +30,13 @@ Pair: TypeAlias = tuple[float, float]
 
 
 class RangesPart(BaseModel):
-    """Frozen, and no unknown keys."""
+    """Base class of the sections of a ranges file: frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def unknown(key: object, names_in_use: Iterable[str]) -> str:
-    """The sentence about a key that does not exist, with the nearest that does."""
+    """Return the message about a key that does not exist, with the most similar valid key."""
     names = list(names_in_use)
     close = difflib.get_close_matches(str(key), names, n=1)
     return f"unknown entry '{key}'; " + (
@@ -45,11 +45,11 @@ def unknown(key: object, names_in_use: Iterable[str]) -> str:
 
 
 def sentence(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first error of a part of a ranges file: where, what, and what was expected."""
+    """Return the first error of a section of a ranges file as one message: location, problem and expectation."""
     first = error.errors()[0]
     location = [
         str(x) for x in first["loc"] if not any(c in str(x) for c in "[(")
-    ]  # not pydantic's names of types
+    ]  # without pydantic's names of types
     text = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         allowed = _keys(model, first["loc"][:-1])
@@ -63,7 +63,7 @@ def sentence(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _keys(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
-    """Keys of the model that a path leads to; a part that may be left out is looked through."""
+    """Return the keys of the model at the end of a path, also through optional sections."""
     for step in path:
         field = model.model_fields.get(str(step))
         candidates = [] if field is None else [field.annotation, *getattr(field.annotation, "__args__", ())]
@@ -77,20 +77,21 @@ def _is_number(x: object) -> bool:
 
 
 class Distribution(RangesPart):
-    """One of four distributions, which is drawn from with a probability; the vehicle file's number stays otherwise."""
+    """One of four distributions, sampled with a given probability; otherwise the vehicle file's value is
+    used."""
 
     uniform: Pair | None = None
     """[low, high]"""
     log_uniform: Pair | None = None
     """[low, high], both above 0: equal weight to equal ratios."""
     normal: Pair | None = None
-    """[mean, standard deviation], of the normal distribution before it is cut."""
+    """[mean, standard deviation] of the normal distribution before truncation."""
     within: Pair | None = None
-    """[low, high] where a normal distribution is cut; 4 standard deviations from the mean if None."""
+    """[low, high] at which a normal distribution is truncated; 4 standard deviations from the mean if None."""
     choice: tuple[float, ...] | None = Field(default=None, min_length=1, max_length=MAX_CHOICES)
-    """One of these, in the unit of the entry."""
+    """Discrete values, of which one is chosen, in the unit of the entry."""
     weights: tuple[float, ...] | None = None
-    """Probabilities of the choices, in any unit; equal if None."""
+    """Relative weights of the choices, normalised to probabilities; equal if None."""
     probability: float = Field(default=1.0, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
@@ -129,7 +130,8 @@ class Distribution(RangesPart):
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     def bounds(self) -> Pair:
-        """Least and greatest number that it gives; without what stays when it is not drawn from."""
+        """Return the lowest and highest value of the distribution, without the value used when it is not
+        sampled."""
         if self.choice is not None:
             return min(self.choice), max(self.choice)
         if self.normal is not None:
@@ -138,27 +140,27 @@ class Distribution(RangesPart):
         return self.uniform or self.log_uniform  # type: ignore[return-value]
 
     def cumulative(self) -> list[float]:
-        """Probability of the first choice, of the first two, ...; empty without choices."""
+        """Return the cumulative probabilities of the choices; empty without choices."""
         weights = self.weights or (1.0,) * len(self.choice or ())
         return [sum(weights[: i + 1]) / sum(weights) for i in range(len(weights))]
 
 
 Drawn: TypeAlias = Pair | Distribution
-"""Two numbers, between which every number is as likely, or a distribution."""
+"""Two bounds of a uniform distribution, or a distribution."""
 
 
 def bounds_of(drawn: Drawn) -> Pair:
-    """Least and greatest number."""
+    """Return the lowest and highest value."""
     return drawn.bounds() if isinstance(drawn, Distribution) else drawn
 
 
 def distribution_of(drawn: Drawn) -> Distribution:
-    """Two numbers as the uniform distribution between them."""
+    """Return the distribution; for two numbers, the uniform distribution between them."""
     return drawn if isinstance(drawn, Distribution) else Distribution(uniform=drawn)
 
 
 def _read(value: Any) -> Any:
-    """A mapping as a distribution; two numbers as they are."""
+    """Return a mapping as a distribution, and two numbers unchanged."""
     if isinstance(value, Mapping):
         return checked(Distribution, value)
     if isinstance(value, Distribution):
@@ -171,7 +173,7 @@ def _read(value: Any) -> Any:
 
 
 def checked(model: type[BaseModel], value: Mapping[str, Any]) -> Any:
-    """A part from a mapping; what is wrong with it in one sentence, as a ValueError."""
+    """Build a section from a mapping; raise a ValueError with one sentence if it is invalid."""
     try:
         return model.model_validate(value)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""A vehicle's model, linearised about level motion at constant speed; its stability without control."""
+"""Linearised model of a vehicle about level motion at constant speed, and its open-loop stability."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ Array = NDArray[np.float64]
 MOTIONS = {"surge": (0,), "course": (1, 5), "roll": (3, 6), "pitch": (2, 4, 7)}
 """Motion -> its states: surge; sway and yaw rate; roll rate and angle; heave, pitch rate and angle."""
 STEP, DEPTH = 1e-3, -100.0
-"""Step of the differences [m/s, rad/s, rad], and depth [m]."""
+"""Step of the finite differences [m/s, rad/s, rad], and depth [m]."""
 SLOW = 5e-3
-"""Rate below which a motion neither grows nor dies out [1/s]; differences over a step of v|v| are smaller."""
+"""Rate below which a mode counts as neutral [1/s]; finite differences over a step of v|v| are smaller."""
 
 
 class FreeMotion(NamedTuple):
-    """One motion without control: the eigenvalue with the greatest real part at rest and at top speed [1/s]."""
+    """One open-loop mode: the eigenvalue with the greatest real part at rest and at top speed [1/s]."""
 
     at_rest: complex
     at_top_speed: complex
     unstable_above: float | None
-    """Least speed at which it grows [m/s]; None if none up to top speed."""
+    """Lowest speed at which the mode is unstable [m/s]; None if it is stable up to top speed."""
 
     @staticmethod
     def words(rate: complex) -> str:
-        """Return what an eigenvalue [1/s] does, in words."""
+        """Return a description of the mode of an eigenvalue [1/s]."""
         swing = f", period {2.0 * math.pi / abs(rate.imag):.3g} s" if abs(rate.imag) > SLOW else ""
         if abs(rate.real) <= SLOW:
             return f"neutral{swing}"
@@ -47,18 +47,18 @@ class FreeMotion(NamedTuple):
 def linear_model(
     vehicle: Vehicle, speeds: ArrayLike | None = None, hydrodynamics: str | None = None
 ) -> LinearModel:
-    """Return a vehicle about level motion over its speed, with the columns of its channels, by central differences.
+    """Return the model of a vehicle linearised about level motion over a range of speeds, by central differences.
 
-    The channels that hold a speed are the least thrusts for it, with every other actuator at 0; what else it takes to
-    stay level is left to the integrals of a controller. A fin's travel ends at its stall, beyond which it gives less.
+    The trim uses the least thrusts that hold each speed, with every other actuator at 0; the remaining loads in level
+    motion are left to the integrators of a controller. A fin's range ends at its stall angle, beyond which lift drops.
 
     Args:
         vehicle: The vehicle.
-        speeds: Surge in equal steps [m/s], (n,); those of `course_speeds` if None.
-        hydrodynamics: Its set; that with coefficients if None.
+        speeds: Surge speeds in equal steps [m/s], (n,); those of `course_speeds` if None.
+        hydrodynamics: Hydrodynamic model; the one with coefficients if None.
 
     Raises:
-        SimulatorError: No thruster drives it ahead.
+        SimulatorError: No thruster drives the vehicle forward.
     """
     model = hydrodynamics or coefficients_of(vehicle)
     stall = [getattr(part, "stall", math.inf) for part in vehicle.actuators.values()]
@@ -85,7 +85,8 @@ def linear_model(
 
 
 def _trim(vehicle: Vehicle, eta: Array, nu: Array, model: str) -> Array:
-    """Return the channels that hold surges: the least thrusts, by the secant method, (n, channels)."""
+    """Return the channel values that hold each surge speed: the least thrusts, by the secant method, (n,
+    channels)."""
     thrusters = len(vehicle.thrusters)
     ahead = np.asarray(vehicle.thruster_matrix())[0]
     if not (ahead @ ahead > 0.0):
@@ -116,13 +117,13 @@ def _system_matrices(
 ) -> Array:
     """Return A of x_dot = A x about level motion, for the state (nu, roll, pitch), in SI units, (n, 8, 8).
 
-    The wrench that holds the motion, besides that of the channels, stays constant.
+    The wrench that holds the motion, besides that of the channels, is kept constant.
 
     Args:
         vehicle: The vehicle.
-        speeds: Surge [m/s], (n,).
-        hydrodynamics: Its set.
-        channels: Of its actuators, (n, channels); all at 0 if None.
+        speeds: Surge speeds [m/s], (n,).
+        hydrodynamics: Hydrodynamic model.
+        channels: Steady actuator values, (n, channels); all 0 if None.
     """
     eta, nu = np.zeros((len(speeds), 6)), np.zeros((len(speeds), 6))
     eta[:, 2], nu[:, 0] = DEPTH, speeds
@@ -147,20 +148,20 @@ def _system_matrices(
 
 
 def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[float, dict[str, FreeMotion]]:
-    """Return top speed [m/s] and what each motion of `MOTIONS` does without control up to it.
+    """Return the top speed [m/s] and the open-loop stability of each motion of `MOTIONS` up to that speed.
 
-    An eigenvalue belongs to the motion whose states take the greatest part in it.
+    An eigenvalue is assigned to the motion whose states have the largest participation factor.
 
     Args:
         vehicle: The vehicle.
-        hydrodynamics: Its set.
+        hydrodynamics: Hydrodynamic model.
     """
     top = top_speed(vehicle, hydrodynamics)
     speeds = np.linspace(0.0, top, 101)
     values, vectors = np.linalg.eig(_system_matrices(vehicle, speeds, hydrodynamics))
     part = np.abs(
         vectors * np.swapaxes(np.linalg.pinv(vectors), 1, 2)
-    )  # of states in eigenvalues, without units
+    )  # participation factors of states in modes [-]
     share = np.stack([part[:, states].sum(axis=1) for states in MOTIONS.values()])
     motions = {}
     for k, name in enumerate(MOTIONS):

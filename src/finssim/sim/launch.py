@@ -1,7 +1,7 @@
 """Launching kernels over all worlds: split over threads on a CPU, captured as a graph on a GPU.
 
 Warp runs a CPU launch on the calling thread and releases the GIL meanwhile, so worlds are cut into one slice per thread
-and each thread takes its slice through all stages. Nothing crosses worlds: the result is the same for any cut.
+and each thread runs all stages of its slice. Worlds share no data: the result does not depend on the slicing.
 """
 
 import os
@@ -15,14 +15,14 @@ import warp as wp
 from finssim.sim.plant_arrays import SimulatorError
 
 MIN_SLICE = 64
-"""Number of worlds below which a slice is not given to another thread."""
+"""Number of worlds below which a slice is not assigned to another thread."""
 
 MANY = 1024
-"""Worlds from which on a second kernel is compiled that takes several together."""
+"""Number of worlds from which a second kernel is compiled that processes several worlds together."""
 
 
 class _Job:
-    """One slice of one run: done when its event is set."""
+    """One slice of one run; its event is set when it has finished."""
 
     def __init__(self, commands: list[wp.Launch]) -> None:
         self.commands = commands
@@ -70,7 +70,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def default_threads() -> int:
-    """Number of threads of a simulator that names none: FINSSIM_THREADS, else the processors this process may use."""
+    """Return the number of threads of a simulator without an explicit one: FINSSIM_THREADS, else the
+    available processors."""
     if given := os.environ.get("FINSSIM_THREADS"):
         if not given.isdecimal() or int(given) < 1:
             raise SimulatorError(f"FINSSIM_THREADS is '{given}', expected an integer of 1 or more")
@@ -79,7 +80,7 @@ def default_threads() -> int:
 
 
 class _Kernels:
-    """Kernels that follow each other without anything between them, recorded by slice."""
+    """Kernels that run one after the other without a function call in between, recorded by slice."""
 
     def __init__(self, slices: int) -> None:
         self.recorded: list[list[wp.Launch]] = [[] for _ in range(slices)]
@@ -117,9 +118,7 @@ class _Kernels:
             except KeyboardInterrupt as error:
                 interrupt = error
                 for worker, job in zip(_workers, jobs[1:], strict=False):
-                    if (
-                        job.queued
-                    ):  # whether it came as far as the queue is not known; run twice, it does nothing
+                    if job.queued:  # it may not have reached the queue; running it twice has no effect
                         worker.jobs.put(job)
             interrupt = _finish(jobs) or interrupt
         for failure in (interrupt, *(job.error for job in jobs)):
@@ -128,10 +127,10 @@ class _Kernels:
 
 
 class KernelSequence:
-    """A fixed sequence of kernels over all worlds, recorded once and run every step.
+    """A fixed sequence of kernels over all worlds, recorded once and run in every step.
 
-    Every kernel takes `world_offset` as its last argument and is launched over its slice's worlds, or over (worlds,
-    vehicles). Between kernels a function may be called, once for all worlds.
+    Every kernel has `world_offset` as its last argument and is launched over its slice's worlds, or over (worlds,
+    vehicles). A function may be called between kernels, once for all worlds.
     """
 
     def __init__(self, worlds: int, device: wp.Device, threads: int | None = None) -> None:
@@ -147,7 +146,7 @@ class KernelSequence:
 
     @property
     def in_blocks(self) -> bool:
-        """Return whether kernels that take several worlds together are worth their time to compile."""
+        """Return True if kernels that process several worlds together repay their compilation time."""
         return self.device.is_cpu and self.worlds >= MANY
 
     def add(
@@ -159,7 +158,7 @@ class KernelSequence:
             kernel: Its last parameter is `world_offset`.
             inputs: All arguments but `world_offset`.
             vehicles: Launch over (worlds, vehicles) if given, else over worlds.
-            block: Launch over blocks of so many worlds; the kernel takes the number of worlds before `world_offset`.
+            block: Launch over blocks of this many worlds; the number of worlds then precedes `world_offset`.
         """
         last = self._parts[-1] if self._parts else None
         if not isinstance(last, _Kernels):
@@ -174,7 +173,8 @@ class KernelSequence:
             commands.append(command)
 
     def call(self, function: Callable[[], None]) -> None:
-        """Append a function: it runs when the kernels before it have, on a GPU have been queued."""
+        """Append a function: it runs after the preceding kernels have finished or, on a GPU, have been
+        queued."""
         self._parts.append(function)
 
     def run(self) -> None:
@@ -187,9 +187,9 @@ class KernelSequence:
 
 
 def _finish(jobs: list[_Job]) -> BaseException | None:
-    """Wait for all queued jobs, through Ctrl-C too; the interrupt, if there was one.
+    """Wait for all queued jobs, also through Ctrl-C; return the interrupt, or None.
 
-    Worlds must not move on while somebody reads them, frees them or starts the next step.
+    Worlds must not change while a caller reads them, frees them or starts the next step.
     """
     interrupt: BaseException | None = None
     while True:

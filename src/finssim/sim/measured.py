@@ -1,11 +1,11 @@
-"""Noise, delay and dropouts of what a controller observes, for every vehicle of every world."""
+"""Noise, delay and dropouts of a controller's observations, for every vehicle of every world."""
 
 import warp as wp
 
 
 @wp.struct
 class MeasurementErrors:
-    """Errors of what is seen of one vehicle; all 0 is the truth."""
+    """Errors of the observations of one vehicle; all 0 gives the true state."""
 
     position_std: float  # noise drawn every control step, per axis [m]
     yaw_std: float  # [rad]
@@ -16,8 +16,8 @@ class MeasurementErrors:
     velocity_bias: float  # [m/s]
     rate_bias: float  # [rad/s]
     dropout: float  # probability that a control step has no new sample
-    delay: float  # age of what is seen [s], taken to the nearest control step
+    delay: float  # age of the observation [s], rounded to the nearest control step
 
 
 SENSORS = tuple(MeasurementErrors.cls.__annotations__)
-"""Names of its fields."""
+"""Names of the fields of `MeasurementErrors`."""

@@ -39,15 +39,15 @@ def acceleration(
 
     (M_RB + s M_A) nu_dot = tau - C_RB(nu) nu - s C_A(nu) nu - s D(nu) nu - g(eta)      (Fossen 2021, eq. 6.1)
 
-    where s is the wet share of the vehicle's volume. It is the equation that `Simulator` integrates, in single
-    precision.
+    where s is the wet fraction of the vehicle's volume. It is the equation that `Simulator` integrates, in
+    single precision.
 
     Args:
         vehicle: A vehicle, the name of one in the catalogue, or the path of a vehicle file.
         eta: Position of the body origin, world frame [m], and attitude, (..., 6) with roll, pitch and yaw [rad], or
             (..., 7) with a quaternion body to world, xyzw. The world's z is up, and 0 on the water surface.
         nu: Velocity of the body origin, body frame [m/s, rad/s], (..., 6).
-        tau: Wrench of everything else from outside, about the body origin, body frame [N, N m],
+        tau: Wrench of all other external loads, about the body origin, body frame [N, N m],
             (..., 6).
         actuators: Steady value of each actuator, (..., n) in the order of `Vehicle.channel_names`: static thrust [N]
             of a thruster, angle [rad], volume [m³] or position [m] of another; all 0 if None.
@@ -57,8 +57,8 @@ def acceleration(
         nu_dot, body frame [m/s², rad/s²], (..., 6), broadcast over the leading axes of the arguments.
 
     Raises:
-        SimulatorError: A shape does not fit, a number is not finite, a quaternion has no length, or the vehicle has no
-            such model.
+        SimulatorError: A shape does not fit, a number is not finite, a quaternion has length 0, or the
+            vehicle has no such model.
         VehicleError: There is no such vehicle.
     """
     start_warp()
@@ -96,7 +96,7 @@ def acceleration(
 
 
 def _checked(name: str, value: ArrayLike, lengths: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return an argument as an array whose last axis has one of some lengths."""
+    """Return an argument as an array whose last axis has one of the given lengths."""
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] not in lengths:
         expected = " or ".join(f"(..., {length})" for length in lengths)
@@ -108,7 +108,7 @@ def _checked(name: str, value: ArrayLike, lengths: tuple[int, ...]) -> NDArray[n
 
 @lru_cache(maxsize=16)
 def _model(vehicle: Vehicle, model: str) -> tuple[wp.Kernel, list[Any]]:
-    """Return the kernel of a vehicle's model and the parameters that it takes after the states."""
+    """Return the kernel of a vehicle's model and its parameters that follow the states."""
     device = find_device("cpu")
     plant = build_plant([vehicle], model, 1, [0], device)
     everywhere = wp.ones(1, dtype=wp.int32, device=device)
@@ -124,7 +124,7 @@ def _model(vehicle: Vehicle, model: str) -> tuple[wp.Kernel, list[Any]]:
 
 @cache
 def _acceleration_kernel(model: str, terms: tuple[Any, ...]) -> wp.Kernel:
-    """Return the kernel that evaluates one model with some terms."""
+    """Return the kernel that evaluates one hydrodynamic model with the given terms."""
     motion_at = motion_function(model, True, terms=terms)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -1,6 +1,6 @@
 """Per-vehicle structs in one Warp array, with a view of each field as a separate array.
 
-The physics kernel reads one struct per vehicle: one address instead of forty. Everybody else sees plain arrays by
+The physics kernel reads one struct per vehicle: one address instead of forty. All other code sees plain arrays by
 (world, vehicle), which share that memory.
 """
 
@@ -14,7 +14,7 @@ class Packed:
     """An array of structs by (world, vehicle), whose fields are also attributes: `plant.mass` is a Warp array."""
 
     def __init__(self, struct: Any, shape: tuple[int, int], device: wp.Device) -> None:
-        """Zero structs of one Warp struct type."""
+        """Allocate zeroed structs of one Warp struct type."""
         self.array: wp.array = wp.zeros(shape, dtype=struct, device=device)
         """The structs themselves, for kernels."""
         layout = np.dtype(struct.numpy_dtype()).fields or {}
@@ -30,7 +30,7 @@ class Packed:
         }
         """Every field as an array that shares the structs' memory."""
         for view in self.fields.values():
-            # As Warp's own views do: a view keeps the memory alive, under NumPy and torch too.
+            # As in Warp's own views: a view keeps the memory alive, also under NumPy and torch.
             view._ref = self.array
 
     def __getattr__(self, name: str) -> wp.array:

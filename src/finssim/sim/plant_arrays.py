@@ -1,4 +1,4 @@
-"""Parameter arrays of the physics kernel, made from vehicle files."""
+"""Parameter arrays of the physics kernel, filled from vehicle files."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 Matrix = NDArray[np.float64]
 
 NO_LIMIT = 1.0e9
-"""Slew limit of a motor whose file gives none."""
+"""Slew limit of a motor whose file states none."""
 
 
 class SimulatorError(ValueError):
-    """A simulation that cannot be set up, or was asked for something it cannot do."""
+    """A simulation cannot be set up, or does not support a request."""
 
 
 def twist_shift(r: Sequence[float]) -> Matrix:
-    """H with nu(at r) = H nu(at the origin): [[1, -S(r)], [0, 1]]; a 6x6 inertia at r is Hᵀ M H at the origin."""
+    """Return H with nu(at r) = H nu(at the origin): [[1, -S(r)], [0, 1]]; a 6x6 inertia at r is Hᵀ M H at the
+    origin."""
     x, y, z = r
     H = np.eye(6)
     H[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -36,14 +37,14 @@ def twist_shift(r: Sequence[float]) -> Matrix:
 
 
 def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
-    """Every field of a `PlantArrays` but the derived ones, for one vehicle and one hydrodynamic model.
+    """Return every field of `PlantArrays`, without derived ones, for one vehicle and one hydrodynamic model.
 
     Args:
         vehicle: The vehicle.
         model: Key of its hydrodynamics.
 
     Returns:
-        Field name to scalar, vector or matrix, in its units.
+        Field name -> scalar, vector or matrix, each in its unit.
 
     Raises:
         SimulatorError: the vehicle has no such model, too many thrusters, or thrusters with different delays.
@@ -82,23 +83,23 @@ def vehicle_parameters(vehicle: "Vehicle", model: str) -> dict[str, Any]:
 
 
 def terms_of(vehicles: Sequence["Vehicle"], model: str) -> tuple[Item, ...]:
-    """The terms and actuators that at least one of the vehicles has, in the order of their rows."""
+    """Return the terms and actuators of at least one of the vehicles, in the order of their rows."""
     names = {name for vehicle in vehicles for name in getattr(vehicle.hydrodynamics.get(model), "terms", {})}
     actuators = {item for vehicle in vehicles for item in installed(vehicle)}
     return (*(TERMS[name] for name in sorted(names)), *sorted(actuators, key=lambda item: item.name))
 
 
 class PlantArrays(Packed):
-    """Parameters of vehicles by (world, vehicle): those of `VehicleParameters`, and those of their terms and
+    """Parameters of vehicles by (world, vehicle): the fields of `VehicleParameters`, and those of terms and
     actuators."""
 
     def __init__(self, terms: tuple[Item, ...], shape: tuple[int, int], device: wp.Device) -> None:
-        """Zeros."""
+        """Allocate zeros."""
         super().__init__(VehicleParameters, shape, device)
         self.terms = terms
         rows = (*shape, row_length(terms)) if terms else (1, 1, row_length(terms))
         self.extra: wp.array = wp.zeros(rows, dtype=wp.float32, device=device)
-        """Parameters of the terms, (worlds, vehicles, numbers) where there are terms."""
+        """Parameters of the terms, (worlds, vehicles, numbers) if there are terms."""
         for slot in layout(terms):
             view = wp.array(
                 ptr=self.extra.ptr + 4 * slot.first, dtype=slot.kind, shape=shape, strides=self.extra.strides[:2],
@@ -109,9 +110,11 @@ class PlantArrays(Packed):
 
 
 def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
-    """The fields of `VehicleParameters` by channel for one vehicle: thrusters, then its other actuators, then zeros.
+    """Return the fields of `VehicleParameters` by channel for one vehicle: thrusters, other actuators, then
+    zeros.
 
-    A channel whose c_plus is 0 follows its command, in the unit of the actuator, whatever the others' domain.
+    A channel whose c_plus is 0 follows its command, in the unit of the actuator, for either domain of the
+    thrusters.
     """
     thrusters, others = list(vehicle.thrusters.values()), list(vehicle.actuators.values())
     n = len(thrusters)
@@ -152,14 +155,15 @@ def thruster_parameters(vehicle: "Vehicle") -> dict[str, Any]:
 
 
 def _force_at(rpm: float | None, c: float | None) -> float:
-    """Magnitude of the steady thrust at a shaft speed given in rpm [N]; 0 where the file gives none."""
+    """Return the magnitude of the steady thrust at a shaft speed in rpm [N]; 0 if the file states none."""
     return (c or 0.0) * (abs(rpm or 0.0) * 2.0 * np.pi / 60.0) ** 2
 
 
 def build_plant(
     vehicles: Sequence["Vehicle"], model: str, worlds: int, hulls: Sequence[int], device: wp.Device
 ) -> PlantArrays:
-    """Parameters of `worlds` equal worlds that hold these vehicles; derived fields are zero until refreshed."""
+    """Return the parameters of `worlds` equal worlds with these vehicles; derived fields are zero until
+    refreshed."""
     parameters = [{**vehicle_parameters(v, model), "hull": h} for v, h in zip(vehicles, hulls, strict=True)]
     plant = PlantArrays(terms_of(vehicles, model), (worlds, len(vehicles)), device)
     for name in dict.fromkeys(name for p in parameters for name in p):

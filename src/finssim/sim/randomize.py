@@ -34,13 +34,13 @@ UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = range(len(KINDS))
 
 @wp.struct
 class DrawTable:
-    """Distribution of every entry of the table; rows of entries that never vary are not read."""
+    """Distributions of all entries of the table; rows of entries that never vary are not read."""
 
     count: int
-    drawn: wp.array(dtype=int)  # the entries that vary
+    drawn: wp.array(dtype=int)  # indices of the entries that vary
     kind: wp.array(dtype=int)
     ends: wp.array(dtype=wp.vec4)  # low, high, mean, standard deviation, in the unit of the entry
-    probability: wp.array(dtype=float)  # probability of being drawn at all
+    probability: wp.array(dtype=float)  # probability that the entry is drawn
     nominal: wp.array(dtype=float)  # value where nothing is drawn, in the unit of the entry
     stream: wp.array(dtype=int)
     first_choice: wp.array(dtype=int)
@@ -48,20 +48,20 @@ class DrawTable:
     choice: wp.array(dtype=float)  # values to choose from, in the unit of the entry
     cumulative: wp.array(dtype=float)  # cumulative probability of each choice
     first_tie: wp.array(dtype=int)
-    ties: wp.array(dtype=int)  # number of normal numbers that its own is a sum of; 0: it is independent
-    tied: wp.array(dtype=int)  # entries of these
+    ties: wp.array(dtype=int)  # number of normal numbers in the entry's weighted sum; 0: independent
+    tied: wp.array(dtype=int)  # entries of these normal numbers
     tie_weight: wp.array(dtype=float)  # weight of each normal number in the sum
 
 
 @wp.func
 def normal_part(x: float) -> float:
-    """Share of a standard normal distribution below x."""
+    """Return the fraction of a standard normal distribution below x."""
     return 0.5 + 0.5 * wp.erf(0.70710678 * x)
 
 
 @wp.func
 def quantile(t: DrawTable, k: int, u: float) -> float:
-    """The number of entry k below which a share u in [0, 1) of its distribution lies."""
+    """Return the u-quantile of entry k, with u in [0, 1)."""
     e = t.ends[k]
     kind = t.kind[k]
     x = e[0] + u * (e[1] - e[0])
@@ -85,7 +85,8 @@ def quantile(t: DrawTable, k: int, u: float) -> float:
 
 @wp.func
 def draw_entry(t: DrawTable, k: int, key: int) -> float:
-    """Return entry k in its unit, from its own stream of a key, which does not depend on other entries."""
+    """Return a draw of entry k in its unit, from the entry's own random stream, which is independent of other
+    entries."""
     rng = wp.rand_init(key, 2 * t.stream[k])
     u = wp.randf(rng)
     gate = wp.randf(rng)
@@ -102,15 +103,15 @@ def draw_entry(t: DrawTable, k: int, key: int) -> float:
 
 
 def widened(distribution: Distribution, nominal: float, part: float) -> tuple[list[float], float]:
-    """Ends [low, high, mean, standard deviation] and probability of a distribution at a part of its width.
+    """Return ends [low, high, mean, standard deviation] and probability of a distribution at a fraction of its width.
 
-    Widths grow from the number of the range that lies nearest to the nominal one. What is drawn from with a
-    probability, and a choice, keep their numbers, and the probability grows.
+    Widths grow from the value of the range closest to the nominal one. Discrete choices, and distributions with a
+    probability below 1, keep their values; their probability grows instead.
 
     Args:
-        distribution: At its full width.
-        nominal: Value where nothing is drawn, in the unit of the distribution.
-        part: Of the way to both ends, of the standard deviation and of probabilities, in [0, 1].
+        distribution: Distribution at its full width.
+        nominal: Value if nothing is drawn, in the unit of the distribution.
+        part: Fraction of the distance to both ends, of the standard deviation and of probabilities, in [0, 1].
     """
     low, high = distribution.bounds()
     mean, std = distribution.normal or (0.0, 0.0)
@@ -127,7 +128,8 @@ def widened(distribution: Distribution, nominal: float, part: float) -> tuple[li
 
 
 def ties_of(ranges: Ranges) -> dict[int, list[tuple[int, float]]]:
-    """Entry -> the entries whose normal numbers its own is a sum of, with their weights: rows of a square root of R."""
+    """Return entry -> entries whose normal numbers are summed for its draw, with weights: rows of a square root of
+    R."""
     rows = {}
     for group in ranges.correlated:
         values, vectors = np.linalg.eigh(np.array(group.correlation))
@@ -141,13 +143,13 @@ def ties_of(ranges: Ranges) -> dict[int, list[tuple[int, float]]]:
 def draw_table(
     drawn: Mapping[str, Distribution], nominal: NDArray[np.float64], ranges: Ranges, device: wp.Device
 ) -> DrawTable:
-    """The table at full width.
+    """Return the table at full width.
 
     Args:
-        drawn: Entry -> distribution, of those that vary.
-        nominal: Value of every entry where nothing is drawn, in its unit, (len(ENTRIES),).
-        ranges: For the correlations.
-        device: Where.
+        drawn: Entry -> distribution, of the entries that vary.
+        nominal: Value of every entry if nothing is drawn, in its unit, (len(ENTRIES),).
+        ranges: Ranges with the correlations.
+        device: Warp device of the table.
     """
     n = len(ENTRIES)
     kind, first, choices = np.zeros((3, n), np.int32)
@@ -170,7 +172,7 @@ def draw_table(
             "tie_weight": weights}  # fmt: skip
     for fields, dtype, plain in ((integer, wp.int32, np.int32), (real, wp.float32, np.float32)):
         for name, values in fields.items():
-            # No kernel reads beyond the counts: one element keeps empty columns valid.
+            # No kernel reads beyond the counts; one element keeps empty columns valid.
             column = np.asarray(values if len(values) else [0], dtype=plain)
             setattr(t, name, wp.array(column, dtype=dtype, device=device))
     t.ends = wp.array(ends.astype(np.float32), dtype=wp.vec4, device=device)
@@ -187,7 +189,7 @@ def _flat(rows: Mapping[int, list[tuple[int, float]]], n: int) -> tuple[Any, Any
     return first, count, tied, weights
 
 
-# Where drawn numbers go: body, thrusters, water, tether and sensors.
+# Application of drawn numbers: body, thrusters, water, tether and sensors.
 
 
 COLUMN = INDEX
@@ -196,25 +198,25 @@ COLUMN = INDEX
 
 @wp.struct
 class Nominal:
-    """The vehicles as their files have them, by vehicle; and the given water."""
+    """Nominal vehicles from their files, by vehicle, and the nominal water."""
 
     plant: wp.array2d(dtype=VehicleParameters)  # one world
-    M_A: wp.array(dtype=mat66)  # added mass about the point where its coefficients hold [kg, kg m²]
+    M_A: wp.array(dtype=mat66)  # added mass about the reference point of its coefficients [kg, kg m²]
     H: wp.array(dtype=mat66)  # twist at that point from the twist at the body origin [-, m]
-    current: wp.vec3  # of the given water; what is drawn adds to it [m/s]
-    waves: int  # waves of the given water stay in the first slots
+    current: wp.vec3  # current of the nominal water, to which draws are added [m/s]
+    waves: int  # number of nominal waves, which stay in the first slots
     sea_ratio: wp.array(
         dtype=float
-    )  # frequencies of a drawn sea's waves over the peak's [-]; none without a sea
-    sea_turn: wp.array(dtype=float)  # their directions from the sea's [rad]
+    )  # frequencies of a drawn sea's waves relative to the peak [-]; empty without a sea
+    sea_turn: wp.array(dtype=float)  # directions of these waves relative to the sea's [rad]
     extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units, one world
-    factor: wp.array(dtype=int)  # entry that multiplies each of them, -1 for none
-    added: wp.array(dtype=int)  # entry that is added to it
+    factor: wp.array(dtype=int)  # entry that multiplies each parameter, -1 for none
+    added: wp.array(dtype=int)  # entry that is added to each parameter, -1 for none
 
 
 @wp.func
 def scaled_matrix(M: mat66, factor: vec6) -> mat66:
-    """S M S with S = diag(sqrt(factor)): scales the diagonal by the factors and keeps symmetry and definiteness."""
+    """Return S M S with S = diag(sqrt(factor)): the diagonal scaled by the factors; stays symmetric and definite."""
     out = mat66()
     for i in range(6):
         for j in range(6):
@@ -224,7 +226,7 @@ def scaled_matrix(M: mat66, factor: vec6) -> mat66:
 
 @wp.func
 def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
-    """Return the common factor in `column` times the factors of the axes, which follow it."""
+    """Return the common factor in `column` times the factors of the axes in the following columns."""
     out = vec6()
     for i in range(6):
         out[i] = x[w, v, column] * x[w, v, column + 1 + i]
@@ -233,13 +235,13 @@ def factors(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> vec6:
 
 @wp.func
 def offset(x: wp.array3d(dtype=float), w: int, v: int, column: int) -> wp.vec3:
-    """Three numbers that follow each other. They keep their unit."""
+    """Return three consecutive numbers as a vector, in their unit."""
     return wp.vec3(x[w, v, column], x[w, v, column + 1], x[w, v, column + 2])
 
 
 @wp.func
 def drawn_delay(x: wp.array3d(dtype=float), w: int, v: int, nominal: float) -> float:
-    """Command delay of the episode, without jitter [s]."""
+    """Return the command delay of the episode, without jitter [s]."""
     return nominal * x[w, v, wp.static(COLUMN["delay"])] + x[w, v, wp.static(COLUMN["added_delay"])]
 
 
@@ -251,7 +253,7 @@ def write_body(
     mass = x[w, v, wp.static(COLUMN["mass"])] * n.plant[0, v].mass
     r_n = n.plant[0, v].r_g
     r_g = r_n + offset(x, w, v, wp.static(COLUMN["center_of_gravity.x"]))
-    # The factor is on the inertia about the centre of gravity; Steiner's part follows mass and centre.
+    # The factor scales the inertia about the centre of gravity; the Steiner term follows mass and centre.
     I_n = n.plant[0, v].inertia - n.plant[0, v].mass * (
         wp.dot(r_n, r_n) * wp.identity(3, dtype=float) - wp.outer(r_n, r_n)
     )
@@ -324,7 +326,7 @@ def write_thrusters(
 
 @wp.func
 def number_of(omega: float, depth: float, gravity: float) -> float:
-    """Wave number [rad/m] of an angular frequency [rad/s] at a depth [m], as `finssim.physics.water.wave_number`."""
+    """Return the wave number [rad/m] of an angular frequency [rad/s] at a depth [m]; see `finssim.physics.water`."""
     deep = omega * omega / gravity
     k = deep / wp.sqrt(wp.tanh(deep * depth))
     for _ in range(5):
@@ -369,7 +371,7 @@ def write_water(water: WaterArrays, n: Nominal, x: wp.array3d(dtype=float), w: i
 
 @wp.func
 def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w: int, v: int):
-    """Write the line to a vehicle from the drawn entries x, each in its unit."""
+    """Write the tether of a vehicle from the drawn entries x, each in its unit."""
     tether[w, v].diameter = x[w, v, wp.static(COLUMN["tether.diameter"])]
     tether[w, v].drag_coefficient = x[w, v, wp.static(COLUMN["tether.drag_coefficient"])]
     tether[w, v].wet_weight = x[w, v, wp.static(COLUMN["tether.wet_weight"])]
@@ -379,7 +381,7 @@ def write_tether(tether: wp.array2d(dtype=Tether), x: wp.array3d(dtype=float), w
 def write_sensors(
     measurement: wp.array2d(dtype=MeasurementErrors), x: wp.array3d(dtype=float), w: int, v: int
 ):
-    """Write noise, delay and dropouts of what a controller observes of a vehicle from entries x, each in its unit."""
+    """Write noise, delay and dropouts of a controller's observations of a vehicle from entries x, each in its unit."""
     measurement[w, v].position_std = x[w, v, wp.static(COLUMN["sensors.position_std"])]
     measurement[w, v].yaw_std = x[w, v, wp.static(COLUMN["sensors.yaw_std"])]
     measurement[w, v].velocity_std = x[w, v, wp.static(COLUMN["sensors.velocity_std"])]
@@ -396,27 +398,27 @@ if TYPE_CHECKING:
     from finssim.sim.simulator import Simulator
 
 
-# The kernels that draw: an episode's vehicle, water and sensors, and when each command arrives.
+# Kernels that draw an episode's vehicle, water and sensors, and the delay of each command.
 
 VEHICLE = wp.constant(122949823)
-"""Distance between the streams of two vehicles of a world, larger than the distance of any two seeds in use."""
+"""Offset between the random streams of two vehicles of a world, larger than any difference between two seeds."""
 
 
 @wp.struct
 class PrivilegedNumbers:
-    """Drawn numbers that agents, the first vehicles, are told, scaled."""
+    """Scaled drawn numbers that agents, the first vehicles, observe as privileged information."""
 
-    agents: int  # how many are told; 0: none
+    agents: int  # number of agents that observe them; 0: none
     told: wp.array(dtype=int)  # columns of these numbers
     nominal: wp.array(dtype=float)  # nominal value in the unit of the entry
-    scale: wp.array(dtype=float)  # one over the unit that they are counted in
+    scale: wp.array(dtype=float)  # reciprocal of the unit of scaling
     now: wp.array2d(dtype=float)  # (worlds, agents * told), (value - nominal) * scale
-    before: wp.array2d(dtype=float)  # the same of the episode before [-]
+    before: wp.array2d(dtype=float)  # the same numbers in the previous episode [-]
 
 
 @wp.struct
 class DrawnArrays:
-    """Drawn numbers, and the arrays that they are written to; the water's are separate."""
+    """Drawn numbers, and the arrays that they are written to; those of the water are separate."""
 
     plant: wp.array2d(dtype=VehicleParameters)
     extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units
@@ -433,14 +435,14 @@ class DrawnArrays:
 
 @wp.func
 def stream(seed: int, w: int) -> int:
-    """The seed of a world's or vehicle's own streams."""
+    """Return the seed of a world's or vehicle's own random streams."""
     rng = wp.rand_init(seed, w)
     return wp.randi(rng)
 
 
 @wp.func
 def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, vehicle_key: int, shared: int):
-    """Every entry that varies."""
+    """Draw every entry that varies."""
     for i in range(t.count):
         k = t.drawn[i]
         key = vehicle_key
@@ -451,8 +453,8 @@ def draw_values(t: DrawTable, d: DrawnArrays, w: int, v: int, vehicle_key: int, 
 
 @wp.func
 def finish_values(d: DrawnArrays, w: int, v: int):
-    """Compute what follows from other entries: a volume that keeps the trim, the parts of the current, the waves in
-    use."""
+    """Compute entries that follow from others: a volume that preserves the trim, the current's components, active
+    waves."""
     x = d.values
     if d.volume_with_mass != 0:
         x[w, v, wp.static(COLUMN["volume"])] = x[w, v, wp.static(COLUMN["mass"])]
@@ -470,7 +472,7 @@ def finish_values(d: DrawnArrays, w: int, v: int):
 
 @wp.func
 def write_privileged(d: DrawnArrays, w: int, v: int):
-    """The privileged numbers of an agent; those of the episode that ended move aside."""
+    """Write the privileged numbers of an agent, and save those of the previous episode."""
     p = d.privileged
     size = p.told.shape[0]
     for i in range(size):
@@ -490,9 +492,9 @@ def draw_episode(
     mask: wp.array(dtype=int),
     world_offset: int,
 ):
-    """Draw what the episode that starts has, where mask is not 0; refresh the plant afterwards.
+    """Draw the parameters of the episodes that start, where mask is not 0; refresh the plant afterwards.
 
-    The draw depends on seed, world, vehicle, episode and entry alone.
+    The draw depends only on seed, world, vehicle, episode and entry.
     """
     i, v = wp.tid()
     w = world_offset + i
@@ -530,7 +532,7 @@ def jitter_commands(
     seed: int,
     world_offset: int,
 ):
-    """The delay of the coming step's command: the episode's, and a part of the jitter drawn for this step."""
+    """Set the delay of the next step's command: that of the episode plus a drawn fraction of the jitter."""
     i, v = wp.tid()
     w = world_offset + i
     rng = wp.rand_init(stream(seed + 86028121 * state.episode[w] + VEHICLE * v, w), state.steps[w])
@@ -538,17 +540,17 @@ def jitter_commands(
     plant[w, v].delay = drawn_delay(values, w, v, nominal.plant[0, v].delay) + late
 
 
-# What a simulation is given to draw with.
+# Interface of a simulation to randomisation.
 
 
 class Randomization:
     """Draws a new vehicle and new water for every episode."""
 
     def __init__(self, ranges: Ranges | str | Path) -> None:
-        """Take ranges, or the name or file of ranges."""
+        """Store ranges, or load them by name or file."""
         self.ranges = ranges if isinstance(ranges, Ranges) else load_ranges(ranges)
         self.drawn = drawn_entries(self.ranges)
-        """Entry of the table -> its distribution, of those that vary."""
+        """Entry of the table -> distribution, of the entries that vary."""
 
     def __repr__(self) -> str:
         return f"<Randomization {self.ranges.name}: draws {len(self.drawn)} numbers>"
@@ -589,11 +591,11 @@ class Randomization:
         return self._draws("sensors.velocity_", "sensors.rate_")
 
     def simulator_arguments(self, vehicle_delay: float, tether: TetherLine | None = None) -> dict[str, Any]:
-        """Return the arguments that make room in a simulator for what is drawn.
+        """Return the simulator arguments that reserve memory for everything that is drawn.
 
         Args:
             vehicle_delay: Longest command delay of the vehicles [s].
-            tether: The line that is given; where lines are drawn and none is, each vehicle gets the usual one.
+            tether: The given tether; if None and tethers are drawn, each vehicle has the default one.
         """
         r = self.ranges
         factor, added, jitter = (bounds_of(x)[1] for x in (r.delay, r.added_delay, r.command_jitter))
@@ -613,22 +615,22 @@ class Randomization:
         agents: int = 0,
         privileged: tuple[wp.array, wp.array] | None = None,
     ) -> "Draws":
-        """Return the draws in the worlds of one simulator, which was made with `simulator_arguments`.
+        """Return the draws in the worlds of one simulator, which was created with `simulator_arguments`.
 
         Args:
             simulator: The worlds.
-            measurement: What the controllers see of the vehicles, by (world, vehicle), as it is without randomisation.
-            agents: The first vehicles, which are told what was drawn.
-            privileged: Where they are written scaled [-], and where that of the episode before is kept: (worlds, agents
-                * P) with P = `len(told(...))`.
+            measurement: Errors of the controllers' observations without randomisation, by (world, vehicle).
+            agents: Number of agents, the first vehicles, which observe the privileged numbers.
+            privileged: Arrays of the scaled privileged numbers [-] of this and of the previous episode, each (worlds,
+                agents * P) with P = `len(told(...))`.
         """
         return Draws(self, simulator, measurement, agents, privileged)
 
     def told(self, thrusters: int) -> list[str]:
-        """Names of the privileged numbers of an agent: the entries that vary, without directions and phases.
+        """Return the names of the privileged numbers of an agent: the entries that vary, without directions and phases.
 
         Args:
-            thrusters: Of the vehicle that has most.
+            thrusters: Number of thrusters of the vehicle with the most.
         """
         names = set(drawn_entries(self.ranges, thrusters))
         names |= {"current.x", "current.y"} if "current" in names else set()
@@ -641,7 +643,7 @@ class Draws:
     Attributes:
         names: Entries that vary, in the order of the table.
         values: All entries, Warp array (worlds, vehicles, len(ENTRIES)); those that never vary are nominal.
-        nominal: Of all entries, (len(ENTRIES),).
+        nominal: Nominal values of all entries, each in its unit, (len(ENTRIES),).
     """
 
     def __init__(
@@ -652,7 +654,7 @@ class Draws:
         agents: int,
         privileged: tuple[wp.array, wp.array] | None,
     ) -> None:
-        """See `Randomization.draws`."""
+        """Build the draws; see `Randomization.draws`."""
         self.randomization, self.simulator = randomization, simulator
         thrusters = max(len(vehicle.thrusters) for vehicle in simulator.vehicles)
         self.distributions = drawn_entries(randomization.ranges, thrusters)
@@ -702,13 +704,13 @@ class Draws:
         return self.randomization.told(max(len(v.thrusters) for v in self.simulator.vehicles))
 
     def _scale(self, name: str) -> float:
-        """One over the farthest that an entry may be from its nominal number."""
+        """Return the reciprocal of the greatest deviation of an entry from its nominal value."""
         distribution = self.distributions["current" if name in ("current.x", "current.y") else name]
         nominal = float(self.nominal[INDEX[name]])
         return 1.0 / (max(abs(end - nominal) for end in distribution.bounds()) or 1.0)
 
     def set_width(self, part: float, names: Sequence[str]) -> None:
-        """Draw entries from a part of their full ranges from now on, in [0, 1]."""
+        """Draw entries from a fraction of their full ranges from now on, in [0, 1]."""
         ends, probability = self.table.ends.numpy().copy(), self.table.probability.numpy().copy()
         for name in names:
             k = INDEX[name]
@@ -723,14 +725,14 @@ class Draws:
         pipeline.add(draw_episode, inputs, vehicles=len(s.vehicles))
 
     def add_step(self, pipeline: KernelSequence, seed: int) -> None:
-        """Append what is drawn for every control step, before the simulator's step: when the command arrives."""
+        """Append the draw of every control step, the delay of the command, before the simulator's step."""
         if "command_jitter" in self.distributions:
             s = self.simulator
             inputs = [s.plant.array, self._nominal, self.values, s.state, seed]
             pipeline.add(jitter_commands, inputs, vehicles=len(s.vehicles))
 
     def numpy(self, names: Sequence[str] | None = None) -> NDArray[np.float32]:
-        """Return a copy of some entries of the running episodes, or of all that vary if None: (worlds, vehicles, n).
+        """Return a copy of some entries of the current episodes, or of all that vary if None: (worlds, vehicles, n).
 
         Each entry has its own unit.
         """
@@ -739,7 +741,7 @@ class Draws:
 
 
 def _nominal_values(simulator: "Simulator", measurement: Packed | None) -> NDArray[np.float64]:
-    """Every entry where nothing is drawn: the given tether's and sensors' numbers among them."""
+    """Return every entry if nothing is drawn, including the values of the given tether and sensors."""
     out = np.array([entry.nominal for entry in ENTRIES])
     line = simulator.surroundings[2]
     for name in TETHER if line else ():

@@ -1,4 +1,4 @@
-"""Ranges of domain randomisation: one YAML file, checked when it is read."""
+"""Domain randomisation ranges: one YAML file, validated when it is read."""
 
 import difflib
 from collections.abc import Callable, Mapping
@@ -38,19 +38,20 @@ from finssim.vehicles.terms import Term
 SHIPPED = Path(__file__).parent / "ranges"
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 MAX_WAVES = 8
-"""Most waves that may be drawn for a world: every one costs time in every step."""
+"""Greatest number of waves that may be drawn for a world; each one slows down every step."""
 LONGEST = 2.0
-"""Longest delay that may be drawn, of a command or of what is seen [s]."""
+"""Longest delay that may be drawn, of a command or of an observation [s]."""
 FASTEST_WATER = 10.0
-"""[m/s]"""
+"""Greatest current speed that may be drawn [m/s]."""
 
 
 class RangesError(ValueError):
-    """A ranges file that cannot be used."""
+    """A ranges file is invalid."""
 
 
 def _either(part: type[BaseModel]) -> Callable[[Any], Any]:
-    """Reads a mapping that has a key of `part` as that part; leaves everything else to the distributions."""
+    """Return a validator that reads a mapping with keys of `part` as that section, and passes other values
+    on."""
 
     def read(value: Any) -> Any:
         named = isinstance(value, Mapping) and not set(value) & set(Distribution.model_fields)
@@ -92,13 +93,13 @@ ONE, NONE = (1.0, 1.0), (0.0, 0.0)
 
 
 class AxisScales(RangesPart):
-    """A common factor and one factor per axis; an axis not named keeps its own factor at 1."""
+    """A common factor and one factor per axis; the factor of an omitted axis is 1."""
 
     all: Scale = ONE
     axes: dict[Literal["surge", "sway", "heave", "roll", "pitch", "yaw"], Scale] = Field(default_factory=dict)
 
     def bounds(self) -> tuple[list[float], list[float]]:
-        """Low and high factor of each axis, six each."""
+        """Return the low and high factor of each axis, six each."""
         pairs = [bounds_of(self.axes.get(axis, ONE)) for axis in AXES]  # type: ignore[call-overload]
         return [p[0] for p in pairs], [p[1] for p in pairs]
 
@@ -112,21 +113,22 @@ class Offsets(RangesPart):
 
 
 class EachScales(RangesPart):
-    """A factor common to all thrusters and one for each."""
+    """A factor common to all thrusters and one for each thruster."""
 
     all: Scale = ONE
     each: Scale = ONE
 
 
 class ThrustScales(EachScales):
-    """Factors on the thrust; and thrusters that fail."""
+    """Factors on the thrust, and failures of thrusters."""
 
     failure: Scale = ONE
-    """Remaining share of a thruster's thrust; give it a probability, with which each thruster fails independently."""
+    """Remaining fraction of a failed thruster's thrust; its probability applies to each thruster
+    independently."""
 
 
 class WaveRanges(RangesPart):
-    """Waves of random number, size and direction; the period follows from the length and the depth."""
+    """Waves of random number, size and direction; the period follows from wavelength and depth."""
 
     count: Annotated[tuple[int, int], AfterValidator(_count)]
     amplitude: Scale
@@ -185,12 +187,13 @@ class ProfileRanges(RangesPart):
 
 
 def _waves_or_sea(value: Any) -> Any:
-    """Read a mapping with a spectrum as a sea state, so that a refusal names its words alone."""
+    """Read a mapping with a spectrum as a sea state, so that an error message lists only the keys of a sea
+    state."""
     return checked(SeaRanges, value) if isinstance(value, Mapping) and "spectrum" in value else value
 
 
 class DriftRanges(RangesPart):
-    """A slow random part of the current, along each horizontal axis."""
+    """A slow random component of the current, along each horizontal axis."""
 
     deviation: Scale
     """Its standard deviation [m/s]."""
@@ -199,7 +202,7 @@ class DriftRanges(RangesPart):
 
 
 class TetherRanges(RangesPart):
-    """The line to the vehicle; a line of the environment's own keeps what is not named here."""
+    """Tether of the vehicle; omitted keys keep the values of the environment's own tether."""
 
     diameter: Above0 | None = None
     """[m]"""
@@ -209,7 +212,7 @@ class TetherRanges(RangesPart):
 
 
 class SensorRanges(RangesPart):
-    """Noise, delay and dropouts of what the controller observes; omitted keys keep the environment's values."""
+    """Noise, delay and dropouts of the controller's observations; omitted keys keep the environment's values."""
 
     position_std: Scale | None = None
     """Standard deviation of the noise, per axis [m]."""
@@ -230,17 +233,17 @@ class SensorRanges(RangesPart):
     dropout: Share | None = None
     """Probability that a control step has no new sample."""
     delay: Time | None = None
-    """Age of what is seen [s]."""
+    """Age of the observation [s]."""
 
 
 class Correlated(RangesPart):
-    """Entries whose draws are correlated by rank, so that each keeps its distribution."""
+    """Entries with rank-correlated draws; each keeps its own distribution."""
 
     entries: tuple[str, ...] = Field(min_length=2)
     """Names as in the table of entries, such as linear_damping.surge."""
     correlation: tuple[tuple[float, ...], ...]
-    """Correlation of the normal numbers behind them, (n, n); of the draws themselves if these are normal and hardly
-    cut."""
+    """Correlation of the underlying normal numbers, (n, n); for normal distributions with little truncation also that
+    of the draws."""
 
     @model_validator(mode="after")
     def _positive(self) -> "Correlated":
@@ -260,12 +263,13 @@ class Correlated(RangesPart):
 
 
 class Success(RangesPart):
-    """When an episode counts as a success: exactly one of the two."""
+    """Criterion of a successful episode: exactly one of the two."""
 
     held: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    """The task's tolerance was kept for so long when the episode ended [s]."""
+    """Time for which the task's tolerance was met without interruption at the end of the episode, at least
+    [s]."""
     episode_return: float | None = Field(default=None, allow_inf_nan=False)
-    """The return, a sum of rewards, was at least this."""
+    """Return of the episode (sum of rewards), at least."""
 
     @model_validator(mode="after")
     def _single(self) -> "Success":
@@ -275,24 +279,24 @@ class Success(RangesPart):
 
 
 class Curriculum(RangesPart):
-    """Schedule by which all ranges grow together from a part of their width to the full width."""
+    """Schedule by which all ranges grow together from a fraction of their width to the full width."""
 
     by: Literal["progress", "steps", "success"] = "progress"
-    """The share of the training done, the environment's own control steps, or the share of successes."""
+    """Measure of progress: fraction of the training, the environment's own control steps, or the success rate."""
     start: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Part of the width at the start; 0 is the vehicle of the file."""
+    """Fraction of the full width at the start; 0 is the vehicle of the file."""
     over: tuple[float, float] = (0.0, 1.0)
-    """Start and end of the growth, as shares of the training or as control steps of all worlds together."""
+    """Start and end of the growth, as a fraction of the training or a number of control steps of all worlds."""
     success: Success | None = None
-    """The task's own hold time if None."""
+    """Criterion of success; the task's own hold time if None."""
     episodes: int = Field(default=400, ge=1)
-    """After so many the share of successes is looked at."""
+    """Number of episodes after which the success rate is evaluated."""
     widen_at: float = Field(default=0.8, ge=0.0, le=1.0)
-    """A share of at least this widens."""
+    """Success rate from which the ranges are widened [-]."""
     narrow_at: float = Field(default=0.4, ge=0.0, le=1.0)
-    """A share below this narrows."""
+    """Success rate below which the ranges are narrowed [-]."""
     step: float = Field(default=0.1, gt=0.0, le=1.0)
-    """Growth of each step, as a share of the full width."""
+    """Change of the width in each step, as a fraction of the full width."""
 
     @model_validator(mode="after")
     def _possible(self) -> "Curriculum":
@@ -307,7 +311,7 @@ class Curriculum(RangesPart):
         return self
 
     def width(self, done: float) -> float:
-        """Part of the full width when so much is done, in [0, 1]."""
+        """Return the fraction of the full width at a stage of progress, in [0, 1]."""
         low, high = self.over
         part = min(max((done - low) / (high - low), 0.0), 1.0)
         return self.start + part * (1.0 - self.start)
@@ -320,7 +324,7 @@ class Ranges(RangesPart):
     source: str = ""
     mass: Above0 = ONE
     volume: Annotated[Above0 | Literal["with_mass"], BeforeValidator(_factor_or_with_mass)] = ONE
-    """A factor, or `with_mass`: the volume follows the mass, so that the trim is kept."""
+    """A factor, or `with_mass`: the volume follows the mass, so that the trim is preserved."""
     buoyancy: Above0 = ONE
     """Factor on the displaced volume, on top of `volume`'s."""
     inertia: Above0 = ONE
@@ -332,8 +336,8 @@ class Ranges(RangesPart):
     linear_damping: AxisScales = AxisScales()
     quadratic_damping: AxisScales = AxisScales()
     terms: dict[str, Interval] = Field(default_factory=dict)
-    """Distributions of the vehicle's terms and actuators by entry (see `term_entries`); in a file under the name of the
-    term, or of the kind of actuator."""
+    """Distributions of the vehicle's terms and actuators by entry (see `term_entries`); a ranges file lists them under
+    the name of the term or of the kind of actuator."""
     mesh_drag: Scale = ONE
     """Factor on form and skin drag of the mesh model."""
     thrust: ThrustScales = ThrustScales()
@@ -348,11 +352,11 @@ class Ranges(RangesPart):
     slew: Scale = ONE
     dead_zone: Scale = ONE
     added_dead_zone: Scale = NONE
-    """To either side [N]."""
+    """Widening of the dead zone on either side [N]."""
     current: Annotated[Scale, AfterValidator(_swimmable)] = NONE
     """Horizontal speed [m/s], in a random direction."""
     vertical_current: Annotated[Interval, AfterValidator(_swimmable)] = NONE
-    """Upwards [m/s]."""
+    """Upward speed [m/s]."""
     current_drift: DriftRanges | None = None
     waves: Annotated[WaveRanges | SeaRanges | None, BeforeValidator(_waves_or_sea)] = None
     current_profile: ProfileRanges | None = None
@@ -363,7 +367,7 @@ class Ranges(RangesPart):
 
     @property
     def most_waves(self) -> int:
-        """Greatest number of waves that are drawn for a world."""
+        """Return the greatest number of waves that can be drawn for a world."""
         waves = self.waves
         return waves.components if isinstance(waves, SeaRanges) else 0 if waves is None else waves.count[1]
 
@@ -373,13 +377,13 @@ class Ranges(RangesPart):
         if not isinstance(data, Mapping):
             return data
         out, terms = dict(data), {}
-        for entry, drawn in dict(out.pop("terms", {})).items():  # as a record of a training has them
+        for entry, drawn in dict(out.pop("terms", {})).items():  # flat names, as in the record of a training
             name, _, parameter = entry.partition(".")
             out[name] = {**out.get(name, {}), parameter: drawn} if parameter else drawn
         for name in [name for name in out if name not in cls.model_fields]:
             family = TERMS if name in TERMS else ACTUATORS
             member = family.get(str(name))
-            if member is not None:  # another is refused as an unknown entry
+            if member is not None:  # other names are refused as unknown entries
                 terms |= _of_member(member, out.pop(name))
         return {**out, "terms": terms} if terms else out
 
@@ -395,7 +399,7 @@ def _of_member(member: Term | ActuatorKind, stated: Any) -> dict[str, Any]:
     """Return the distributions of a term or a kind of actuator by entry.
 
     Raises:
-        ValueError: An entry that it does not have, or a range that cannot be; one sentence.
+        ValueError: An entry does not exist or its range is invalid; the message is one sentence.
     """
     from finssim.sim.ranges_table import actuator_entries, term_entries  # the table imports this module
 
@@ -420,7 +424,7 @@ def _of_member(member: Term | ActuatorKind, stated: Any) -> dict[str, Any]:
 
 
 def available() -> list[str]:
-    """Names of the ranges that ship with FinsSim."""
+    """Return the names of the ranges that ship with FinsSim."""
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 
@@ -431,7 +435,7 @@ def load_ranges(name_or_path: str | Path) -> Ranges:
         name_or_path: One of `available()`, or a YAML file.
 
     Raises:
-        RangesError: no such file, or a key or number in it is wrong; names file, key, value and expectation.
+        RangesError: There is no such file, or a key or value in it is invalid; the message names file, key and value.
     """
     path = Path(name_or_path)
     if not path.is_file() and str(name_or_path) in available():

@@ -1,4 +1,4 @@
-"""The table of everything that can be drawn, and the distributions that a ranges file gives its entries."""
+"""Table of all parameters that can be randomised, and the distributions that a ranges file states for them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ TETHER = ("diameter", "drag_coefficient", "wet_weight")
 
 @dataclass(frozen=True)
 class DrawnNumber:
-    """One number that is drawn for every episode."""
+    """One number that is drawn in every episode."""
 
     name: str
     """Name as in a ranges file, with dots; `thrust.each.2` is that of the third thruster."""
     unit: str = "1"
-    """`1` is a factor on the vehicle file's number."""
+    """Unit; `1` is a factor on the vehicle file's number."""
     nominal: float = 1.0
-    """Value if nothing is drawn, in the unit of the entry."""
+    """Value if no distribution is given, in the unit of the entry."""
     world: bool = False
-    """Drawn once for a world and not for each vehicle in it."""
+    """True if the number is drawn once per world and not for each vehicle."""
     angle: bool = False
     """True for a direction or phase, which is always drawn from the full circle."""
     told: bool = True
-    """Among the privileged numbers where it varies."""
+    """True if the number is a privileged observation where it varies."""
     stream: int = -1
-    """Stream of its random numbers, which other entries do not change."""
+    """Stream of its random numbers, independent of other entries."""
 
 
 def _table() -> Iterator[DrawnNumber]:
@@ -92,17 +92,18 @@ def _sensor_unit(name: str) -> str:
 
 
 ENTRIES = [replace(entry, stream=i) for i, entry in enumerate(_table())]
-"""All entries; those of a vehicle's terms join them when ranges first name the term."""
+"""All entries; entries of a vehicle's terms are added when ranges first name the term."""
 INDEX = {entry.name: i for i, entry in enumerate(ENTRIES)}
 WORLD = next(i for i, entry in enumerate(ENTRIES) if entry.world)
-"""Entries from this one to before `WORLD_END` are the world's."""
+"""Index of the first entry of the world; those of the world end before `WORLD_END`."""
 WORLD_END = len(ENTRIES)
 
 
 def term_entries(term: Term) -> list[DrawnNumber]:
-    """Entries of a term: `lift.coefficient`, a factor on each parameter, and `lift.added_coefficient`, to be added.
+    """Return the entries of a term: `lift.coefficient`, a factor on a parameter, and `lift.added_coefficient`, an
+    offset.
 
-    Only parameters that are one number in a section of their own can be added to.
+    Only scalar parameters in a section of their own have an offset.
     """
     scalars, out = term.scalars(), []
     for name, path in term.parameters.items():
@@ -113,7 +114,7 @@ def term_entries(term: Term) -> list[DrawnNumber]:
 
 
 def _registered(entries: list[DrawnNumber]) -> list[DrawnNumber]:
-    """Add entries to the table, where it lacks them; their streams follow from their names."""
+    """Add missing entries to the table; their random streams follow from their names."""
     for entry in entries:
         if entry.name not in INDEX:
             INDEX[entry.name] = len(ENTRIES)
@@ -122,18 +123,19 @@ def _registered(entries: list[DrawnNumber]) -> list[DrawnNumber]:
 
 
 def actuator_entries(kind: ActuatorKind) -> list[DrawnNumber]:
-    """Entries of a kind of actuator: `fin.lift_slope`, a factor on a parameter of all actuators of that kind."""
+    """Return the entries of a kind of actuator: `fin.lift_slope`, a factor on that parameter of all actuators
+    of the kind."""
     return _registered([DrawnNumber(f"{kind.name}.{name}") for name in kind.scalars])
 
 
 def added_entry(path: str) -> str:
-    """Name of the entry that is added to the parameter at a path."""
+    """Return the name of the entry that is added to the parameter at a path."""
     term, _, name = path.rpartition(".")
     return f"{term}.added_{name}"
 
 
 def varies(distribution: Distribution, nominal: float) -> bool:
-    """Return whether a distribution gives numbers other than the nominal one, both in one unit."""
+    """Return whether a distribution has values other than the nominal one, both in one unit."""
     return distribution.probability > 0.0 and distribution.bounds() != (nominal, nominal)
 
 
@@ -142,7 +144,7 @@ def drawn_entries(ranges: Ranges, thrusters: int = MAX_THRUSTERS) -> dict[str, D
 
     Args:
         ranges: The ranges.
-        thrusters: Of the vehicle that has most; entries of further ones are left out.
+        thrusters: Number of thrusters of the vehicle with the most; entries of further thrusters are omitted.
     """
     distributions = {
         name: distribution_of(drawn)
@@ -211,10 +213,10 @@ def _directions(ranges: Ranges) -> Iterator[tuple[str, Drawn]]:
 
 
 def check_correlated(ranges: Ranges) -> None:
-    """Refuse correlated entries that are not drawn, are tied twice, or are drawn at different places.
+    """Refuse correlated entries that are not drawn, are in two groups, or mix entries of worlds and of vehicles.
 
     Raises:
-        ValueError: One sentence.
+        ValueError: The correlations are invalid; the message is one sentence.
     """
     drawn: Mapping[str, Distribution] = drawn_entries(ranges)
     tied: set[str] = set()

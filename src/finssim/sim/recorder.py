@@ -1,4 +1,4 @@
-"""Recording a run: state, commands and thrusts of chosen worlds, in a folder of Parquet parts that pandas opens."""
+"""Recording of a run: state, commands and thrusts of selected worlds, in a folder of Parquet files for pandas."""
 
 import json
 from collections.abc import Sequence
@@ -33,9 +33,9 @@ ABOUT = "_run.json"
 
 
 class StateRecorder:
-    """Writes one row per recorded world, vehicle and call of `record`.
+    """Recorder of one row per recorded world, vehicle and call of `record`.
 
-    A part is written whole every `chunk` rows, so a run that is cut short opens up to its last part:
+    A file is written completely every `chunk` rows, so an interrupted run can be read up to its last file:
     `pandas.read_parquet(folder)` or `read_run(folder)`. Use it as a context manager.
     """
 
@@ -49,13 +49,13 @@ class StateRecorder:
         """Start a run.
 
         Args:
-            simulator: What is recorded.
-            folder: New or empty folder for the parts.
-            worlds: Which worlds; all if None.
-            chunk: Rows in a part.
+            simulator: The simulator to record.
+            folder: New or empty folder for the files.
+            worlds: Indices of the worlds to record; all if None.
+            chunk: Number of rows per file.
 
         Raises:
-            SimulatorError: the folder holds something already, or a world does not exist.
+            SimulatorError: The folder is not empty, or a world does not exist.
         """
         self.simulator, self.folder, self.chunk = simulator, Path(folder), chunk
         self.worlds = np.arange(simulator.worlds) if worlds is None else np.asarray(worlds, dtype=int)
@@ -92,7 +92,7 @@ class StateRecorder:
         }
 
     def record(self) -> None:
-        """Add the present state of the recorded worlds."""
+        """Add the current state of the recorded worlds."""
         s, chosen = self.simulator, self.worlds
         shape = (len(chosen), len(s.vehicles))
         world = np.broadcast_to(chosen[:, None], shape)
@@ -110,7 +110,7 @@ class StateRecorder:
             self.flush()
 
     def flush(self) -> None:
-        """Write the rows that wait as a part."""
+        """Write the buffered rows as a file."""
         if not self._rows:
             return
         import pyarrow
@@ -134,16 +134,16 @@ class StateRecorder:
 
 
 def read_run(folder: str | Path) -> "pandas.DataFrame":
-    """Read a recorded run up to its last complete part.
+    """Read a recorded run up to its last complete file.
 
     Args:
-        folder: What `StateRecorder` was given.
+        folder: Folder of a `StateRecorder`.
 
     Returns:
-        One row per world, vehicle and time; `.attrs` holds what `_run.json` says.
+        One row per world, vehicle and time; `.attrs` has the content of `_run.json`.
 
     Raises:
-        SimulatorError: the folder holds no run.
+        SimulatorError: The folder contains no run.
     """
     import pandas
 

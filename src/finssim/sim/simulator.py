@@ -47,13 +47,13 @@ class Simulator:
     Attributes:
         state: Warp arrays by (world, vehicle); see `State`.
         command: Commands of thrusters [N] and other actuators, and disturbance wrenches; write them before `step`.
-        plant: Parameters by (world, vehicle); after writing any of them call `refresh`.
+        plant: Parameters by (world, vehicle); call `refresh` after writing any of them.
         water: Water by world.
-        funnel: Poses of the docks, and how hard vehicles touched them, by world.
+        funnel: Poses of the docks, and the contact forces on them, by world.
         world: The described world, whose `draw` moves its solids; None without one.
-        solids: Of that world; `solids.force` is the greatest force on each vehicle in the last control step [N],
+        solids: Solids of that world; `solids.force` is the greatest force on each vehicle in the last control step [N],
             float (worlds, vehicles).
-        tether: Lines by (world, vehicle).
+        tether: Tethers by (world, vehicle).
     """
 
     def __init__(
@@ -80,30 +80,33 @@ class Simulator:
     ) -> None:
         """Set up the worlds.
 
+        Set up the worlds.
+
         Args:
             vehicles: One vehicle or several, each a `Vehicle`, a catalogue name or a file.
-            worlds: How many worlds.
+            worlds: Number of worlds.
             hydrodynamics: Key of `HYDRODYNAMICS`: calibrated, mesh or simplified.
             control_step: Time between commands [s].
             substeps: Physics steps in a control step.
             integrator: `midpoint` or `rk4`; both are of order 2 for vehicles whose thrusters lag.
             water: Currents and waves; still water if None.
             pool: Walls and floor; open water if None.
-            tether: On every vehicle; none if None.
-            dock: One in every world, which touches every vehicle; none if None.
-            world: Site that vehicles collide with, and start in: a name of `finssim worlds`, a path, or a `World`,
+            tether: Tether of every vehicle; none if None.
+            dock: One in every world, in contact with any vehicle; none if None.
+            world: Site that vehicles start in and collide with: a name of `finssim worlds`, a path, or a `World`,
                 `WorldLayout` or `WorldBatch` (of as many worlds) of `finssim.extensions.perception`. Its basin is the
                 pool.
             device: Warp device, `cpu` or `cuda`.
             threads: Threads on a CPU; all processors if None.
-            seed: Of everything random in the worlds.
+            seed: Seed of all random numbers in the worlds.
             max_delay: Longest thruster delay that randomisation may set [s]; twice the vehicles' own if None.
-            max_waves: Room for this many randomised waves besides those of `water`.
-            water_moves: Simulate moving water even if `water` stands still: somebody will write currents or waves.
-            water_drifts: Let currents drift by world, even if those of `water` do not: somebody will write how far.
+            max_waves: Number of randomised waves to reserve memory for, besides those of `water`.
+            water_moves: Simulate moving water even if `water` is still, for a caller that writes currents or waves.
+            water_drifts: Let currents drift by world even if those of `water` do not, for a caller that writes the
+                drift.
 
         Raises:
-            SimulatorError: a name or number is out of its range; it says which.
+            SimulatorError: A name is unknown or a number out of range; the message states which.
         """
         crew = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
         self.vehicles = [load_vehicle(v) for v in crew]
@@ -188,7 +191,8 @@ class Simulator:
         self.hull = hull_mesh(meshes, self.device) if meshes else HullMesh()
 
     def pipeline(self) -> KernelSequence:
-        """An empty pipeline over the simulator's worlds, for a caller that adds its own kernels around the step."""
+        """Return an empty pipeline over the simulator's worlds, for a caller that adds kernels before or after the
+        step."""
         return KernelSequence(self.worlds, self.device, self._threads)
 
     def add_step(self, pipeline: KernelSequence) -> None:
@@ -199,7 +203,7 @@ class Simulator:
         if self._solids is not None:
             inputs = [self.state, self.solids, self.plant.array, self.control_step]
             pipeline.add(refresh_clearing, inputs, len(self.vehicles))
-        # One world at a time on a processor, what is not there costs less than another kernel takes to compile.
+        # One world at a time on a processor: absent features cost less than compiling another kernel.
         general = self.device.is_cpu and not self.in_lanes
         walls = general or self.surroundings[1] is not None
         parts = math.ceil(self.control_step / self.substeps / WALL_STEP - 1e-4)
@@ -215,7 +219,7 @@ class Simulator:
             solids=self._solids is not None,
             play=bool(self.plant.play.numpy().any()),
             lanes=self.in_lanes,
-            # More would be a kernel that takes long to compile: a world near a wall then goes alone.
+            # More parts would make a kernel that compiles slowly: a world near a wall is then stepped separately.
             parts=parts if self.in_lanes and walls and parts <= MOST_PARTS else 1,
         )
         machines, around = Vehicles(), SimSurroundings()
@@ -231,9 +235,9 @@ class Simulator:
 
     @property
     def in_lanes(self) -> bool:
-        """True if blocks of worlds are stepped together: on a processor, for what the traced code supports."""
+        """True if blocks of worlds are stepped together: on a CPU, with features that the traced code supports."""
         traceable = self.integrator == "midpoint"
-        # A moving mass changes the mass matrix, which takes double precision to solve: one world at a time.
+        # A moving mass changes the mass matrix, whose inversion needs double precision: one world at a time.
         traceable = traceable and composed(self.plant.terms, "shift") is None
         return self.device.is_cpu and traceable and not self.water.moving and self.dock is None
 
@@ -242,7 +246,7 @@ class Simulator:
         pipeline.add(clear_actuators, [self.state, mask])
 
     def add_refresh(self, pipeline: KernelSequence, mask: wp.array) -> None:
-        """Append the kernel that recomputes derived parameters of worlds that draw their own, where mask is not 0."""
+        """Append the kernel that recomputes derived parameters of randomised worlds, where mask is not 0."""
         self._drawn = True
         self._shared.zero_()
         self._add_refresh(pipeline, mask)
@@ -287,12 +291,12 @@ class Simulator:
         """Change the time between commands during a run; poses and motors are kept.
 
         Args:
-            control_step: From now on [s].
-            substeps: Physics steps in it.
-            elapsed: Since the reset [s]; clocks, and with them the waves, are set to it.
+            control_step: New time between commands [s].
+            substeps: Physics steps in a control step.
+            elapsed: Time since the reset [s]; clocks, and with them the waves, are set to it.
 
         Raises:
-            SimulatorError: The delay line is too short for a step so much smaller (see `max_delay`).
+            SimulatorError: The delay line is too short for the smaller step (see `max_delay`).
         """
         self.control_step, self.substeps = control_step, substeps
         self.state.steps.fill_(round(elapsed / control_step))
@@ -304,7 +308,7 @@ class Simulator:
         """Recompute what depends on `plant` (mass matrix inverses, lag coefficients) after writing to it.
 
         Raises:
-            SimulatorError: a delay is longer than the delay line.
+            SimulatorError: A delay is longer than the delay line.
         """
         longest = float(self.plant.delay.numpy().max())
         if longest > (self.state.commands.shape[2] - 2) * self.control_step + 1e-6:
@@ -317,7 +321,8 @@ class Simulator:
         self.compare_worlds()
 
     def compare_worlds(self) -> None:
-        """Note whether all worlds have equal parameters, which are then read once; never if some are drawn."""
+        """Check whether all worlds have equal parameters, which are then read once; never the case if some are
+        randomised."""
         if self.in_lanes:
             arrays = [self.plant.array] + [self.plant.extra] * bool(self.plant.terms)
             rows = [array.numpy().view(np.uint8).reshape(self.worlds, -1) for array in arrays]
@@ -327,7 +332,7 @@ class Simulator:
         """Stop the motors, empty the delay lines and set the clocks to zero; pose and velocity stay.
 
         Args:
-            mask: Which worlds, bool by world; all if None. A frozen world moves again after its pose is set.
+            mask: Worlds to reset, bool by world; all if None. A frozen world moves again after its pose is set.
         """
         if mask is None:
             self._reset_all.run()
@@ -341,15 +346,15 @@ class Simulator:
         quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0),
         velocity: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     ) -> None:
-        """Put every vehicle somewhere and reset all worlds.
+        """Set the pose and velocity of every vehicle and reset all worlds.
 
         Args:
-            position: Of the body origin, world frame [m], shape broadcastable to (worlds, vehicles, 3).
+            position: Position of the body origin, world frame [m], shape broadcastable to (worlds, vehicles, 3).
             quaternion: Body to world, xyzw, broadcastable to (..., 4).
             velocity: nu, body frame [m/s, rad/s], broadcastable to (..., 6).
 
         Raises:
-            SimulatorError: a number is not finite, a quaternion has no length, or a shape does not fit.
+            SimulatorError: A number is not finite, a quaternion has length 0, or a shape does not fit.
         """
         shape = (self.worlds, len(self.vehicles))
         values = {"position": position, "quaternion": quaternion, "velocity": velocity}
@@ -358,26 +363,27 @@ class Simulator:
         self.reset()
 
     def numpy(self, name: str) -> NDArray[Any]:
-        """A field of `state` as NumPy; on a CPU a view that shares memory, on a GPU a copy."""
+        """Return a field of `state` as NumPy; on a CPU a view that shares memory, on a GPU a copy."""
         return getattr(self.state, name).numpy()
 
     def torch(self, name: str) -> Any:
-        """A field of `state` as a torch tensor that shares memory on its device."""
+        """Return a field of `state` as a torch tensor that shares memory on its device."""
         return wp.to_torch(getattr(self.state, name), requires_grad=False)
 
     def set_thrust(self, force: ArrayLike) -> None:
         """Command thruster forces.
+        Command thruster forces.
 
         Args:
-            force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters in the
-                vehicle's order; vehicles with fewer thrusters leave the last numbers unused.
+            force: Forces along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters in
+                the vehicle's order; for vehicles with fewer thrusters, the last numbers are ignored.
 
         Raises:
-            SimulatorError: the shape is wrong or a number is not finite.
+            SimulatorError: The shape is wrong or a number is not finite.
         """
         table = thrust_table(force, self.vehicles, self.worlds)
         for i, vehicle in enumerate(self.vehicles):
-            if vehicle.actuators:  # the others keep their commands
+            if vehicle.actuators:  # other actuators keep their commands
                 table[:, i, len(vehicle.thrusters) :] = self.numpy_command()[:, i, len(vehicle.thrusters) :]
         self.command.thrust.assign(table)
 
@@ -386,12 +392,12 @@ class Simulator:
         return np.array(self.command.thrust.numpy())
 
     def set_actuators(self, values: ArrayLike) -> None:
-        """Command every actuator: thrusters and the others.
+        """Command every actuator: thrusters and others.
 
         Args:
             values: One number per channel, in the order of `Vehicle.channel_names`: static thrust [N] of a thruster,
                 angle [rad], volume [m³] or position [m] of another; shape broadcastable to (worlds, vehicles, n), n
-                channels of the vehicle that has most. Vehicles with fewer leave the last numbers unused.
+                channels of the vehicle with the most. For vehicles with fewer, the last numbers are ignored.
 
         Raises:
             SimulatorError: The shape is wrong or a number is not finite.
@@ -402,7 +408,7 @@ class Simulator:
         self.command.thrust.assign(table)
 
     def set_wrench(self, wrench: ArrayLike) -> None:
-        """Command thruster forces that come nearest to a wrench within the thrusters' limits (paper, eq. 18).
+        """Command the thruster forces closest to a wrench within the thrusters' limits (paper, eq. 18).
 
         Args:
             wrench: Body frame, about each vehicle's `wrench_reference` [N, N m], shape broadcastable to
@@ -420,16 +426,16 @@ class Simulator:
         self.set_thrust(forces)
 
     def set_pwm(self, pulse: ArrayLike, voltage: float | None = None) -> None:
-        """Command the thruster forces that pulse widths give in the steady state, by the law of the speed controllers.
+        """Command the steady-state thruster forces of pulse widths, by the characteristic of the speed controllers.
 
         Args:
             pulse: Pulse widths [µs], shape broadcastable to (worlds, vehicles, n), n thrusters in the vehicle's order;
-                0 is no signal and stops a motor. Vehicles with fewer thrusters leave the last numbers unused.
-            voltage: Voltage of the battery [V]; that of the speed controller's numbers if None.
+                0 is no signal and stops a motor. For vehicles with fewer thrusters, the last numbers are ignored.
+            voltage: Voltage of the battery [V]; the nominal voltage of the speed controller if None.
 
         Raises:
             SimulatorError: The shape is wrong or a number is not finite.
-            VehicleError: The vehicle file gives a thruster no speed controller (`esc`).
+            VehicleError: A thruster in the vehicle file has no speed controller (`esc`).
         """
         pulses = self._by_vehicle(pulse, self._most_thrusters, "pulse command")
         forces = np.zeros(pulses.shape, dtype=np.float32)
@@ -450,7 +456,7 @@ class Simulator:
         return np.array(broadcast(array, (self.worlds, len(self.vehicles), n), label))
 
     def restart_episodes(self, mask: ArrayLike | None = None) -> None:
-        """Count episodes from zero again, so that the random streams repeat: where mask is true, everywhere if None."""
+        """Restart the episode count, so that the random streams repeat: where mask is true, everywhere if None."""
         if mask is None:
             self.state.episode.zero_()
         else:
@@ -467,11 +473,11 @@ class Simulator:
         """Write the last 50 states of every newly frozen world to a CSV file.
 
         Args:
-            directory: Where; made if missing.
-            most: How many files are written at most; all if None.
+            directory: Folder of the files; created if missing.
+            most: Greatest number of files to write; all if None.
 
         Returns:
-            The files written.
+            Paths of the files.
         """
         episode = self.state.episode.numpy()
         new = [w for w in self.frozen_worlds() if (int(w), int(episode[w])) not in self._reported]
@@ -479,11 +485,11 @@ class Simulator:
         return [write_post_mortem(self, int(w), directory) for w in new[:most]]
 
 
-# What a simulator is given, checked: names, devices, vehicles that share a world.
+# Validation of a simulator's arguments: names, devices, vehicles of one world.
 
 
 def checked_choice(value: str, available: Sequence[str], kind: str) -> str:
-    """The value, if it is among the available ones; else a sentence that lists them."""
+    """Return the value if it is available; otherwise raise an error that lists the available ones."""
     if value not in available:
         close = difflib.get_close_matches(value, available, n=1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
@@ -492,7 +498,7 @@ def checked_choice(value: str, available: Sequence[str], kind: str) -> str:
 
 
 def find_device(name: str) -> wp.Device:
-    """Return the Warp device of a name."""
+    """Return the Warp device with a name."""
     start_warp()
     if name.startswith("cuda") and not wp.is_cuda_available():
         raise SimulatorError(f"device '{name}' is not available here; available: cpu")
@@ -504,7 +510,7 @@ def find_device(name: str) -> wp.Device:
 
 
 def shared_water(vehicles: Sequence[Vehicle]) -> Fluid:
-    """Density and gravity of the water that vehicles of one world swim in, which must agree in their files."""
+    """Return density and gravity of the water of vehicles in one world, which must be equal in their files."""
     fluid = vehicles[0].water
     for other in vehicles[1:]:
         if other.water != fluid:
@@ -516,7 +522,7 @@ def shared_water(vehicles: Sequence[Vehicle]) -> Fluid:
 
 
 def broadcast(array: NDArray[Any], shape: tuple[int, int, int], label: str) -> NDArray[Any]:
-    """Return the array, of any unit, for every world and vehicle."""
+    """Return the array, of any unit, broadcast to every world and vehicle."""
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
@@ -527,7 +533,8 @@ def broadcast(array: NDArray[Any], shape: tuple[int, int, int], label: str) -> N
 
 
 def placed_at(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """A position, quaternion or velocity to place vehicles at, for every world and vehicle; quaternions of length 1."""
+    """Return a position, quaternion or velocity for every world and vehicle, as `Simulator.place`; quaternions
+    normalised."""
     array = np.asarray(value, dtype=np.float32)
     if not np.isfinite(array).all():
         raise SimulatorError(f"{name} to place a vehicle at has a number that is not finite")
@@ -541,16 +548,16 @@ def placed_at(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np
 
 
 def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> NDArray[np.float32]:
-    """Thruster forces for every world and vehicle, zero for the thrusters that a vehicle does not have.
+    """Return thruster forces for every world and vehicle, zero for thrusters that a vehicle does not have.
 
     Args:
-        force: Along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters of the
-            vehicle that has most.
-        vehicles: In their order.
-        worlds: How many.
+        force: Forces along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters of the
+            vehicle with the most.
+        vehicles: Vehicles in their order.
+        worlds: Number of worlds.
 
     Returns:
-        [N], (worlds, vehicles, `MAX_THRUSTERS`).
+        Forces [N], (worlds, vehicles, `MAX_THRUSTERS`).
 
     Raises:
         SimulatorError: The shape is wrong or a number is not finite.
@@ -570,29 +577,29 @@ def thrust_table(force: ArrayLike, vehicles: Sequence[Vehicle], worlds: int) -> 
     return full
 
 
-# What is left of a world in which a number stopped being finite.
+# Record of a world in which a number stopped being finite.
 
 COLUMNS = "vehicle step t x y z qx qy qz qw u v w p q r".split()
 
 
 def write_post_mortem(simulator: "Simulator", world: int, directory: Path) -> Path:
-    """Write the last control steps of one world, the last row being the one that broke.
+    """Write the last control steps of one world to a CSV file; the last row is the step that failed.
 
     Args:
-        simulator: The simulator that holds the world.
+        simulator: The simulator of the world.
         world: Its index.
-        directory: Where the file goes; made if missing.
+        directory: Folder of the file; created if missing.
 
     Returns:
         Path of a CSV file with one row per vehicle and step, columns `COLUMNS` (SI, world and body frames).
     """
-    last = int(simulator.state.steps.numpy()[world])  # steps counted, the broken one included
+    last = int(simulator.state.steps.numpy()[world])  # number of steps, including the failed one
     episode = int(simulator.state.episode.numpy()[world])
     history = simulator.state.history.numpy()[:, world]
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"frozen-world{world}-episode{episode}.csv"
     again = 2
-    while path.exists():  # an earlier run's
+    while path.exists():  # file of an earlier run
         path = directory / f"frozen-world{world}-episode{episode}-{again}.csv"
         again += 1
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:

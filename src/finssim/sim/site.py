@@ -1,4 +1,4 @@
-"""Surroundings of the vehicles: a pool with walls, a tether, a dock. Plain data, checked on construction."""
+"""Surroundings of the vehicles: a pool with walls, a tether, a dock. Plain data, validated on construction."""
 
 import math
 from dataclasses import astuple, dataclass, fields
@@ -14,11 +14,11 @@ from finssim.physics.tether import Tether
 
 
 class SurroundingsError(ValueError):
-    """A description of water, pool or tether that is not possible."""
+    """A description of water, pool, tether or dock is invalid."""
 
 
 def require(condition: bool, sentence: str) -> None:
-    """Refuse a description by a sentence unless a condition holds."""
+    """Raise an error with the given message unless a condition is true."""
     if not condition:
         raise SurroundingsError(sentence)
 
@@ -28,15 +28,15 @@ class RectangularPool:
     """A rectangular pool centred on the world's z axis. The default is the paper's: 4 × 2 m, 1 m of water."""
 
     length: float = 4.0
-    """Along world x [m]."""
+    """Length along world x [m]."""
     width: float = 2.0
-    """Along world y [m]."""
+    """Width along world y [m]."""
     depth: float = 1.0
     """[m]"""
     stiffness: float = 4000.0
     """Stiffness of a wall, per corner of the vehicle [N/m]."""
     damping: float = 100.0
-    """Against approach, per corner [N s/m]."""
+    """Damping of the approach to a wall, per corner [N s/m]."""
     friction: float = 0.2
     """Coulomb coefficient of walls and floor [-]."""
 
@@ -52,7 +52,7 @@ class RectangularPool:
         )
 
     def walls(self) -> PoolWalls:
-        """The struct that kernels take."""
+        """Return the struct for the kernels."""
         walls = PoolWalls()
         walls.present = 1
         walls.half_length, walls.half_width, walls.depth = 0.5 * self.length, 0.5 * self.width, self.depth
@@ -65,7 +65,7 @@ class TetherLine:
     """A taut tether from an anchor to the vehicle."""
 
     anchor: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Point where it enters the water, world frame [m]."""
+    """Point where the tether enters the water, world frame [m]."""
     attachment: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Point on the vehicle, body frame [m]."""
     diameter: float = 0.0076
@@ -82,7 +82,7 @@ class TetherLine:
         require(self.drag_coefficient >= 0.0, "tether: drag_coefficient must not be negative")
 
     def struct(self) -> Tether:
-        """The struct that kernels take."""
+        """Return the struct for the kernels."""
         tether = Tether()
         tether.anchor, tether.attachment = wp.vec3(*self.anchor), wp.vec3(*self.attachment)
         tether.diameter, tether.drag_coefficient = self.diameter, self.drag_coefficient
@@ -92,7 +92,7 @@ class TetherLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Dock:
-    """A block with a bored cone and tube in every world, placed by world.
+    """A block with a conical funnel and a tube, one in every world, with a pose per world.
 
     Dock axes: the origin is the middle of the throat, where cone and tube meet; x points into the tube.
     """
@@ -108,11 +108,11 @@ class Dock:
     rim: float
     """Thickness of the block around the mouth and behind the tube [m]."""
     stiffness: float
-    """Per point of the hull [N/m]."""
+    """Stiffness per point of the hull [N/m]."""
     damping: float
-    """Against approach, per point [N s/m]."""
+    """Damping of the approach, per point [N s/m]."""
     friction: float = 0.2
-    """Coulomb coefficient of its surface [-]."""
+    """Coulomb coefficient of the dock's surface [-]."""
     slip: float = 0.05
     """Speed below which friction is linear [m/s]."""
 
@@ -129,7 +129,7 @@ class Dock:
             )
 
     def struct(self, worlds: int, vehicles: int, device: wp.Device) -> Funnel:
-        """Return the struct that kernels take, with every dock at the origin, pointing along world x."""
+        """Return the struct for the kernels, with every dock at the origin and along world x."""
         funnel = Funnel()
         for name in ("mouth_radius", "throat_radius", "cone_length", "tube_length"):
             setattr(funnel, name, getattr(self, name))
@@ -144,13 +144,13 @@ class Dock:
 
 
 def described_world(name_or_path: "str | Path") -> Any:
-    """Return a described world, which the extension for perception reads.
+    """Return a described world, read by the perception extension.
 
     Args:
         name_or_path: A site of `finssim worlds`, or a YAML file.
 
     Raises:
-        WorldError: There is none of that name, or the file is refused.
+        WorldError: No world has that name, or the file is invalid.
         SurroundingsError, RegistryError: The extension is not installed, or cannot be used.
     """
     if "described" not in WORLDS:

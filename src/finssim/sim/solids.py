@@ -1,4 +1,4 @@
-"""The solids of a described world as kernels take them, and the free water around vehicles."""
+"""Solids of a described world in the layout of the kernels, and the free water around vehicles."""
 # mypy: disable-error-code="index,no-untyped-def,untyped-decorator,valid-type"
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ KINDS = ("box", "sphere", "capsule", "cylinder", "plane", "mesh", "heightfield")
 
 
 def layout_of(world: Any, worlds: int, device: wp.Device) -> Any:
-    """A layout with as many worlds, made if only a world or its name is there.
+    """Return the layout of a world in the given number of copies; create it if only a world or its name is given.
 
     Raises:
-        SimulatorError: It has another number of worlds, or is on another device.
+        SimulatorError: The layout has another number of worlds, or is on another device.
     """
     if isinstance(world, str | Path):
         world = described_world(world)
@@ -40,7 +40,7 @@ def layout_of(world: Any, worlds: int, device: wp.Device) -> Any:
 
 
 def pool_of(world: Any) -> RectangularPool | None:
-    """The basin of a world as walls and a floor; None if it has none."""
+    """Return the basin of a world as walls and a floor; None if the world has no basin."""
     if world.basin is None:
         return None
     length, width, depth = map(float, world.basin.size)
@@ -51,7 +51,7 @@ def pool_of(world: Any) -> RectangularPool | None:
 
 
 def solid_shapes(layout: Any) -> list[int]:
-    """Return the shapes of a layout, other than the basin, that vehicles collide with."""
+    """Return the indices of the shapes of a layout, other than the basin, that vehicles collide with."""
     return [
         k
         for k, shape in enumerate(layout.shapes)
@@ -60,15 +60,15 @@ def solid_shapes(layout: Any) -> list[int]:
 
 
 class WorldSolids:
-    """Shapes that a vehicle can collide with, other than the basin: the struct that kernels take, and its arrays."""
+    """Shapes that a vehicle can collide with, other than the basin: the struct for the kernels, and its arrays."""
 
     def __init__(self, layout: Any, vehicles: int, lightest: float) -> None:
-        """Take the shapes of a layout whose objects are solid.
+        """Collect the solid shapes of a layout.
 
         Args:
-            layout: Of the world.
-            vehicles: How many in each world.
-            lightest: Least mass along an axis of any of them, added mass included [kg].
+            layout: Layout of the world.
+            vehicles: Number of vehicles in each world.
+            lightest: Least mass of any vehicle along an axis, added mass included [kg].
         """
         device = layout.device
         chosen = solid_shapes(layout)
@@ -76,7 +76,7 @@ class WorldSolids:
         self.count = len(shapes)
         contact, solids = layout.world.contact, Solids()
         self.meshes: dict[int, wp.Mesh] = {}
-        """By the id of their vertices; kept alive for the kernels."""
+        """Meshes by the id of their vertices; kept alive for the kernels."""
         size, bound = np.array([shape.size for shape in shapes], np.float32).reshape(-1, 3), []
         for row, shape in zip(size, shapes, strict=True):
             a, b, c = map(float, shape.size)
@@ -117,7 +117,7 @@ class WorldSolids:
             contact.damping,
             contact.friction,
         )
-        # With an eighth of the mass on each point that touches: half a radian of its spring, a time constant.
+        # With an eighth of the mass on each contact point: half a radian of its oscillation, one time constant.
         quick = min(
             0.5 * math.sqrt(lightest / 8.0 / contact.stiffness), lightest / 8.0 / max(contact.damping, 1e-9)
         )
@@ -141,9 +141,8 @@ def refresh_clearing(
     control_step: float,
     world_offset: int,
 ):
-    """Search again for the nearest solids of vehicles that may leave their ball of free water in this control step.
-
-    `control_step` is its length [s].
+    """Update the nearest solids of vehicles that may leave their sphere of free water in this control step of
+    `control_step` [s].
     """
     i, v = wp.tid()
     w = world_offset + i

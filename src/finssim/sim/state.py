@@ -6,7 +6,7 @@ from finssim.physics.types import vec6, vec8
 from finssim.sim.packed import Packed
 
 HISTORY = 50
-"""Control steps that are kept to explain a world that was frozen."""
+"""Number of control steps that are stored to diagnose a frozen world."""
 
 vec13 = wp.types.vector(length=13, dtype=wp.float32)
 
@@ -19,18 +19,18 @@ class VehicleState:
     quaternion: wp.quat  # body to world, xyzw
     velocity: vec6  # nu, body frame [m/s, rad/s]
     acceleration: vec6  # nu_dot in this state, body frame [m/s², rad/s²]
-    coasting: vec6  # mean nu_dot of the last substep without thrust and contacts [m/s², rad/s²], extrapolated
+    coasting: vec6  # extrapolated: mean nu_dot of the last substep without thrust and contacts [m/s², rad/s²]
     pressed: vec6  # mean nu_dot of the last substep by contacts [m/s², rad/s²]
-    actuator: vec8  # lagged force [N] or propeller speed [rad/s]; of other actuators their value
-    thrust: vec8  # delivered by each thruster [N]; of other actuators their value [rad, m³ or m]
-    clearing: wp.vec4  # a ball without solids of the world: centre, world frame, and radius [m]
+    actuator: vec8  # lagged force [N] or propeller speed [rad/s]; value of other actuators
+    thrust: vec8  # thrust of each thruster [N]; value of other actuators [rad, m³ or m]
+    clearing: wp.vec4  # a sphere without solids of the world: centre, world frame, and radius [m]
 
 
 @wp.struct
 class State:
     """Views of the vehicles' states by (world, vehicle); clocks and status by world; delay line and history."""
 
-    vehicle: wp.array2d(dtype=VehicleState)  # the memory behind the nine views that follow
+    vehicle: wp.array2d(dtype=VehicleState)  # memory of the following nine views
     position: wp.array2d(dtype=wp.vec3)  # body origin, world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)  # body to world, xyzw
     velocity: wp.array2d(dtype=vec6)  # nu, body frame [m/s, rad/s]
@@ -41,12 +41,12 @@ class State:
     pressed: wp.array2d(dtype=vec6)  # mean nu_dot of the last substep by contacts [m/s², rad/s²]
     actuator: wp.array2d(dtype=vec8)  # lagged force [N] or propeller speed [rad/s]
     thrust: wp.array2d(dtype=vec8)  # delivered by each thruster [N]
-    clearing: wp.array2d(dtype=wp.vec4)  # a ball without solids: centre, world frame, and radius [m]
-    commands: wp.array3d(dtype=vec8)  # delay line: past commands [N], a ring over control steps
+    clearing: wp.array2d(dtype=wp.vec4)  # a sphere without solids: centre, world frame, and radius [m]
+    commands: wp.array3d(dtype=vec8)  # delay line: past commands [N], a ring buffer over control steps
     steps: wp.array(dtype=int)  # control steps since the world's reset
     episode: wp.array(dtype=int)  # resets so far
     broken: wp.array(dtype=int)  # 1: a number stopped being finite in this control step
-    frozen: wp.array(dtype=int)  # 1: the world has been frozen since that happened
+    frozen: wp.array(dtype=int)  # 1: the world is frozen since a number stopped being finite
     history: wp.array3d(
         dtype=vec13
     )  # (slot, world, vehicle): position [m], quaternion, velocity [m/s, rad/s]
@@ -56,7 +56,7 @@ def new_state(vehicles: Packed, slots: int) -> State:
     """Return the state of upright vehicles at the origin.
 
     Args:
-        vehicles: Memory of their `VehicleState`s, by (world, vehicle).
+        vehicles: Memory of the `VehicleState`s, by (world, vehicle).
         slots: Length of the delay line, in control steps.
     """
     shape, device = vehicles.array.shape, vehicles.array.device
@@ -95,7 +95,7 @@ def clear_actuators(state: State, mask: wp.array(dtype=int), world_offset: int):
 
 @wp.func
 def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
-    """True if every number of a state is finite.
+    """Return True if every number of a state is finite.
 
     Args:
         position: Body origin, world frame [m].
@@ -111,7 +111,7 @@ def is_finite(position: wp.vec3, q: wp.quat, nu: vec6) -> bool:
 
 @wp.func
 def snapshot(p: wp.vec3, q: wp.quat, nu: vec6) -> vec13:
-    """A row of the history: position, quaternion, velocity.
+    """Return a row of the history: position, quaternion, velocity.
 
     Args:
         p: Body origin, world frame [m].

@@ -1,4 +1,4 @@
-"""The physics kernel: one thread takes one vehicle through all substeps of a control step."""
+"""The physics kernel: one thread simulates one vehicle through all substeps of a control step."""
 
 import math
 from dataclasses import dataclass
@@ -72,12 +72,12 @@ from finssim.sim.midpoint import (
 )
 from finssim.sim.state import HISTORY, State, VehicleState, is_finite, snapshot, vec13
 
-# Thrusters: what the lag tends to, what it delivers, and the delay line's command.
+# Thrusters: target of the lag, delivered thrust, and the delayed command.
 
 
 @wp.func
 def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
-    """Force of each thruster [N] for the state of its lag."""
+    """Return the force of each thruster [N] for the state of its lag."""
     T = actuator
     if plant[w, v].speed_lag != 0:
         c_plus = plant[w, v].c_plus
@@ -89,7 +89,7 @@ def delivered_thrust(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int,
 
 @wp.func
 def lag_target(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, force: vec8) -> vec8:
-    """Return the value that the lag approaches for a force command: the force, or the propeller speed that gives it.
+    """Return the steady state of the lag for a force command: the force, or the propeller speed that produces it.
 
     Args:
         plant: Parameters.
@@ -120,20 +120,20 @@ def delayed_command(
     h: float,
     rate: float,
 ) -> vec8:
-    """Mean of the delayed command over the coming substep.
+    """Return the mean of the delayed command over the next substep.
 
     Args:
         commands: The delay line [N], by world, vehicle and slot.
         w: World.
         v: Vehicle.
-        head: Slot of the delay line that holds the newest command.
+        head: Slot of the newest command in the delay line.
         elapsed: Time since the newest command was issued [s].
-        delay: Of the command [s].
+        delay: Delay of the command [s].
         h: Substep [s].
-        rate: Commands a second [1/s].
+        rate: Commands per second [1/s].
 
     Returns:
-        Command in lag units; the exact mean, also when the delay ends inside the substep.
+        Command in lag units; the exact mean, also if the delay ends inside the substep.
     """
     age = delay - elapsed
     old = steps_ago(age, rate)
@@ -146,7 +146,7 @@ def delayed_command(
 
 @wp.func
 def slot_before(head: int, steps: int, slots: int) -> int:
-    """Slot of a ring that lies `steps` (fewer than `slots`) before its head."""
+    """Return the slot of a ring buffer that lies `steps` (fewer than `slots`) before its head."""
     slot = head - steps
     return wp.where(slot < 0, slot + slots, slot)
 
@@ -155,12 +155,12 @@ MODULE_OPTIONS = {
     "cpu_compiler_flags": "-march=native -ffp-contract=fast"
     " -mllvm=-inline-threshold=20000 -mllvm=-inline-cold-callsite-threshold=9000"
 }
-"""Warp's defaults, but with fused multiply-adds and no limit on the depth of SLP vectorisation: a quarter faster."""
+"""Warp's defaults, but with fused multiply-adds and no depth limit of SLP vectorisation: a quarter faster."""
 
 
 @wp.struct
 class Course:
-    """A vehicle on its way through the substeps of a control step."""
+    """State of a vehicle during the substeps of a control step."""
 
     start: wp.vec3  # body origin at the start of the control step, world frame [m]
     moved: (
@@ -171,11 +171,11 @@ class Course:
     actuator: vec8  # lagged force [N] or propeller speed [rad/s]
     coasting: vec6  # mean acceleration of the last substep without thrust and contacts [m/s², rad/s²]
     x_dot: wp.vec3  # rate of the position, world frame [m/s]
-    jerk: vec6  # by how much the last acceleration was another than expected [m/s², rad/s²]
+    jerk: vec6  # difference of the last acceleration from its extrapolation [m/s², rad/s²]
     pressed: vec6  # mean acceleration by contacts in the last substep [m/s², rad/s²]
-    greatest: float  # force of the dock so far [N]
-    impulse: float  # of the dock so far [N s]
-    clearing: wp.vec4  # a ball without solids: centre, world frame, and radius [m]
+    greatest: float  # greatest force of the dock so far [N]
+    impulse: float  # impulse of the dock so far [N s]
+    clearing: wp.vec4  # a sphere without solids: centre, world frame, and radius [m]
     struck: float  # greatest force of the world's solids so far [N]
 
 
@@ -187,12 +187,12 @@ class Vehicles:
     plant: wp.array2d(dtype=VehicleParameters)
     extra: wp.array3d(dtype=float)  # parameters of terms and actuators, each in its unit [-]
     shared: wp.array(dtype=int)  # 1: all worlds have equal parameters
-    way: wp.array2d(dtype=int)  # through a block of worlds in the last step; -1: outside blocks
+    way: wp.array2d(dtype=int)  # position in a block of worlds in the last step; -1: not in a block
 
 
 @wp.struct
 class Obstacles:
-    """Everything that a vehicle can bump into."""
+    """Everything that a vehicle can collide with."""
 
     walls: PoolWalls
     funnel: Funnel
@@ -211,15 +211,15 @@ class SimSurroundings:
 
 @wp.struct
 class Instant:
-    """A state of a vehicle, and what acts on it, in which the equation of motion is evaluated."""
+    """A state of a vehicle and its loads, at which the equation of motion is evaluated."""
 
     position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat  # body to world
     velocity: vec6  # nu, body frame [m/s, rad/s]
     before: vec6  # nu at the start of the substep [m/s, rad/s]
-    thrust: vec8  # of each thruster [N]; of other actuators their value
+    thrust: vec8  # thrust of each thruster [N]; value of other actuators
     pushed: vec6  # acceleration by that thrust, submerged [m/s², rad/s²]
-    other: vec6  # wrench of everything else from outside, body frame [N, N m]
+    other: vec6  # wrench of all other external loads, body frame [N, N m]
     t: float  # time since the reset [s]
     t_step: float  # time since the start of the control step [s]
     h: float  # substep [s]
@@ -236,7 +236,7 @@ class Rates:
 
 @wp.struct
 class Beat:
-    """The control step that is being made."""
+    """The current control step."""
 
     step: int  # number since the reset
     head: int  # slot of its command in the delay line
@@ -246,16 +246,16 @@ class Beat:
 
 @wp.struct
 class Lagged:
-    """Actuators in a substep."""
+    """Actuators during a substep."""
 
-    after: vec8  # lagged force [N] or propeller speed [rad/s] at its end
-    thrust: vec8  # mean of each thruster [N]; of other actuators their value
+    after: vec8  # lagged force [N] or propeller speed [rad/s] at the end of the substep
+    thrust: vec8  # mean thrust of each thruster [N]; value of other actuators
     pushed: vec6  # acceleration by that thrust, submerged [m/s², rad/s²]
 
 
 @dataclass(frozen=True)
 class Features:
-    """Parts of a simulation for which its kernel is compiled: code for what is not there is left out."""
+    """Features of a simulation for which its kernel is compiled; code for absent features is omitted."""
 
     model: str
     """A key of `HYDRODYNAMICS`."""
@@ -264,23 +264,23 @@ class Features:
     water_moving: bool = True
     """True with currents or waves."""
     walls: bool = True
-    """True with a pool to bump into."""
+    """True with the walls of a pool."""
     tether: bool = True
     speed_lag: bool = True
-    """True if some vehicle's motors lag in speed rather than in force."""
+    """True if the lag of any vehicle's motors is in speed rather than in force."""
     terms: tuple[Item, ...] = ()
-    """Terms and actuators that some vehicle has, in the order of the rows of their parameters."""
+    """Terms and actuators of any vehicle, in the order of the rows of their parameters."""
     funnel: bool = False
-    """True with a dock to enter."""
+    """True with a dock."""
     solids: bool = False
-    """True with a world with solids to bump into."""
+    """True with a world that has solids."""
     play: bool = False
-    """True if some actuator has play."""
+    """True if any actuator has play."""
     lanes: bool = False
-    """True if worlds go in blocks of `LANES`, on a processor; see `finssim.physics.lanes`."""
+    """True if worlds are processed in blocks of `LANES`, on a CPU; see `finssim.physics.lanes`."""
 
     parts: int = 1
-    """Steps of contacts in a substep, of blocks of worlds near walls."""
+    """Number of contact steps in a substep, of blocks of worlds near walls."""
 
     @property
     def runge_kutta(self) -> bool:
@@ -289,13 +289,13 @@ class Features:
 
     @property
     def contacts(self) -> bool:
-        """Return whether there is anything to bump into."""
+        """Return whether there is anything to collide with."""
         return self.walls or self.funnel or self.solids
 
 
 @cache
 def relaxation_function(model: str, terms: tuple[Item, ...] = ()) -> Any:
-    """Return the Warp function of θ of the midpoint rule, by which damping takes velocity away implicitly.
+    """Return the Warp function of θ of the midpoint rule, which makes damping implicit.
 
     Args:
         model: A key of `HYDRODYNAMICS`.
@@ -308,7 +308,7 @@ def relaxation_function(model: str, terms: tuple[Item, ...] = ()) -> Any:
         vehicles: Vehicles, hull: HullMesh, water: WaterArrays, w: int, v: int, body: Afloat, thrust: vec8,
         share: vec6,
     ) -> vec6:  # fmt: skip
-        """θ [-] of each axis by all of the damping, of which a vehicle has some share [-] at the surface."""
+        """Return θ [-] of each axis by all of the damping, scaled by the fraction `share` [-] at the surface."""
         plant = vehicles.plant
         extra = vehicles.extra
         relaxation = vec6()
@@ -345,10 +345,10 @@ def motion_function(
 
     Args:
         model: A key of `HYDRODYNAMICS`.
-        runge_kutta: Whether the integrator is `rk4`, which needs no relaxation.
-        water_moving: Whether there are currents or waves.
-        tethered: Whether there is a tether.
-        terms: Terms and actuators that some vehicle has, in the order of the rows of their parameters.
+        runge_kutta: True if the integrator is `rk4`, which needs no relaxation.
+        water_moving: True if there are currents or waves.
+        tethered: True if there is a tether.
+        terms: Terms and actuators of any vehicle, in the order of the rows of their parameters.
     """
     hydrodynamic_wrench, relaxed_by = HYDRODYNAMICS[model], relaxation_function(model, terms)
     term_wrench, actuator_wrench, mass_shift = (composed(terms, kind) for kind in ("wrench", "push", "shift"))
@@ -359,17 +359,19 @@ def motion_function(
         vehicles: Vehicles, hull: HullMesh, water: WaterArrays, tether: wp.array2d(dtype=Tether), w: int, v: int,
         moment: Instant,
     ) -> StateDerivative:  # fmt: skip
-        """Acceleration from the equation of motion, with nu_r = nu - [v_c; 0] and the water's v_c in the body frame.
+        """Return the acceleration by the equation of motion, with nu_r = nu - [v_c; 0] and v_c the current in body
+        axes.
 
         (M_RB + s M_A) nu_dot = tau_model + s tau_thrust + tau_other - C_RB(nu) nu - s C_A(nu_r) nu_r
                                 + s M_A d(nu_c)/dt + tau_FK - [s_dot]_+ M_A nu_r
 
-        Solved with M_RB + s M_A together: as an applied force, added mass diverges once M_A exceeds M_RB. Both Coriolis
-        terms share ω, so C_RB(nu) nu + s C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A].
+        It is solved for M_RB + s M_A together: as an applied force, added mass diverges once M_A exceeds M_RB. Both
+        Coriolis terms share ω, so C_RB(nu) nu + s C_A(nu_r) nu_r is that of the summed momentum less [0; v_c × p_A].
 
-        Propellers push, and water moves along, in proportion to the wet part s of the vehicle. Where s grows, momentum
-        is shared with more water (von Kármán 1929); where it falls, the water keeps what it has: neither adds energy.
-        That term is taken at the middle of a substep h that starts with nu_start, implicitly: M_A sets no limit to h.
+        Thrust and added mass are proportional to the wet fraction s of the vehicle. When s increases, momentum is
+        shared with more water (von Kármán 1929); when it decreases, the detached water keeps its momentum: neither adds
+        energy. That term is evaluated implicitly at the middle of a substep h that starts with nu_start, so M_A does
+        not limit h.
         """
         out = StateDerivative()
         plant = vehicles.plant
@@ -429,7 +431,7 @@ def motion_function(
         if wp.static(tethered):
             tau += tether_wrench(tether[w, v], water.density, position, q, nu, flow.velocity)
         tau -= coriolis_wrench(momentum, nu)
-        # The drag of the wet faces of a mesh is all there before much of its volume is wet.
+        # The drag of the wet faces of a mesh acts fully before much of its volume is wet.
         damped = wet.wet
         if wp.static(model == "mesh"):
             damped = wp.where(wet.wet > 0.0, 1.0, 0.0)
@@ -458,7 +460,7 @@ def motion_function(
 
 @cache
 def thrust_function(speed_lag: bool) -> Any:
-    """Return the Warp function of the thrusts of lagged actuators, without speeds where no motor lags in speed."""
+    """Return the Warp function of the thrusts of lagged actuators, without speeds if no motor's lag is in speed."""
 
     @wp.func
     def thrust_of(plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, actuator: vec8) -> vec8:
@@ -471,14 +473,14 @@ def thrust_function(speed_lag: bool) -> Any:
 
 @cache
 def contact_function(walls: bool, funnel: bool, solids: bool) -> Any:
-    """Return the Warp function of the wrench of what a vehicle can bump into."""
+    """Return the Warp function of the contact wrench of a vehicle."""
 
     @wp.func
     def contact_at(
         plant: wp.array2d(dtype=VehicleParameters), obstacles: Obstacles, clearing: wp.vec4, w: int, v: int,
         position: wp.vec3, q: wp.quat, nu: vec6,
     ) -> Touch:  # fmt: skip
-        """Wrench of walls, dock and solids, and the sizes of the forces of the latter two."""
+        """Return the wrench of walls, dock and solids, and the magnitudes of the forces of the latter two."""
         out = Touch()
         if wp.static(walls):
             out.tau = contact_wrench(obstacles.walls, position, q, nu, plant[w, v].half_size)
@@ -505,7 +507,7 @@ def lag_function(speed_lag: bool, play: bool) -> Any:
         commands: wp.array3d(dtype=vec8), plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, beat: Beat,
         k: int, actuator: vec8,
     ) -> Lagged:  # fmt: skip
-        """Actuators in substep k: their values after it, and the thrusts of their mean."""
+        """Return the actuators in substep k: their values at its end, and the thrusts of their mean values."""
         out = Lagged()
         max_change = beat.h * plant[w, v].slew
         elapsed = float(wp.max(k, 0)) * beat.h
@@ -524,7 +526,7 @@ def lag_function(speed_lag: bool, play: bool) -> Any:
 
 @cache
 def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
-    """Return the Warp function of what masses that move within a vehicle do to it; None without such masses."""
+    """Return the Warp function of the recoil of masses that move within a vehicle; None without such masses."""
     carried, mass_shift = composed(terms, "carry"), composed(terms, "shift")
     if carried is None or mass_shift is None:
         return None
@@ -532,18 +534,19 @@ def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
 
     @wp.func
     def carrying(plant: VehicleParameters, shift: vec9) -> mat66:
-        """Mass matrix of the submerged vehicle, from the change of its first moment and inertia [kg m, kg m²]."""
+        """Return the mass matrix of the submerged vehicle, from the change of its first moment and inertia [kg m,
+        kg m²]."""
         r_g = plant.r_g + wp.vec3(shift[0], shift[1], shift[2]) / plant.mass
         return mass_matrix(plant.mass, r_g, plant.inertia + symmetric_inertia(shift), plant.M_A)
 
     @wp.func
     def recoiled(vehicles: Vehicles, density: float, w: int, v: int, before: vec8, course: Course) -> Course:
-        """The course once the masses have moved from where they were `before`, at equal momentum.
+        """Return the course after the masses have moved from their positions `before`, with conserved momentum.
 
         d = -M⁻¹ (c - c_before),   π = M_before nu,   nu' = M⁻¹ (π - C(d) π)
 
-        The body goes by d, where c's rate is the masses' momentum relative to the body. nu is the body's velocity when
-        they stand still: M nu is the momentum of all.
+        The body is displaced by d, where the rate of c is the masses' momentum relative to the body. nu is the body's
+        velocity when the masses are at rest: M nu is the total momentum.
         """
         out = course
         q, nu, plant = course.quaternion, course.velocity, vehicles.plant[w, v]
@@ -567,7 +570,7 @@ def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
 
 @cache
 def rates_function(features: Features) -> Any:
-    """Return the Warp function of the rates of a state, for the rule of Runge and Kutta."""
+    """Return the Warp function of the rates of a state, for the Runge-Kutta method."""
     motion_at = motion_function(features.model, True, features.water_moving, features.tether, features.terms)
     contact_at = contact_function(features.walls, features.funnel, features.solids)
     contacts = features.contacts
@@ -577,7 +580,7 @@ def rates_function(features: Features) -> Any:
         vehicles: Vehicles, around: SimSurroundings, clearing: wp.vec4, w: int, v: int, start: Instant, h: float,
         rates: Rates,
     ) -> Rates:  # fmt: skip
-        """Rates of the state that is a time h [s] on from another, at given rates."""
+        """Return the rates of the state that is a time h [s] after the start, at the given rates."""
         out = Rates()
         on = Instant()
         on.position = start.position + h * rates.x_dot
@@ -604,7 +607,7 @@ def rates_function(features: Features) -> Any:
 
 @cache
 def runge_kutta_function(features: Features) -> Any:
-    """Return the Warp function of one substep by the rule of Runge and Kutta."""
+    """Return the Warp function of one substep of the Runge-Kutta method."""
     rates_at = rates_function(features)
     contact_at = contact_function(features.walls, features.funnel, features.solids)
     lag_at, contacts = lag_function(features.speed_lag, features.play), features.contacts
@@ -614,7 +617,7 @@ def runge_kutta_function(features: Features) -> Any:
         commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
         k: int, course: Course,
     ) -> Course:  # fmt: skip
-        """The course after substep k."""
+        """Return the course after substep k."""
         out = Course()
         h = beat.h
         q = course.quaternion
@@ -640,7 +643,7 @@ def runge_kutta_function(features: Features) -> Any:
             out.impulse = course.impulse + h * touch.push
             out.struck = wp.max(course.struck, touch.strike)
         rates, mean = Rates(), Rates()
-        # Warp unrolls loops over constants: four copies of the equation of motion would compile and run more slowly.
+        # Warp unrolls loops over constants: four copies of the equation of motion would be slower to compile and run.
         stages = int(4)
         for stage in range(stages):
             outer = stage == 0 or stage == 3
@@ -667,7 +670,7 @@ def runge_kutta_function(features: Features) -> Any:
 
 @cache
 def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
-    """Return the Warp function of a substep of the midpoint rule beside what a vehicle can bump into."""
+    """Return the Warp function of a substep of the midpoint rule near something that a vehicle can collide with."""
     contact_at = contact_function(walls, funnel, solids)
     contact_step = DOCK_STEP if funnel else WALL_STEP
 
@@ -682,7 +685,7 @@ def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
         nu_dot: vec6,
         course: Course,
     ) -> Course:
-        """The course after a substep [s] of a vehicle that may touch something, in shorter steps."""
+        """Return the course after a substep [s] of a vehicle that may be in contact, in shorter steps."""
         out = Course()
         out.start = course.start
         out.clearing = course.clearing
@@ -729,7 +732,7 @@ def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
 
 @cache
 def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
-    """Return the Warp function that checks whether a vehicle may touch something within a substep."""
+    """Return the Warp function that checks whether a vehicle may come into contact within a substep."""
 
     @wp.func
     def is_near(
@@ -741,8 +744,9 @@ def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
         guess: vec6,
         course: Course,
     ) -> bool:
-        """Return True if a vehicle could reach something in a substep h [s], at a guess of its acceleration."""
-        near = bool(False)  # a variable, which Warp lets a branch change
+        """Return True if a vehicle could touch something within a substep h [s], at an estimate of its
+        acceleration."""
+        near = bool(False)  # a variable, because Warp only lets branches change variables
         nu = course.velocity
         turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
         slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
@@ -770,7 +774,7 @@ def midpoint_function(features: Features) -> Any:
         commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
         k: int, course: Course,
     ) -> Course:  # fmt: skip
-        """The course after substep k; -1 only looks ahead."""
+        """Return the course after substep k; -1 only computes the extrapolation."""
         out = Course()
         h = beat.h
         q = course.quaternion
@@ -783,8 +787,9 @@ def midpoint_function(features: Features) -> Any:
         if wp.static(contacts):
             half_size = vehicles.plant[w, v].half_size
             near = is_near(around.obstacles, w, position, h, half_size, guess, course)
-        # What leans on a wall does not fall through it, and the water must not feel that it did. A wall's push is
-        # expected to stop a vehicle at most: expected to throw it back, it would feed on itself. A dock's is short.
+        # A vehicle that leans on a wall does not fall through it, so the water's forces must not include such a fall.
+        # The predicted push of a wall stops a vehicle at most: a predicted rebound would amplify itself. A dock's push
+        # is short.
         lead = h * lead_of(nu, h)
         nu_middle = nu + lead * guess
         push_ahead = lead * course.pressed
@@ -835,12 +840,12 @@ def midpoint_function(features: Features) -> Any:
 
 @cache
 def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
-    """Return the Warp functions that start the course of a control step and that write down where it ended."""
+    """Return the Warp functions that start the course of a control step and that write its final state."""
     thrust_of = thrust_function(speed_lag)
 
     @wp.func
     def set_out(state: State, vehicles: Vehicles, w: int, v: int, head: int) -> Course:
-        """Start the course of a control step, with the newest command in the delay line."""
+        """Return the course at the start of a control step, with the newest command in the delay line."""
         out = Course()
         plant = vehicles.plant
         newest = admissible(
@@ -866,7 +871,7 @@ def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
     def arrive(
         state: State, vehicles: Vehicles, around: SimSurroundings, w: int, v: int, slot: int, course: Course
     ):
-        """Write down where the vehicle has come to, unless a number stopped being finite."""
+        """Write the final state of the vehicle, unless a number stopped being finite."""
         position = course.start + course.moved
         q = wp.normalize(course.quaternion)
         state.history[slot, w, v] = snapshot(position, q, course.velocity)
@@ -896,11 +901,11 @@ def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
 def physics_kernel(features: Features) -> wp.Kernel:
     """Return the kernel of one control step.
 
-    It is over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), and takes the number of
-    the slice's worlds before its offset.
+    It is launched over (worlds of the slice, vehicles); with lanes over (blocks of the slice, vehicles), with the
+    number of the slice's worlds as the argument before its offset.
 
     Args:
-        features: Parts of the simulation.
+        features: Features of the simulation.
     """
     runge_kutta, solids = features.runge_kutta, features.solids
     substep = (runge_kutta_function if runge_kutta else midpoint_function)(features)
@@ -917,7 +922,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
         w: int,
         v: int,
     ):
-        """One control step of one vehicle."""
+        """Simulate one control step of one vehicle."""
         beat = Beat()
         beat.step = state.steps[w]
         beat.control_step = control_step
@@ -936,7 +941,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
         course = set_out(state, vehicles, w, v, beat.head)
         first = int(0)
         if wp.static(not runge_kutta):
-            # The first substep of an episode has nothing to extrapolate: it is taken twice, and -1 only looks ahead.
+            # The first substep of an episode has nothing to extrapolate: it is computed twice, at first without motion.
             first = wp.where(beat.step == 0, -1, 0)
         for k in range(first, substeps):
             after = substep(state.commands, vehicles, around, w, v, beat, k, course)
@@ -984,21 +989,21 @@ def physics_kernel(features: Features) -> wp.Kernel:
 
 
 MOST_PARTS = 4
-"""Steps of contacts in a substep that are traced one after the other."""
+"""Greatest number of contact steps in a substep that are traced one after the other."""
 SUBMERGED = {
     "position": (0.0, 0.0, -5.0),
     "quaternion": (0.0, 0.0, 0.0, 1.0),
     "clearing": (0.0, 0.0, -5.0, 1e3),
 }
-"""Example of a state, in which the vehicle is under water, far from everything."""
+"""Example of a state: the vehicle is submerged, far from all obstacles."""
 WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
-"""Example of a pool, whose walls are far away."""
+"""Example of a pool with distant walls."""
 
 
 def lane_blocks(set_out: Any, substep: Any, arrive: Any, term_numbers: int, parts: int) -> Any:
-    """A native function that takes a group of worlds through a control step, traced from the functions for one.
+    """Return a native function that simulates a group of worlds for a control step, traced from the functions for one.
 
-    Worlds are left out whose episode has just begun, that are frozen, whose command is not finite, or that are near a
+    It excludes worlds whose episode has just begun, that are frozen, whose command is not finite, or that are near a
     solid.
     """
     trace = Trace()
@@ -1023,7 +1028,7 @@ def lane_blocks(set_out: Any, substep: Any, arrive: Any, term_numbers: int, part
         tether=StructArray(trace, "tether", Tether, {}),
     )
     step, head, slot = (trace.symbol("I", name, 2) for name in ("step", "head", "place"))
-    # A substep in which a contact takes so many parts.
+    # Substep length for which a contact takes this many parts.
     h = trace.symbol("F", "h", (parts - 0.5) * WALL_STEP)
     control_step = trace.symbol("F", "control", 0.1)
     for number in command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers:
@@ -1077,7 +1082,7 @@ const F control = all(control_step), h = all(control_step / (float)substeps);
 
 @wp.kernel(enable_backward=False)
 def tick(state: State, world_offset: int):
-    """Close the control step: count it, and freeze the worlds in which a number stopped being finite."""
+    """Finish the control step: count it, and freeze the worlds in which a number stopped being finite."""
     w = world_offset + wp.tid()
     if state.frozen[w] != 0:
         return

@@ -1,4 +1,4 @@
-"""Moving water of a site: currents, profiles of depth and time, regular waves and sea states. Plain data."""
+"""Moving water of a site: currents, profiles over depth and time, regular waves and sea states. Plain data."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ __all__ = ["CurrentProfile", "SeaState", "Water", "Wave", "load_water", "read_pr
 Array = NDArray[np.float64]
 
 MOST_ROWS = 100_000
-"""Most rows of a table of a current."""
+"""Greatest number of rows in a current table."""
 FASTEST = 10.0
 """Greatest speed of a current [m/s]."""
 DEEP = 1e6
 """Depth of deep water: no wave reaches its floor [m]."""
 COLUMNS = {"depth": "depth", "time": "time", "t": "time", "east": "east", "north": "north", "up": "up"}
-"""Column of a table of a current -> its meaning: depth [m], time [s], velocities [m/s]."""
+"""Column of a current table -> its meaning: depth [m], time [s], velocities [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,8 @@ class Wave:
 
 @dataclass(frozen=True, kw_only=True)
 class CurrentProfile:
-    """Current over depth and time, linear between the given ones and constant beyond them; the same everywhere."""
+    """Current over depth and time, linearly interpolated and constant outside the table; uniform in the horizontal
+    plane."""
 
     depths: tuple[float, ...] = (0.0,)
     """Depths, ascending [m]."""
@@ -85,13 +86,13 @@ class CurrentProfile:
 
 
 def read_profile(path: str | Path) -> CurrentProfile:
-    """Read the table of a current: columns depth [m], time [s], east, north and up [m/s], in any order.
+    """Read a current table: columns depth [m], time [s], east, north and up [m/s], in any order.
 
-    Columns of depth, time and up may be left out; there is a row for each pair of a depth and a time.
+    The columns depth, time and up are optional; there is one row for each pair of a depth and a time.
 
     Raises:
-        SurroundingsError: The table cannot be read, has an unknown column, a cell that is no number, or a pair of a
-            depth and a time without a row or with two.
+        SurroundingsError: The table cannot be read, has an unknown column or a cell that is not a number, or has no row
+            or two rows for a pair of a depth and a time.
     """
     table = read_text_table(path, SurroundingsError)
     names = [COLUMNS.get(name.strip().lower(), "") for name in table.names]
@@ -130,11 +131,11 @@ def read_profile(path: str | Path) -> CurrentProfile:
 
 @dataclass(frozen=True, kw_only=True)
 class SeaState:
-    """Waves of a spectrum, with a spread of their directions: components of equal energy, drawn once by a seed.
+    """Waves of a spectrum, with directional spreading: components of equal energy, drawn once from a seed.
 
     S(w) = w^-5 exp(-5/4 (wp/w)^4) g^exp(-(w/wp - 1)^2 / (2 s^2)), s = 0.07 below wp and 0.09 above it, scaled to
-    m0 = H^2 / 16 (Hasselmann et al., 1973); with g = 1 it is that of Pierson and Moskowitz. Directions are distributed
-    as cos^(2n) of half the angle from the heading, with n = 2 / spread^2 - 1.
+    m0 = H^2 / 16 (Hasselmann et al., 1973); g = 1 gives the Pierson-Moskowitz spectrum. The spreading function is
+    cos^(2n) of half the angle from the heading, with n = 2 / spread^2 - 1.
     """
 
     spectrum: Literal["jonswap", "pierson-moskowitz"]
@@ -149,9 +150,9 @@ class SeaState:
     peak: float = 3.3
     """Enhancement g of JONSWAP's peak [-]."""
     components: int = 24
-    """Number of waves; each costs time in every step."""
+    """Number of waves; each one slows down every step."""
     seed: int = 1
-    """Seed of phases, and of which direction belongs to which frequency."""
+    """Seed of phases, and of the assignment of directions to frequencies."""
 
     def __post_init__(self) -> None:
         require(
@@ -197,7 +198,7 @@ class SeaState:
 
 
 def sea_bands(spectrum: str, peak: float, spread: float, components: int) -> tuple[Array, Array]:
-    """Return the frequencies of bands of equal energy, in parts of the peak's, and their directions from the mean.
+    """Return relative frequencies of bands of equal energy, and their directions from the mean.
 
     Args:
         spectrum: Name of the spectrum.
@@ -206,7 +207,7 @@ def sea_bands(spectrum: str, peak: float, spread: float, components: int) -> tup
         components: Number of bands n.
 
     Returns:
-        Ratios of frequencies, ascending, and directions [rad], (n,) each: those with half of their band below them.
+        Ratios of frequencies to that of the peak, ascending, and directions [rad], (n,) each: the median of each band.
     """
     x = np.linspace(0.4, 4.0, 4001)
     sigma = np.where(x <= 1.0, 0.07, 0.09)
@@ -232,14 +233,14 @@ def _kind(value: Any) -> str:
 Waves = Annotated[
     Annotated[Sequence[Wave], Tag("(list)")] | Annotated[SeaState, Tag("(one)")], Discriminator(_kind)
 ]
-"""Waves one by one, or a sea state."""
+"""A sequence of waves, or a sea state."""
 Current = Annotated[
     Annotated[tuple[float, float, float], Tag("(list)")]
     | Annotated[CurrentProfile, Tag("(one)")]
     | Annotated[Path, Tag("(file)")],
     Discriminator(_kind),
 ]
-"""Velocity [m/s], a profile of it over depth and time, or the table of one."""
+"""Velocity [m/s], its profile over depth and time, or the path of a current table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,20 +248,20 @@ class Water:
     """Moving water, the same in every world until it is randomised."""
 
     current: Current = (0.0, 0.0, 0.0)
-    """Velocity at the still surface, world frame [m/s]; or a profile over depth and time, or the table of one, which
-    becomes `profile`."""
+    """Velocity at the still surface, world frame [m/s]; or a profile over depth and time, or the path of a current
+    table, which becomes `profile`."""
     shear: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Change of the current with height, d(current)/dz [1/s]."""
     drift_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviation of the slowly drifting part [m/s]."""
+    """Standard deviation of the slowly drifting component [m/s]."""
     drift_time: float = 15.0
-    """Its correlation time [s]."""
+    """Correlation time of the drifting component [s]."""
     waves: Waves = ()
-    """Waves, one by one or of a spectrum."""
+    """Waves, as a sequence or of a spectrum."""
     depth: float | None = None
-    """Still water depth, for the waves [m]; None is that of the pool, and without a pool deep water."""
+    """Still water depth, for the waves [m]; if None that of the pool, or deep water without a pool."""
     profile: CurrentProfile | None = None
-    """Current over depth and time, which adds to `current`."""
+    """Current over depth and time, which is added to `current`."""
 
     def __post_init__(self) -> None:
         given = self.current
@@ -275,7 +276,7 @@ class Water:
         require(all(math.isfinite(x) for x in numbers), "water: every number must be finite")
         require(self.still_depth > 0.0, f"water: depth is {self.depth}, expected more than 0 m")
         require(min(self.drift_std) >= 0.0, "water: drift_std is a standard deviation, expected 0 or more")
-        _ = self.components  # refuses a sea that breaks
+        _ = self.components  # raises an error for a sea that breaks
 
     @property
     def uniform(self) -> tuple[float, float, float]:
@@ -285,17 +286,17 @@ class Water:
 
     @property
     def still_depth(self) -> float:
-        """Still water depth, of which deep water has a finite one [m]."""
+        """Still water depth [m]; a large finite value for deep water."""
         return DEEP if self.depth is None else self.depth
 
     @property
     def components(self) -> tuple[Wave, ...]:
-        """Waves one by one."""
+        """Individual waves."""
         return self.waves.waves(self.still_depth) if isinstance(self.waves, SeaState) else tuple(self.waves)
 
     @property
     def drifting(self) -> bool:
-        """True if the current has a random part that must be advanced every step."""
+        """True if the current has a random component that must be advanced in every step."""
         return any(x > 0.0 for x in self.drift_std) and self.drift_time > 0.0
 
     @property
@@ -308,14 +309,14 @@ class Water:
     def arrays(
         self, worlds: int, density: float, gravity: float, device: wp.Device, max_waves: int = 0
     ) -> WaterArrays:
-        """Return the same water for every world, as Warp arrays with room for `max_waves` more waves.
+        """Return the water as Warp arrays, equal in every world, with room for `max_waves` more waves.
 
         Args:
-            worlds: How many.
-            density: Of the water [kg/m³].
+            worlds: Number of worlds.
+            density: Density of the water [kg/m³].
             gravity: [m/s²].
-            device: Of the arrays.
-            max_waves: How many more.
+            device: Warp device of the arrays.
+            max_waves: Number of additional waves.
         """
 
         def full(value: object, dtype: object) -> wp.array:
@@ -364,10 +365,10 @@ class WaterFile(BaseModel):
 
 
 def load_water(path: str | Path) -> Water:
-    """Read a water file: the fields of `Water`; the table of a current is sought beside the file.
+    """Read a water file: the fields of `Water`; a current table is looked up in the folder of the file.
 
     Raises:
-        SurroundingsError: The file cannot be read, or has an unknown word or a value that is not possible.
+        SurroundingsError: The file cannot be read, or has an unknown key or an invalid value.
     """
     path = Path(path)
     tree = read_mapping(path, SurroundingsError, such_as="current: profile.csv")
@@ -378,7 +379,7 @@ def load_water(path: str | Path) -> Water:
 
 
 def beside(water: Any, folder: Path) -> Any:
-    """Return the content of a section of water with the table of its current sought in a folder."""
+    """Return a water section with the path of its current table resolved in a folder."""
     if isinstance(water, dict) and isinstance(water.get("current"), str):
         return {**water, "current": folder / water["current"]}
     return water

@@ -1,4 +1,4 @@
-"""Conversion of light to pixel values: reflection and loss in water, then charge, noise and digits."""
+"""Conversion of light to pixel values: reflection, attenuation in water, charge, noise and quantisation."""
 # mypy: ignore-errors
 
 import warp as wp
@@ -6,15 +6,15 @@ import warp as wp
 
 @wp.func
 def fresnel(cos_near: float, cos_far: float, n_near: float, n_far: float) -> float:
-    """Reflectance of a smooth dielectric surface for unpolarised light (Fresnel).
+    """Return the reflectance of a smooth dielectric surface for unpolarised light (Fresnel).
 
     R = (r_s² + r_p²) / 2;   at normal incidence ((n1 - n2) / (n1 + n2))².
 
     Args:
         cos_near: Cosine of the angle of incidence.
         cos_far: Cosine of the angle of refraction.
-        n_near: Index on the side of incidence.
-        n_far: Index on the other side.
+        n_near: Refractive index on the side of incidence.
+        n_far: Refractive index on the other side.
     """
     r_s = (n_near * cos_near - n_far * cos_far) / (n_near * cos_near + n_far * cos_far)
     r_p = (n_far * cos_near - n_near * cos_far) / (n_far * cos_near + n_near * cos_far)
@@ -27,8 +27,8 @@ def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
 
     Args:
         ray: Unit direction of the incident ray, any frame.
-        normal: Unit normal against it, same frame [-].
-        ratio: Index on its side over the index on the other, η.
+        normal: Unit normal against the ray, same frame [-].
+        ratio: Refractive index on the ray's side over the index on the other side, η.
     """
     c = -wp.dot(normal, ray)
     kappa = 1.0 - ratio * ratio * (1.0 - c * c)
@@ -39,7 +39,7 @@ def refracted(ray: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
 
 @wp.func
 def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: float) -> wp.vec3:
-    """Radiance after a way through water (Beer-Lambert, with veiling light).
+    """Return the radiance after a path through water (Beer-Lambert, with veiling light).
 
     L = L0 exp(-c s) + B (1 - exp(-c s))
 
@@ -48,7 +48,7 @@ def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: 
     Args:
         radiance: L0 at the start, (red, green, blue) [-].
         attenuation: c [1/m].
-        veil: B, radiance of water without end [-].
+        veil: B, radiance of infinitely deep water [-].
         path: s [m].
     """
     out = wp.vec3()
@@ -60,26 +60,27 @@ def through_water(radiance: wp.vec3, attenuation: wp.vec3, veil: wp.vec3, path: 
 
 @wp.struct
 class SensorLevels:
-    """How an image sensor makes numbers of radiance."""
+    """Conversion of radiance to pixel values by an image sensor."""
 
-    gain: float  # share of the full scale of radiance 1 [-]
+    gain: float  # fraction of full scale for radiance 1 [-]
     full_well: float  # charge at full scale [electrons]
-    read_noise: float  # standard deviation of reading out [electrons]
+    read_noise: float  # standard deviation of the read noise [electrons]
     gamma: float  # exponent of the encoding [-]
     noisy: wp.bool  # whether there is noise
 
 
 @wp.func
 def digitised_charge(charge: float, noise: float, sensor: SensorLevels) -> wp.uint8:
-    """The number a pixel reports, 0 to 255.
+    """Return the value that a pixel reports, 0 to 255.
 
     Args:
         charge: Mean charge [electrons].
         noise: A standard normal number, or zero.
-        sensor: Its full scale, noise and encoding.
+        sensor: Full scale, noise and encoding.
 
     Note:
-        Shot noise, of variance `charge` (photon transfer), is normal here instead of Poisson: alike above 20 electrons.
+        Shot noise, with variance `charge` (photon transfer), is modelled as normal instead of Poisson: the two are
+        alike above 20 electrons.
     """
     measured = charge + noise * wp.sqrt(charge + sensor.read_noise * sensor.read_noise)
     level = wp.clamp(measured / sensor.full_well, 0.0, 1.0)
@@ -97,7 +98,8 @@ def digitise(
     key: int,
     image: wp.array3d(dtype=wp.uint8),
 ):
-    """Numbers of a rectangle of the image from its radiance; noise depends on the key and the pixel alone."""
+    """Convert the radiance of a rectangle of the image to pixel values; noise depends only on the key and the
+    pixel."""
     i, j = wp.tid()
     row = first_row + i
     column = first_column + j
@@ -115,11 +117,11 @@ def digitise(
 
 
 def noise_key(seed: int, time: float) -> int:
-    """A 31-bit key of a picture's noise.
+    """Return a 31-bit key of a picture's noise.
 
     Args:
-        seed: Of the noise.
-        time: Of the picture [s]; it counts to the microsecond.
+        seed: Seed of the noise.
+        time: Time of the picture [s], resolved to the microsecond.
     """
     mixed = (seed * 0x9E3779B97F4A7C15 + round(time * 1e6) * 0xC2B2AE3D27D4EB4F + 0x165667B19E3779F9) % 2**64
     for shift in (30, 27):

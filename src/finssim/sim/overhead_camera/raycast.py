@@ -1,7 +1,8 @@
-"""The ray caster: each thread follows the rays of four pixels from the camera through the surface to what they meet.
+"""The ray caster: each thread traces the rays of four pixels from the camera through the surface to the first
+object.
 
-Everything is in the surface frame, in single precision: with the camera's foot as origin, coordinates of a few metres
-keep 0.001 px.
+Everything is in the surface frame, in single precision: with the origin below the camera, coordinates of a
+few metres resolve 0.001 px.
 """
 # mypy: ignore-errors
 
@@ -10,13 +11,13 @@ import warp as wp
 from finssim.sim.overhead_camera.photometry import fresnel, refracted, through_water
 from finssim.sim.overhead_camera.surface import Patch, SurfaceWave, distance_to, normal_of, surface_hit
 
-# What light meets in and around the pool: printed tags and the tiled basin, each for one ray.
+# Objects in and around the pool: printed tags and the tiled basin, each intersected with one ray.
 #
-# Texture is averaged over the ray's share of the pixel, a square of a given width, in closed form.
+# Texture is averaged over the ray's part of the pixel, a square of a given width, in closed form.
 
 
 NOTHING = wp.constant(1.0e9)
-"""Distance to what a ray does not meet [m]."""
+"""Distance to an object that a ray misses [m]."""
 
 BACK = wp.constant(0.45)
 """Reflectance of a tag's unprinted side."""
@@ -24,10 +25,10 @@ BACK = wp.constant(0.45)
 
 @wp.struct
 class Surfel:
-    """The first thing on a ray's way."""
+    """The first surface that a ray hits."""
 
     distance: float  # [m], NOTHING if there is none
-    radiance: wp.vec3  # radiance that it sends back [-]
+    radiance: wp.vec3  # reflected radiance [-]
 
 
 @wp.struct
@@ -59,13 +60,14 @@ class BasinData:
     joint: float  # [m]
     colour: wp.vec3  # reflectance of the tiles
     joint_colour: wp.vec3  # reflectance of the joints
-    variation: float  # share by which tiles differ
+    variation: float  # relative variation of the reflectance between tiles
     deck_colour: wp.vec3  # reflectance of the deck
 
 
 @wp.func
 def share(x: float, period: float, width: float, spread: float) -> float:
-    """Mean over [x - spread/2, x + spread/2] of stripes: 1 on [0, width) of every period, 0 elsewhere."""
+    """Return the mean over [x - spread/2, x + spread/2] of stripes: 1 on [0, width) of every period, 0
+    elsewhere."""
     a = (x - 0.5 * spread) / period
     b = (x + 0.5 * spread) / period
     w = width / period
@@ -75,13 +77,13 @@ def share(x: float, period: float, width: float, spread: float) -> float:
 
 @wp.func
 def printed(cells: wp.array(dtype=wp.uint8), tag: TagData, x: float, y: float, spread: float) -> float:
-    """Reflectance of a tag's print around a point, averaged over a square of at most one cell.
+    """Return the reflectance of a tag's print around a point, averaged over a square of at most one cell.
 
     Args:
         cells: Bitmaps of all tags, 1 for white.
         tag: The tag.
-        x: To the right of its middle [m].
-        y: Above its middle [m].
+        x: Coordinate to the right of the tag's middle [m].
+        y: Coordinate above the tag's middle [m].
         spread: Width of the square [m].
     """
     w = wp.clamp(spread / tag.cell, 1.0e-3, 1.0)
@@ -107,13 +109,13 @@ def printed(cells: wp.array(dtype=wp.uint8), tag: TagData, x: float, y: float, s
 
 @wp.func
 def near_ray(origin: wp.vec3, ray: wp.vec3, centre: wp.vec3, radius: float) -> bool:
-    """Return whether a ray passes a sphere.
+    """Return whether a ray hits a sphere.
 
     Args:
-        origin: Of the ray, surface frame [m].
+        origin: Origin of the ray, surface frame [m].
         ray: Its unit direction.
-        centre: Of the sphere, surface frame [m].
-        radius: Of the sphere [m].
+        centre: Centre of the sphere, surface frame [m].
+        radius: Radius of the sphere [m].
     """
     to = centre - origin
     along = wp.dot(to, ray)
@@ -130,16 +132,16 @@ def meet_tag(
     angle: float,
     travelled: float,
 ) -> Surfel:
-    """Return the point where a ray meets a tag.
+    """Return the point where a ray hits a tag.
 
     Args:
         cells: Bitmaps of all tags.
         tag: The tag.
-        origin: Of the ray, surface frame [m].
+        origin: Origin of the ray, surface frame [m].
         ray: Its unit direction.
         t: Time as a fraction of the exposure, 0 to 1.
-        angle: Width of the ray's share of the pixel per distance travelled [rad].
-        travelled: Distance before the origin that counts for that width [m].
+        angle: Width of the ray's part of the pixel per distance travelled [rad].
+        travelled: Path length before the origin that adds to that width [m].
     """
     hit = Surfel()
     hit.distance = NOTHING
@@ -169,13 +171,13 @@ def meet_tag(
 
 @wp.func
 def tiles(basin: BasinData, x: float, y: float, face: int, spread: float) -> wp.vec3:
-    """Reflectance of tiles around a point of a face, coordinates and spread in metres."""
+    """Return the reflectance of tiles around a point of a face, coordinates and spread in metres."""
     if basin.tile <= 0.0:
         return basin.colour
     column = int(wp.floor(x / basin.tile))
     row = int(wp.floor(y / basin.tile))
     key = wp.rand_init(face * 7919 + column, row)
-    # Tiles far smaller than the ray's square average out.
+    # Tiles far smaller than the averaging square have no visible variation.
     visible = wp.clamp(basin.tile / wp.max(spread, 1.0e-6) - 1.0, 0.0, 1.0)
     joint_x = share(x, basin.tile, basin.joint, spread)
     joint_y = share(y, basin.tile, basin.joint, spread)
@@ -196,14 +198,14 @@ def on_deck(basin: BasinData, p: wp.vec3) -> bool:
 
 @wp.func
 def meet_basin(basin: BasinData, p: wp.vec3, d: wp.vec3, angle: float, travelled: float) -> Surfel:
-    """Return the point where a ray from inside leaves the basin.
+    """Return the point where a ray from inside hits the basin.
 
     Args:
         basin: The tiled box.
         p: Origin of the ray, basin axes [m].
         d: Its unit direction, basin axes.
-        angle: Width of the ray's share of the pixel per distance travelled [rad].
-        travelled: Distance before p that counts for that width [m].
+        angle: Width of the ray's part of the pixel per distance travelled [rad].
+        travelled: Path length before p that adds to that width [m].
     """
     hit = Surfel()
     hit.distance = NOTHING
@@ -225,12 +227,12 @@ def meet_basin(basin: BasinData, p: wp.vec3, d: wp.vec3, angle: float, travelled
     return hit
 
 
-# A scene as the ray caster reads it.
+# The scene in the layout of the ray caster.
 
 
 @wp.struct
 class SceneData:
-    """All that rays can meet, surface frame."""
+    """Everything that rays can hit, surface frame."""
 
     camera_height: float  # above the still surface [m]
     index_near: float  # refractive index on the camera's side
@@ -239,7 +241,7 @@ class SceneData:
     layer_index: wp.array(dtype=float)  # refractive index of each layer
     waves: wp.array(dtype=SurfaceWave)
     attenuation: wp.vec3  # [1/m]
-    veil: wp.vec3  # radiance of water without end [-]
+    veil: wp.vec3  # radiance of infinitely deep water [-]
     sky: float  # radiance of the sky [-]
     basin: BasinData
     tags: wp.array(dtype=TagData)
@@ -249,10 +251,11 @@ class SceneData:
 
 
 ON_TOP = wp.constant(1.0e-3)
-"""A tag this little behind a wall lies on it: stuck-on tags are given the same height [m]."""
+"""Distance behind a wall up to which a tag counts as lying on it: attached tags have the wall's coordinates
+[m]."""
 
 HORIZON = wp.constant(-1.0e-3)
-"""Rays that go down no steeper than this are left dark, as is what the lens does not see (zero)."""
+"""Vertical component above which rays are rendered dark, as are directions outside the lens' view (zero)."""
 
 
 @wp.struct
@@ -261,22 +264,22 @@ class RefractedRay:
 
     origin: wp.vec3  # [m]
     ray: wp.vec3  # unit direction; zero after total reflection
-    transmitted: float  # share of the light
+    transmitted: float  # transmitted fraction of the light
 
 
 @wp.func
 def meet_tags(
     scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float
 ) -> Surfel:
-    """The first tag on a ray.
+    """Return the first tag that a ray hits.
 
     Args:
-        scene: Holds the tags.
-        origin: Of the ray, surface frame [m].
+        scene: The scene with its tags.
+        origin: Origin of the ray, surface frame [m].
         ray: Its unit direction.
         t: Time as a fraction of the exposure, 0 to 1.
-        angle: Width of the ray's share of the pixel per distance travelled [rad].
-        travelled: Distance before the origin that counts for that width [m].
+        angle: Width of the ray's part of the pixel per distance travelled [rad].
+        travelled: Path length before the origin that adds to that width [m].
     """
     first = Surfel()
     first.distance = NOTHING
@@ -289,11 +292,11 @@ def meet_tags(
 
 @wp.func
 def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3) -> RefractedRay:
-    """A ray through the surface, or through the layers of a window, by Snell's and Fresnel's laws.
+    """Refract a ray through the surface, or through the layers of a window, by Snell's and Fresnel's laws.
 
     Args:
-        scene: Holds indices and layers.
-        origin: On the near face, surface frame [m].
+        scene: The scene with refractive indices and layers.
+        origin: Point on the near face, surface frame [m].
         ray: Unit direction in air.
         normal: Unit normal of the face towards the camera, surface frame [-].
     """
@@ -325,16 +328,16 @@ def enter_water(scene: SceneData, origin: wp.vec3, ray: wp.vec3, normal: wp.vec3
 def under_water(
     scene: SceneData, origin: wp.vec3, ray: wp.vec3, t: float, angle: float, travelled: float, tagged: bool
 ) -> wp.vec3:
-    """Radiance that reaches the surface from below [-].
+    """Return the radiance that reaches the surface from below [-].
 
     Args:
-        scene: What is there.
-        origin: Where the ray starts [m].
+        scene: The scene.
+        origin: Origin of the ray [m].
         ray: Its unit direction.
         t: Time as a fraction of the exposure.
-        angle: Width of the ray's share of the pixel per distance, in the water [rad].
-        travelled: Distance before that counts for that width [m].
-        tagged: Whether tags may be near.
+        angle: Width of the ray's part of the pixel per distance, in the water [rad].
+        travelled: Path length before the origin that adds to that width [m].
+        tagged: True if tags may be near.
     """
     p = scene.basin.R_bs * (origin - scene.basin.origin)
     hit = meet_basin(scene.basin, p, scene.basin.R_bs * ray, angle, travelled)
@@ -349,15 +352,15 @@ def under_water(
 def radiance_along(
     scene: SceneData, patch: Patch, ray: wp.vec3, t: float, angle: float, tagged: bool
 ) -> wp.vec3:
-    """Radiance that the camera receives from one direction at one moment [-].
+    """Return the radiance that the camera receives from one direction at one instant [-].
 
     Args:
-        scene: What is there.
+        scene: The scene.
         patch: The surface around the pixel.
         ray: Unit direction from the camera.
         t: Time as a fraction of the exposure.
-        angle: Width of the ray's share of the pixel [rad].
-        tagged: Whether tags may be near.
+        angle: Width of the ray's part of the pixel [rad].
+        tagged: True if tags may be near.
     """
     eye = wp.vec3(0.0, 0.0, scene.camera_height)
     after = (t - 0.5) * scene.shutter
@@ -384,15 +387,17 @@ def radiance_along(
 
 @wp.func
 def moment(i: int, j: int, n: int, start: float) -> float:
-    """When a ray of a pixel is sent, as a fraction of the exposure.
+    """Return the time at which a ray of a pixel is cast, as a fraction of the exposure.
 
-    Each of n² equal parts of the exposure gets one ray; the rays of a row, and of a column, are spread over all of it.
+    Each of n² equal intervals of the exposure has one ray; the rays of a row, and of a column, are spread
+    over all of it.
 
     Args:
         i: Column of the ray in its pixel.
         j: Row of the ray.
         n: Rays per row and column.
-        start: The pixel's own number in [0, 1): what the pattern gets wrong must not be the same along an edge.
+        start: Random offset of the pixel in [0, 1), which decorrelates the sampling error of neighbouring
+            pixels.
     """
     part = n * ((i + j) % n) + (i * (n // 3) + j * (n // 3 + 1)) % n
     t = (float(part) + 0.5) / float(n * n) + start
@@ -408,7 +413,7 @@ def pixel(
     row: int,
     column: int,
 ) -> wp.vec3:
-    """Mean radiance of a pixel. Arguments as of `cast`, with the surface around it."""
+    """Return the mean radiance of a pixel. Arguments as of `cast`, with the surface around the pixel."""
     a = corner_rays[row, column]
     b = corner_rays[row, column + 1]
     c = corner_rays[row + 1, column]
@@ -437,15 +442,17 @@ def cast(
     first_column: int,
     radiance: wp.array2d(dtype=wp.vec3),
 ):
-    """Mean radiance of the pixels of a rectangle; a thread takes a block of 2 x 2, whose rays share the surface's
-    Taylor series. Blocks start at even rows and columns, whatever the rectangle.
+    """Compute the mean radiance of the pixels of a rectangle.
+
+    Each thread renders a block of 2 x 2 pixels, whose rays share the surface's Taylor series. Blocks start at
+    even rows and columns, independently of the rectangle.
 
     Args:
-        scene: What is there.
-        corner_rays: Directions through the pixels' corners, zero where the lens sees nothing.
-        samples: Rays along each axis of each pixel; 0 for one ray that passes by all tags.
-        first_row: Of the rectangle.
-        first_column: Of the rectangle.
+        scene: The scene.
+        corner_rays: Directions through the pixels' corners, zero outside the lens' field of view.
+        samples: Rays along each axis of each pixel; 0 for one ray that ignores all tags.
+        first_row: First row of the rectangle.
+        first_column: First column of the rectangle.
         radiance: Result over the rectangle [-].
     """
     i, j = wp.tid()

@@ -1,4 +1,4 @@
-"""The overhead camera: pictures of a scene, complete or around the tags alone."""
+"""The overhead camera: pictures of a complete scene, or of the regions around the tags alone."""
 # mypy: disable-error-code="attr-defined,call-overload,no-untyped-call,index"
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from finssim.sim.overhead_camera.scene import (
 from finssim.sim.overhead_camera.surface import SurfaceWave, layout_of, pack_waves, waves_of
 from finssim.sim.sensors.batch import SensorError
 
-# Which pixels tags may touch: rectangles of the image, with room for ripples and motion.
+# Pixels that tags may affect: rectangles of the image, with margins for ripples and motion.
 
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Rectangle(NamedTuple):
     bottom: int
 
     def clipped(self, width: int, height: int) -> Rectangle:
-        """The part of it within an image."""
+        """Return the part of the rectangle within an image."""
         x0, top = min(max(self.left, 0), width), min(max(self.top, 0), height)
         return Rectangle(x0, top, max(min(self.right, width), x0), max(min(self.bottom, height), top))
 
@@ -54,15 +54,15 @@ class Rectangle(NamedTuple):
 
 _SQUARE = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)])
 BORDER = 2
-"""Pixels around a tag that its picture may touch, besides those of the lens' spot."""
+"""Margin around a tag that its picture may affect, besides the lens' spot [px]."""
 
 
 def rectangles(scene: Scene, tags: Sequence[TagInScene], steepest: float) -> list[Rectangle]:
-    """Return a rectangle around the image of each tag, or the complete image if there are no bounds.
+    """Return a rectangle around the image of each tag, or the complete image where the tag cannot be bounded.
 
     Args:
         scene: Camera and still surface.
-        tags: Whose.
+        tags: The tags.
         steepest: Bound on the slope of ripples [-].
     """
     if not tags:
@@ -83,7 +83,8 @@ def rectangles(scene: Scene, tags: Sequence[TagInScene], steepest: float) -> lis
 
 
 def merged(boxes: Iterable[Rectangle]) -> list[Rectangle]:
-    """Rectangles that cover the same pixels, with those that overlap joined while that costs few pixels more."""
+    """Return rectangles that cover the same pixels; overlapping ones are joined where that adds no more
+    pixels."""
     rest = [r for r in boxes if r.area > 0]
     done: list[Rectangle] = []
     while rest:
@@ -100,7 +101,7 @@ def merged(boxes: Iterable[Rectangle]) -> list[Rectangle]:
 
 
 def _corners(tag: TagInScene) -> Array:
-    """Corners of a tag at the start and the end of the exposure, pool frame, (8, 3)."""
+    """Return the corners of a tag at the start and the end of the exposure, pool frame, (8, 3)."""
     poses, half = (tag.pose, tag.end or tag.pose), tag.half_size
     return np.concatenate(
         [quat_rotate(x.orientation, half * _SQUARE) + np.asarray(x.position) for x in poses]
@@ -108,7 +109,7 @@ def _corners(tag: TagInScene) -> Array:
 
 
 def _seen(scene: Scene, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the image points of corners, on either side of the surface, and whether they have one."""
+    """Return the image points of corners, above or below the surface, and whether each is visible."""
     camera = scene.camera
     view = project(camera, scene.interface, corners)
     dry = view.status == Status.WRONG_SIDE
@@ -119,7 +120,7 @@ def _seen(scene: Scene, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _ripple_shift(scene: Scene, corners: Array, depth: Array, steepest: float) -> Array:
-    """Bound on how far ripples move the image of each tag [px]."""
+    """Return a bound on the displacement of each tag's image by ripples [px]."""
     camera, interface = scene.camera, scene.interface
     if steepest == 0.0:
         return np.zeros(len(depth))
@@ -131,11 +132,11 @@ def _ripple_shift(scene: Scene, corners: Array, depth: Array, steepest: float) -
     return np.asarray(focal * depth * bend / (distance.min(axis=1) * cosine))
 
 
-# A scene as the structs that the ray caster reads, on one device.
+# The scene as the structs that the ray caster reads, on one device.
 
 
 def pack_scene(scene: Scene, frame: SurfaceFrame, device: Any) -> SceneData:
-    """Everything but tags and waves, which change from picture to picture."""
+    """Return the struct of everything except tags and waves, which change from picture to picture."""
     data = SceneData()
     data.camera_height = frame.camera_height
     data.index_near, data.index_far = scene.interface.index_near, scene.interface.index_far
@@ -150,9 +151,9 @@ def pack_scene(scene: Scene, frame: SurfaceFrame, device: Any) -> SceneData:
 
 
 def on_device(table: NDArray[Any], dtype: Any, device: Any) -> wp.array[Any]:
-    """Return a contiguous table of any unit as Warp's array.
+    """Return a contiguous table of any unit as a Warp array.
 
-    On a CPU it shares the memory; Warp itself would look at it for 0.6 ms first.
+    On a CPU the array shares the memory; Warp's own constructor would inspect it for 0.6 ms first.
     """
     if not table.size:
         return wp.empty(table.shape, dtype=dtype, device=device)
@@ -174,7 +175,7 @@ def _tags(tags: Sequence[TagInScene], frame: SurfaceFrame) -> NDArray[Any]:
             row[position_field] = frame.point(pose.position)
             row[axes] = frame.quaternion(quat_to_matrix(pose.orientation))
         if np.dot(row["q_start"], row["q_end"]) < 0.0:
-            row["q_end"] *= -1.0  # the same axes, on the short way from the start
+            row["q_end"] *= -1.0  # the same axes, with the shorter rotation from the start
         row["moving"] = tag.end is not None
         row["cell"], row["half"] = tag.cell, tag.half_size
         row["cells"], row["offset"] = len(tag.bitmap), offset
@@ -200,7 +201,7 @@ Region = Rectangle | tuple[int, int, int, int]
 
 
 def sensor_levels(sensor: ImageSensor) -> SensorLevels:
-    """Return the numbers of an image sensor for the kernel that makes its pixel values."""
+    """Return the parameters of an image sensor for the kernel that computes its pixel values."""
     levels = SensorLevels()
     levels.gain, levels.full_well, levels.read_noise = sensor.gain, sensor.full_well, sensor.read_noise
     levels.gamma, levels.noisy = sensor.gamma, sensor.noise
@@ -210,15 +211,15 @@ def sensor_levels(sensor: ImageSensor) -> SensorLevels:
 class OverheadCamera:
     """A fixed camera above a pool.
 
-    Its pictures are a function of the scene, the tags, the time and the seed: the same on every call, and in every
-    region the same as in the complete picture.
+    Its pictures are a function of the scene, the tags, the time and the seed: identical on every call, and
+    identical in every region to the complete picture.
     """
 
     def __init__(self, scene: Scene, *, device: Any = "cpu") -> None:
-        """Compute what stays: the pixels' directions and the waves.
+        """Compute what is constant: the pixels' viewing directions and the waves.
 
         Args:
-            scene: What stands before the camera.
+            scene: Scene in front of the camera.
             device: Warp device.
 
         Raises:
@@ -243,15 +244,15 @@ class OverheadCamera:
         seed: int = 0,
         region: Literal["tags"] | Region | None = None,
     ) -> Image:
-        """One picture.
+        """Render one picture.
 
         Args:
-            tags: Those that move, besides the scene's.
+            tags: Moving tags, besides those of the scene.
             time: Middle of the exposure [s], for ripples and noise.
-            seed: Of the noise.
-            region: What to draw anew, as (left, top, right, bottom) in pixels with right and bottom excluded, or "tags"
-                for the neighbourhood of `tags`. The remainder is the background: the scene without them, at the time
-                and with the seed of the first such call. None draws everything.
+            seed: Seed of the noise.
+            region: Region to render, as (left, top, right, bottom) in pixels with right and bottom excluded,
+                or "tags" for the neighbourhood of `tags`. The remainder is the background: the scene without
+                them, at the time and with the seed of the first such call. None renders everything.
 
         Returns:
             (height, width) grey or (height, width, 3) red, green, blue.
@@ -274,7 +275,8 @@ class OverheadCamera:
         return np.asarray(image.numpy()).reshape(shape if sensor.colour else shape[:2])
 
     def radiance(self, *, time: float = 0.0, region: Region | None = None) -> NDArray[np.float32]:
-        """Mean radiance of every pixel of the scene before it becomes a number, (height, width, 3); white paper has 1.
+        """Return the mean radiance of every pixel before its digitisation, (height, width, 3); that of white
+        paper is 1.
 
         Args:
             time: Middle of the exposure [s].
@@ -284,7 +286,7 @@ class OverheadCamera:
         return np.asarray(self._cast(r, self._prepare(self.scene.tags, time)).numpy())
 
     def neighbourhood(self, tags: Sequence[TagInScene]) -> list[Rectangle]:
-        """The rectangles that `region="tags"` draws."""
+        """Return the rectangles that `region="tags"` renders."""
         return merged(self._rectangles(tags))
 
     def _clipped(self, region: Region) -> Rectangle:
@@ -296,7 +298,7 @@ class OverheadCamera:
         return rectangles(self.scene, tags, 0.0 if self._waves is None else self._waves.steepest)
 
     def _prepare(self, tags: Sequence[TagInScene], time: float) -> wp.array[Any]:
-        """Pack what changes; returns the rays per pixel, (height, width)."""
+        """Pack the tags and waves of a picture; return the rays per pixel, (height, width)."""
         self._data.tags = on_device(_tags(tags, self._frame), TagData, self.device)
         cells = [np.asarray(tag.bitmap, np.uint8).ravel() for tag in tags]
         self._data.cells = on_device(np.concatenate([*cells, np.zeros(0, np.uint8)]), wp.uint8, self.device)

@@ -1,7 +1,7 @@
-"""The scene before a fixed camera above a pool: basin, water, light and tags, as plain data.
+"""Scene in front of a fixed camera above a pool: basin, water, light and tags, as plain data.
 
-Everything is in the pool frame unless a line says otherwise. Radiance is relative: white paper in the pool's light
-has 1. Colours and water constants are triples (red, green, blue).
+Everything is in the pool frame unless stated otherwise. Radiance is relative: that of white paper in the
+pool's light is 1. Colours and water constants are triples (red, green, blue).
 """
 
 from __future__ import annotations
@@ -43,13 +43,14 @@ class TagInScene:
     bitmap: NDArray[np.bool_]
     """Cells as printed, row 0 at the top, column 0 at the left; true is white; (n, n)."""
     edge: float
-    """Between the corners that a detector reports [m]."""
+    """Distance between the corners that a detector reports [m]."""
     pose: ObjectPose
     """Pose at the start of the exposure."""
     end: ObjectPose | None = None
     """Pose at the end of the exposure; None for a tag at rest."""
     border_cells: int | None = None
-    """Cells along `edge`; None for all of the bitmap. Some families print cells outside the border too."""
+    """Cells along `edge`; all cells of the bitmap if None. Some families also print cells outside the
+    border."""
     margin: float = 0.0
     """White rim around the bitmap [m]."""
     white: float = 0.90
@@ -80,7 +81,7 @@ class TagInScene:
 
 @dataclass(frozen=True, kw_only=True)
 class TiledBasin:
-    """The pool's tiled inside, an upright box between two corners; around it lies the deck."""
+    """Tiled interior of the pool, an axis-aligned box between two corners; the deck surrounds it."""
 
     lower: Triple
     """Corner with the least coordinates [m]."""
@@ -97,7 +98,7 @@ class TiledBasin:
     variation: float = 0.05
     """Relative standard deviation of the reflectance from tile to tile."""
     deck_colour: Triple = (0.62, 0.60, 0.56)
-    """Reflectance of what lies around the pool."""
+    """Reflectance of the pool's surroundings."""
 
     def __post_init__(self) -> None:
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
@@ -108,14 +109,14 @@ class TiledBasin:
 
 @dataclass(frozen=True, kw_only=True)
 class WaterOptics:
-    """Water, which absorbs and adds light on the way from an object to the surface: L = L0 exp(-c s) + B (1 - exp(-c
-    s))."""
+    """Water that absorbs light from an object to the surface and adds veiling light: L = L0 exp(-c s) + B (1
+    - exp(-c s))."""
 
     attenuation: Triple = (0.40, 0.10, 0.08)
     """Beam attenuation c [1/m]. Pure water absorbs 0.35 of red, 0.06 of green and 0.01 of blue; a filtered pool
     scatters some 0.05 to 0.1 more."""
     veil: Triple = (0.10, 0.28, 0.33)
-    """Radiance B of water without end [-]: backscattered light."""
+    """Radiance B of infinitely deep water [-]: backscattered light."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +127,10 @@ class Ripples:
     """Root mean square of the surface's slope |∇h| [-]. Still indoor water has below 0.005, a pool in use 0.02 to
     0.06."""
     wavelengths: tuple[float, float] = (0.08, 0.60)
-    """Shortest and longest [m]."""
+    """Shortest and longest wavelength [m]."""
     waves: int = 16
-    """Number of sines; their wavelengths are spread evenly on a logarithmic scale and share the mean square slope."""
+    """Number of sines; their wavelengths are evenly spaced on a logarithmic scale and share the mean square
+    slope equally."""
     seed: int = 0
     """Seed of wavelengths, headings and phases."""
 
@@ -143,7 +145,7 @@ class Ripples:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageSensor:
-    """Conversion of light to numbers. All pixels are exposed together, centred on the requested time."""
+    """Conversion of light to pixel values. All pixels are exposed together, centred on the requested time."""
 
     shutter: float = 0.0
     """Exposure time [s], during which tags and ripples move."""
@@ -154,9 +156,10 @@ class ImageSensor:
     read_noise: float = 5.0
     """Standard deviation [electrons]; small CMOS sensors have 2 to 8."""
     noise: bool = True
-    """Shot and read noise."""
+    """True with shot and read noise."""
     gamma: float = 1.0
-    """Numbers are (charge)^(1/gamma): 1 for linear, 2.2 for video, where dark tags look smaller [-]."""
+    """Pixel values are (charge)^(1/gamma): 1 for linear, 2.2 for video, in which dark tags look smaller
+    [-]."""
     spot: float = 1.0
     """Width of the square from which a pixel gathers light [px]: 1 for perfect optics, 1.5 to 2 for a cheap lens."""
     colour: bool = False
@@ -171,23 +174,24 @@ class ImageSensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """All that a picture depends on, but for the time and the seed of its noise."""
+    """Everything that a picture depends on, except the time and the seed of its noise."""
 
     camera: Camera
     interface: Interface
-    """Between camera and water; its layers are flat, so ripples need an interface without window."""
+    """Interface between camera and water; its layers are flat, so ripples need an interface without a
+    window."""
     basin: TiledBasin
     water: WaterOptics = field(default_factory=WaterOptics)
     sky: float = 0.3
-    """Radiance [-] of ceiling or sky, of which the surface shows 2 % at normal incidence. Light on the scene is even,
-    from above."""
+    """Radiance [-] of ceiling or sky; the surface reflects 2 % of it at normal incidence. The scene is lit
+    evenly from above."""
     ripples: Ripples | None = None
     tags: tuple[TagInScene, ...] = ()
-    """Tags that do not move: surveyed tags on the floor."""
+    """Tags at rest, such as surveyed tags on the floor."""
     sensor: ImageSensor = field(default_factory=ImageSensor)
     samples: int = 2
-    """Rays per pixel along each image axis near tags (elsewhere one ray). Texture and tiles are filtered
-    over each ray's share of the pixel, so 2 places a straight edge to about 0.01 px."""
+    """Rays per pixel along each image axis near tags (elsewhere one ray). Texture and tiles are filtered over
+    each ray's part of the pixel, so 2 resolves a straight edge to about 0.01 px."""
 
     def __post_init__(self) -> None:
         if self.ripples is not None and self.interface.window:
@@ -196,7 +200,7 @@ class Scene:
             raise SensorError(f"samples is {self.samples}, expected 1 to 16 along each axis of a pixel")
 
 
-# What the camera's place decides, once: the surface frame, and the direction of view of every pixel corner.
+# Geometry fixed by the camera's pose: the surface frame, and the viewing direction of every pixel corner.
 
 
 Array = NDArray[np.float64]
@@ -204,20 +208,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SurfaceFrame:
-    """Surface frame s: z along the interface's normal, origin on the still surface right below the camera.
+    """Surface frame s: z along the interface's normal, origin on the still surface vertically below the
+    camera.
 
-    Coordinates near the camera stay small there, which is what single precision needs.
+    Coordinates near the camera are small in this frame, as single precision requires.
     """
 
     origin_p: Array
-    """[m], (3,)."""
+    """Origin, pool frame [m], (3,)."""
     R_sp: Array
     """Rotation matrix from pool frame to surface frame, (3, 3)."""
     camera_height: float
     """Height of the camera above the plane [m]."""
 
     def point(self, point_p: ArrayLike) -> Array:
-        """A point of the pool frame in the surface frame [m], (..., 3)."""
+        """Return a point of the pool frame in the surface frame [m], (..., 3)."""
         return np.asarray((np.asarray(point_p, float) - self.origin_p) @ self.R_sp.T)
 
     def quaternion(self, R_px: Array) -> Array:
@@ -226,12 +231,12 @@ class SurfaceFrame:
 
     @property
     def offset(self) -> Array:
-        """Origin from the pool's origin along the tangents [m], (2,)."""
+        """Tangential offset of the origin from the pool's origin [m], (2,)."""
         return np.asarray(self.R_sp[:2] @ self.origin_p)
 
 
 def surface_frame(camera: Camera, interface: Interface) -> SurfaceFrame:
-    """The surface frame below a camera.
+    """Return the surface frame below a camera.
 
     Raises:
         SensorError: The camera is not on the side that the interface's normal points to.
@@ -249,13 +254,14 @@ def surface_frame(camera: Camera, interface: Interface) -> SurfaceFrame:
 
 @lru_cache(maxsize=4)
 def corner_rays(lens: Lens) -> Array:
-    """Unit directions through the corners of all pixels, optical frame, (height + 1, width + 1, 3).
+    """Return unit directions through the corners of all pixels, optical frame, (height + 1, width + 1, 3).
 
-    Corner (i, j) is at pixel coordinates (j - 0.5, i - 0.5). Zero where the lens sees nothing.
+    Corner (i, j) is at pixel coordinates (j - 0.5, i - 0.5). Directions are zero outside the lens' field of
+    view.
 
     Note:
-        Directions inside a pixel are interpolated between its corners, wrong by at most (1/8) |d²ray/du²|, below
-        0.001 px for focal lengths above 100 px.
+        Directions inside a pixel are interpolated between its corners, with an error of at most (1/8)
+        |d²ray/du²|, below 0.001 px for focal lengths above 100 px.
     """
     u, v = np.meshgrid(np.arange(lens.width + 1) - 0.5, np.arange(lens.height + 1) - 0.5)
     rays, ok = lens.rays(np.stack([u, v], axis=-1))

@@ -1,4 +1,4 @@
-"""A rippling water surface: a sum of gravity-capillary waves, its slope, and where a ray meets it.
+"""Rippling water surface: a sum of gravity-capillary waves, its slope, and the intersection with a ray.
 
 Surface frame s: z along the interface's normal towards the camera, 0 on the still surface; x and y along its tangents.
 """
@@ -36,11 +36,11 @@ class Waves:
     """Phase at the pool's origin and time 0 [rad], (N,)."""
 
     def height(self, xy: ArrayLike, time: float) -> NDArray[np.float64]:
-        """Height above the still surface [m], (...,), at points (..., 2) [m]."""
+        """Return the height above the still surface [m], (...,), at points (..., 2) [m]."""
         return np.sin(self._angle(xy, time)) @ self.amplitude
 
     def slope(self, xy: ArrayLike, time: float) -> NDArray[np.float64]:
-        """Gradient of the height, (..., 2), at points (..., 2) [m]."""
+        """Return the gradient of the height, (..., 2), at points (..., 2) [m]."""
         return (np.cos(self._angle(xy, time)) * self.amplitude) @ self.k
 
     def _angle(self, xy: ArrayLike, time: float) -> NDArray[np.float64]:
@@ -48,12 +48,12 @@ class Waves:
 
     @property
     def steepest(self) -> float:
-        """Return a slope [-] that the surface never exceeds."""
+        """Upper bound on the slope of the surface [-]."""
         return float(np.sum(self.amplitude * np.linalg.norm(self.k, axis=1)))
 
 
 def dispersion(wave_number: ArrayLike) -> NDArray[np.float64]:
-    """Angular frequency of a wave on deep water, ω² = g k + (σ/ρ) k³ [rad/s].
+    """Return the angular frequency of a wave on deep water, ω² = g k + (σ/ρ) k³ [rad/s].
 
     Args:
         wave_number: k = 2π / wavelength [rad/m], any shape.
@@ -63,12 +63,12 @@ def dispersion(wave_number: ArrayLike) -> NDArray[np.float64]:
 
 
 def waves_of(ripples: Ripples) -> Waves:
-    """The sines of a rippling surface: even shares of the mean square slope, a k = sqrt(2/N) s."""
+    """Return the sines of a rippling surface, each with the same mean square slope: a k = sqrt(2/N) s."""
     rng = np.random.default_rng([ripples.seed, 0x5EA])
     n = ripples.waves
     shortest, longest = (math.log(length) for length in ripples.wavelengths)
     wavelength = np.exp(shortest + (longest - shortest) * (np.arange(n) + rng.random(n)) / n)
-    # Headings fill the circle evenly, in an order that has nothing to do with the wavelength.
+    # Headings fill the circle evenly, in an order that is independent of the wavelength.
     heading = 2.0 * math.pi * (rng.permutation(n) + rng.random(n)) / n
     k = 2.0 * math.pi / wavelength
     return Waves(
@@ -91,7 +91,7 @@ class SurfaceWave:
 
 @wp.struct
 class Patch:
-    """The surface around one point: a Taylor series in place and time. All zero for a flat surface."""
+    """The surface around one point: a Taylor series in position and time. All zero for a flat surface."""
 
     x: float  # the point [m]
     y: float  # [m]
@@ -101,14 +101,14 @@ class Patch:
     hxx: float  # curvature [1/m]
     hxy: float  # [1/m]
     hyy: float  # [1/m]
-    ht: float  # rise [m/s]
+    ht: float  # vertical speed [m/s]
     hxt: float  # rate of the slope [1/s]
     hyt: float  # [1/s]
 
 
 @lru_cache
 def layout_of(struct: Any) -> np.dtype[Any]:
-    """A Warp struct as NumPy lays it out; Warp itself would work it out for 0.4 ms at every picture."""
+    """Return the NumPy type of a Warp struct, cached: Warp itself would compute it in 0.4 ms for every picture."""
     return np.dtype(struct.numpy_dtype())
 
 
@@ -117,7 +117,7 @@ def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[A
 
     Args:
         waves: The surface; None for a flat one.
-        origin: Of the surface frame, in its own axes from the pool's origin [m], (2,).
+        origin: Origin of the surface frame relative to the pool's origin, in surface axes [m], (2,).
         time: Middle of the exposure [s].
     """
     count = 0 if waves is None else len(waves.omega)
@@ -130,7 +130,7 @@ def pack_waves(waves: Waves | None, origin: ArrayLike, time: float) -> NDArray[A
 
 @wp.func
 def surface_at(waves: wp.array(dtype=SurfaceWave), x: float, y: float) -> Patch:
-    """The surface around a point, mid-exposure. The point (x, y) is in [m]."""
+    """Return the surface around a point (x, y) [m], mid-exposure."""
     p = Patch()
     p.x = x
     p.y = y
@@ -153,17 +153,17 @@ def surface_at(waves: wp.array(dtype=SurfaceWave), x: float, y: float) -> Patch:
 
 @wp.func
 def surface_hit(waves: wp.array(dtype=SurfaceWave), height: float, ray: wp.vec3) -> Patch:
-    """The surface around the point where a ray from the camera meets it, by a Newton step from the still surface.
+    """Return the surface around the point where a ray from the camera hits it, by a Newton step from the still surface.
 
     Args:
-        waves: Of the surface.
-        height: Of the camera above the still surface [m]; it stands at (0, 0, height).
+        waves: Waves of the surface.
+        height: Height of the camera, at (0, 0, height), above the still surface [m].
         ray: Unit direction, surface frame, with ray_z < 0.
     """
     s = -height / ray[2]
     p = surface_at(waves, s * ray[0], s * ray[1])
     if waves.shape[0] > 0:
-        # One step ends half a curvature times the square of h tan(view angle) from the surface: micrometres.
+        # The remaining error after one step is half a curvature times the square of h tan(view angle): micrometres.
         gap = height + s * ray[2] - p.h
         s -= gap / (ray[2] - p.hx * ray[0] - p.hy * ray[1])
         p = surface_at(waves, s * ray[0], s * ray[1])
@@ -172,14 +172,14 @@ def surface_hit(waves: wp.array(dtype=SurfaceWave), height: float, ray: wp.vec3)
 
 @wp.func
 def distance_to(p: Patch, height: float, ray: wp.vec3, t: float) -> float:
-    """Distance along a ray from the camera to the patch's tangent plane, `t` after mid-exposure [m]."""
+    """Return the distance along a ray from the camera to the patch's tangent plane, `t` after mid-exposure [m]."""
     rise = p.h + p.ht * t - p.hx * p.x - p.hy * p.y
     return (rise - height) / (ray[2] - p.hx * ray[0] - p.hy * ray[1])
 
 
 @wp.func
 def normal_of(p: Patch, x: float, y: float, t: float) -> wp.vec3:
-    """Unit normal towards the camera at a point of the patch, `t` after mid-exposure."""
+    """Return the unit normal towards the camera at a point of the patch, `t` after mid-exposure."""
     dx = x - p.x
     dy = y - p.y
     hx = p.hx + p.hxx * dx + p.hxy * dy + p.hxt * t

@@ -1,4 +1,4 @@
-"""Sensors of a vehicle's own motion, with the noise, delays and losses of real instruments."""
+"""Sensors of a vehicle's own motion, with the noise, delays and dropouts of real instruments."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Common Python part of the sensors of all vehicles of all worlds."""
+"""Base class of the sensors of all vehicles of all worlds."""
 
 from __future__ import annotations
 
@@ -14,35 +14,36 @@ from finssim.vehicles.equipment import Sensor
 
 
 class SensorError(ValueError):
-    """A sensor refuses its arguments; the message states what to change."""
+    """A sensor's arguments are invalid; the message states what to change."""
 
 
 class Surroundings(NamedTuple):
-    """Surroundings that a sensor's parameters may depend on, besides the vehicle's file."""
+    """Properties of the site that a sensor's parameters may depend on, besides the vehicle's file."""
 
     gravity: float
     """[m/s²]"""
     density: float
     """Density of the water [kg/m³]."""
     floor_depth: float
-    """Depth of the flat floor [m]; infinite if not known."""
+    """Depth of the flat floor [m]; infinite if unknown."""
 
 
 NUMBERS = {"imu": 1, "depth": 2, "dvl": 3, "compass": 4}
-"""Number of a sensor in the key of its random numbers; that of another name is a checksum of the name."""
+"""Number of a sensor in the key of its random numbers; for other names it is a checksum of the name."""
 
 
 class SensorBatch:
-    """One sensor, by its name in the vehicle files, for every vehicle of every world.
+    """One sensor, identified by its name in the vehicle files, for every vehicle of every world.
 
-    Its readings are Warp arrays (W, V) that stay in place. `stamp` and `fresh` say how old they are. Where a vehicle
-    lacks the sensor they stay zero, never fresh, with the stamp -1.
+    Its readings are Warp arrays (W, V) at fixed addresses; `stamp` and `fresh` give their age. For a vehicle without
+    the sensor they are zero, never fresh, with the stamp -1.
     """
 
     kind: ClassVar[str]
     """Its key under `sensors` in a vehicle file."""
     schema: ClassVar[Any] = None
-    """Schema of its section in a vehicle file, derived from `vehicles.equipment.Sensor`; those of FinsSim have none."""
+    """Schema of its section in a vehicle file, derived from `vehicles.equipment.Sensor`; None for FinsSim's own
+    sensors."""
     kernel: ClassVar[Any]
     """Kernel made by `sampling.sampling_kernel`."""
     readings: ClassVar[tuple[str, ...]]
@@ -51,18 +52,18 @@ class SensorBatch:
     def __init__(
         self, name: str, entries: Sequence[Any], worlds: int, control_step: float, seed: int, device: Any
     ) -> None:
-        """Lay out the memory.
+        """Allocate the memory.
 
         Args:
             name: Name of the sensor under `sensors` in the vehicle files.
-            entries: What each vehicle's file says about this sensor, or None; only rate and latency are read here.
+            entries: Section of this sensor in each vehicle's file, or None; only rate and latency are read here.
             worlds: Number of worlds W.
             control_step: [s]
-            seed: Of all random numbers.
+            seed: Seed of all random numbers.
             device: Warp device.
         """
         self.name = name
-        # The kernel's own structs: Warp takes an earlier kernel where a class is defined again with the same code.
+        # The kernel's own structs: if a class is defined again with the same code, Warp reuses the earlier kernel.
         arguments = {argument.label: argument.type for argument in self.kernel.adj.args}
         self.parameter_struct: Any = arguments["errors"].dtype
         """Struct made by `sampling.parameters_of`."""
@@ -80,15 +81,15 @@ class SensorBatch:
         )
         self.sampling.number = NUMBERS.get(name) or zlib.crc32(name.encode()) >> 1
         self.stamp: wp.array[Any] = self.sampling.stamp
-        """Time since reset at which the reading on display was taken [s], -1 before the first; float (W, V)."""
+        """Time since reset at which the current reading was sampled [s], -1 before the first; float (W, V)."""
         self.fresh: wp.array[Any] = self.sampling.fresh
-        """Whether that reading arrived in the last update; bool (W, V)."""
+        """True if that reading arrived in the last update; bool (W, V)."""
         self.arrays = self._new_arrays()
         self.parameters: wp.array[Any] = wp.zeros(self.shape, dtype=self.parameter_struct, device=device)
         """Parameter structs (W, V); change them with `set`."""
 
     def _new_arrays(self) -> Any:
-        """Zeroed readings and rings, each also an attribute of this object."""
+        """Allocate zeroed readings and ring buffers, each also an attribute of this object."""
         arrays = self.array_struct()
         for name, variable in self.array_struct.vars.items():
             shape = self.shape if variable.type.ndim == 2 else self.sampling.sent.shape
@@ -98,13 +99,13 @@ class SensorBatch:
         return arrays
 
     def inputs(self, state: SensedState, water_velocity: Any, mask: Any, restarting: bool) -> list[Any]:
-        """All arguments of the kernel but its last, `world_offset`.
+        """Return all arguments of the kernel except the last, `world_offset`.
 
         Args:
-            state: What to measure.
+            state: State to measure.
             water_velocity: World frame [m/s], vec3 (W, V), or None.
-            mask: Worlds to look at, int (W,).
-            restarting: Whether these worlds have just been reset.
+            mask: Worlds to update, int (W,).
+            restarting: True if these worlds have just been reset.
         """
         truth = SensedArrays()
         for name in ("position", "quaternion", "velocity", "acceleration", "steps", "episode"):
@@ -114,38 +115,38 @@ class SensorBatch:
         return [truth, self.parameters, self.arrays, self.sampling, mask, restarting, self.seed]
 
     def use(self, vehicle: int, entry: Any, site: Surroundings) -> None:
-        """Take one vehicle's parameters from its file.
+        """Read one vehicle's parameters from its file.
 
         Args:
             vehicle: Index.
-            entry: Its section in the vehicle file, of `vehicle.sensors.by_name`.
-            site: What else they depend on.
+            entry: The sensor's section in the vehicle file, of `vehicle.sensors.by_name`.
+            site: Properties of the site that parameters may depend on.
         """
         names = self.parameter_struct.vars
         values = {name: getattr(entry, name) for name in names if hasattr(entry, name)}
         self.set(vehicle, **{**values, **self.derived(entry, site)})
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Parameters that the file does not give as they are, or that replace what it gives; none by default.
+        """Return parameters that are not in the file or that replace those of the file; none by default.
 
         Each is in the unit of the kernel's parameter.
         """
         return {}
 
     def numpy(self) -> dict[str, NDArray[Any]]:
-        """Copies of the readings with `stamp` and `fresh`, each (W, V, ...).
+        """Return copies of the readings with `stamp` and `fresh`, each (W, V, ...).
 
         Units are those of the readings; stamps are in [s].
         """
         return {name: getattr(self, name).numpy().copy() for name in (*self.readings, "stamp", "fresh")}
 
     def set(self, vehicle: int | slice = slice(None), **values: Any) -> None:
-        """Change parameters: how worlds get sensors that differ.
+        """Change parameters, for example to give each world a different sensor.
 
         Args:
-            vehicle: Which vehicle; all of them if not given.
-            values: By field of the parameter struct, each broadcast over (W, V) or, for one vehicle, (W,); a vector
-                has its components last. Rate and latency cannot change, since they size the memory.
+            vehicle: Index of the vehicle; all of them by default.
+            values: Values by field of the parameter struct, each broadcast over (W, V) or, for one vehicle, (W,); a
+                vector has its components last. Rate and latency cannot change, since they determine the memory layout.
 
         Raises:
             SensorError: There is no such field.
@@ -160,14 +161,14 @@ class SensorBatch:
 
 
 def check_registered(kind: str, batch: Any) -> None:
-    """Refuse what is no kind of sensor.
+    """Refuse a registered object that is not a kind of sensor.
 
     Args:
-        kind: Key in a vehicle file under which it is registered.
-        batch: The object that is registered under it.
+        kind: Key in a vehicle file under which the object is registered.
+        batch: The registered object.
 
     Raises:
-        SensorError: It is no `SensorBatch`, has another kind, or no schema.
+        SensorError: It is not a `SensorBatch`, has another kind, or has no schema.
     """
     if (
         not (isinstance(batch, type) and issubclass(batch, SensorBatch))

@@ -22,16 +22,16 @@ CompassParameters = parameters_of(Compass)
 
 @wp.struct
 class CompassArrays:
-    """Readings and memory of all compasses, by (world, vehicle); the ring has one more index."""
+    """Readings and internal state of all compasses, by (world, vehicle); the ring buffer has one more index."""
 
     heading: wp.array2d(dtype=float)  # left positive from world x [rad]
-    bias: wp.array2d(dtype=float)  # true offset [rad]
-    ring: wp.array3d(dtype=float)  # headings on their way [rad]
+    bias: wp.array2d(dtype=float)  # true bias [rad]
+    ring: wp.array3d(dtype=float)  # headings in transit [rad]
 
 
 @wp.func
 def heading_of(q_wb: wp.quat) -> float:
-    """Angle of the body's x axis from world x about the vertical, in [-π, π] [rad].
+    """Return the angle of the body's x axis from world x about the vertical, in [-π, π] [rad].
 
     Args:
         q_wb: Attitude, body to world, xyzw.
@@ -44,7 +44,7 @@ def heading_of(q_wb: wp.quat) -> float:
 def measure_heading(
     truth: SampledState, p: CompassParameters, compass: CompassArrays, w: int, v: int, slot: int
 ) -> bool:
-    """One sample of a compass; arguments as `sampling_kernel` has them."""
+    """Take one sample of a compass; for the arguments see `sampling_kernel`."""
     if truth.restarting:
         compass.bias[w, v] = p.bias_initial * normal(truth.key, TURN_ON)
     heading = heading_of(truth.quaternion) + compass.bias[w, v] + p.noise_std * normal(truth.key, WHITE)
@@ -54,7 +54,7 @@ def measure_heading(
 
 @wp.func
 def display_heading(p: CompassParameters, compass: CompassArrays, w: int, v: int, slot: int):
-    """The heading of a sample that arrived."""
+    """Copy the heading of an arrived sample to the readings."""
     compass.heading[w, v] = compass.ring[w, v, slot]
 
 
@@ -68,4 +68,4 @@ class CompassBatch(SensorBatch):
     heading: "wp.array[Any]"
     """Heading of the body's x axis from world x, left positive [rad]; float (W, V)."""
     bias: "wp.array[Any]"
-    """Truth: the offset in it [rad]; float (W, V)."""
+    """Truth: bias of the heading [rad]; float (W, V)."""

@@ -1,4 +1,4 @@
-"""Pressure gauge: depth of its mount below the still surface."""
+"""Pressure sensor: depth of its mounting point below the still surface."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
 from typing import Any
@@ -27,17 +27,17 @@ DepthParameters = parameters_of(DepthSensor, specific_weight=float)
 
 @wp.struct
 class DepthArrays:
-    """Readings and memory of all gauges, by (world, vehicle); the ring has one more index."""
+    """Readings and internal state of all pressure sensors, by (world, vehicle); the ring buffer has one more index."""
 
     depth: wp.array2d(dtype=float)  # below the still surface [m]
     pressure: wp.array2d(dtype=float)  # absolute [Pa]
     bias: wp.array2d(dtype=float)  # true bias [m]
-    ring: wp.array3d(dtype=float)  # pressures on their way [Pa]
+    ring: wp.array3d(dtype=float)  # depths in transit [m]
 
 
 @wp.func
 def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
-    """Return the reading of an ideal gauge: depth of its point in still water, max(0, -(p + R_wb r)_z) [m].
+    """Return the reading of an ideal sensor: depth of its point in still water, max(0, -(p + R_wb r)_z) [m].
 
     Args:
         position: Body origin, world frame [m].
@@ -45,7 +45,7 @@ def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
         r: Sensor from the body origin, body frame [m].
 
     Note:
-        In air it reads zero, the pressure of the atmosphere. The pressure of passing waves is left out.
+        In air the depth is zero, at atmospheric pressure. The pressure of passing waves is neglected.
     """
     point = position + wp.quat_rotate(q_wb, r)
     return wp.max(-point[2], 0.0)
@@ -55,7 +55,7 @@ def depth_of_point(position: wp.vec3, q_wb: wp.quat, r: wp.vec3) -> float:
 def measure_depth(
     truth: SampledState, p: DepthParameters, gauge: DepthArrays, w: int, v: int, slot: int
 ) -> bool:
-    """One sample of a gauge; arguments as `sampling_kernel` has them."""
+    """Take one sample of a pressure sensor; for the arguments see `sampling_kernel`."""
     if truth.restarting:
         gauge.bias[w, v] = p.bias_initial * normal(truth.key, TURN_ON)
     bias = gauge.bias[w, v] + p.bias_walk * truth.root * normal(truth.key, WALK)
@@ -69,25 +69,26 @@ def measure_depth(
 
 @wp.func
 def display_depth(p: DepthParameters, gauge: DepthArrays, w: int, v: int, slot: int):
-    """Depth, and the absolute pressure in still water, p = p_atm + rho g depth [Pa]."""
+    """Copy depth and absolute pressure in still water, p = p_atm + rho g depth [Pa], of an arrived sample to the
+    readings."""
     gauge.depth[w, v] = gauge.ring[w, v, slot]
     gauge.pressure[w, v] = ATMOSPHERE + p.specific_weight * gauge.ring[w, v, slot]
 
 
 class DepthBatch(SensorBatch):
-    """The pressure gauges of all vehicles of all worlds."""
+    """The pressure sensors of all vehicles of all worlds."""
 
     kind = "depth"
     kernel = sampling_kernel(DepthParameters, DepthArrays, measure_depth, display_depth)
     readings = ("depth", "pressure")
 
     depth: "wp.array[Any]"
-    """Depth of the gauge below the still surface [m]; float (W, V)."""
+    """Depth of the sensor below the still surface [m]; float (W, V)."""
     pressure: "wp.array[Any]"
-    """Absolute [Pa]; float (W, V)."""
+    """Absolute pressure [Pa]; float (W, V)."""
     bias: "wp.array[Any]"
-    """Truth: the bias in the depth [m]; float (W, V)."""
+    """Truth: bias of the depth [m]; float (W, V)."""
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Weight of the water."""
+        """Return the specific weight of the water [N/m³]."""
         return {"specific_weight": site.density * site.gravity}

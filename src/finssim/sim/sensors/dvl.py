@@ -1,4 +1,4 @@
-"""Doppler velocity log: velocity of its mount over the floor or through the water."""
+"""Doppler velocity log: velocity of its mounting point over the floor or through the water."""
 # mypy: disable-error-code="valid-type,misc,index,return-value,no-any-return,no-untyped-def,untyped-decorator"
 
 import math
@@ -22,19 +22,19 @@ from finssim.sim.sensors.sampling import (
 )
 from finssim.vehicles.equipment import Dvl
 
-# Cosine of the largest tilt with an echo [-], and depth of the flat floor [m].
+# Cosine of the largest tilt with bottom lock [-], and depth of the flat floor [m].
 DvlParameters = parameters_of(Dvl, tilt_cosine=float, floor_depth=float)
 
 
 @wp.struct
 class DvlArrays:
-    """Readings and memory of all DVLs, by (world, vehicle); the ring has one more index."""
+    """Readings and internal state of all DVLs, by (world, vehicle); the ring buffer has one more index."""
 
     velocity: wp.array2d(dtype=wp.vec3)  # sensor frame [m/s]
     bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s]
     scale_error: wp.array2d(dtype=float)  # true scale error
-    lock: wp.array2d(dtype=int)  # whether the beams find the bottom of a described world
-    ring: wp.array3d(dtype=wp.vec3)  # velocities on their way [m/s]
+    lock: wp.array2d(dtype=int)  # 1 if the beams reach the bottom of a described world
+    ring: wp.array3d(dtype=wp.vec3)  # velocities in transit [m/s]
 
 
 @wp.func
@@ -59,12 +59,12 @@ def sensed_velocity(nu: vec6, q_wb: wp.quat, water: wp.vec3, r: wp.vec3, q_bs: w
 
 @wp.func
 def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
-    """Return whether the beams find the floor: the vehicle is not tilted too far, nor too close, nor too high.
+    """Return whether the beams reach the floor: tilt and altitude of the DVL are within its limits.
 
     Args:
         position: Body origin, world frame [m].
         q_wb: Attitude, body to world, xyzw.
-        p: Mount and reach.
+        p: Mounting pose and limits.
     """
     up = wp.quat_rotate(q_wb, wp.vec3(0.0, 0.0, 1.0))
     point = position + wp.quat_rotate(q_wb, p.position)
@@ -76,7 +76,7 @@ def has_echo(position: wp.vec3, q_wb: wp.quat, p: DvlParameters) -> bool:
 def measure_velocity(
     truth: SampledState, p: DvlParameters, dvl: DvlArrays, w: int, v: int, slot: int
 ) -> bool:
-    """One sample of a DVL; arguments as `sampling_kernel` has them."""
+    """Take one sample of a DVL; for the arguments see `sampling_kernel`."""
     if truth.restarting:
         dvl.bias[w, v] = p.bias_initial * normal3(truth.key, TURN_ON)
         dvl.scale_error[w, v] = p.scale_error * normal(truth.key, TURN_ON_2)
@@ -90,7 +90,7 @@ def measure_velocity(
 
 @wp.func
 def display_velocity(p: DvlParameters, dvl: DvlArrays, w: int, v: int, slot: int):
-    """The velocity of a sample that arrived."""
+    """Copy the velocity of an arrived sample to the readings."""
     dvl.velocity[w, v] = dvl.ring[w, v, slot]
 
 
@@ -102,13 +102,13 @@ class DvlBatch(SensorBatch):
     readings = ("velocity",)
 
     velocity: "wp.array[Any]"
-    """Over the floor, or through the water where the water's velocity was given; sensor frame [m/s]; vec3 (W, V)."""
+    """Velocity over the floor, or through the water if its velocity was given; sensor frame [m/s]; vec3 (W, V)."""
     bias: "wp.array[Any]"
-    """Truth: the bias in it, sensor frame [m/s]; vec3 (W, V)."""
+    """Truth: bias of the velocity, sensor frame [m/s]; vec3 (W, V)."""
     scale_error: "wp.array[Any]"
-    """Truth: the scale error in it; float (W, V)."""
+    """Truth: scale error of the velocity; float (W, V)."""
     lock: "wp.array[Any]"
-    """Flag [-] of the beams finding the bottom, int (W, V): 1, unless beams of a described world write it."""
+    """Flag [-] of bottom lock, int (W, V): 1, unless the beams in a described world update it."""
 
     def _new_arrays(self) -> Any:
         arrays = super()._new_arrays()
@@ -116,6 +116,6 @@ class DvlBatch(SensorBatch):
         return arrays
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Reach of the beams; without a known floor it is always near [m]."""
+        """Return the limits of the beams; without a known floor the altitude is unlimited [m]."""
         tilt = {"tilt_cosine": math.cos(min(entry.max_tilt, math.pi)), "floor_depth": site.floor_depth}
         return tilt if math.isfinite(site.floor_depth) else {**tilt, "altitude_max": math.inf}

@@ -1,4 +1,4 @@
-"""Inertial measurement unit: specific force and angular rate at its mount."""
+"""Inertial measurement unit: specific force and angular rate at its mounting point."""
 # mypy: disable-error-code="valid-type,misc,index,return-value,no-any-return,no-untyped-def,untyped-decorator,operator"
 
 import math
@@ -29,13 +29,13 @@ ImuParameters = parameters_of(Imu, gravity=float, gyro_noise=float, accel_noise=
 
 @wp.struct
 class ImuArrays:
-    """Readings and memory of all IMUs, by (world, vehicle); the ring has one more index."""
+    """Readings and internal state of all IMUs, by (world, vehicle); the ring buffers have one more index."""
 
     gyro: wp.array2d(dtype=wp.vec3)  # angular rate, sensor frame [rad/s]
     accel: wp.array2d(dtype=wp.vec3)  # specific force, sensor frame [m/s²]
     gyro_bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [rad/s]
     accel_bias: wp.array2d(dtype=wp.vec3)  # true bias, sensor frame [m/s²]
-    gyro_ring: wp.array3d(dtype=wp.vec3)  # angular velocities on their way [rad/s]
+    gyro_ring: wp.array3d(dtype=wp.vec3)  # angular rates in transit, sensor frame [rad/s]
     accel_ring: wp.array3d(dtype=wp.vec3)
 
 
@@ -75,7 +75,7 @@ def angular_rate(nu: vec6, q_bs: wp.quat) -> wp.vec3:
 
 @wp.func
 def measure_motion(truth: SampledState, p: ImuParameters, imu: ImuArrays, w: int, v: int, slot: int) -> bool:
-    """One sample of an IMU; arguments as `sampling_kernel` has them."""
+    """Take one sample of an IMU; for the arguments see `sampling_kernel`."""
     if truth.restarting:
         imu.gyro_bias[w, v] = p.gyro_bias_initial * normal3(truth.key, TURN_ON)
         imu.accel_bias[w, v] = p.accel_bias_initial * normal3(truth.key, TURN_ON_2)
@@ -95,7 +95,7 @@ def measure_motion(truth: SampledState, p: ImuParameters, imu: ImuArrays, w: int
 
 @wp.func
 def display_motion(p: ImuParameters, imu: ImuArrays, w: int, v: int, slot: int):
-    """Both readings of a sample that arrived."""
+    """Copy both readings of an arrived sample."""
     imu.gyro[w, v] = imu.gyro_ring[w, v, slot]
     imu.accel[w, v] = imu.accel_ring[w, v, slot]
 
@@ -112,14 +112,11 @@ class ImuBatch(SensorBatch):
     accel: "wp.array[Any]"
     """Specific force, sensor frame [m/s²]; vec3 (W, V)."""
     gyro_bias: "wp.array[Any]"
-    """Truth: the bias in it, sensor frame [rad/s]; vec3 (W, V)."""
+    """Truth: bias of the angular rate, sensor frame [rad/s]; vec3 (W, V)."""
     accel_bias: "wp.array[Any]"
-    """Truth: the bias in it, sensor frame [m/s²]; vec3 (W, V)."""
+    """Truth: bias of the specific force, sensor frame [m/s²]; vec3 (W, V)."""
 
     def derived(self, entry: Any, site: Surroundings) -> dict[str, float]:
-        """Gravity; white noise of density σ deviates by σ √rate in each of `rate` samples a second.
-
-        Gravity is in [m/s²].
-        """
+        """Return gravity [m/s²] and the standard deviations of white noise per sample: density times √rate."""
         noise = {name: getattr(entry, f"{name}_density") for name in ("gyro_noise", "accel_noise")}
         return {"gravity": site.gravity, **{name: std * math.sqrt(entry.rate) for name, std in noise.items()}}

@@ -1,4 +1,4 @@
-"""When a sensor samples, how late a sample arrives, and the arrays that remember both."""
+"""Timing of sensor samples, their latency, and the arrays that store both."""
 # mypy: disable-error-code="no-any-return,valid-type,misc,index,no-untyped-def,untyped-decorator,attr-defined"
 
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ import warp as wp
 from finssim.physics.types import vec6
 from finssim.vehicles.equipment import Sensor
 
-# Imperfections shared by all sensors: random streams, white noise, wandering bias, quantisation and saturation.
+# Errors common to all sensors: random streams, white noise, random-walk bias, quantisation and saturation.
 
 
-# The independent random streams of one sample.
+# Independent random streams of one sample.
 WHITE = 0
 WHITE_2 = 1
 WALK = 2
@@ -25,12 +25,12 @@ DROPOUT = 6
 
 @wp.func
 def sample_key(seed: int, sensor: int, world: int, vehicle: int, episode: int, step: int) -> wp.uint32:
-    """Key of everything random in one sample.
+    """Return the key of all random numbers of one sample.
 
     It depends on nothing else, so a world's noise is bitwise the same in any batch, slice or thread.
 
     Args:
-        seed: Of the suite.
+        seed: Seed of the suite.
         sensor: Number of the sensor.
         world: Index of the world.
         vehicle: Index of the vehicle in its world.
@@ -46,13 +46,13 @@ def sample_key(seed: int, sensor: int, world: int, vehicle: int, episode: int, s
 
 @wp.func
 def normal(key: wp.uint32, stream: int) -> float:
-    """One standard normal number of a stream of a sample."""
+    """Return one standard normal number of a stream of a sample."""
     return wp.randn(wp.rand_init(int(key), stream))
 
 
 @wp.func
 def normal3(key: wp.uint32, stream: int) -> wp.vec3:
-    """Three independent standard normal numbers of a stream of a sample."""
+    """Return three independent standard normal numbers of a stream of a sample."""
     state = wp.rand_init(int(key), stream)
     x = wp.randn(state)
     y = wp.randn(state)
@@ -61,15 +61,13 @@ def normal3(key: wp.uint32, stream: int) -> wp.vec3:
 
 @wp.func
 def lost(key: wp.uint32, dropout: float) -> bool:
-    """Return whether a sample is lost on its way, with probability `dropout`."""
+    """Return whether a sample is lost in transit, with probability `dropout`."""
     return wp.randf(wp.rand_init(int(key), DROPOUT)) < dropout
 
 
 @wp.func
 def digitised(x: float, quantum: float, limit: float) -> float:
-    """The number a converter gives for x: the nearest multiple of its quantum, within its range.
-
-    The unit is kept.
+    """Return x, of any unit, as quantised and saturated by a converter.
 
     Args:
         x: Exact value, of any unit.
@@ -91,7 +89,7 @@ def digitised3(x: wp.vec3, quantum: float, limit: float) -> wp.vec3:
 
 
 class SensedState(Protocol):
-    """The state arrays that sensors read; `finssim.sim` has them, and so may anything else."""
+    """The state arrays that sensors read, as provided by `finssim.sim` or by any other object."""
 
     position: Any
     """Body origin, world frame [m]: vec3 (W, V)."""
@@ -122,7 +120,7 @@ class SensedArrays:
 
 @wp.struct
 class Timing:
-    """When one sensor of one vehicle samples."""
+    """Sampling times of one sensor of one vehicle."""
 
     samples_per_step: wp.float64  # samples in a control step [-]
     latency: int  # control steps between a sample and its arrival
@@ -132,45 +130,45 @@ class Timing:
 class Sampling:
     """State of the samples of one kind of sensor, by (world, vehicle)."""
 
-    number: int  # of the sensor, in the key of its random numbers
+    number: int  # number of the sensor in the key of its random numbers
     timing: wp.array(dtype=Timing)  # by vehicle
     control_step: float  # [s]
     seen: wp.array2d(dtype=int)  # step of the last update
     last: wp.array2d(dtype=int)  # step of the last sample
-    sent: wp.array3d(dtype=wp.bool)  # whether the slot holds a sample on its way
-    stamp: wp.array2d(dtype=float)  # time since reset of the sample on display [s]; -1: none yet
-    fresh: wp.array2d(dtype=wp.bool)  # whether it arrived in this step
+    sent: wp.array3d(dtype=wp.bool)  # True if the slot contains a sample in transit
+    stamp: wp.array2d(dtype=float)  # time since reset of the current reading's sample [s]; -1: none yet
+    fresh: wp.array2d(dtype=wp.bool)  # True if that reading arrived in this step
 
 
 @wp.func
 def samples_until(samples_per_step: wp.float64, step: int) -> int:
-    """Samples due in a number of control steps, floor(rate * time)."""
+    """Return the number of samples due after a number of control steps, floor(rate * time)."""
     # In float64, and with a margin far below a step, so that 10 Hz on a 0.1 s step is one sample in every step.
     return int(wp.floor(wp.float64(step) * samples_per_step + wp.float64(1.0e-6)))
 
 
 @wp.func
 def sample_due(sampling: Sampling, w: int, v: int, step: int) -> bool:
-    """Return whether at least one sample fell due since the last one was taken."""
+    """Return whether at least one sample has become due since the last one."""
     n = sampling.timing[v].samples_per_step
     return samples_until(n, step) > samples_until(n, sampling.last[w, v])
 
 
 @wp.func
 def root_of_wait(sampling: Sampling, w: int, v: int, step: int) -> float:
-    """Square root of the time since the last sample, by which a random walk grows [√s]."""
+    """Return the square root of the time since the last sample, the growth factor of a random walk [√s]."""
     return wp.sqrt(float(step - sampling.last[w, v]) * sampling.control_step)
 
 
 @wp.func
 def slot_of(sampling: Sampling, step: int) -> int:
-    """Return the slot of the ring for the sample of a step."""
+    """Return the slot of the ring buffer for the sample of a step."""
     return step % sampling.sent.shape[2]
 
 
 @wp.func
 def begin_update(sampling: Sampling, w: int, v: int, step: int) -> bool:
-    """Mark the old sample as no longer fresh, and return whether there is anything to do in this step."""
+    """Mark the old sample as no longer fresh, and return True if the sensor must be updated in this step."""
     sampling.fresh[w, v] = False
     if sampling.timing[v].samples_per_step == wp.float64(0.0) or step == sampling.seen[w, v]:
         return False
@@ -181,7 +179,7 @@ def begin_update(sampling: Sampling, w: int, v: int, step: int) -> bool:
 
 @wp.func
 def restart(sampling: Sampling, w: int, v: int, step: int):
-    """Forget all samples."""
+    """Discard all samples."""
     sampling.seen[w, v] = step - 1
     sampling.last[w, v] = step
     sampling.stamp[w, v] = -1.0
@@ -189,14 +187,14 @@ def restart(sampling: Sampling, w: int, v: int, step: int):
 
 @wp.func
 def arrival(sampling: Sampling, w: int, v: int, step: int, restarting: bool) -> int:
-    """Return the slot of the sample that arrives in this step, or -1, and show its stamp.
+    """Return the slot of the sample that arrives in this step, or -1, and publish its stamp.
 
     Args:
-        sampling: Of this kind of sensor.
+        sampling: State of this kind of sensor.
         w: World.
         v: Vehicle.
         step: Control steps since the reset.
-        restarting: The sample taken at a reset arrives at once, as if the sensor had been running before.
+        restarting: True at a reset: the sample arrives at once, as if the sensor had been running before.
     """
     sampled = step
     if not restarting:
@@ -215,11 +213,11 @@ def arrival(sampling: Sampling, w: int, v: int, step: int, restarting: bool) -> 
 def new_sampling(
     rates: Sequence[float], latencies: Sequence[float], worlds: int, control_step: float, device: Any
 ) -> Sampling:
-    """Memory of one kind of sensor that has not sampled yet.
+    """Return the state of one kind of sensor before its first sample.
 
     Args:
-        rates: By vehicle [Hz]; 0 where the vehicle has no such sensor.
-        latencies: By vehicle [s]; taken to the nearest control step, since only then can anybody look.
+        rates: Sampling rates by vehicle [Hz]; 0 for a vehicle without such a sensor.
+        latencies: Latencies by vehicle [s], rounded to the nearest control step, since readings change only then.
         worlds: Number of worlds.
         control_step: [s].
         device: Warp device.
@@ -239,31 +237,32 @@ def new_sampling(
     return sampling
 
 
-# A kind of sensor is what it measures and what it shows of a sample that arrives; all else is the same for every kind.
+# A kind of sensor defines its measurement and the readings of an arrived sample; all else is common to all kinds.
 
 
 @wp.struct
 class SampledState:
-    """True state of one vehicle at the end of a control step, in which a sensor samples."""
+    """True state of one vehicle at the end of a control step, when a sensor samples."""
 
     position: wp.vec3  # body origin, world frame [m]
     quaternion: wp.quat  # attitude, body to world, xyzw
     velocity: vec6  # nu at the body origin, body frame [m/s, rad/s]
     acceleration: vec6  # nu_dot, rate of the components of nu, body frame [m/s², rad/s²]
     water: wp.vec3  # velocity of the water, world frame [m/s]
-    water_known: wp.bool  # whether that was given
-    key: wp.uint32  # of everything random in the sample
+    water_known: wp.bool  # True if that velocity was given
+    key: wp.uint32  # key of all random numbers of the sample
     root: float  # square root of the time since the last sample [√s]
-    restarting: wp.bool  # whether the world was just reset
+    restarting: wp.bool  # True if the world was just reset
 
 
 def parameters_of(schema: type[Sensor], **derived: Any) -> Any:
-    """Warp struct of what the kernel of a kind of sensor reads of one of them.
+    """Return the Warp struct of a sensor's parameters that its kernel reads.
 
-    It has the numbers that a vehicle file gives, under their names there, but rate and latency, which size the memory.
+    It has the numbers of the vehicle file under the same names, without rate and latency, which determine the memory
+    layout.
 
     Args:
-        schema: What a vehicle file says of the sensor.
+        schema: Schema of the sensor's section in a vehicle file.
         derived: Further fields, which `SensorBatch.derived` fills, and their Warp types.
     """
     types = {"position": wp.vec3, "orientation": wp.quat}
@@ -278,11 +277,11 @@ def sampling_kernel(parameters: Any, arrays: Any, measure: Any, display: Any) ->
 
     Args:
         parameters: Warp struct of one sensor, from `parameters_of`.
-        arrays: Warp struct of readings and memory.
-        measure: Warp function (truth, parameters, arrays, world, vehicle, slot) -> whether there is a sample; it puts
-            the sample into the slot of its rings, and at a reset draws what stays for an episode.
-        display: Warp function (parameters, arrays, world, vehicle, slot) that copies a sample that arrives from the
-            slot to the readings.
+        arrays: Warp struct of readings and internal state.
+        measure: Warp function (truth, parameters, arrays, world, vehicle, slot) -> whether there is a sample; it writes
+            the sample into the slot of its ring buffers, and at a reset draws the errors that last an episode.
+        display: Warp function (parameters, arrays, world, vehicle, slot) that copies an arrived sample from the slot to
+            the readings.
     """
 
     @wp.kernel(enable_backward=False, module="unique")

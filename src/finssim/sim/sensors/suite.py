@@ -24,7 +24,7 @@ Stage = tuple[Any, list[Any]]
 
 
 def add_sensor(batch: type[SensorBatch]) -> type[SensorBatch]:
-    """Make a kind of sensor known to this program: vehicle files may then have it under its `kind`.
+    """Register a kind of sensor in this process, so that vehicle files can use its `kind` as a key.
 
     An installed package registers it by an entry point instead; see `finssim.core.registry`.
 
@@ -32,8 +32,8 @@ def add_sensor(batch: type[SensorBatch]) -> type[SensorBatch]:
         batch: Class with `kind`, the `schema` of its section in a vehicle file, a kernel and `readings`.
 
     Raises:
-        RegistryError: There is another sensor of that kind.
-        SensorError: It is no `SensorBatch`, or has no schema.
+        RegistryError: Another sensor of that kind exists.
+        SensorError: The class is not a `SensorBatch`, or has no schema.
     """
     SENSORS[batch.kind] = batch
     return batch
@@ -42,14 +42,14 @@ def add_sensor(batch: type[SensorBatch]) -> type[SensorBatch]:
 class SensorSuite:
     """The sensors that the vehicle files list, for W worlds of V vehicles.
 
-    Call `reset` after worlds were reset and `update` after every control step, or record their stages. Sensors sample
-    at the ends of control steps, each at its own rate: a slower sensor holds its last reading, a faster one gives the
-    newest of the samples that fell into the step. All randomness is keyed on (seed, sensor, world, vehicle, episode,
-    step), so it does not depend on how many worlds there are or how they are sliced over launches.
+    Call `reset` after a reset of worlds and `update` after every control step, or record their stages. Sensors sample
+    at the ends of control steps, each at its own rate: a slower sensor holds its last reading, a faster one returns the
+    newest of the samples within the step. All random numbers are keyed on (seed, sensor, world, vehicle, episode,
+    step), so they depend neither on the number of worlds nor on the slicing of launches.
     """
 
     imu: ImuBatch | None
-    """None where no vehicle has one, and so for the others."""
+    """IMUs; None if no vehicle has one. The same applies to the other sensors."""
     depth: DepthBatch | None
     dvl: DvlBatch | None
     compass: CompassBatch | None
@@ -66,17 +66,17 @@ class SensorSuite:
         density: float | None = None,
         floor_depth: float | None = None,
     ) -> None:
-        """Lay out the memory of all sensors.
+        """Allocate the memory of all sensors.
 
         Args:
             vehicles: The V vehicles of every world.
             worlds: Number of worlds W.
             control_step: Time between updates [s].
-            seed: Of all noise; 0 to 2³¹ - 1.
+            seed: Seed of all noise; 0 to 2³¹ - 1.
             device: Warp device of the state arrays.
             gravity: [m/s²]; each vehicle file's own if not given.
-            density: Of the water [kg/m³]; each vehicle file's own if not given.
-            floor_depth: Depth of the flat floor, for the reach of a DVL [m]; if not given the floor is always in reach.
+            density: Density of the water [kg/m³]; each vehicle file's own if not given.
+            floor_depth: Depth of the flat floor, for the range of a DVL [m]; if not given the floor is always in range.
 
         Raises:
             SensorError: A number is out of range, or vehicles have sensors of one name and different kinds.
@@ -123,14 +123,14 @@ class SensorSuite:
     def update_stages(self, state: SensedState, water_velocity: Any = None) -> list[Stage]:
         """Return the launches of `update`, for a program that records its launches.
 
-        Each stage is a kernel over (worlds of a slice, vehicles) and all its arguments but the last, `world_offset`.
-        Slices share nothing that is written, so threads may each run their own.
+        Each stage is a kernel over (worlds of a slice, vehicles) and all its arguments except the last, `world_offset`.
+        Slices write to disjoint memory, so each thread may run its own.
 
         Args:
-            state: What to measure, at the end of a control step, with `steps` already counted up. Its arrays are
+            state: State to measure, at the end of a control step, with `steps` already incremented. Its arrays are
                 recorded: keep them in place.
-            water_velocity: Velocity of the water at each vehicle, world frame [m/s], vec3 (W, V): DVLs then track the
-                water. If not given they track the floor.
+            water_velocity: Velocity of the water at each vehicle, world frame [m/s], vec3 (W, V), for DVLs in water
+                track; if not given they are in bottom track.
         """
         return [(b.kernel, b.inputs(state, water_velocity, self._everywhere, False)) for b in self.batches]
 
@@ -138,8 +138,8 @@ class SensorSuite:
         """Return the launches of `reset`, in the same form.
 
         Args:
-            state: The state that the episode starts from, with `episode` already counted up.
-            mask: Worlds to reset, those where it is not 0, int (W,); all if not given.
+            state: Initial state of the episode, with `episode` already incremented.
+            mask: Nonzero for the worlds to reset, int (W,); all if not given.
             water_velocity: As for `update_stages`.
         """
         mask = self._everywhere if mask is None else mask
@@ -148,7 +148,8 @@ class SensorSuite:
     def launches(
         self, state: SensedState, world_offset: int = 0, count: int | None = None, water_velocity: Any = None
     ) -> list[Any]:
-        """Recorded Warp launches of `update_stages` for `count` worlds from `world_offset` on (all by default)."""
+        """Return recorded Warp launches of `update_stages` for `count` worlds from `world_offset` on (all by
+        default)."""
         dim = (self.worlds - world_offset if count is None else count, self.vehicles)
         return [
             wp.launch(kernel, dim=dim, inputs=[*inputs, world_offset], device=self.device, record_cmd=True)
@@ -156,16 +157,16 @@ class SensorSuite:
         ]
 
     def update(self, state: SensedState, water_velocity: Any = None) -> None:
-        """Sample whatever fell due in the control step that just ended; arguments as for `update_stages`.
+        """Take all samples that were due in the last control step; arguments as for `update_stages`.
 
-        A world whose `steps` have not moved on keeps its readings, and they are no longer fresh.
+        In a world whose `steps` have not increased, readings are unchanged and no longer fresh.
         """
         self._run(self.update_stages(state, water_velocity))
 
     def reset(self, state: SensedState, mask: Any = None, water_velocity: Any = None) -> None:
-        """Start an episode: draw the turn-on errors and read every sensor once; arguments as for `reset_stages`.
+        """Start an episode: draw the turn-on errors and sample every sensor once; arguments as for `reset_stages`.
 
-        This first reading arrives at once, whatever the latency, and is never dropped: the sensors were running before.
+        This first reading has no latency and is never dropped, as if the sensors had been running before.
         """
         self._run(self.reset_stages(state, mask, water_velocity))
 
@@ -189,5 +190,5 @@ def _kinds(vehicles: Sequence[Vehicle]) -> dict[str, str]:
 
 
 def _order(name: str) -> tuple[int, str]:
-    """Return the place of a sensor: those of FinsSim come first, in their order."""
+    """Return the sort key of a sensor: FinsSim's own sensors first, in their order."""
     return ([*OWN_KINDS].index(name) if name in OWN_KINDS else len(OWN_KINDS), name)
