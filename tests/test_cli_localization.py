@@ -418,7 +418,7 @@ def test_fuse_follows_the_vehicle(files, tmp_path, capsys):
     rows = fused(files, tmp_path)
     out, err = capsys.readouterr()
     assert err == "" and f"wrote {tmp_path / 'fused.csv'}" in out
-    assert "against the truth, fresh" in out and "vision  taken in 2" in out
+    assert "against the truth, fresh" in out and "vision  accepted 2" in out
     t = column(rows, "t")
     np.testing.assert_allclose(np.diff(t), 1 / 60, atol=1e-6)
     late = t > 1.0
@@ -611,7 +611,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
     [
         (["project", "nowhere.csv", "--pool", "pool.yaml"], "nowhere.csv: cannot be read"),
         (["project", "points.csv", "--pool", "nowhere.yaml"], "nowhere.yaml"),
-        (["project", "uv.csv", "--pool", "pool.yaml"], "uv.csv: column x is not there among u, v"),
+        (["project", "uv.csv", "--pool", "pool.yaml"], "uv.csv: column x is missing among u, v"),
         (["project", "points.csv", "--pool", "pool.yaml", "--out", "/proc/x/y.csv"], "write elsewhere"),
         (["project", "points.csv"], "Missing option '--pool'"),
         (["project", "--pool", "pool.yaml"], "Missing argument 'POINTS'"),

@@ -1,4 +1,4 @@
-"""Localization by a camera above the pool: tags in pictures, poses through the water, and their fusion."""
+"""Localization by a camera above the pool: tag detection, poses through the water surface, and sensor fusion."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Camera files: a lens with its record, in our format or in that of another program, which an importer reads."""
+"""Camera files: a lens with its calibration record, in FinsSim's format or one that an importer reads."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.localization import LocalizationError
 
 OWN = re.compile(rb"^(lens|camera)\s*:", re.MULTILINE)
-"""Beginning of a line of our own camera and pool files."""
+"""Beginning of a line that identifies FinsSim's own camera and pool files."""
 
-# Reading typed values out of a YAML mapping, each refusal one sentence with the place.
+# Typed values of a YAML mapping; every error message is one sentence that names the file and section.
 
 
 class Fields:
-    """One section of a file; what was not asked for is refused by `finish`."""
+    """One section of a file; `finish` refuses the keys that were not read."""
 
     def __init__(self, values: Mapping[Any, Any], label: str) -> None:
         """
         Args:
             values: The section.
-            label: File and section, as messages call it.
+            Label of the file and section in messages.
         """
         self._values = dict(values)
         self._known: list[str] = []
@@ -40,22 +40,20 @@ class Fields:
         return self._values.get(key) is not None
 
     def given(self, key: str) -> bool:
-        """Return whether the key is there, with a value or without."""
+        """Return whether the key is present, with or without a value."""
         return key in self._values
 
     def take(self, key: str, default: Any = None) -> Any:
-        """Return the value as it is, or the default."""
+        """Return the unchecked value, or the default."""
         self._known.append(key)
         value = self._values.get(key)
         return default if value is None else value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Return a finite number.
-
-        The unit is that of the key.
+        """Return a finite number, in the unit that the key implies.
 
         Raises:
-            LocalizationError: It is missing without a default, or not a finite number.
+            LocalizationError: The key is missing without a default, or its value is not a finite number.
         """
         value = self.take(key, default)
         if value is None:
@@ -63,10 +61,11 @@ class Fields:
         return self._finite(key, value)
 
     def numbers(self, key: str, count: int | None, default: Any = None) -> tuple[float, ...]:
-        """Return a list of finite numbers, of that many where `count` is given.
+        """Return a list of finite numbers, `count` of them unless it is None.
 
         Raises:
-            LocalizationError: It is missing without a default, of another length, or holds something else.
+            LocalizationError: The key is missing without a default, the length differs, or an item is not a
+                finite number.
         """
         value = self.take(key, default)
         if value is None:
@@ -76,10 +75,10 @@ class Fields:
         return tuple(self._finite(key, item) for item in value)
 
     def word(self, key: str, default: str | None = None) -> str:
-        """Return a word.
+        """Return a string.
 
         Raises:
-            LocalizationError: It is missing without a default, or is not a word.
+            LocalizationError: The key is missing without a default, or its value is not a string.
         """
         value = self.take(key, default)
         if not isinstance(value, str):
@@ -87,10 +86,10 @@ class Fields:
         return value
 
     def section(self, key: str) -> Fields:
-        """Return a mapping inside this one; empty where it is not given.
+        """Return a nested mapping; empty if the key is missing.
 
         Raises:
-            LocalizationError: It is no mapping.
+            LocalizationError: The value is not a mapping.
         """
         value = self.take(key, {})
         if not isinstance(value, Mapping):
@@ -98,10 +97,10 @@ class Fields:
         return Fields(value, f"{self.where}: {key}")
 
     def finish(self) -> None:
-        """Refuse keys that were not taken.
+        """Refuse keys that were not read.
 
         Raises:
-            LocalizationError: There is one.
+            LocalizationError: There is an unread key.
         """
         for key in self._values:
             if key not in self._known:
@@ -127,16 +126,17 @@ class CameraFile:
 
 
 class LensWarning(UserWarning):
-    """Warning of a lens that is possible, but probably not the one that is meant."""
+    """Warning about a lens that is possible but probably not the intended one."""
 
 
 def load_camera(path: str | Path) -> CameraFile:
-    """Read a camera file: ours (`lens:`), a pool file, or that of a program for which there is an importer of lenses.
+    """Read a camera file: FinsSim's own (`lens:`), a pool file, or a format for which a lens importer exists.
 
-    A principal point outside the middle half of the picture is warned of.
+    Warns with a `LensWarning` if the principal point lies outside the middle half of the picture.
 
     Raises:
-        LocalizationError: The file is unreadable, in another format, or lacks image size, camera matrix or distortion.
+        LocalizationError: The file is unreadable, in another format, or lacks image size, camera matrix or
+            distortion.
     """
     path = Path(path)
     file = _camera_file(path)
@@ -213,11 +213,11 @@ def lens_from(values: Mapping[Any, Any], label: str) -> Lens:
     """Return the lens of a `lens:` section.
 
     Args:
-        values: The section.
-        label: File and section, as messages call it.
+        values: Content of the section.
+        label: Label of the file and section in messages.
 
     Raises:
-        LocalizationError: A key is missing, unknown, or refused by the lens.
+        LocalizationError: A key is missing or unknown, or `Lens` refuses a value.
     """
     fields = Fields(values, label)
     fx = fields.number("fx")
@@ -236,10 +236,10 @@ def lens_from(values: Mapping[Any, Any], label: str) -> Lens:
 
 
 def only(tree: Mapping[Any, Any], known: Sequence[str], label: str) -> None:
-    """Refuse keys that are not known.
+    """Refuse unknown keys.
 
     Raises:
-        LocalizationError: There is one.
+        LocalizationError: There is an unknown key.
     """
     fields = Fields(tree, label)
     for key in known:
@@ -248,10 +248,10 @@ def only(tree: Mapping[Any, Any], known: Sequence[str], label: str) -> None:
 
 
 def model_of(word: str, label: str) -> str:
-    """Return the lens model of a word, as `lens_model`.
+    """Return the lens model of a name, as `lens_model`.
 
     Raises:
-        LocalizationError: The word is unknown.
+        LocalizationError: The name is unknown.
     """
     try:
         return lens_model(word)
@@ -260,10 +260,10 @@ def model_of(word: str, label: str) -> str:
 
 
 def lens_of(arguments: Mapping[str, Any], label: str) -> Lens:
-    """Return the lens of the arguments of `Lens`.
+    """Return the lens with the given arguments of `Lens`.
 
     Raises:
-        LocalizationError: It is refused.
+        LocalizationError: `Lens` refuses them.
     """
     try:
         return Lens(**arguments)

@@ -1,4 +1,4 @@
-"""Work of `finssim localize`: for each picture one measured pose or one reason."""
+"""Implementation of `finssim localize`: one measured pose, or the reason for having none, per picture."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 Array = npt.NDArray[np.float64]
 
-# Height and tilt of the vehicle at the exposure of a picture, from files or from one number.
+# Height and tilt of the vehicle at the exposure of a picture, from files or constants.
 
 LEVEL_STD = math.radians(2.0)
-"""Standard deviation of the tilt of a vehicle whose tilt is not given [rad]."""
+"""Standard deviation of roll and pitch without an IMU [rad]."""
 TILT_STD = math.radians(0.5)
-"""Error of an IMU's roll and pitch [rad]."""
+"""Standard deviation of an IMU's roll and pitch [rad]."""
 DEPTH_STD = 0.01
-"""Error of a depth where the vehicle file has no sensor [m]."""
+"""Standard deviation of a depth if the vehicle file has no depth sensor [m]."""
 LONGEST_GAP = 1.0
 """Longest gap between samples over which depth and tilt are interpolated [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PriorSources:
-    """Sources of height and tilt."""
+    """Sources of the vehicle's height and tilt."""
 
     base: Constraints
-    """All that does not change: vertical, port, standard deviations."""
+    """Constant part of the constraints: vertical, port, standard deviations."""
     surface: float
     """Height of the still surface along `base.up`, from the pool's origin [m]."""
     depth: Series | float | None
@@ -59,10 +59,10 @@ class PriorSources:
     up: Series | None
     """Unit vector upwards in the body frame; None: level."""
     assumed: tuple[str, ...]
-    """Sentences on what was assumed."""
+    """Sentences about assumptions."""
 
     def at(self, time: float, *, needs_height: bool) -> Constraints | str | None:
-        """Height and tilt at a time [s], or why they are not known; None where nothing is known nor needed.
+        """Return height and tilt at a time [s], or the reason why they are unknown; None if unknown but not needed.
 
         z_b = surface - depth - e3 . R_y(θ) R_x(φ) P_port, along the vertical.
         """
@@ -93,19 +93,19 @@ def prior_sources(
     tilt_std: float | None = None,
     shared_pixel_std: float = 0.0,
 ) -> PriorSources:
-    """Read the sources.
+    """Read the sources of height and tilt.
 
     Args:
-        pool: Where the water is. Where its plane is a surface, depth and tilt are relative to it; where it is a wall,
+        pool: Pool with the water plane. If it is a surface, depth and tilt are relative to it; if it is a wall,
             to the world frame of the pool file.
-        vehicle: Where its pressure port is and how well that measures.
+        vehicle: Vehicle with the position and accuracy of its pressure port.
         depth: File with columns t, depth, or one number [m], or None.
         imu: File with columns t and roll, pitch or qx, qy, qz, qw, or None.
-        tilt_std: Of roll and pitch [rad]; None: 0.5 degrees with an IMU, 2 degrees without.
-        shared_pixel_std: Error that all corners share [px].
+        tilt_std: Standard deviation of roll and pitch [rad]; None: 0.5 degrees with an IMU, 2 degrees without.
+        shared_pixel_std: Standard deviation of an error common to all corners [px].
 
     Raises:
-        LocalizationError: A file without the columns, or a number that is none.
+        LocalizationError: A file lacks the columns, or a number is invalid.
     """
     up, surface = _vertical(pool)
     sensor = vehicle.sensors.depth
@@ -131,10 +131,10 @@ def prior_sources(
 
 
 def _vertical(pool: Pool) -> tuple[tuple[float, float, float], float]:
-    """The unit vector upwards, pool frame, and the height of the still surface along it.
+    """Return the unit vector upwards, pool frame, and the height of the still surface along it.
 
-    It is the plane's own normal where that is within 45 degrees of the world's z axis: water is level, surveys are
-    nearly so.
+    Up is the plane's normal if that is within 45 degrees of the world's z axis, since water is level and
+    surveys only nearly so.
     """
     T_pw = pool.T_pw
     if float(T_pw[:3, 2] @ pool.interface.normal) > math.sqrt(0.5):
@@ -164,15 +164,15 @@ def _depth(depth: str | float | Path | None) -> Series | float | None:
 
 
 def _tilt(imu: str | Path | None) -> Series | None:
-    """Up in the body frame, whose straight line between rows is how a vehicle leans."""
+    """Read the direction of up in the body frame; it may be interpolated linearly between rows."""
     if imu is None:
         return None
     table = read_stream_table(imu)
     up = table.up()
     if up is None:
         raise LocalizationError(
-            f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; of gyro and accelerometer "
-            "alone `finssim fuse` makes one"
+            f"{imu}: no attitude: expected columns roll, pitch [rad] or qx, qy, qz, qw; run "
+            "`finssim fuse` on gyro and accelerometer to compute one"
         )
     return series("attitude", table.t, up, LONGEST_GAP, label=str(imu))
 
@@ -185,11 +185,11 @@ def _spread(name: str, value: float | None, default: float) -> float:
     return float(value)
 
 
-# Poses of a vehicle from the tags of one picture after the other, with what else is known at each exposure.
+# Poses of a vehicle from the tags of each picture, with height and tilt at its exposure.
 
 
 class Locator:
-    """Measures the pose in one picture after the other; it remembers nothing of them."""
+    """Locator of the vehicle in single pictures; it keeps no state between them."""
 
     def __init__(
         self,
@@ -200,29 +200,28 @@ class Locator:
         method: str = "refractive",
         pixel_std: float = 0.5,
     ) -> None:
-        """
-        Args:
+        """Args:
             pool: Camera and water.
-            vehicle: Its tags.
+            vehicle: Vehicle with its tags.
             prior: Height and tilt over time.
-            method: A name of `METHODS`.
+            method: A name in `METHODS`.
             pixel_std: Standard deviation of a corner, per axis [px].
 
         Raises:
-            LocalizationError: As of `TagLocator`, or no depth where the method needs one.
+            LocalizationError: As `TagLocator`, or the method needs a depth and there is none.
         """
         self._locate = TagLocator(pool, vehicle.file_tags, method=method, pixel_std=pixel_std)
         if self._locate.needs_height and prior.depth is None:
             raise LocalizationError(
                 f"method {method} needs --depth FILE (columns t, depth) or --depth METRES, the depth of the pressure "
-                "port; --method refractive-6dof does without"
+                "port; --method refractive-6dof needs none"
             )
         self.known, self.tags_b = prior, self._locate.tags_b
         """Corners of the vehicle's tags, body frame [m]: tag id -> (4, 3)."""
         self.family = family_named(self._locate.family).name
 
     def locate(self, frame: Frame) -> PoseMeasurement:
-        """The pose in one picture, or why there is none."""
+        """Return the pose in one picture, or a refusal with its reason."""
         locate = self._locate
         of_family = [d for d in frame.detections if _name(d.family) in ("", self.family)]
         if frame.detections and not of_family:
@@ -236,14 +235,14 @@ class Locator:
 
 @cache
 def _name(family: str) -> str:
-    """The family's own name, such as `tag25h9` for `25h9`; unknown ones as they are."""
+    """Return the family's canonical name, such as `tag25h9` for `25h9`; unknown names are returned unchanged."""
     try:
         return family_named(family).name if family else ""
     except LocalizationError:
         return family
 
 
-# The table that `finssim localize` writes, and its summary.
+# Output table of `finssim localize`, and its summary.
 
 Row = tuple[Frame, PoseMeasurement]
 
@@ -252,8 +251,9 @@ COLUMNS = (
     *("qx", "qy", "qz", "qw", "cov_xy", "cov_xyaw", "cov_yyaw", "residual_px", "tags", "corners", "medium"),
     *("status", "reason"),
 )
-"""Metres and radians, pool frame; z of the body origin; q turns body vectors into the pool's. `time` is the stamp of
-the picture. A refused picture has empty numbers, status `refused` and a reason."""
+"""Columns of the table, metres and radians, pool frame; z of the body origin; q rotates body vectors to the
+pool frame. `time` is the stamp of the picture. A refused picture has empty numbers, status `refused` and a
+reason."""
 
 
 def write_rows(rows: Sequence[Row], out: Path) -> None:
@@ -278,7 +278,7 @@ def _cells(frame: Frame, measurement: PoseMeasurement) -> list[Any]:
 
 
 def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
-    """Figures of a run, as plain values."""
+    """Return the figures of a run, as plain values."""
     located = [measurement for _, measurement in rows if measurement.ok]
     reasons = Counter(counted(measurement.reason) for _, measurement in rows if not measurement.ok)
     rejected: Counter[str] = Counter()
@@ -296,7 +296,7 @@ def summary_of(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
-    """The summary for a person."""
+    """Return the lines of the printed summary."""
     lines = [f"{summary['located']} of {summary['frames']} pictures located with method {summary['method']}"]
     lines += [f"refused {n:5d}: {reason}" for reason, n in summary["refused"].items()]
     if summary["corners_rejected"]:
@@ -314,10 +314,10 @@ def _median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
-# Pictures with the tags found in them: from pictures and videos, or from detection files.
+# Pictures with their tags: from pictures and videos, or from detections files.
 
 TABLES = (".csv", ".tsv", ".txt")
-"""Suffixes of detection files."""
+"""Suffixes of detections files."""
 
 
 def frames_of(
@@ -328,19 +328,19 @@ def frames_of(
     times: Path | None,
     notes: list[str],
 ) -> tuple[Iterator[Frame], int | None]:
-    """Frames one after the other, and how many there will be where that is known.
+    """Return an iterator over the frames, and their number if it is known in advance.
 
     Args:
-        inputs: Pictures, folders of them, videos or detection files.
-        lens: Of the camera: pictures of another size are refused.
-        find: Finds tags in pictures.
-        corners: Tag id -> its corners on the vehicle [m], (4, 3). In videos these tags are looked for near where they
-            were a picture before.
+        inputs: Pictures, folders of them, videos or detections files.
+        lens: Lens of the camera: pictures of another size are refused.
+        find: Detector of the tags in pictures.
+        corners: Tag id -> its corners on the vehicle [m], (4, 3). In videos these tags are first searched
+            near their previous positions.
         times: File with the time stamps of the pictures.
-        notes: Takes one sentence on each thing that was left out.
+        notes: List to which one sentence is appended for each thing that was left out.
 
     Raises:
-        LocalizationError: An input is not there, of unknown kind or cannot be read.
+        LocalizationError: An input is missing, of unknown kind or cannot be read.
     """
     if not inputs:
         raise LocalizationError(
@@ -377,7 +377,7 @@ def _seen(
                 "pool file's lens: calibrate at the size at which you record"
             )
         of_film, number, _ = name.rpartition("#")
-        if not number:  # a picture for itself
+        if not number:  # a single picture
             yield Frame(time, name, tuple(find.detect(image)))
             continue
         if tracker is None or of_film != film:
@@ -386,7 +386,7 @@ def _seen(
 
 
 def _count(inputs: Sequence[Path]) -> int | None:
-    """Return the number of pictures; None with videos."""
+    """Return the number of pictures; None if there are videos."""
     from finssim.localization.detection.pictures import PICTURE_FILES
 
     count = 0
@@ -401,7 +401,7 @@ def _count(inputs: Sequence[Path]) -> int | None:
 
 @dataclass
 class LocalizeResult:
-    """Result of the pictures."""
+    """Result of localizing the vehicle in pictures."""
 
     rows: list[Row] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
@@ -410,33 +410,33 @@ class LocalizeResult:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageTables:
-    """Measurements beside the images: depth, tilt and times."""
+    """Additional measurements: depth, tilt and times of the images."""
 
     depth: str | float | Path | None = None
     """(FILE|Z) Table with columns t, depth, or one depth of the pressure port below the surface [m]."""
     imu: str | Path | None = None
-    """(FILE) Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; level if not given."""
+    """(FILE) Table with columns t and roll, pitch [rad] or qx, qy, qz, qw; by default the vehicle is level."""
     tilt_std_deg: float | None = None
-    """Error of roll and pitch [deg]; 0.5 with --imu, 2 without, if not given."""
+    """Standard deviation of roll and pitch [deg]; default 0.5 with --imu, 2 without."""
     times: str | Path | None = None
-    """(FILE) Table with columns image, time [s], if the image names contain none."""
+    """(FILE) Table with columns image, time [s], if the image names contain no times."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalizeSettings:
-    """Method of the localization, and how corners are refined and how much they err."""
+    """Method of the localization, refinement of corners and their errors."""
 
     method: str = "refractive"
     """(METHOD) refractive, refractive-weighted, refractive-6dof, pinhole-depth or pinhole."""
     refine: str = "fit"
-    """(WAY) Corner refinement: fit, or AprilTag's own edges or none."""
+    """(METHOD) Corner refinement: fit, edges (AprilTag's own) or none."""
     gamma: float = 1.0
     """Exponent gamma of the images: 1 linear, 2.2 video."""
     pixel_std: float | None = None
-    """Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
-    given."""
+    """Standard deviation of a detected corner, per axis [px]; by default that of the pool's calibration,
+    otherwise 0.5."""
     shared_pixel_std: float = 0.0
-    """Error common to all corners of an image, per axis [px]: waves."""
+    """Standard deviation of an error common to all corners of an image, such as by waves, per axis [px]."""
 
 
 def run(
@@ -454,18 +454,18 @@ def run(
     Example: finssim localize video.mp4 --pool pool.yaml --vehicle finsrov --depth depth.csv --out poses.csv
 
     Args:
-        inputs (INPUT): Images, folders of them, videos, or detection files (.csv).
+        inputs (INPUT): Images, folders of them, videos, or detections files (.csv).
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv), one row per image.
-        tables: Measurements beside the images: depth, tilt and times.
+        tables: Additional measurements: depth, tilt and times of the images.
         settings: Method, refinement and errors of corners.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        LocalizationError: An input cannot be used, or the method needs a depth that is not given.
+        LocalizationError: An input cannot be used, or the method needs a depth and there is none.
         OutputError: `out` cannot be written.
-        KeyboardInterrupt: After what was done until then has been written.
+        KeyboardInterrupt: The run was interrupted; the rows measured until then have been written.
     """
     out, paths = Path(out), [Path(p) for p in ([inputs] if isinstance(inputs, (str, Path)) else inputs)]
     refuse_unwritable(atomic_write(out))
@@ -519,7 +519,7 @@ def run(
 
 
 def _measure(frames: Iterator[Frame], count: int | None, locator: Locator) -> LocalizeResult:
-    """Measure one frame after the other, until the end or Ctrl-C."""
+    """Measure all frames, until the end or Ctrl-C."""
     result = LocalizeResult()
     screen = Console(stderr=True)
     columns = (TextColumn("localize"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))

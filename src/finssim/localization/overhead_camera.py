@@ -1,4 +1,4 @@
-"""The pool file: one camera, the water before it, and where the world frame lies in the frame of the survey."""
+"""Pool file: one camera, the water in front of it, and the pose of the world frame in the frame of the survey."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ Array = npt.NDArray[np.float64]
 
 FORMAT = 1
 SUREST_PIXEL = 0.05
-"""A corner is believed no more than this [px], however small the residuals were."""
+"""Smallest standard deviation assumed for a corner [px], even if the residuals are smaller."""
 USUAL_PIXEL = 0.5
 """Standard deviation of a corner without a calibration [px]."""
 
 
 @dataclass(frozen=True)
 class Pool:
-    """A camera that looks into water through a plane. Everything is written in the pool frame, that of the survey."""
+    """Camera that views the water through a plane. All quantities are in the pool frame, that of the survey."""
 
     camera: Camera
     interface: Interface
     latency: float = 0.0
     """Time stamp of a picture minus the middle of its exposure [s]."""
     world_position: tuple[float, float, float] | None = None
-    """Origin of the world frame, pool frame [m]; None: on the surface at x = y = 0, or the pool's own origin where the
+    """Origin of the world frame, pool frame [m]; None: on the surface at x = y = 0, or the pool's own origin if the
     plane is a wall."""
     world_orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """World axes to pool axes, xyzw."""
+    """Rotation of world axes to pool axes, xyzw."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Record of the calibration: estimates, intervals, provenance."""
 
     @property
     def is_surface(self) -> bool:
-        """Return whether the plane is a water surface with z up: its normal is nearer to z than to the horizon."""
+        """Return whether the plane is a water surface with z up: its normal is nearer to z than to the horizontal."""
         return bool(self.interface.normal[2] > np.sqrt(0.5))
 
     @property
@@ -70,14 +70,16 @@ class Pool:
 
     @property
     def pixel_std(self) -> float:
-        """Return the standard deviation of a corner, per axis [px]: from the calibration's residuals, otherwise 0.5."""
+        """Return the standard deviation of a corner, per axis [px]: that of the calibration's residuals,
+        otherwise 0.5."""
         residual = self.record.get("residual")
         value = residual.get("pixel_sigma") if isinstance(residual, Mapping) else None
         return max(float(value), SUREST_PIXEL) if isinstance(value, (int, float)) else USUAL_PIXEL
 
     @property
     def sha256(self) -> str:
-        """Hash of all that decides a measurement: camera, plane, latency and world frame, not the record."""
+        """Hash of everything that affects a measurement: camera, plane, latency and world frame, but not the
+        record."""
         return hashlib.sha256(json.dumps(_values(self), sort_keys=True).encode()).hexdigest()
 
 
@@ -85,7 +87,7 @@ def load_pool(path: str | Path) -> Pool:
     """Read a pool file.
 
     Raises:
-        LocalizationError: Unreadable, a key missing or unknown, a number refused; says where and what to write.
+        LocalizationError: The file is unreadable, a key is missing or unknown, or a number is refused.
     """
     path = Path(path)
     tree = read_mapping(path, LocalizationError, such_as="camera: {position: [0, 0, 2.2]}")
@@ -100,7 +102,7 @@ def load_pool(path: str | Path) -> Pool:
     orientation = _unit(world, "orientation", world.numbers("orientation", 4, (0.0, 0.0, 0.0, 1.0)))
     world.finish()
     frames.finish()
-    top.section("calibration")  # a record, not read any further
+    top.section("calibration")  # a record, not read further
     top.finish()
     return Pool(
         camera, interface, latency, _three(position), _four(orientation), dict(tree.get("calibration") or {})
@@ -108,7 +110,7 @@ def load_pool(path: str | Path) -> Pool:
 
 
 def write_pool(pool: Pool, path: str | Path) -> None:
-    """Write a pool file that `load_pool` reads back to the same hash.
+    """Write a pool file; `load_pool` reads it back with the same hash.
 
     Raises:
         OutputError: The file cannot be written.
@@ -154,7 +156,7 @@ def _values(pool: Pool) -> dict[str, Any]:
 
 def _camera(fields: Fields, path: Path) -> tuple[Camera, float]:
     lens = fields.take("lens")
-    if isinstance(lens, str):  # a camera file beside this one
+    if isinstance(lens, str):  # a camera file in the same folder
         lens_ = load_camera(path.parent / lens).lens
     elif isinstance(lens, Mapping):
         lens_ = lens_from(lens, f"{fields.where}: lens")
@@ -168,7 +170,7 @@ def _camera(fields: Fields, path: Path) -> tuple[Camera, float]:
 
 
 def _interface(fields: Fields) -> Interface:
-    """The plane, from normal and offset (or a point of it), or from the height of level water."""
+    """Read the plane, from its normal and offset (or a point on it), or from the height of level water."""
     near, far = fields.number("index_near", 1.0003), fields.number("index_far", 1.333)
     layers = []
     for item in fields.take("window", ()):
@@ -195,7 +197,7 @@ def _unit(fields: Fields, key: str, values: tuple[float, ...]) -> tuple[float, .
     length = float(np.linalg.norm(values))
     if abs(length - 1.0) > 1e-3:
         raise fields.error(f"{key} has length {length:.4g}, expected 1")
-    # What was normalised before stays bit by bit what it is, so that a file keeps its hash.
+    # A normalized value stays unchanged to the last bit, so that a file keeps its hash.
     return values if abs(length - 1.0) < 1e-15 else tuple(float(x / length) for x in values)
 
 

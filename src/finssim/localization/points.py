@@ -1,4 +1,5 @@
-"""Work of `finssim project` and `finssim backproject`: tables of points to pixels, and of pixels to points."""
+"""Implementation of `finssim project` and `finssim backproject`: tables of points to pixels, and of pixels to
+points."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from finssim.core.text_table import csv_text, read_text, text_table, write_csv
 from finssim.localization import LocalizationError
 from finssim.localization.overhead_camera import load_pool
 
-# Tables of points or pixels, one per row: named columns of numbers, and others that are carried along.
+# Tables of points or pixels, one per row: named columns of numbers; other columns are copied.
 
 _UNIT = re.compile(r"(\[[^\]]{0,80}\]|\([^)]{0,80}\)|_m|_px|_pix|_pixels?|_metres|_meters)$")
 _BAD_ROWS_NAMED = 5
@@ -28,19 +29,20 @@ _BAD_ROWS_NAMED = 5
 
 @dataclass(frozen=True, eq=False)
 class PointTable:
-    """A table as it was read."""
+    """Table as it was read."""
 
     label: str
-    """The file, as messages call it."""
+    """Label of the file in messages."""
     names: list[str]
-    """All columns, as the file calls them."""
+    """Names of all columns, as in the file."""
     rows: list[list[str]]
-    """All cells, as the file writes them."""
+    """Texts of all cells, as in the file."""
     numbers: dict[str, Array]
-    """The columns that were asked for and are there, in the unit of the table, (n,) each."""
+    """Requested columns that are present, in the unit of the table, (n,) each."""
 
     def with_columns(self, columns: dict[str, Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-        """Names and rows with columns added; one of the file that has the name of an added one becomes NAME_given."""
+        """Return names and rows with columns added; a column of the file with the name of an added one
+        becomes NAME_given."""
         added = {name.lower() for name in columns}
         names = [f"{name}_given" if _plain(name) in added else name for name in self.names]
         cells = zip(*columns.values(), strict=True)
@@ -50,17 +52,17 @@ class PointTable:
 def read_points(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> PointTable:
     """Read a table of numbers.
 
-    Columns may stand in any order, in capitals, with a unit (`x [m]`, `u_px`). Without a header the columns are those
-    wanted, then the optional ones. Cells are separated by commas, semicolons (then with decimal commas too), tabs or
-    spaces; lines that begin with # are comments.
+    Columns may be in any order, in capitals and with a unit (`x [m]`, `u_px`). Without a header the columns
+    are the required ones, then the optional ones. Cells are separated by commas, semicolons (then also with
+    decimal commas), tabs or spaces; lines that begin with # are comments.
 
     Args:
         path: The file; `-` is the standard input.
-        required: Columns that must be there.
-        optional: Columns that may be there.
+        required: Names of the required columns.
+        optional: Names of optional columns.
 
     Raises:
-        LocalizationError: A column is missing, or cells are not numbers: the lines are named.
+        LocalizationError: A column is missing, or cells are not numbers: the message names the lines.
     """
     label = "standard input" if str(path) == "-" else str(path)
     text = sys.stdin.read() if str(path) == "-" else read_text(path, LocalizationError)[0]
@@ -81,9 +83,9 @@ def read_points(path: Path, required: Sequence[str], optional: Sequence[str] = (
     plain = [_plain(name) for name in names]
     for name in (*required, *optional):
         if plain.count(name) > 1 or (name in required and name not in plain):
-            there = "twice" if name in plain else "not"
+            there = "repeated" if name in plain else "missing"
             raise LocalizationError(
-                f"{label}: column {name} is {there} there among {', '.join(names)}: name the columns "
+                f"{label}: column {name} is {there} among {', '.join(names)}: name the columns "
                 f"{', '.join(required)} in the first line"
             )
     places = {name: plain.index(name) for name in (*required, *optional) if name in plain}
@@ -137,11 +139,11 @@ def run_project(
     Args:
         points (POINTS): Table with columns x, y, z, pool frame [m]; - for standard input.
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
-        out (FILE): Table to write; standard output if not given.
+        out (FILE): Table to write; by default standard output.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        LocalizationError: A file that cannot be used; wrong rows are named.
+        LocalizationError: A file cannot be used; the message names wrong rows.
         OutputError: `out` cannot be written.
     """
     if out is not None:
@@ -176,13 +178,13 @@ def run_backproject(
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         z: Height of the points, pool frame [m]; a column z has priority.
         plane: Plane of the points, instead of --z: a,b,c,d with a x + b y + c z + d = 0 [m].
-        pixel_std: Error of a pixel [px]; adds columns with the error of the points [m].
-        out (FILE): Table to write; standard output if not given.
+        pixel_std: Standard deviation of a pixel [px]; adds columns with the standard deviations of the points [m].
+        out (FILE): Table to write; by default standard output.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        LocalizationError: A file that cannot be used (wrong rows are named), no plane or two, or numbers that make no
-            plane or error.
+        LocalizationError: A file cannot be used (the message names wrong rows), there is no plane or more
+            than one, or the plane or standard deviation is invalid.
         OutputError: `out` cannot be written.
     """
     if out is not None:
@@ -207,7 +209,7 @@ def run_backproject(
 
 
 def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array, Array | float]:
-    """Normal and offset of the plane, from the only place that gives one."""
+    """Return normal and offset of the plane, from the option or column that specifies it."""
     up = np.array([0.0, 0.0, 1.0])
     if plane is not None:
         if z is not None:
@@ -231,7 +233,7 @@ def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array
 
 
 def _cells(values: Array, digits: int) -> list[str]:
-    """Numbers as text, empty where there is none."""
+    """Return numbers as text; those that are not finite are empty."""
     return [f"{x:.{digits}f}" if np.isfinite(x) else "" for x in values.tolist()]
 
 
@@ -248,7 +250,7 @@ def _give(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Write the table, and say on standard error how many rows have no answer, and why."""
+    """Write the table, and report on standard error how many rows have no result, and why."""
     names, rows = table.with_columns(dict[str, Sequence[str]](columns))
     rejected = count_rejections(status)
     good = len(status) - sum(rejected.values())

@@ -1,1 +1,1 @@
-"""Tags in pictures: families, detectors, regions, and files of what was found."""
+"""Tags in pictures: families, detectors, search regions, and detections files."""

@@ -1,8 +1,8 @@
-"""Tags found in pictures, and the CSV file that keeps them.
+"""Tags detected in pictures, and the CSV file that stores them.
 
-One row per tag: `time,image,tag,u0,v0,u1,v1,u2,v2,u3,v3,margin,hamming,family`. Time in seconds, corners in pixels with
-integers at pixel centres, in the order top-left, top-right, bottom-right, bottom-left of the printed black border. A
-picture without tags is a row whose cells after `image` are empty.
+One row per tag: `time,image,tag,u0,v0,u1,v1,u2,v2,u3,v3,margin,hamming,family`. Time in seconds, corners in
+pixels with integers at pixel centres, in the order top-left, top-right, bottom-right, bottom-left of the
+printed black border. A picture without tags is a row whose cells after `image` are empty.
 """
 
 from __future__ import annotations
@@ -47,31 +47,32 @@ class Detection:
     """One tag in one picture."""
 
     tag: int
-    """Its id within the family."""
+    """Id of the tag within its family."""
     corners: Array
     """Pixels (u, v), integers at pixel centres, (4, 2): top-left, top-right, bottom-right, bottom-left as printed."""
     margin: float = math.nan
-    """Contrast with which its bits were read [grey levels]: higher is more certain; NaN if it is not known."""
+    """Decision margin, the contrast with which the bits were read [grey levels]; higher is more certain, NaN
+    if unknown."""
     hamming: int = 0
-    """Bits that were corrected."""
+    """Number of corrected bits."""
     family: str = ""
-    """Family such as `tag25h9`; empty if it is not known."""
+    """Family such as `tag25h9`; empty if unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Tags found in one picture."""
+    """Tags detected in one picture."""
 
     time: float
-    """Time stamp of the picture [s]; NaN where it has none."""
+    """Time stamp of the picture [s]; NaN if it has none."""
     image: str
-    """Its name; empty where it has none."""
+    """Name of the picture; empty if it has none."""
     detections: tuple[Detection, ...]
-    """Detections in the order in which they were found: an id may occur twice."""
+    """Detections in the order in which they were made; an id may occur twice."""
 
 
 def best_detections(detections: Iterable[Detection]) -> list[Detection]:
-    """One detection of each family and id: that with the fewest corrected bits, then the greatest margin."""
+    """Return one detection per family and id: that with the fewest corrected bits, then the greatest margin."""
     best: dict[tuple[str, int], Detection] = {}
     for detection in detections:
         rival = best.setdefault((detection.family, detection.tag), detection)
@@ -81,14 +82,14 @@ def best_detections(detections: Iterable[Detection]) -> list[Detection]:
 
 
 def in_our_order(frames: Sequence[Frame], corners: Mapping[int, Array]) -> tuple[list[Frame], str]:
-    """Return pictures whose corners are in our order, and a sentence if the file had them in another one.
+    """Return pictures whose corners are in FinsSim's order, and a sentence if the file had another order.
 
-    Other programs begin at another corner or go round the other way. A printed tag is seen from its front, which shows
-    the direction. The first corner is the one with which each tag, as a ruler of the plane around it, best gives the
-    places of the others: so it takes two tags in a picture.
+    Other programs begin at another corner or go round in the other direction. A printed tag is seen from its
+    front, which reveals the direction. The first corner is the one for which an affine extrapolation from
+    each tag best predicts the positions of the others, so at least two tags must be visible in a picture.
 
     Args:
-        frames: As they were read.
+        frames: Pictures as they were read.
         corners: Tag id -> its corners in the order of `families.corners` in any common frame [m], (4, 3).
     """
     seen = [
@@ -128,22 +129,22 @@ def in_our_order(frames: Sequence[Frame], corners: Mapping[int, Array]) -> tuple
 
 
 UNCLEAR = 0.5
-"""Share of the miss of the second best order below which the best one is believed."""
+"""Ratio of the best order's error to that of the second best, above which the best order is not accepted [-]."""
 
 
 def _area(pixels: Array) -> float:
-    """Signed area of a ring of corners [px²]; above 0 where it goes round clockwise on the screen."""
+    """Return the signed area of a ring of corners [px²]; positive if it runs clockwise on the screen."""
     x, y = pixels.T
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def _miss(X: Array, x: Array, Y: Array, y: Array) -> float | None:
-    """Return by how much a tag misses the place of another one in the picture, as a share of their distance.
+    """Return the error with which a tag predicts the picture position of another, as a fraction of their distance.
 
     Args:
         X: Corners of the tag [m], (4, 3).
         x: Its corners in the picture [px], (4, 2).
-        Y: Corners of the other one [m].
+        Y: Corners of the other tag [m].
         y: Its corners in the picture [px].
     """
     there, seen = Y.mean(axis=0) - X.mean(axis=0), y.mean(axis=0) - x.mean(axis=0)
@@ -158,10 +159,10 @@ def _miss(X: Array, x: Array, Y: Array, y: Array) -> float | None:
 
 
 def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
-    """Write a detections file; every number reads back bit for bit.
+    """Write a detections file; every number is restored exactly when it is read.
 
     Args:
-        frames: In the order in which they are written.
+        frames: Pictures in the order in which they are written.
         path: The file (.csv).
 
     Raises:
@@ -183,21 +184,22 @@ def write_detections(frames: Iterable[Frame], path: str | Path) -> None:
 def read_detections(path: str | Path, notes: list[str] | None = None) -> list[Frame]:
     """Read a detections file.
 
-    Columns may stand in any order and be called as others call them (`id`, `tag_id`; `x0`, `corner0_u`, `c0_x`; corners
-    may count from 1), others are left aside; cells are separated by commas, semicolons or tabs, lines that begin with #
-    are comments. Rows of one picture belong together by image and time, whichever is there; without either, the file
-    is one picture. A file that a crash cut short opens up to the cut.
+    Columns may be in any order and have common alternative names (`id`, `tag_id`; `x0`, `corner0_u`, `c0_x`;
+    corners may count from 1); other columns are ignored. Cells are separated by commas, semicolons or tabs;
+    lines that begin with # are comments. Rows with equal image and time, where present, belong to one
+    picture; without either column, the file is one picture. A file that was truncated by a crash is read up
+    to the cut.
 
     Args:
         path: The file.
-        notes: Takes one sentence for each thing that was left out.
+        notes: List to which one sentence is appended for each thing that was left out.
 
     Returns:
-        Pictures in the order in which the file first names them.
+        Pictures in the order of their first appearance in the file.
 
     Raises:
-        LocalizationError: Unreadable, without the tag or corner columns, or with a cell that is no number; names file
-            and line.
+        LocalizationError: The file is unreadable, lacks the tag or corner columns, or has a cell that is not
+            a number; the message names file and line.
     """
     table = read_text_table(path, LocalizationError)
     header, rows = table.names, list(zip(table.lines, table.rows, strict=True))
@@ -256,7 +258,7 @@ def _integer(table: TextTable, row: Mapping[str, str], name: str, label: str) ->
 
 
 def _columns(header: list[str], label: str) -> dict[str, int]:
-    """Our column name -> its place in the file."""
+    """Return our column name -> column index in the file."""
     spoken = [re.sub(r"[\s\-.\[\]()]+", "_", name.lower()).strip("_") for name in header]
     standard_names = {other: name for name, others in _OTHER_NAMES.items() for other in (name, *others)}
     matches = [(standard_names.get(name) or "", _CORNER.fullmatch(name)) for name in spoken]

@@ -1,4 +1,5 @@
-"""Finding tags in a picture, their corners to a few hundredths of a pixel, and both in a stream of pictures."""
+"""Tag detection in a picture, corner refinement to a few hundredths of a pixel, and tracking in a stream of
+pictures."""
 
 from __future__ import annotations
 
@@ -20,26 +21,27 @@ __all__ = ["REFINEMENTS", "Detector", "RegionTracker", "adjugate", "detector", "
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
-# A tag as it should look in a picture, and how its gray changes as it moves, blurs or brightens.
+# Expected appearance of a tag in a picture, and the derivatives of its gray by motion, blur and brightness.
 
 REACH = 0.1
-"""White around the black border that is looked at [cells]. Little: many prints have less margin than the one cell that
-is asked for, and the blur brings in what lies beyond."""
+"""Width of the white around the black border that is used in the fit [cells]. It is small: many prints have a
+narrower margin than the specified one cell, and blur mixes in the background beyond it."""
 REACH_OF_DATA = -0.4
-"""White around the border that is used if data cells lie at the outside of the tag, next to any background [cells]."""
+"""Width of the white around the border that is used if data cells lie at the outside of the tag, next to any
+background [cells]."""
 SAMPLES = 5
-"""Along a cell, each way."""
+"""Number of samples along a cell, in each direction."""
 BLURS = np.array([0.2, 0.24, 0.29, 0.35, 0.42, 0.5])
-"""Blurs of the pattern to choose from, standard deviation [cells]."""
+"""Candidate blurs of the pattern, standard deviation [cells]."""
 SURROUND = 0.8
-"""Reach of the local mean that is taken off, standard deviation [cells]."""
+"""Width of the Gaussian window of the local mean that is subtracted, standard deviation [cells]."""
 FLAT = 0.5
-"""Share of the contrast of the complete tag below which a place counts as flat."""
+"""Floor of the local contrast, as a fraction of the contrast of the complete tag [-]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """A tag as it should look, at n = m² points of a grid on its own plane."""
+    """Expected appearance of a tag at n = m² points of a grid on its own plane."""
 
     points: Array
     """x right, y down from the top left of the measured square [edges]; (n, 2)."""
@@ -48,24 +50,25 @@ class Pattern:
     surround: Array
     """Weights of the local mean along a side of the grid, (m, m)."""
     columns: Array
-    """Derivatives of the gray by 8 parameters of a homography, blur and gain, less their local means, (n, 10)."""
+    """Derivatives of the gray by 8 parameters of a homography, blur and gain, minus their local means, (n, 10)."""
     solver: Array
-    """Their pseudo-inverse, parameters per grey level [-], (10, n)."""
+    """Pseudo-inverse of `columns`, parameters per grey level [-], (10, n)."""
     plain: Array
-    """Pseudo-inverse of derivatives by 8 parameters, offset and two slopes of the light, blur and gain, per grey level
-    [-], (13, n)."""
+    """Pseudo-inverse of the derivatives by 8 parameters of a homography, offset and two slopes of the
+    illumination, blur and gain, per grey level [-], (13, n)."""
 
     def even(self, gray: Array) -> Array:
-        """Gray at the points as under even light: less its local mean, over its local contrast, (n,)."""
+        """Return the gray at the points as under even illumination: minus its local mean, divided by its
+        local contrast, (n,)."""
         level = self.less_mean(gray)
         return level / self._spread(level)
 
     def less_mean(self, gray: Array) -> Array:
-        """Gray less its local mean, (n,)."""
+        """Return the gray minus its local mean, (n,)."""
         return gray - self._smooth(gray)
 
     def contrast(self, gray: Array) -> Array:
-        """Local standard deviation of the gray, with a share of that of all of it, (n,)."""
+        """Return the local standard deviation of the gray, with a floor relative to the overall contrast, (n,)."""
         return self._spread(self.less_mean(gray))
 
     def _spread(self, level: Array) -> Array:
@@ -78,13 +81,13 @@ class Pattern:
 
 
 def nearest_blur(blur: float) -> float:
-    """The blur of a pattern that comes nearest. Both in pixels."""
+    """Return the candidate blur [cells] that is nearest to the given one [cells]."""
     return float(BLURS[np.abs(BLURS - blur).argmin()])
 
 
 @lru_cache(maxsize=256)
 def pattern_of(family: str, tag: int, blur: float) -> Pattern:
-    """The pattern of a tag with a blur [cells]."""
+    """Return the pattern of a tag with a given blur [cells]."""
     kind = family_named(family)
     reach = REACH_OF_DATA if kind.outside else REACH
     low, high = -kind.outside - reach, kind.border + kind.outside + reach
@@ -114,7 +117,8 @@ def _inverse(columns: Array) -> Array:
 
 
 def _weights(places: Array, outside: int, cells: int, blur: float) -> tuple[Array, Array, Array]:
-    """Share of every cell in the gray at the places along one axis, and its derivatives by place and blur."""
+    """Return each cell's contribution to the gray at positions along one axis, and its derivatives by
+    position and blur."""
     from scipy.special import ndtr  # here and below: who is sent corners starts without them
 
     edges = np.arange(-outside - 3, cells - outside + 4)
@@ -127,22 +131,22 @@ def _weights(places: Array, outside: int, cells: int, blur: float) -> tuple[Arra
 # Corners to a few hundredths of a pixel: the known tag is fitted to the picture.
 #
 # The cells of a decoded tag are known, so each of their edges, inner ones too, locates the tag. A homography
-# is fitted by Gauss-Newton (inverse compositional, so that its Jacobian is computed once) together with what the light
-# did: gain, offset, two slopes across the tag, and the blur. Blur widens an edge equally to both sides and moves no
-# corner. Then the same in local contrast, which glare and shadows change little, with less weight where something hides
-# the tag.
+# is fitted by Gauss-Newton (inverse compositional, so that its Jacobian is computed once) together with the effects of
+# the illumination: gain, offset, two slopes across the tag, and the blur. Blur widens an edge equally to both sides and
+# moves no corner. A second fit in local contrast, which glare and shadows change little, follows; a third gives less
+# weight to points where something covers the tag.
 
 Gray = npt.NDArray[Any]
 
 LENS_BLUR = 0.7
-"""Assumed before the fit, pixel area and interpolation included, standard deviation [px]."""
+"""Blur assumed before the fit, pixel area and interpolation included, standard deviation [px]."""
 STEPS = 15
 SETTLED = 2e-3
 """Movement of a corner below which the fit ends [px]."""
 COARSE = 0.05
-"""Movement of a corner below which the first part of the fit ends [px]."""
+"""Movement of a corner below which the first stage of the fit ends [px]."""
 SMALLEST_RESIDUAL = 0.02
-"""Misfit that is always taken for noise, share of the contrast."""
+"""Residual that is always attributed to noise, as a fraction of the contrast [-]."""
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
@@ -151,25 +155,25 @@ class TagFit:
     """Fitted position of a tag in the picture."""
 
     corners: Array
-    """Corners of the measured edge, pixels, (4, 2)."""
+    """Corners of the measured edge [px], (4, 2)."""
     correlation: float
-    """Correlation of the picture with the pattern: 1 is perfect, and low if the tag is absent."""
+    """Correlation of the picture with the pattern: 1 is perfect; low if the tag is absent."""
     contrast: float
     """White minus black [gray levels]."""
 
 
 def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> TagFit | None:
-    """Fit a tag near the place where it was found.
+    """Fit a tag near a detected position.
 
     Args:
-        image: Gray, linear in light where corners shall be without bias, (h, w).
+        image: Gray, linear in light if the corners must be unbiased, (h, w).
         family: Name of its family.
         tag: Its id.
-        corners: Where it was found, within about a third of a cell, pixels, (4, 2).
+        corners: Detected corners, accurate to about a third of a cell [px], (4, 2).
 
     Returns:
-        The fit; where it does not settle near there the given corners, with the correlation that they have. None where
-        part of the tag lies outside the picture, or the corners are no convex ring.
+        The fit; if it does not converge nearby, the given corners with their correlation. None if
+        part of the tag lies outside the picture, or the corners do not form a convex ring.
     """
     if not _convex(corners):
         return None
@@ -184,7 +188,7 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> TagFit | None
     coarse = _settle(pattern, patch, corners - shift, limit, plain=True)
     settled = coarse
     if coarse is not None:
-        fitted_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than was assumed
+        fitted_blur = nearest_blur(blur + coarse.wider)  # sharper or softer than assumed
         pattern = pattern_of(family, tag, fitted_blur)
         settled = _settle(pattern, patch, coarse.corners, limit) or coarse
         weights = _weights_of(settled.residual, settled.gain) if settled is not coarse else None
@@ -199,12 +203,12 @@ def fit_tag(image: Gray, family: str, tag: int, corners: Array) -> TagFit | None
 
 @dataclass(frozen=True, eq=False)
 class _Settled:
-    """Position on the patch at which a pattern converged."""
+    """Position on the patch to which a pattern converged."""
 
     corners: Array
     """(4, 2)."""
     gain: float
-    """White minus black, in gray levels or in shares of the local contrast."""
+    """White minus black, in gray levels or relative to the local contrast."""
     wider: float
     """Difference between the picture's blur and the pattern's [cells]."""
     residual: Array
@@ -221,9 +225,9 @@ def _settle(
     plain: bool = False,
     solver: Array | None = None,
 ) -> _Settled | None:
-    """Gauss-Newton from a start; `plain` comes from farther, in gray as it is, and ends sooner.
+    """Fit by Gauss-Newton from a start; `plain` converges from farther away, in unnormalized gray, and ends sooner.
 
-    None where it moves a corner by more than the limit [px], or out of the patch, or does not come to rest.
+    Return None if a corner moves by more than the limit [px] or out of the patch, or if the fit does not converge.
     """
     solver = pattern.plain if plain else pattern.solver if solver is None else solver
     H = np.array(from_square(start.tolist()))
@@ -237,7 +241,7 @@ def _settle(
         gain = float(solution[-1])
         if not gain > 0.0 or np.abs(solution[:8]).max() > 0.3 * gain:
             return None
-        a, b, c, d, e, f, g, h = (solution[:8] / gain).tolist()  # how far the pattern has moved
+        a, b, c, d, e, f, g, h = (solution[:8] / gain).tolist()  # motion of the pattern
         H = H @ adjugate([[1.0 + a, b, c], [d, 1.0 + e, f], [g, h, 1.0]])
         before, here = here, _through(H, _SQUARE).T
         if not np.abs(here - start).max() < limit:
@@ -251,7 +255,8 @@ def _settle(
 
 
 def _weights_of(residual: Array, gain: float) -> Array | None:
-    """Weights of the points, small where glare, a shadow's edge or a finger hides the tag; None if nothing does."""
+    """Return weights of the points, small where glare, a shadow's edge or a finger covers the tag; None if
+    nothing does."""
     scale = max(1.48 * float(np.median(np.abs(residual))), SMALLEST_RESIDUAL * gain)
     far = (residual / (3.0 * scale)) ** 2
     if np.mean(far > 1.0) < 0.01:
@@ -260,7 +265,7 @@ def _weights_of(residual: Array, gain: float) -> Array | None:
 
 
 def _solver(pattern: Pattern, weights: Array) -> Array:
-    """Weighted pseudo-inverse, (10, n)."""
+    """Return the weighted pseudo-inverse, (10, n)."""
     weighted = pattern.columns * weights[:, None]
     return np.asarray(np.linalg.solve(weighted.T @ pattern.columns, weighted.T))
 
@@ -278,13 +283,14 @@ def _convex(corners: Array) -> bool:
 
 
 def _cell(corners: Array, family: str) -> float:
-    """Mean side of a cell [px]."""
+    """Return the mean side of a cell [px]."""
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     return float(sides.mean()) / family_named(family).border
 
 
 def _patch(image: Gray, corners: Array, cell: float, smooth: float) -> tuple[Array, Array]:
-    """The picture around a tag, blurred by a variance [px²] where that is positive, and its top left pixel."""
+    """Return the picture around a tag, blurred by a variance [px²] if it is positive, and the patch's top
+    left pixel."""
     reach = 3.0 * cell + 4.0
     low = np.maximum(np.floor(corners.min(axis=0) - reach), 0.0)
     high = np.ceil(corners.max(axis=0) + reach).astype(int) + 1
@@ -298,7 +304,7 @@ def _patch(image: Gray, corners: Array, cell: float, smooth: float) -> tuple[Arr
 
 
 def _sample(patch: Array, points: Array) -> Array | None:
-    """Gray at points between pixels (2, n), bilinear, (n,); None where one lies outside the patch."""
+    """Return the gray at points between pixels (2, n), bilinear, (n,); None if a point lies outside the patch."""
     height, width = patch.shape
     x, y = points
     if not (points.min() >= 0.0 and x.max() < width - 1 and y.max() < height - 1):
@@ -314,8 +320,8 @@ def _sample(patch: Array, points: Array) -> Array | None:
 
 
 def from_square(corners: list[list[float]]) -> list[list[float]]:
-    """Return the homography that takes the unit square, x right and y down, to four corners [px], (3, 3); the identity
-    where none does.
+    """Return the homography that maps the unit square, x right and y down, to four corners [px], (3, 3); the
+    identity if the square spanned by the corners is degenerate.
 
     The last row (g, h, 1) solves g (b - c) + h (d - c) = a - b + c - d.
     """
@@ -330,7 +336,7 @@ def from_square(corners: list[list[float]]) -> list[list[float]]:
 
 
 def adjugate(H: list[list[float]]) -> list[list[float]]:
-    """Return the inverse of a homography [-] but for a factor, which a homography does not feel, (3, 3)."""
+    """Return the adjugate of a homography [-], its inverse up to a factor, which does not matter, (3, 3)."""
     (a, b, c), (d, e, f), (g, h, i) = H
     return [
         [e * i - f * h, c * h - b * i, b * f - c * e],
@@ -340,7 +346,7 @@ def adjugate(H: list[list[float]]) -> list[list[float]]:
 
 
 def _through(H: Array, points: Array) -> Array:
-    """Points (n, 2) taken through a homography, (2, n): in rows, which NumPy works through several times faster."""
+    """Return points (n, 2) mapped by a homography, (2, n): in rows, which NumPy processes several times faster."""
     p = H[:, :2] @ points.T + H[:, 2:]
     return np.asarray(p[:2] / p[2])
 
@@ -349,36 +355,36 @@ Region = tuple[int, int, int, int]
 """Part of a picture: left, top, right, bottom [px], right and bottom just outside."""
 
 LEAST_CORRELATION = 0.7
-"""Least correlation of a picture with the tag that a library reports; below it the tag counts as absent."""
+"""Least correlation with the picture of a detected tag; below it the tag counts as absent [-]."""
 
 
 REFINEMENTS = ("fit", *EDGES)
-"""Methods of locating corners."""
+"""Methods of locating the corners."""
 
 
 @dataclass(frozen=True)
 class Detector:
-    """Finds the tags of one family. Made by `detector`."""
+    """Detector of the tags of one family, made by `detector`."""
 
     family: str
     refine: str
     gamma: float
-    """Exponent gamma of the pictures: 1 linear, 2.2 video."""
+    """Exponent gamma of the pictures' encoding: 1 linear, 2.2 video."""
     max_hamming: int
 
     def detect(self, image: npt.ArrayLike, region: Region | None = None) -> list[Detection]:
-        """Tags in a picture.
+        """Return the tags in a picture.
 
         Args:
             image: Gray, uint8, (h, w).
-            region: The part that is searched; None: all of it. Clipped to the picture.
+            region: Region to search, clipped to the picture; None: the full picture.
 
         Returns:
-            Detections with corners in pixels of the whole picture, integers at pixel centres, in the order top-left,
-            top-right, bottom-right, bottom-left as AprilTag 3 prints the tag. An id may be there twice.
+            Detections with corners in pixels of the full picture, integers at pixel centres, in the order top-left,
+            top-right, bottom-right, bottom-left as AprilTag 3 prints the tag. An id may occur twice.
 
         Raises:
-            LocalizationError: The picture is not one of gray bytes.
+            LocalizationError: The picture is not an array of gray bytes.
         """
         gray = np.asarray(image)
         if gray.ndim != 2 or gray.dtype != np.uint8:
@@ -400,7 +406,7 @@ class Detector:
         return self._fitted(gray, moved) if self.refine == "fit" else moved
 
     def _fitted(self, gray: Image, detections: list[Detection]) -> list[Detection]:
-        """The detections with corners from the fit; a tag that the fit denies is left out."""
+        """Return the detections with fitted corners, without the tags that the fit rejects."""
         light = _linear(gray, self.gamma) if self.gamma != 1.0 and detections else gray
         fitted = []
         for tag in detections:
@@ -413,18 +419,18 @@ class Detector:
 
 
 def detector(family: str, *, refine: str = "fit", gamma: float = 1.0, max_hamming: int = 1) -> Detector:
-    """A detector of one family.
+    """Return a detector of one family.
 
     Args:
-        family: Such as `tag25h9` or `tagStandard41h12`.
-        refine: How corners are placed: `fit` lays the whole known tag over the picture (the most accurate); `edges` are
-            AprilTag's own, `none` those that it starts from.
-        gamma: Encoding of the picture, gray ~ light^(1/gamma): 2.2 for what most cameras deliver, 1 for raw sensors. It
-            matters because a blurred edge of encoded gray lies in the black by up to half a pixel.
-        max_hamming: Most bits that may be corrected.
+        family: Family such as `tag25h9` or `tagStandard41h12`.
+        refine: Method of locating corners: `fit` fits the complete known tag to the picture (the most accurate);
+            `edges` is AprilTag's own edge refinement, `none` uses its unrefined corners.
+        gamma: Encoding of the picture, gray ~ light^(1/gamma): 2.2 for most cameras, 1 for raw sensors. A wrong
+            value moves blurred edges of encoded gray into the black by up to half a pixel.
+        max_hamming: Greatest number of bits that may be corrected.
 
     Raises:
-        LocalizationError: Unknown family or refinement, or a gamma out of range.
+        LocalizationError: The family or refinement is unknown, or gamma is out of range.
     """
     if refine not in REFINEMENTS:
         raise LocalizationError(f"unknown refinement '{refine}'; available: {', '.join(REFINEMENTS)}")
@@ -444,51 +450,52 @@ def _clipped(region: Region | None, gray: Image) -> Region:
 
 
 def _linear(gray: Image, gamma: float) -> npt.NDArray[Any]:
-    """Gray in proportion to light, 0 to 255; the picture itself where it is so."""
+    """Return gray proportional to light, 0 to 255; the picture itself if it is linear already."""
     if gamma == 1.0:
         return gray
     table = 255.0 * (np.arange(256) / 255.0) ** gamma
     return np.asarray(table.astype(np.float32)[gray])
 
 
-# Tags of a stream of pictures, searched first where they are expected: a few percent of the picture, at its rate.
+# Tags in a stream of pictures: the expected regions, a few percent of the picture, are searched first.
 
 BESIDE = 0.6
-"""White that a tag needs around it to be found, and a change of its pose [edges]."""
+"""Padding for the white around a tag that its detection needs, and for a change of its pose [edges]."""
 LEAST = 8.0
 """Smallest padding [px]."""
 PER_LOSS = 0.5
-"""Growth of the padding with every picture in which the tag was not found [edges]."""
+"""Growth of the padding with every picture in which the tag was not detected [edges]."""
 MAX_LOST = 30
-"""Number of pictures after which a lost tag is searched in complete pictures only."""
+"""Number of pictures after which a lost tag is searched only in full pictures."""
 AHEAD = 1.5
-"""Regions reach from the last place of a tag, should it have stopped, to this many times its motion since."""
+"""Extent of a region ahead of the tag's last position, relative to its predicted motion since; it starts at
+the last position, in case the tag stopped [-]."""
 
 
 @dataclass
 class _Remembered:
-    """The last that is known of a tag."""
+    """Last known state of a tag."""
 
     corners: Array
     time: float
     velocity: Array = field(default_factory=lambda: np.zeros(2))
     """Velocity of the centre [px/s]."""
     lost: int = 0
-    """Pictures since."""
+    """Number of pictures since the last detection."""
 
 
 class RegionTracker:
-    """Detects tags picture after picture; remembers where they were and how they moved."""
+    """Tag detector for a sequence of pictures that predicts the region of each tag from its last position and
+    velocity."""
 
     def __init__(
         self, detector: Detector, tags: Collection[int] | None = None, *, search_every: int = 15
     ) -> None:
-        """
-        Args:
-            detector: Finds tags in a picture or a part of it.
-            tags: Ids that are looked for, others are left out; None: all that there are.
-            search_every: Pictures between searches of the whole one while a tag is missing (always, where `tags` is
-                None). If none is found at all, the whole picture is searched at once.
+        """Args:
+        detector: Detector of tags in a picture or a region of it.
+        tags: Ids to detect; others are left out. None: all.
+        search_every: Number of pictures between searches of the full picture while a tag is missing (always if
+            `tags` is None). If no tag is detected at all, the full picture is searched at once.
         """
         self._detector = detector
         self._tags = None if tags is None else frozenset(tags)
@@ -498,14 +505,15 @@ class RegionTracker:
         self._last_time = math.nan
 
     def detect(self, image: npt.NDArray[np.uint8], time: float = math.nan) -> list[Detection]:
-        """Tags in the next picture, each id once; they are searched between their last places and where they move to.
+        """Return the tags in the next picture, each id once, searched between their last and their predicted
+        positions.
 
         Args:
             image: Gray, (h, w).
-            time: Of the picture [s]; pictures without a time count as one second apart.
+            time: Time of the picture [s]; pictures without a time count as one second apart.
 
         Raises:
-            LocalizationError: The picture is not one of gray bytes.
+            LocalizationError: The picture is not an array of gray bytes.
         """
         now = time if math.isfinite(time) else (0.0 if math.isnan(self._last_time) else self._last_time + 1.0)
         regions = merged(self._regions(now))
@@ -545,11 +553,11 @@ class RegionTracker:
 
 
 def region_around(corners: Array, lost: int = 0) -> Region:
-    """The part of a picture in which a tag is searched.
+    """Return the region of a picture in which a tag is searched.
 
     Args:
-        corners: Where it is expected [px], (n, 2).
-        lost: Pictures since it was last found.
+        corners: Expected corners [px], (n, 2).
+        lost: Number of pictures since the tag was last detected.
     """
     low, high = corners.min(axis=0), corners.max(axis=0)
     edge = float(np.linalg.norm(corners[1] - corners[0]) + np.linalg.norm(corners[2] - corners[1])) / 2.0
@@ -560,7 +568,8 @@ def region_around(corners: Array, lost: int = 0) -> Region:
 
 
 def merged(regions: list[Region]) -> list[Region]:
-    """Return regions that cover the same places without overlap: those that overlap become one around both."""
+    """Return non-overlapping regions that cover the given ones: overlapping regions are replaced by their
+    bounding box."""
     separate: list[Region] = []
     for region in regions:
         joined = region

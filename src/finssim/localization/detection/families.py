@@ -1,4 +1,4 @@
-"""AprilTags by AprilTag 3: their families and cells, where a picture shows them, and their corners in space."""
+"""AprilTags: families, bitmaps, detection by AprilTag 3, and tag corners in space."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from finssim.localization import LocalizationError
 from finssim.localization.detection.detections import Detection
 from finssim.vehicles.equipment import Tags
 
-# Tags found by AprilTag 3, through pupil-apriltags, in our conventions.
+# Tag detection by AprilTag 3, through pupil-apriltags, in FinsSim's conventions.
 
 Image = npt.NDArray[np.uint8]
 
 MANY = 10_000
-"""Tags of a family from which one wrong bit is corrected, not two."""
+"""Number of tags in a family from which one wrong bit is corrected instead of two."""
 EDGES = {"edges": 1, "none": 0}
-"""Name -> the library's `refine_edges`."""
+"""Name of a refinement -> the library's `refine_edges`."""
 
 _LOCK = Lock()
-"""The library keeps its memory in the detector, and ctypes lets other threads run meanwhile."""
+"""Lock around the library: it uses memory inside the detector, and ctypes releases the interpreter lock."""
 
 
 def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[Detection]:
-    """Tags of a family in a picture.
+    """Return the tags of a family in a picture.
 
     Args:
         image: Gray, (h, w).
         family: Name of the family.
         refine: One of `EDGES`.
-        max_hamming: Most bits that may be corrected.
+        max_hamming: Greatest number of bits that may be corrected.
     """
-    # The library looks at squares whose sides are read two pixels around: a picture of a few pixels has none.
+    # The library reads two pixels around the sides of candidate squares; a picture of a few pixels contains no tag.
     if min(image.shape) < 16:
         return []
     with _LOCK:
@@ -59,9 +59,10 @@ def find_tags(image: Image, family: str, refine: str, max_hamming: int) -> list[
 
 @cache
 def family_table(family: str) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Code words of a family, first bit highest, and column and row of each bit's cell from the measured edge's corner.
+    """Return the codes of a family, first bit highest, and column and row of each bit's cell from the
+    measured edge's corner.
 
-    Cells outside the measured edge have negative places, or such beyond it.
+    Cells outside the measured edge have indices that are negative or beyond the edge.
     """
     table = _library(family, "edges").tag_families[family].contents
     codes = np.array(table.codes[: table.ncodes], np.uint64)
@@ -74,7 +75,7 @@ def family_table(family: str) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.in
 
 @cache
 def _library(family: str, refine: str) -> Any:
-    """The library's detector, made once.
+    """Return the library's detector, created once.
 
     It is never destroyed: pupil-apriltags frees the family before the detector that still refers to it, which
     corrupts memory.
@@ -90,7 +91,7 @@ def _library(family: str, refine: str) -> Any:
     options = {"nthreads": 1, "quad_decimate": 1.0, "refine_edges": EDGES[refine]}
     if FAMILIES[family].count < MANY:
         return Kept(families=family, **options)
-    # A table of two wrong bits takes 4.6 GB and 24 s (tagCustom48h12), of one 140 MB and 0.2 s.
+    # The table for two wrong bits takes 4.6 GB and 24 s (tagCustom48h12), that for one 140 MB and 0.2 s.
     detector = Kept(families="tag16h5", **options)
     library, pointer = detector.libc, detector.tag_detector_ptr
     library.apriltag_detector_remove_family.restype = None
@@ -113,12 +114,12 @@ class TagFamily:
     cells: int
     """Number of cells along the edge of the complete bitmap."""
     border: int
-    """Cells along the edge that is measured, the `edge` of a vehicle or survey file: the outside of the black border,
-    or the line between black and white ring where the border is reversed."""
+    """Number of cells along the measured edge, the `edge` of a vehicle or survey file: the outside of the
+    black border, or the line between the black and white rings if the border is reversed."""
     count: int
     """Number of ids."""
     distance: int
-    """Bits in which two tags differ at least."""
+    """Smallest Hamming distance of two tags [bits]."""
 
     @property
     def outside(self) -> int:
@@ -143,10 +144,10 @@ FAMILIES = {
 
 
 def family_named(name: str) -> TagFamily:
-    """The family of that name; `25h9`, `Tag25h9` and `DICT_APRILTAG_25h9` are understood too.
+    """Return the family of a name; `25h9`, `Tag25h9` and `DICT_APRILTAG_25h9` are accepted too.
 
     Raises:
-        LocalizationError: There is none.
+        LocalizationError: No family has that name.
     """
     plain = _bare(name.lower().removeprefix("dict_apriltag_"))
     for family in FAMILIES.values():
@@ -156,15 +157,15 @@ def family_named(name: str) -> TagFamily:
 
 
 def _bare(name: str) -> str:
-    """Return a family's name in small letters without its first words: `41h12` of `tagstandard41h12`."""
+    """Return a family's name in lower case without its prefix: `41h12` of `tagstandard41h12`."""
     return re.sub(r"^(tag)?(standard|custom|circle)?", "", name)
 
 
 @cache
 def bitmap(family: str, tag: int) -> Cells:
-    """Cells of a tag, rows from the top, 1 white and 0 black, (n, n) with n = `TagFamily.cells`.
+    """Return the cells of a tag, rows from the top, 1 white and 0 black, (n, n) with n = `TagFamily.cells`.
 
-    The black border is in it, the white margin around it is not.
+    The black border is included, the white margin around it is not.
 
     Args:
         family: Name of the family.
@@ -187,12 +188,12 @@ def bitmap(family: str, tag: int) -> Cells:
 
 
 def printable(family: str, tag: int, *, pixels_per_cell: int = 40, margin: float = 1.0) -> Cells:
-    """A picture of a tag with its white margin, ready to be printed, gray 0 or 255, (side, side).
+    """Return a printable picture of a tag with its white margin, gray 0 or 255, (side, side).
 
     Args:
         family: Name of the family.
         tag: Id within it.
-        pixels_per_cell: [px]
+        pixels_per_cell: Side of a cell [px].
         margin: Width of the white margin [cells].
 
     Raises:
@@ -202,7 +203,7 @@ def printable(family: str, tag: int, *, pixels_per_cell: int = 40, margin: float
     return np.pad(cells, round(margin * pixels_per_cell), constant_values=255)
 
 
-# Corners of a tag: on its own plate and on the vehicle that carries it.
+# Corners of a tag in its own frame and on the vehicle that carries it.
 
 Array = npt.NDArray[np.float64]
 
@@ -210,20 +211,20 @@ _SIGNS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 
 
 def corners(edge: float) -> Array:
-    """Corners of the black border in the tag frame [m], (4, 3).
+    """Return the corners of the black border in the tag frame [m], (4, 3).
 
     Tag frame: x to the right and y up in the printed image, z out of the printed side. Order: top-left, top-right,
     bottom-right, bottom-left as printed.
 
     Args:
-        edge: Length of an edge of the border [m]; for tagStandard41h12 of the line where its black ring meets
+        edge: Length of an edge of the border [m]; for tagStandard41h12, of the line where its black ring meets
             the white square inside, as AprilTag 3 measures it.
     """
     return np.asarray(edge * _SIGNS)
 
 
 def tag_corners_b(tags: Tags) -> dict[int, Array]:
-    """Corners of a vehicle's tags in the body frame [m]: tag id -> (4, 3), in the order of `corners`."""
+    """Return the corners of a vehicle's tags in the body frame [m]: tag id -> (4, 3), in the order of `corners`."""
     return {
         tag: np.asarray(
             np.asarray(mount.position)

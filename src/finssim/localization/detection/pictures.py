@@ -1,4 +1,5 @@
-"""Pictures and videos as a stream of gray pictures with names and times; unreadable ones are reported and left out."""
+"""Pictures and videos as a stream of gray pictures with names and times; unreadable files are reported and
+left out."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pg
 VIDEO_FILES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg")
 
 _UNITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
-"""Digits of a clock's count since 1970 -> seconds that one of it lasts."""
+"""Number of digits of a count since 1970 -> its unit [s]."""
 
 
 def pictures(
@@ -33,21 +34,23 @@ def pictures(
     times: Path | str | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> Iterator[Timed]:
-    """Time stamp [s], name and gray picture (h, w) of everything in the sources, one after the other.
+    """Return an iterator over time stamp [s], name and gray picture (h, w) of all sources, in sequence.
 
-    A folder gives its pictures in natural order (2 before 10), or its videos where it holds no pictures. The time of a
-    picture is that in `times`; else that in its name, where a number with a decimal point is seconds and a count of 10,
-    13, 16 or 19 digits is seconds, milli-, micro- or nanoseconds since 1970; else NaN. Pictures of a video have its own
-    time stamps and are called `video.mp4#0`, `video.mp4#1`, ... Pixels stay as the camera wrote them: a note in the
-    file on how to turn the picture is not followed, so that all pictures of a camera share one pixel frame.
+    A folder stands for its pictures in natural order (2 before 10), or for its videos if it contains no
+    pictures. The time of a picture is that in `times`; else that in its name, where a number with a decimal
+    point is seconds and a count of 10, 13, 16 or 19 digits is seconds, milli-, micro- or nanoseconds since
+    1970; else NaN. Pictures of a video have its time stamps and are called `video.mp4#0`, `video.mp4#1`, ...
+    Pixels stay as the camera wrote them: the orientation stored in a file is ignored, so that all pictures of
+    a camera share one pixel frame.
 
     Args:
         sources: Pictures, folders or videos.
         times: CSV file with the columns `image` and `time` [s].
-        tell: Takes one sentence for each file that is left out and one with their number; None: standard error.
+        tell: Function that receives one sentence for each excluded file and one with their number; None: print to
+            standard error.
 
     Raises:
-        LocalizationError: A source is not there or of unknown kind, no picture can be read, or `times` misses one.
+        LocalizationError: A source is missing or of unknown kind, no picture can be read, or `times` lacks one.
     """
     locations = [sources] if isinstance(sources, (str, Path)) else list(sources)
     files = [file for source in locations for file in _files(Path(source))]
@@ -56,15 +59,15 @@ def pictures(
     if clock is not None:
         for file, name in names.items():
             if file.suffix.lower() in PICTURE_FILES and name not in clock and file.name not in clock:
-                raise LocalizationError(f"{times}: no time of {name}: add a line with it or omit it")
+                raise LocalizationError(f"{times}: no time of {name}: add a line with it or omit the picture")
     return _stream(files, names, clock or {}, tell or _print_note)
 
 
 def read_picture(path: Path) -> Image:
-    """One gray picture, (h, w).
+    """Return one gray picture, (h, w).
 
     Raises:
-        LocalizationError: It cannot be read, is cut short or is no picture.
+        LocalizationError: The file cannot be read, is cut short or is not a picture.
     """
     import cv2
 
@@ -102,7 +105,7 @@ def _print_note(sentence: str) -> None:
 
 
 def _files(source: Path) -> list[Path]:
-    """The files of one source."""
+    """Return the files of one source."""
     if source.is_dir():
         inside = sorted(
             (p for p in source.iterdir() if p.is_file() and not p.name.startswith(".")), key=_natural
@@ -123,13 +126,13 @@ def _files(source: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sorting key in which numbers count as numbers."""
+    """Return a sorting key in which numbers are compared as numbers."""
     parts = re.findall(r"\d+|\D+", path.name.lower())
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def _names(files: Sequence[Path]) -> dict[Path, str]:
-    """Return the name of each file: its own, with its folders if two have the same."""
+    """Return the name of each file: its own, with its folders if another file has the same name."""
     often = Counter(file.name for file in files)
     return {file: file.name if often[file.name] == 1 else file.as_posix() for file in files}
 
@@ -200,7 +203,7 @@ def _of_video(file: Path, name: str, notify: Callable[[str], None]) -> Iterator[
 
 
 def _time_in(stem: str) -> float:
-    """Time stamp that a file's name carries [s], NaN where it carries none."""
+    """Return the time stamp in a file's name [s], NaN if it contains none."""
     decimal = re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", stem)
     if len(decimal) == 1:
         return float(decimal[0])
@@ -212,7 +215,7 @@ def _time_in(stem: str) -> float:
 
 
 def _read_times(path: Path) -> dict[str, float]:
-    """Name -> time [s] of a CSV file with the columns image and time."""
+    """Return name -> time [s] from a CSV file with the columns image and time."""
     table = read_text_table(path, LocalizationError)
     image = table.place(("image", "file", "filename", "name"))
     time = table.place(("time", "t", "timestamp", "time_s"))
@@ -240,9 +243,9 @@ def _cut_short(raw: bytes) -> bool:
     while raw[at : at + 2] not in (
         b"\xff\xda",
         b"",
-    ):  # over the segments, which may hold a small picture of their own
+    ):  # skip the segments, which may contain a thumbnail
         if raw[at] != 0xFF or at + 4 > len(raw):
             return True
-        filled = raw[at + 1] == 0xFF  # a byte that only fills
+        filled = raw[at + 1] == 0xFF  # a fill byte
         at += 1 if filled else 2 + int.from_bytes(raw[at + 2 : at + 4], "big")
     return raw.find(b"\xff\xd9", at) < 0

@@ -1,1 +1,1 @@
-"""Position, velocity and heading from camera, depth and inertia."""
+"""Estimation of position, velocity and heading from camera, depth sensor and IMU."""

@@ -1,7 +1,7 @@
-"""Roll and pitch from a gyro and an accelerometer, for logs that hold no orientation.
+"""Roll and pitch from a gyro and an accelerometer, for logs without an orientation; yaw from the gyro and fixes.
 
-The explicit complementary filter (Mahony, Hamel and Pflimlin 2008), reduced to the direction of "up" in the body: yaw
-is not touched. Pure functions over a leading `...` batch.
+Roll and pitch come from the explicit complementary filter (Mahony, Hamel and Pflimlin 2008), reduced to the
+direction of "up" in the body frame: it leaves yaw unchanged. Pure functions over a leading `...` batch.
 """
 
 from __future__ import annotations
@@ -23,31 +23,29 @@ class TiltGains:
     """Gains of the correction by the accelerometer."""
 
     proportional: float = 0.4
-    """[1/s]: errors of tilt die away with its inverse."""
+    """Gain of the tilt correction [1/s]; its inverse is the time constant with which tilt errors decay."""
     integral: float = 0.02
-    """[1/s²]: of the gyro's bias."""
+    """Gain of the gyro bias correction [1/s²]."""
     gravity: float = 9.81
-    """[m/s²]"""
+    """Acceleration of gravity [m/s²]."""
     tolerance: float = 0.5
-    """Specific force that differs this much from gravity [m/s²] counts exp(-1/2) as much, more of it still less."""
+    """Standard deviation of the specific force from gravity [m/s²] in the Gaussian weight of a sample."""
     longest_gap: float = 0.5
-    """After this long without samples the filter starts again from the accelerometer [s]."""
+    """Gap between samples after which the filter restarts from the accelerometer [s]."""
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """Memory of the filter."""
+    """State of the filter."""
 
     up: Array
     """Unit vector upwards, body frame, (..., 3)."""
     bias: Array
-    """Bias of the gyro, body frame [rad/s], (..., 3); only its horizontal part is ever estimated."""
+    """Bias of the gyro, body frame [rad/s], (..., 3); only its horizontal part is estimated."""
 
 
 def in_body_axes(vector_s: npt.ArrayLike, orientation: npt.ArrayLike) -> Array:
-    """Return the reading of an IMU in body axes.
-
-    The unit is kept.
+    """Return the reading of an IMU in body axes, in its own unit.
 
     Args:
         vector_s: Angular rate [rad/s] or specific force [m/s²], sensor frame, (..., 3).
@@ -57,7 +55,8 @@ def in_body_axes(vector_s: npt.ArrayLike, orientation: npt.ArrayLike) -> Array:
 
 
 def up_of(roll: npt.ArrayLike, pitch: npt.ArrayLike) -> Array:
-    """Unit vector upwards in the body frame from roll φ and pitch θ [rad], (..., 3): the last row of R_y(θ) R_x(φ)."""
+    """Return the unit vector upwards in the body frame from roll φ and pitch θ [rad], (..., 3): the last row
+    of R_y(θ) R_x(φ)."""
     roll, pitch = np.asarray(roll, float), np.asarray(pitch, float)
     return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
 
@@ -69,7 +68,8 @@ def height_above_origin(point: tuple[float, float, float], roll: float, pitch: f
 
 
 def roll_pitch(up: Array) -> tuple[Array, Array]:
-    """Roll and pitch [rad] that show the body that "up", (..., 3) -> (...) each; positive pitch is nose down."""
+    """Return the roll and pitch [rad] at which "up" has the body frame direction `up`, (..., 3) -> (...)
+    each; positive pitch is nose down."""
     return (
         np.asarray(np.arctan2(up[..., 1], up[..., 2])),
         np.asarray(np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))),
@@ -77,7 +77,7 @@ def roll_pitch(up: Array) -> tuple[Array, Array]:
 
 
 def tilt_from(accel: npt.ArrayLike) -> Tilt:
-    """Start from an accelerometer at rest, which reads gravity upwards.
+    """Return the initial state from an accelerometer at rest, which measures gravity upwards.
 
     Args:
         accel: Specific force, body frame [m/s²], (..., 3), not zero.
@@ -87,16 +87,16 @@ def tilt_from(accel: npt.ArrayLike) -> Tilt:
 
 
 def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, gains: TiltGains) -> Tilt:
-    """The tilt a sample later.
+    """Return the tilt after one sample.
 
     up_dot = -(ω - b + k_p e) x up,  b_dot = -k_i e,  e = w (f/|f| x up),  w = exp(-(|f| - g)² / 2 tolerance²)
 
     Args:
-        tilt: Before.
+        tilt: Tilt before the step.
         omega: Angular rate over the step, body frame [rad/s], (..., 3).
-        accel: Specific force, body frame [m/s²], (..., 3); NaN where there is none.
+        accel: Specific force, body frame [m/s²], (..., 3); NaN if there is none.
         dt: Length of the step [s].
-        gains: How quickly the accelerometer is believed.
+        gains: Gains of the correction by the accelerometer.
     """
     accel = np.asarray(accel, float)
     force = np.sqrt((accel * accel).sum(axis=-1, keepdims=True))
@@ -110,10 +110,10 @@ def follow(tilt: Tilt, omega: npt.ArrayLike, accel: npt.ArrayLike, dt: float, ga
     return Tilt(up / length, np.asarray(tilt.bias - gains.integral * error * dt))
 
 
-# Yaw from the gyro, corrected by what the camera sees (paper, eq. 15), with the gyro's bias as a second state.
+# Yaw from the gyro, corrected by the camera (paper, eq. 15), with the gyro's bias as a second state.
 #
-# Pure functions of plain numbers or, but for restarts and caps, of arrays of them. Yaw is left positive, about the
-# vertical.
+# Pure functions of plain numbers or, except restarts and caps, of arrays. Yaw is about the vertical, positive
+# to the left.
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class YawState:
     """State of the filter."""
 
     yaw: Number
-    """[rad], in [-pi, pi)."""
+    """Yaw [rad], in [-pi, pi)."""
     bias: Number
     """Bias of the gyro's yaw rate [rad/s]."""
     variance: Number
@@ -129,7 +129,7 @@ class YawState:
     cross: Number
     """Covariance of yaw and bias [rad²/s]."""
     bias_variance: Number
-    """[rad²/s²]"""
+    """Variance of the bias [rad²/s²]."""
 
     @property
     def P(self) -> Array:
@@ -138,10 +138,10 @@ class YawState:
         return rows.reshape(*rows.shape[:-1], 2, 2)
 
     def innovation(self, residual: Array, H: Array, R: Array) -> Innovation:
-        """Compare a measured yaw with its prediction, by plain numbers.
+        """Return the innovation of a measured yaw, computed with plain numbers.
 
         Args:
-            residual: Measured minus predicted, the short way round [rad], (..., 1).
+            residual: Measured minus predicted, wrapped to the shorter direction [rad], (..., 1).
             H: Jacobian of yaw, [[1, 0]].
             R: Variance of the measurement [rad²], (1, 1).
         """
@@ -178,13 +178,13 @@ class YawNoise:
 
 
 def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
-    """Rate of yaw from body rates [rad/s].
+    """Return the rate of yaw from body rates [rad/s].
 
     psi_dot = (q sin φ + r cos φ) / cos θ
 
-    Body rates are p = φ_dot - ψ_dot sin θ, q = θ_dot cos φ + ψ_dot sin φ cos θ, r = -θ_dot sin φ + ψ_dot cos φ cos θ
-    for R = R_z(ψ) R_y(θ) R_x(φ), whichever way z points: the formula is that of Fossen's axes, and in ours r, q and ψ
-    turn left, nose down and left. The rate p about body x does not enter.
+    Body rates are p = φ_dot - ψ_dot sin θ, q = θ_dot cos φ + ψ_dot sin φ cos θ, r = -θ_dot sin φ + ψ_dot cos
+    φ cos θ for R = R_z(ψ) R_y(θ) R_x(φ), whether z points up or down: the formula is the same in Fossen's
+    axes; in ours, positive r, q and ψ are left, nose down and left. The rate p about body x does not enter.
 
     Args:
         q: Angular rate about body y [rad/s].
@@ -196,14 +196,14 @@ def yaw_rate(q: float, r: float, roll: float, pitch: float) -> float:
 
 
 def predict(state: YawState, rate: Number, dt: float, noise: YawNoise) -> YawState:
-    """Yaw a time later.
+    """Return the yaw state after a time step.
 
     ψ <- ψ + (ω_z - b) dt,  P <- F P F' + Q,  F = [1 -dt; 0 1]                         (paper, eq. 15)
 
     Args:
-        state: Before.
-        rate: Rate of yaw as measured [rad/s].
-        dt: Time that passes [s].
+        state: State before the step.
+        rate: Measured rate of yaw [rad/s].
+        dt: Length of the step [s].
         noise: Errors of the rate.
     """
     w, doubt = noise.bias_walk**2, state.bias_variance
@@ -217,19 +217,19 @@ def predict(state: YawState, rate: Number, dt: float, noise: YawNoise) -> YawSta
 
 
 def restarted(state: YawState, yaw: float, variance: float, bias_std: float) -> YawState:
-    """Start yaw at a measurement; the bias is kept, with at least the doubt it had at power-on if `bias_std` > 0.
+    """Restart yaw at a measurement; the bias is kept, with at least its variance at power-on if `bias_std` > 0.
 
     Args:
-        state: Before.
-        yaw: Measured [rad].
-        variance: Of `yaw` [rad²].
-        bias_std: Of the gyro's bias at power-on [rad/s].
+        state: State before.
+        yaw: Measured yaw [rad].
+        variance: Variance of `yaw` [rad²].
+        bias_std: Standard deviation of the gyro's bias at power-on [rad/s].
     """
     return YawState(wrapped(yaw), state.bias, variance, 0.0, max(state.bias_variance, bias_std**2))
 
 
 def capped(state: YawState, variance: float) -> YawState:
-    """Yaw no less certain than `variance` [rad²]: its row and column are scaled down together."""
+    """Return the state with a yaw variance of at most `variance` [rad²], with its covariance scaled accordingly."""
     scale = math.sqrt(min(1.0, variance / state.variance))
     return YawState(
         state.yaw, state.bias, state.variance * scale * scale, state.cross * scale, state.bias_variance

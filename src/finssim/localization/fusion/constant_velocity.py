@@ -30,21 +30,21 @@ from finssim.localization.fusion.streams import ImuSample, Outcome, PoseEstimate
 Array = npt.NDArray[np.float64]
 
 YAW_CAP = 10.0
-"""Largest variance of yaw [rad²]: far beyond a full circle."""
+"""Largest variance of yaw [rad²]: far above that of an unknown heading."""
 STEEPEST = math.radians(80.0)
-"""Pitch beyond which the gyro gives no yaw rate."""
+"""Pitch beyond which no yaw rate is computed from the gyro [rad]."""
 ACCEPTED, STEEP = (Outcome("imu", "accepted"),), (Outcome("imu", "steep"),)
 _H_XY, _H_YAW = np.eye(6)[:2], np.eye(2)[:1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTrack(FilterMemory):
-    """States of the filters, whose errors are independent of each other, with their memory."""
+    """State of the position and yaw filters, whose errors are independent, with the filter memory."""
 
     position: PositionState
     yaw: YawState
     position_time: float = math.nan
-    """Time of the position [s]; the IMU's samples advance yaw alone."""
+    """Time of the position [s]; IMU samples advance only yaw."""
     yaw_time: float = math.nan
     """Time of the yaw [s]."""
     rate: float | None = None
@@ -60,37 +60,37 @@ class PlaneTrack(FilterMemory):
 
 
 class ConstantVelocity(Filter[PlaneTrack]):
-    """Filters of constant velocity and of yaw."""
+    """Constant-velocity position filter with a separate yaw filter."""
 
     gate_of: ClassVar[Mapping[str, str | None]] = {"heading": "yaw", "velocity": None}
-    """A heading counts as a yaw, for its offset is not estimated; a Doppler velocity is always accepted."""
+    """Gate of each sensor: headings use that of yaw, since their offset is not estimated; Doppler velocities
+    are always accepted."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """
-        Args:
-            settings: Settings of the estimator.
-            site: Numbers of pool and vehicle.
+        """Args:
+        settings: Settings of the estimator.
+        site: Parameters of pool and vehicle.
         """
         super().__init__(settings, site)
         self._H_height = np.array([[*site.up, 0.0, 0.0, 0.0]])
         self._motions = {(xy, z): motion_of(settings, xy, z) for xy in (False, True) for z in (False, True)}
 
     def start(self) -> PlaneTrack:
-        """Return the track before any sample."""
+        """Return the track before the first sample."""
         s = self.settings
         P = np.diag([s.largest_variance] * 3 + [s.speed_std**2] * 3)
         yaw = YawState(0.0, 0.0, YAW_CAP, 0.0, s.imu.gyro_bias_std**2)
         return PlaneTrack(position=PositionState(np.zeros(6), P), yaw=yaw)
 
     def imu(self, track: PlaneTrack, sample: ImuSample) -> tuple[PlaneTrack, tuple[Outcome, ...]]:
-        """Return the track with tilt, and yaw at the time of the sample."""
+        """Return the track with its tilt updated and yaw advanced to the time of the sample."""
         dt = math.inf if track.imu_time is None else sample.time - track.imu_time
         roll, pitch, tilt = self._tilted(track, sample, dt)
         steep = abs(pitch) > STEEPEST
         rate = None if steep else yaw_rate(sample.omega[1], sample.omega[2], roll, pitch)
         yaw = self._yaw_at(track, sample.time)
         if track.rate is not None and rate is not None and dt <= GYRO_HOLD:
-            # Up to here the older rate was held; half the difference makes a trapezium of the step.
+            # So far the older rate was held; adding half the difference gives the trapezoidal rule.
             yaw = changed(yaw, yaw=yaw.yaw + 0.5 * (rate - track.rate) * dt)
         track = changed(
             track,
@@ -107,13 +107,13 @@ class ConstantVelocity(Filter[PlaneTrack]):
     def update(
         self, track: PlaneTrack, name: str, sample: Sample, reading: Array
     ) -> tuple[PlaneTrack, Outcome]:
-        """Return the track after a sensor's reading (m,), and the verdict of its gate.
+        """Return the track after a sensor's reading (m,), and the gate's verdict.
 
         The reading has the unit of the sensor.
         """
         track, outcome = super().update(track, name, sample, reading)
         if name == "heading" and self.settings.aids is not None:
-            # The compass's offset is in every sample: many are no better than one.
+            # The compass's offset is common to all samples: averaging does not reduce it.
             least = self.settings.aids.heading_bias**2
             if track.yaw.variance < least:
                 track = changed(track, yaw=changed(track.yaw, variance=least))
@@ -142,7 +142,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         return self.yaw(track)._replace(doubt=self.settings.aids.heading_bias**2)
 
     def velocity(self, track: PlaneTrack) -> Prediction | str:
-        """Predict the reading of a Doppler log, body frame [m/s], at the origin and with the present heading."""
+        """Predict the reading of a Doppler log, body frame [m/s], at the body origin and with the present heading."""
         if "yaw" not in track.seen or self.settings.aids is None:
             return "no heading"
         H = np.zeros((3, 6))
@@ -151,17 +151,17 @@ class ConstantVelocity(Filter[PlaneTrack]):
         return Prediction(H @ track.position.x, H, offset, track.yaw.variance, part="position")
 
     def restarted(self, track: PlaneTrack, axes: list[int], step: Array, R: Array) -> PlaneTrack:
-        """Start position axes: `step` [m] moves them to the measurement, whose covariance is `R` [m²]."""
+        """Restart position axes at a measurement, `step` [m] from the estimate, with covariance `R` [m²]."""
         state, speed = track.position, self.settings.speed_std
         return changed(track, position=position_filter.restarted(state, axes, state.x[axes] + step, R, speed))
 
     def turned(self, track: PlaneTrack, angle: float, variance: float) -> PlaneTrack:
-        """Start yaw: `angle` [rad] turns it to the measurement, whose variance is `variance` [rad²]."""
+        """Restart yaw at a measurement, `angle` [rad] from the estimate, with variance `variance` [rad²]."""
         yaw = attitude.restarted(track.yaw, track.yaw.yaw + angle, variance, self.settings.imu.gyro_bias_std)
         return changed(track, yaw=yaw)
 
     def estimate(self, track: PlaneTrack, time: float) -> PoseEstimate:
-        """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
+        """Return the estimate at a time [s], or at the track's own time if later; unknown values are NaN."""
         track, seen = self.advanced(track, time), track.seen
         x, P, yaw = track.position.x.copy(), track.position.P.copy(), track.yaw
         unknown = ([] if "vision" in seen else [0, 1, 3, 4]) + ([] if "depth" in seen else [2, 5])
@@ -187,7 +187,8 @@ class ConstantVelocity(Filter[PlaneTrack]):
         return track.roll, track.pitch
 
     def _tilted(self, track: PlaneTrack, sample: ImuSample, dt: float) -> tuple[float, float, Tilt | None]:
-        """Return roll and pitch after a sample, from the unit or from gyro and accelerometer, and the tilt filter."""
+        """Return roll and pitch after a sample, from the IMU's orientation or from gyro and accelerometer,
+        and the tilt filter's state."""
         if sample.tilt is not None:
             return sample.tilt[0], sample.tilt[1], None
         force = np.full(3, math.nan) if sample.force is None else np.array(sample.force)
@@ -202,8 +203,8 @@ class ConstantVelocity(Filter[PlaneTrack]):
         return float(roll), float(pitch), tilt
 
     def advanced(self, track: PlaneTrack, time: float) -> PlaneTrack:
-        """Return the track at a time [s]; it does not go backwards."""
-        # max gives its first argument where the second is NaN: no sample yet.
+        """Return the track advanced to a time [s]; never to an earlier one."""
+        # max returns its first argument if the second is NaN: no sample yet.
         return changed(
             track,
             position=self._position_at(track, time),
@@ -213,7 +214,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         )
 
     def _position_at(self, track: PlaneTrack, time: float) -> PositionState:
-        """Return the position at a time; axes without measurements slow down, then stop."""
+        """Return the position at a time; the velocity of axes without measurements decays, then is zero."""
         s, then, position = self.settings, track.position_time, track.position
         if math.isnan(then) or time <= then:
             return position
@@ -231,7 +232,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         return position_filter.capped(position, s.largest_variance)
 
     def _yaw_at(self, track: PlaneTrack, time: float) -> YawState:
-        """Return yaw at a time: the latest rate is held, and none where the gyro has been silent for too long."""
+        """Return yaw at a time: the latest rate is held for at most `GYRO_HOLD`, then yaw stays constant."""
         s, then, yaw = self.settings, track.yaw_time, track.yaw
         if math.isnan(then) or time <= then:
             return yaw

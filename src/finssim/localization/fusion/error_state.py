@@ -1,9 +1,10 @@
 """Error-state filter: fusion with the IMU's accelerations. Models are pure functions over a leading `...` batch.
 
-Nominal state: position and velocity of the IMU in the pool frame, attitude, gyro bias, accelerometer bias. Error state
-(15): [δp, δv, δθ, δb_g, δb_a], with the attitude error in pool axes, R = exp([δθ]x) R̂.
+Nominal state: position and velocity of the IMU in the pool frame, attitude, gyro bias, accelerometer bias.
+Error state (15): [δp, δv, δθ, δb_g, δb_a], with the attitude error in pool axes, R = exp([δθ]x) R̂.
 
-With a Doppler log or a compass it has five more (20): [δb_c, δs, δb_v], their offsets and the log's scale.
+A Doppler log or a compass adds five states (20): [δb_c, δs, δb_v], the compass offset, and scale and offset
+of the log.
 
     p_dot = v,  v_dot = R (f - b_a) + g,  R_dot = R [ω - b_g]x
     δp_dot = δv,  δv_dot = -[R (f - b_a)]x δθ - R δb_a + n_a,  δθ_dot = -R δb_g + n_g
@@ -44,7 +45,7 @@ Vector = tuple[float, float, float]
 P, V, A, G, B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 """Indices of δp, δv, δθ, δb_g and δb_a in the error state."""
 C, S, D = 15, 16, slice(17, 20)
-"""Indices of the offset of the compass, the scale and the offset of the Doppler log in the aided error state."""
+"""Indices of the compass offset, the scale of the Doppler log and its offset in the extended error state."""
 TILT_CAP = 0.5
 """Largest standard deviation of roll and pitch [rad]."""
 _I3 = np.eye(3)
@@ -52,16 +53,18 @@ _I3 = np.eye(3)
 
 @dataclass(frozen=True)
 class InertialState(PositionState):
-    """State of the filter: `x` is position [m] and velocity [m/s] of the IMU, `P` that of the error state."""
+    """State of the filter: `x` is position [m] and velocity [m/s] of the IMU, `P` the covariance of the error
+    state."""
 
     q: Array
     """Attitude q_pb, body to pool, xyzw, (..., 4)."""
     gyro_bias: Array
-    """Body frame [rad/s], (..., 3)."""
+    """Gyro bias, body frame [rad/s], (..., 3)."""
     accel_bias: Array
-    """Body frame [m/s²], (..., 3)."""
+    """Accelerometer bias, body frame [m/s²], (..., 3)."""
     extra: Array = field(default_factory=lambda: np.zeros(0))
-    """Offset of the compass [rad], scale error [-] and offset of the Doppler log [m/s], (..., 5); none: (0,)."""
+    """Offset of the compass [rad], scale error [-] and offset of the Doppler log [m/s], (..., 5); (0,)
+    without these sensors."""
 
     def moved(self, error: Array, P: Array) -> Self:
         """Return the state corrected by an error (..., n), with a new covariance (..., n, n).
@@ -85,13 +88,13 @@ class ErrorStateNoise:
     """Noise densities of the IMU."""
 
     gyro: float
-    """[rad/s/√Hz]"""
+    """Gyro noise [rad/s/√Hz]."""
     accel: float
-    """[m/s²/√Hz]"""
+    """Accelerometer noise [m/s²/√Hz]."""
     gyro_walk: float
-    """[rad/s²/√Hz]"""
+    """Random walk of the gyro bias [rad/s²/√Hz]."""
     accel_walk: float
-    """[m/s³/√Hz]"""
+    """Random walk of the accelerometer bias [m/s³/√Hz]."""
     log_walk: float = 0.0
     """Random walk of the Doppler log's offset [m/s²/√Hz]."""
 
@@ -99,14 +102,15 @@ class ErrorStateNoise:
 def predict(
     state: InertialState, omega: Array, force: Array, dt: float, noise: ErrorStateNoise, gravity: Array
 ) -> InertialState:
-    """Return the state after a step with constant rate and force, and the attitude of its middle.
+    """Return the state after a step with constant angular rate and specific force, integrated with the
+    mid-step attitude.
 
     Args:
-        state: State before.
+        state: State before the step.
         omega: Angular rate, body frame [rad/s], (..., 3).
         force: Specific force at the IMU, body frame [m/s²], (..., 3).
         dt: Length of the step [s].
-        noise: Noise of the IMU.
+        noise: Noise densities of the IMU.
         gravity: Acceleration of gravity, pool frame [m/s²], (3,): downwards.
     """
     turn = (omega - state.gyro_bias) * dt
@@ -134,7 +138,7 @@ def predict(
 
 
 def _noise(dt: float, noise: ErrorStateNoise, n: int) -> Array:
-    """Return the covariance that one step adds, (n, n): the same in every direction, so that no axes need to turn."""
+    """Return the process noise of one step, (n, n); it is isotropic, so that no rotation is needed."""
     powers = np.array([dt, 0.5 * dt**2, dt**3 / 3.0])
     return np.asarray((powers @ _noise_powers(noise, n)).reshape(n, n))
 
@@ -158,7 +162,7 @@ def position_model(state: InertialState, lever: Array) -> Prediction:
 
     Args:
         state: The state.
-        lever: The point from the IMU, body frame [m], (3,).
+        Position of the point relative to the IMU, body frame [m], (3,).
     """
     arm = (quat_to_matrix(state.q) @ lever[:, None])[..., 0]
     H = np.zeros((*arm.shape[:-1], 3, state.P.shape[-1]))
@@ -172,9 +176,9 @@ def depth_model(state: InertialState, lever: Array, up: Array, offset: float) ->
 
     Args:
         state: The state.
-        lever: The point from the IMU, body frame [m], (3,).
+        Position of the point relative to the IMU, body frame [m], (3,).
         up: Unit normal of the surface, pool frame, (3,).
-        offset: Height of p is up . p + offset [m].
+        Offset of the height: up . p + offset [m].
     """
     point, H, *_ = position_model(state, lever)
     return Prediction(np.asarray(point @ up[:, None] + offset), np.asarray(up[None, :] @ H))
@@ -195,7 +199,7 @@ def yaw_model(state: InertialState) -> Prediction:
 
 
 def heading_model(state: InertialState) -> Prediction:
-    """Predict the reading of a compass, which is yaw and its own offset [rad], (..., 1)."""
+    """Predict the reading of a compass, yaw plus the compass's offset [rad], (..., 1)."""
     yaw, H, *_ = yaw_model(state)
     H[..., 0, C] = 1.0
     return Prediction(yaw + state.extra[..., :1], H)
@@ -206,8 +210,8 @@ def velocity_model(state: InertialState, omega: Array, lever: Array) -> Predicti
 
     Args:
         state: The state.
-        omega: Angular rate as measured, body frame [rad/s], (..., 3).
-        lever: The log from the IMU, body frame [m], (3,).
+        omega: Measured angular rate, body frame [rad/s], (..., 3).
+        lever: Position of the log relative to the IMU, body frame [m], (3,).
     """
     back = np.swapaxes(quat_to_matrix(state.q), -1, -2)
     v = state.x[..., V]
@@ -223,24 +227,26 @@ def velocity_model(state: InertialState, omega: Array, lever: Array) -> Predicti
 
 
 def turned(state: InertialState, angle: float, variance: float) -> InertialState:
-    """Turn the attitude of one state about the pool's z by `angle` [rad], to a yaw of that variance [rad²]."""
+    """Rotate the attitude of one state about the pool's z axis by `angle` [rad], with yaw variance `variance`
+    [rad²]."""
     q = quat_multiply(quat_from_rotvec(np.array([0.0, 0.0, angle])), state.q)
     return changed(state, q=q, P=isolated(state.P, [8], np.array([[variance]])))
 
 
 @lru_cache(maxsize=8)
 def limits(variance: float, n: int) -> Array:
-    """Return the largest variance of each error, (n,), with `variance` as that of a position [m²]."""
+    """Return the largest variance of each error, (n,), with `variance` for the positions [m²]."""
     return np.array([variance] * 3 + [np.inf] * 3 + [TILT_CAP**2] * 2 + [YAW_CAP] + [np.inf] * (n - 9))
 
 
 @dataclass(frozen=True, kw_only=True)
 class InertialTrack(FilterMemory):
-    """State of the filter with its memory."""
+    """State of the filter with the filter memory."""
 
     state: InertialState | None = None
     before: PlaneTrack
-    """Track of the constant-velocity filters, from which this one starts once every sensor has given a sample."""
+    """Track of the constant-velocity filters, which initializes this filter once every sensor has delivered a
+    sample."""
     time: float = math.nan
     """Time of the state [s]."""
     omega: Vector = (0.0, 0.0, 0.0)
@@ -253,10 +259,9 @@ class ErrorState(Filter[InertialTrack]):
     """Error-state filter of one vehicle."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """
-        Args:
-            settings: Settings of the estimator.
-            site: Numbers of pool and vehicle.
+        """Args:
+        settings: Settings of the estimator.
+        site: Parameters of pool and vehicle.
         """
         super().__init__(settings, site)
         self._before = ConstantVelocity(settings, site)
@@ -274,11 +279,11 @@ class ErrorState(Filter[InertialTrack]):
         self._drifts = {slow: motion_of(settings, slow, False) for slow in (False, True)}
 
     def start(self) -> InertialTrack:
-        """Return the track before any sample."""
+        """Return the track before the first sample."""
         return InertialTrack(before=self._before.start())
 
     def apply(self, track: InertialTrack, sample: Sample) -> tuple[InertialTrack, tuple[Outcome, ...]]:
-        """Return the track after a sample, and the result of each sensor that reads it."""
+        """Return the track after a sample, and the outcome for each sensor in it."""
         if track.state is not None:
             return super().apply(track, sample)
         if isinstance(sample, ImuSample):
@@ -294,7 +299,7 @@ class ErrorState(Filter[InertialTrack]):
             return track, (Outcome("imu", "no acceleration"),)
         if (
             track.heard(sample.time) and track.force is not None
-        ):  # the step's mean, rather than its first sample
+        ):  # the mean over the step, rather than its first sample
             omega, force = _mean(track.omega, sample.omega), _mean(track.force, sample.force)
             track = changed(track, omega=omega, force=force)
         track = self.advanced(track, sample.time)
@@ -325,13 +330,13 @@ class ErrorState(Filter[InertialTrack]):
         return velocity_model(_state(track), np.array(track.omega), self._log)
 
     def restarted(self, track: InertialTrack, axes: list[int], step: Array, R: Array) -> InertialTrack:
-        """Start position axes: `step` [m] moves them to the measurement, whose covariance is `R` [m²]."""
+        """Restart position axes at a measurement, `step` [m] from the estimate, with covariance `R` [m²]."""
         state = _state(track)
         state = restarted(state, axes, state.x[axes] + step, R, self.settings.speed_std)
         return changed(track, state=state)
 
     def turned(self, track: InertialTrack, angle: float, variance: float) -> InertialTrack:
-        """Start yaw: `angle` [rad] turns it to the measurement, whose variance is `variance` [rad²]."""
+        """Restart yaw at a measurement, `angle` [rad] from the estimate, with variance `variance` [rad²]."""
         return changed(track, state=turned(_state(track), angle, variance))
 
     def tilt(self, track: InertialTrack) -> tuple[float, float]:
@@ -342,7 +347,7 @@ class ErrorState(Filter[InertialTrack]):
         return float(roll), float(pitch)
 
     def estimate(self, track: InertialTrack, time: float) -> PoseEstimate:
-        """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
+        """Return the estimate at a time [s], or at the track's own time if later; unknown values are NaN."""
         if track.state is None:
             return self._before.estimate(track.before, time)
         track = self.advanced(track, time)
@@ -368,7 +373,7 @@ class ErrorState(Filter[InertialTrack]):
         )
 
     def _begun(self, track: InertialTrack, time: float) -> InertialTrack:
-        """Return the track with the filter started, once position, yaw, depth and tilt are known."""
+        """Return the track with the filter initialized, once position, yaw, depth and tilt are known."""
         before, s = track.before, self.settings
         if track.force is None or not {"vision", "yaw", "depth"} <= before.seen.keys():
             return track
@@ -392,7 +397,8 @@ class ErrorState(Filter[InertialTrack]):
         return changed(track, state=state, time=time, seen=before.seen, gates=before.gates)
 
     def advanced(self, track: InertialTrack, time: float) -> InertialTrack:
-        """Return the track at a time [s]; velocity without measurements decays, and then the position stops."""
+        """Return the track advanced to a time [s]; without measurements the velocity decays, then the
+        position is frozen."""
         s, state = self.settings, _state(track)
         if time <= track.time:
             return track
@@ -406,7 +412,8 @@ class ErrorState(Filter[InertialTrack]):
     def _step(
         self, state: InertialState, track: InertialTrack, dt: float, *, blind: bool, age: float
     ) -> InertialState:
-        """Return the state after a step [s], without the IMU if `blind`; `age` is that of position and velocity [s]."""
+        """Return the state after a step [s], without the IMU if `blind`; `age` is the time since the last
+        position or velocity [s]."""
         s, lost = self.settings, age > self.settings.ages.hold
         if lost:
             state = frozen(state, [0, 1])
@@ -419,7 +426,7 @@ class ErrorState(Filter[InertialTrack]):
         after = predict(state, omega, force, dt, self._noise, self._gravity)
         if age <= s.ages.coast:
             return after
-        if lost:  # the accelerometer no longer gives the position; the vehicle may be anywhere near
+        if lost:  # the accelerometer no longer determines the position: it becomes increasingly uncertain
             x, xy = after.x.copy(), [0, 1]
             x[xy] = state.x[xy]
             spread = after.P[:2, :2] + 2.0 * s.speed_std**2 / s.decay * dt * np.eye(2)

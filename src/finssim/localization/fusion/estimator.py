@@ -1,4 +1,4 @@
-"""The estimator: samples in, in any order and at any rate; the state at any time out."""
+"""Pose estimator: accepts samples in any order and at any rate, and returns the state at any time."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ __all__ = ["MODELS", "MODES", "Estimator", "Fixes", "Health", "health_of"]
 
 S = TypeVar("S")
 
-# Samples in the order of their times, so that one that comes late is put where it belongs.
+# Samples ordered by their times, so that a late sample is inserted at its own time.
 
 SAME = 1e-7
-"""Stamps nearer than this are the same [s]."""
+"""Difference below which two time stamps count as equal [s]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class OtherReadings:
     """Readings of the other sensors at the time of a picture."""
 
     roll: float
-    """[rad]; NaN where no IMU sample is near."""
+    """Roll [rad]; NaN if no IMU sample is near."""
     pitch: float
     depth: float
     """Depth of the pressure port [m]; NaN if no sample is near."""
@@ -53,29 +53,28 @@ class OtherReadings:
 class Timeline(Generic[S]):
     """Samples of the last `horizon` seconds with the state after each; `S` is any immutable state.
 
-    An inserted sample and those after it are applied when `settle` is called, so that many samples that arrive together
-    cost one pass over them, however far a robot's loop has fallen behind.
+    An inserted sample and those after it are applied when `settle` is called, so that many samples that
+    arrive together are processed in one pass, however late a robot's loop runs.
     """
 
     def __init__(self, start: S, horizon: float) -> None:
-        """
-        Args:
-            start: State before any sample.
-            horizon: How far back a late sample is still taken [s].
+        """Args:
+        start: State before any sample.
+        horizon: Age up to which a late sample is accepted [s].
         """
         self.horizon = horizon
         self._ranks = {name: rank for rank, name in enumerate(("imu", *SENSORS))}
-        """Order of samples of one time, so that delivery decides nothing."""
+        """Order of samples of equal time, so that the result does not depend on the order of arrival."""
         self._before = start
-        """State before the oldest sample that is kept."""
+        """State before the oldest retained sample."""
         self._closed = -math.inf
-        """Time up to which samples have been forgotten [s]."""
+        """Time up to which samples have been discarded [s]."""
         self._keys: list[tuple[float, int]] = []
         self._samples: list[Sample] = []
         self._states: list[S] = []
-        """State after each of the first samples: those before the earliest that is not yet applied."""
+        """States after the first samples, up to the earliest that has not been applied."""
         self._outcomes: list[tuple[Outcome, ...] | None] = []
-        """Outcome of each sample when it was last applied; None before."""
+        """Outcomes of each sample when it was last applied; None before."""
 
     @property
     def head(self) -> float:
@@ -88,12 +87,12 @@ class Timeline(Generic[S]):
         return self._states[-1] if self._states else self._before
 
     def state_at(self, time: float) -> S:
-        """State after the last sample not later than `time` [s], of those remembered."""
+        """Return the state after the last retained sample that is not later than `time` [s]."""
         k = bisect.bisect_right(self._keys, (time + SAME, len(self._ranks)))
         return self._states[k - 1] if k else self._before
 
     def refusal(self, sample: Sample) -> str | None:
-        """`too late` or `duplicate`, or None where the sample has a place."""
+        """Return `too late` or `duplicate`, or None if the sample can be inserted."""
         if sample.time < max(self.head - self.horizon, self._closed):
             return "too late"
         k = bisect.bisect_left(self._keys, (sample.time - SAME, 0))
@@ -104,7 +103,7 @@ class Timeline(Generic[S]):
         return None
 
     def insert(self, sample: Sample) -> None:
-        """Insert a sample that `refusal` accepts at its time; states are out of date until `settle`."""
+        """Insert a sample that `refusal` accepts; the states after it are recomputed by `settle`."""
         key = (sample.time, self._ranks[sample.stream])
         k = bisect.bisect_right(self._keys, key)
         self._keys.insert(k, key)
@@ -115,13 +114,13 @@ class Timeline(Generic[S]):
     def settle(
         self, apply: Callable[[S, Sample], tuple[S, tuple[Outcome, ...]]]
     ) -> list[tuple[Sample, tuple[Outcome, ...] | None, tuple[Outcome, ...]]]:
-        """Apply the samples that were inserted since the last call, and those after them again.
+        """Apply the samples that were inserted since the last call, and reapply those after them.
 
         Args:
-            apply: State and sample -> state after it and what became of it.
+            apply: Function of state and sample that returns the state after it and the outcomes.
 
         Returns:
-            Samples in the order of their times, each with its former outcome and the one that holds instead.
+            Samples in the order of their times, each with its former outcomes and its new ones.
         """
         state, settled = self.state, []
         for k in range(len(self._states), len(self._samples)):
@@ -133,22 +132,24 @@ class Timeline(Generic[S]):
         return settled
 
     def _forget(self) -> None:
-        """Drop what is older than the horizon; the state after it stays."""
+        """Discard samples older than the horizon; the state after them is kept."""
         k = bisect.bisect_left(self._keys, (self.head - self.horizon, 0))
-        if k < 32:  # in batches: a list loses its front at the cost of its length
+        if k < 32:  # in batches: deleting from the front of a list costs time proportional to its length
             return
         self._before, self._closed = self._states[k - 1], self._keys[k - 1][0]
         del self._keys[:k], self._samples[:k], self._states[:k], self._outcomes[:k]
 
     def depth_at(self, time: float, longest: float) -> float:
-        """Depth at a time, in a straight line between two samples or the nearest one within `longest` [m]; or NaN."""
+        """Return the depth at a time [m], interpolated linearly, or that of the nearest sample within
+        `longest` [s]; else NaN."""
         near = [self._samples[i] for i in self._around(time, "depth")]
         return _between([(s.time, s.depth) for s in near if isinstance(s, DepthSample)], time, longest)
 
     def tilt_at(
         self, time: float, longest: float, tilt: Callable[[S], tuple[float, float]]
     ) -> tuple[float, float]:
-        """Roll and pitch at a time, likewise, from the states after the IMU's samples [rad]."""
+        """Return roll and pitch at a time [rad], interpolated between the states after the IMU samples, as
+        `depth_at`."""
         near = [(self._keys[i][0], *tilt(self._states[i])) for i in self._around(time, "imu")]
         return (
             _between([(t, roll) for t, roll, _ in near], time, longest),
@@ -165,7 +166,8 @@ class Timeline(Generic[S]):
 
 
 def _between(points: list[tuple[float, float]], time: float, longest: float) -> float:
-    """Value at a time of points in the order of their times; NaN where none is within `longest`."""
+    """Return the value at a time from time-ordered points, by interpolation or the nearest one; NaN if none
+    is within `longest`."""
     k = bisect.bisect_left(points, (time, -math.inf))
     earlier = points[k - 1] if k and time - points[k - 1][0] <= longest else None
     later = points[k] if k < len(points) and points[k][0] - time <= longest else None
@@ -176,17 +178,18 @@ def _between(points: list[tuple[float, float]], time: float, longest: float) -> 
     return nearest[1] if nearest else math.nan
 
 
-# Status of the estimator: vision state, ages, readiness, and what it refused and why.
+# Status of the estimator: vision mode, ages, readiness, and refused samples with reasons.
 
 MODES = ("uninitialized", "fresh", "coast", "hold", "lost")
 
 
 @dataclass(frozen=True)
 class Health:
-    """Condition of the estimator at one time."""
+    """Status of the estimator at one time."""
 
     ready: bool
-    """Initialized, every sensor fresh, vision fresh or coasting, and the variances within the settings' limits."""
+    """True if initialized, every sensor is fresh, vision is fresh or coasting, and the variances are within
+    the limits."""
     initialized: bool
     vision_mode: str
     """One of `MODES`."""
@@ -194,7 +197,7 @@ class Health:
     imu_fresh: bool
     depth_fresh: bool
     age_vision: float
-    """[s]; NaN before the first."""
+    """Age of the latest vision fix [s]; NaN before the first."""
     age_imu: float
     """Age of the latest IMU sample [s]."""
     age_depth: float
@@ -202,18 +205,18 @@ class Health:
     reject_reason: str
     """Stream and reason of the latest refusal; empty before the first."""
     mahalanobis: dict[str, float]
-    """Squared Mahalanobis distance [-] of each stream's latest measurement."""
+    """Squared Mahalanobis distance of each stream's latest measurement [-]."""
     position_covariance: tuple[float, ...]
     """Diagonal, position [m²] then velocity [m²/s²], (6,)."""
     yaw_covariance: float
     """Variance of yaw [rad²]."""
     velocity_world: tuple[float, ...]
-    """World axes [m/s]."""
+    """Velocity, world axes [m/s]."""
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    """Stream -> verdict -> samples."""
+    """Stream -> verdict -> number of samples."""
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values, numbers that are not known as None."""
+        """Return the status as plain values; unknown numbers are None."""
         return {
             "vision_source": "overhead_tags",
             **{name: _plain(value) for name, value in self.__dict__.items()},
@@ -221,7 +224,7 @@ class Health:
 
 
 def mode_of(age: float, settings: Settings) -> str:
-    """The vision state at that age of vision [s]; NaN: there was none."""
+    """Return the vision mode for an age of vision [s]; NaN if there was no fix."""
     if math.isnan(age):
         return "uninitialized"
     limits = {mode: getattr(settings.ages, mode) for mode in MODES[1:4]}
@@ -236,15 +239,15 @@ def health_of(
     reason: str,
     counts: dict[str, dict[str, int]],
 ) -> Health:
-    """The condition that goes with an estimate.
+    """Return the status that belongs to an estimate.
 
     Args:
         estimate: The estimate.
         settings: Limits of ages and variances.
-        site: Turns velocities into world axes.
+        site: Site whose rotation converts velocities to world axes.
         latest: Squared Mahalanobis distance [-] of each stream's latest measurement.
         reason: Stream and reason of the latest refusal.
-        counts: Stream -> verdict -> samples.
+        counts: Stream -> verdict -> number of samples.
     """
     vision, imu, depth = (
         math.nan if then is None else estimate.time - then
@@ -293,37 +296,36 @@ def _plain(value: Any) -> Any:
 
 
 AGREED = 10
-"""Samples on one other clock after which that clock is believed."""
+"""Number of consecutive samples on another clock after which that clock is accepted."""
 UNHEARD = 10.0
-"""Gap between samples without arrival times that counts as a silence [s]."""
+"""Gap between samples without arrival times that still counts as a silence rather than a clock jump [s]."""
 
 
 MODELS: dict[str, Callable[[Settings, Site], Filter[Any]]] = {
     "constant-velocity": ConstantVelocity,
     "error-state": ErrorState,
 }
-"""Name -> filter, made from settings and site."""
+"""Name -> factory of the filter from settings and site."""
 
 
 class Estimator:
-    """Position, velocity and attitude of one vehicle from what it has: IMU and depth; fixes of a camera, of motion
-    capture or of acoustics; Doppler velocity and compass.
+    """Estimator of position, velocity and attitude of one vehicle from the available sensors: IMU and depth;
+    position fixes of a camera, motion capture or acoustics; Doppler velocity and compass.
 
-    Samples are put in the order of their times, whatever the order in which they come: the state is the same for any
-    delivery within the horizon. What cannot be used is counted with its reason, and never raises.
+    Samples are processed in the order of their times, not of their arrival: the state is the same for any
+    delivery within the horizon. Unusable samples are counted with the reason and never raise an exception.
     """
 
     def __init__(
         self, settings: Settings | None = None, site: Site | None = None, *, mode: str = "constant-velocity"
     ) -> None:
-        """
-        Args:
-            settings: What can be tuned; the defaults if None.
-            site: What of pool and vehicle is needed; `site_of` makes it.
-            mode: A name of `MODELS`.
+        """Args:
+            settings: Tunable settings; None: the defaults.
+            site: Parameters of pool and vehicle, made by `site_of`.
+            mode: A name in `MODELS`.
 
         Raises:
-            LocalizationError: Unknown mode.
+            LocalizationError: The mode is unknown.
         """
         if mode not in MODELS:
             raise LocalizationError(f"unknown estimator '{mode}'; available: {', '.join(MODELS)}")
@@ -333,25 +335,25 @@ class Estimator:
         self._latest: dict[str, float] = {}
         self._reason = ""
         self.nis: dict[str, tuple[float, int]] = dict.fromkeys(SENSORS, (0.0, 0))
-        """Sensor -> sum of squared Mahalanobis distances of accepted measurements, and of their dimensions."""
+        """Sensor -> sum of squared Mahalanobis distances of accepted measurements, and sum of their dimensions."""
         self._arrived = -math.inf
         self._other: list[float] = []
         self._timeline: Timeline[Any] = Timeline(self._model.start(), self.settings.ages.horizon)
 
     def add(self, sample: Sample) -> str:
-        """Take in a sample and apply it.
+        """Add a sample and apply it.
 
         Returns:
-            `accepted`, or why it was refused; a fix's is that of its position.
+            `accepted`, or the reason of the refusal; for a fix, the verdict on its position.
         """
         reason = self.put(sample)
         return reason or next(new for item, _, new in self._settle() if item is sample)[0].verdict
 
     def put(self, sample: Sample) -> str | None:
-        """Take in a sample, which is applied when the state is needed.
+        """Add a sample, which is applied when the state is needed.
 
         Returns:
-            Why it was refused without a look at the state; None if it has its place.
+            Reason if the sample is refused before it is applied, else None.
         """
         reason = refusal(sample) or self._clock(sample) or self._timeline.refusal(sample)
         if reason is not None:
@@ -361,10 +363,10 @@ class Estimator:
         return None
 
     def _settle(self) -> list[tuple[Sample, tuple[Outcome, ...] | None, tuple[Outcome, ...]]]:
-        """Apply what was put, and count what became of it."""
+        """Apply the added samples, and count their outcomes."""
         settled = self._timeline.settle(self._model.apply)
         for _, old, new in settled:
-            # An outcome that is the same object as before is kept: those of the IMU's samples, which are most.
+            # Skip an outcome that is the same object as before: most are, those of IMU samples.
             if old is new:
                 continue
             if old is not None:
@@ -378,15 +380,15 @@ class Estimator:
         return settled
 
     def refuse(self, stream: str, reason: str) -> str:
-        """Count what never became a sample, such as a picture without tags; returns the reason."""
+        """Count data that did not become a sample, such as a picture without tags, and return the reason."""
         self._count(stream, reason, 1)
         self._reason = f"{stream}: {reason}"
         return reason
 
     def estimate(self, time: float | None = None) -> PoseEstimate:
-        """The state at a time [s]: predicted beyond the newest sample, which is the default.
+        """Return the estimate at a time [s], by default that of the newest sample; later times are predicted.
 
-        For a time within the horizon it is the state after the samples up to then, as far as they have come.
+        For a time within the horizon, the estimate follows from the samples up to that time that have arrived.
         """
         self._settle()
         if time is None:
@@ -395,13 +397,15 @@ class Estimator:
         return self._model.estimate(track, time)
 
     def health(self, estimate: PoseEstimate) -> Health:
-        """The condition that goes with an estimate."""
+        """Return the status that belongs to an estimate."""
         self._settle()
         return health_of(estimate, self.settings, self.site, self._latest, self._reason, self._counts)
 
     def at(self, time: float) -> OtherReadings:
-        """Roll, pitch and depth at the time of an exposure [s], for the fit of its pose: between samples in a straight
-        line, else from one within the freshness of its stream.
+        """Return roll, pitch and depth at the time of an exposure [s], for the fit of its pose.
+
+        Values are interpolated linearly between samples, else taken from one within the freshness limit of
+        its stream.
         """
         self._settle()
         s = self.settings
@@ -410,7 +414,7 @@ class Estimator:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """Stream -> verdict -> samples."""
+        """Stream -> verdict -> number of samples."""
         self._settle()
         return {stream: dict(verdicts) for stream, verdicts in self._counts.items()}
 
@@ -420,15 +424,16 @@ class Estimator:
         self._arrived = -math.inf
 
     def _clock(self, sample: Sample) -> str | None:
-        """Refuse a stamp that runs away from its arrival, until enough samples agree on the other clock.
+        """Refuse a time stamp that jumps relative to its arrival, until enough samples agree on the other clock.
 
-        A silence of all sensors is no such jump where arrivals are given, for those go on meanwhile. Forwards the state
-        is then predicted over the jump; backwards nothing is known of the time between, and all starts anew.
+        A silence of all sensors is not a jump if arrival times are given, since they advance by the same
+        time. After a forward jump the state is predicted over it; after a backward jump the estimator
+        restarts.
         """
         head = self._timeline.head
         if math.isinf(head):
             return None
-        # Without arrivals a silence and a jump cannot be distinguished, and silences are more frequent.
+        # Without arrival times, silence and jump cannot be distinguished, and silences are more frequent.
         waited = UNHEARD if sample.arrival is None else max(0.0, sample.arrival - self._arrived)
         forward = sample.time - head > waited + self.settings.ages.jump
         if not forward and sample.time >= head - max(self.settings.ages.horizon, self.settings.ages.jump):
@@ -462,25 +467,24 @@ class Estimator:
             del verdicts[verdict]
 
 
-# Pictures with tags as fixes, with the depth and tilt that the estimator knows at their exposure.
+# Position fixes from pictures with tags, with the estimator's depth and tilt at the exposure.
 
 
 class Fixes:
-    """Makes a fix of each picture."""
+    """Converter from pictures with tags to position fixes."""
 
     def __init__(self, locator: TagLocator) -> None:
-        """
-        Args:
-            locator: Measures the poses.
+        """Args:
+        locator: Locator that measures the poses.
         """
         self._locate = locator
 
     def fix(self, frame: Frame, estimator: Estimator) -> VisionSample | str:
-        """The fix of one picture, or why there is none.
+        """Return the fix of one picture, or the reason for having none.
 
         Args:
             frame: The picture's tags; its stamp is that of its arrival.
-            estimator: Knows depth and tilt at the exposure, of the samples that have arrived.
+            estimator: Estimator that provides depth and tilt at the exposure, from the samples that have arrived.
         """
         if not math.isfinite(frame.time):
             return "time not finite"

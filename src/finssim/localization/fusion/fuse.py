@@ -1,4 +1,4 @@
-"""Work of `finssim fuse`: a log through the estimator, as in real time."""
+"""Implementation of `finssim fuse`: process a log with the estimator, as in real time."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from finssim.localization.overhead_camera import Pool, load_pool
 from finssim.localization.poses.methods import TagLocator, check_method
 from finssim.vehicles import Vehicle, load_vehicle
 
-# The table that the fusion writes, and its summary.
+# Output table of the fusion, and its summary.
 
 Array = npt.NDArray[np.float64]
 
@@ -36,14 +36,14 @@ COLUMNS = (
     *(f"std_{name}" for name in (*AXES, "yaw")),
     *("state", "ready", "n_vision", "n_yaw", "n_depth", "n_imu", "n_refused"),
 )
-"""Metres, m/s, rad, rad/s; pool frame. `n_` count the samples taken in so far."""
+"""Columns of the table, in metres, m/s, rad and rad/s, pool frame; `n_` columns count the accepted samples so far."""
 
 GAP = 0.25
-"""Truth is not interpolated over longer gaps [s]."""
+"""Longest gap of the truth that is interpolated [s]."""
 
 
 def row_of(estimate: PoseEstimate, health: Health) -> list[Any]:
-    """One row of the table, in the order of `COLUMNS`."""
+    """Return one row of the table, in the order of `COLUMNS`."""
     numbers = [
         estimate.time,
         *estimate.x,
@@ -62,10 +62,10 @@ def row_of(estimate: PoseEstimate, health: Health) -> list[Any]:
 
 
 def write_rows(rows: Sequence[Sequence[Any]], out: Path) -> None:
-    """Write the table; what is not known is an empty cell.
+    """Write the table; unknown values are empty cells.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The table cannot be written.
     """
     write_csv(out, COLUMNS, ([_cell(value) for value in row] for row in rows))
 
@@ -85,10 +85,10 @@ def summary_of(
     """Return the summary of a run, as plain values.
 
     Args:
-        rows: Of the table.
-        health: At the end.
-        nis: Stream -> sum of squared Mahalanobis distances [-] and of their dimensions.
-        truth: Where the vehicle really was, if known.
+        rows: Rows of the table.
+        health: Status at the end.
+        nis: Stream -> sum of squared Mahalanobis distances [-] and sum of their dimensions.
+        truth: True pose of the vehicle, if known.
     """
     modes = Counter(row[COLUMNS.index("state")] for row in rows)
     counts = health.counts
@@ -110,10 +110,11 @@ def summary_of(
 
 
 def error_figures(rows: Sequence[Sequence[Any]], truth: StreamTable) -> dict[str, Any]:
-    """Differences from the truth, by vision state: root mean square and 95th percentile.
+    """Return the errors relative to the truth, by vision mode: root mean square and 95th percentile.
 
     Returns:
-        State (and `all`) -> samples, rms_x, rms_y, rms_z, p95_horizontal [m], rms_yaw [rad], for what the truth has.
+        Vision mode (and `all`) -> samples, rms_x, rms_y, rms_z, p95_horizontal [m], rms_yaw [rad], as far as
+        the truth has them.
     """
     ours = np.array([[float(row[k]) for k in (0, 1, 2, 3, 9)] for row in rows])
     states = np.array([row[COLUMNS.index("state")] for row in rows])
@@ -151,7 +152,7 @@ def _figures(errors: dict[str, Array], chosen: npt.NDArray[np.bool_]) -> dict[st
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
-    """The summary for a person."""
+    """Return the lines of the printed summary."""
     shares = ", ".join(f"{mode} {share:.1%}" for mode, share in summary["states"].items() if share)
     lines = [f"{summary['rows']} rows: {shares}; ready {summary['ready']:.1%}"]
     for stream, accepted in summary["accepted"].items():
@@ -159,11 +160,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         text = ", ".join(f"{word} {n}" for word, n in sorted(refused.items())) or "none"
         nis = summary["nis_per_dimension"].get(stream)
         lines.append(
-            f"{stream:7s} taken in {accepted}, refused: {text}"
+            f"{stream:7s} accepted {accepted}, refused: {text}"
             + ("" if nis is None else f"; NIS per dimension {nis:.2f} (1 expected)")
         )
     if summary["refused"].get("clock"):
-        lines.append(f"the clock started anew {summary['refused']['clock'].get('restart', 0)} times")
+        lines.append(f"the clock restarted {summary['refused']['clock'].get('restart', 0)} times")
     health = summary["health"]
     ages = ", ".join(f"{s} {_age(health[f'age_{s}'])}" for s in ("vision", "depth", "imu"))
     lines.append(f"ages at the end: {ages}")
@@ -186,34 +187,34 @@ Delivery: TypeAlias = "Sample | Frame | NoFix"
 FASTEST = 1000.0
 """Highest rate of the output [Hz]."""
 LONGEST = 4.0e6
-"""Most rows that are written."""
+"""Greatest number of rows that are written."""
 
 
 @dataclass
 class FuseResult:
-    """Result of a log."""
+    """Result of fusing a log."""
 
     rows: list[list[Any]] = field(default_factory=list)
-    """Rows in the order of `fuse_output.COLUMNS`."""
+    """Rows in the order of `COLUMNS`."""
     summary: dict[str, Any] = field(default_factory=dict)
     interrupted: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class FuseSettings:
-    """Rate of the rows, and methods of the estimation."""
+    """Rate of the output rows, and methods of the estimation."""
 
     rate: float = 60.0
-    """Rows per second [Hz]."""
+    """Rate of the output rows [Hz]."""
     estimator: str | None = None
-    """(NAME) error-state, which uses the IMU's accelerations (default where the log has them), or
+    """(NAME) error-state, which uses the IMU's accelerations (default if the log contains them), or
     constant-velocity (paper, eq. 14-15)."""
     method: str = "refractive"
     """(METHOD) Localization method: refractive, refractive-weighted, refractive-6dof, pinhole-depth or
     pinhole."""
     pixel_std: float | None = None
-    """Error of a detected corner, per axis [px]; that of the pool's calibration, otherwise 0.5, if not
-    given."""
+    """Standard deviation of a detected corner, per axis [px]; by default that of the pool's calibration,
+    otherwise 0.5."""
 
 
 def run(
@@ -225,7 +226,7 @@ def run(
     settings: Annotated[FuseSettings, "options"] = FuseSettings(),
     as_json: bool = False,
 ) -> FuseResult:
-    """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], health.
+    """Fuse vision, depth and IMU in the order of arrival: position [m], velocity [m/s], yaw [rad], status.
 
     Example: finssim fuse log --pool pool.yaml --vehicle finsrov --out fused.csv
 
@@ -234,13 +235,13 @@ def run(
         pool (FILE): Pool file: camera, water plane and frames (.yaml).
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Table to write (.csv).
-        settings: Rate of the rows, and methods of the estimation.
+        settings: Rate of the output rows, and methods of the estimation.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        LocalizationError: The log, pool or a word cannot be used.
+        LocalizationError: The log, pool or a name cannot be used.
         OutputError: `out` cannot be written.
-        KeyboardInterrupt: After what was done until then has been written.
+        KeyboardInterrupt: The run was interrupted; the rows computed until then have been written.
     """
     out = Path(out)
     refuse_unwritable(atomic_write(out))
@@ -262,10 +263,10 @@ def run(
 
 
 def fuse(log: Log, pool: Pool, vehicle: Vehicle, settings: FuseSettings) -> FuseResult:
-    """Fuse a log; arguments as `run`. A row at time t rests on what had arrived by t.
+    """Fuse a log; arguments as in `run`. A row at time t depends only on samples that had arrived by t.
 
     Raises:
-        LocalizationError: A word is unknown, the rate is out of range, or the error-state mode finds no acceleration.
+        LocalizationError: A name is unknown, the rate is out of range, or the error-state mode lacks accelerations.
     """
     rate, method = settings.rate, settings.method
     mode = settings.estimator or ("error-state" if _has_accelerations(log) else "constant-velocity")
@@ -316,10 +317,10 @@ def _take(item: Delivery, estimator: Estimator, fixes: Fixes | None) -> None:
 
 
 def _deliveries(log: Log) -> list[tuple[float, Delivery]]:
-    """Samples and pictures in the order of their arrival; those without a time stay with their neighbour.
+    """Return samples and pictures in the order of their arrival; those without a time come first.
 
     Raises:
-        LocalizationError: There is none with a time, or they span too long.
+        LocalizationError: No sample has a time.
     """
     deliveries: list[tuple[float, Delivery]] = [
         (s.arrival if s.arrival is not None else s.time, s) for s in log.samples
@@ -337,10 +338,10 @@ def _deliveries(log: Log) -> list[tuple[float, Delivery]]:
 def _by_row(
     deliveries: Sequence[tuple[float, Delivery]], rate: float
 ) -> Iterator[tuple[float, list[Delivery]]]:
-    """Times of the rows, and what arrives between the one before and each.
+    """Return an iterator over the times of the rows, each with the data that arrived since the previous row.
 
     Raises:
-        LocalizationError: The log would give more than `LONGEST` rows.
+        LocalizationError: The log would result in more than `LONGEST` rows.
     """
     first, last = deliveries[0][0], deliveries[-1][0]
     if (last - first) * rate > LONGEST:

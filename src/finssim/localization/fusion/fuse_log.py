@@ -1,4 +1,4 @@
-"""A log as samples in the order of their arrival: a folder with one table per stream, or one table of all."""
+"""Logs as samples in the order of their arrival: a folder with one table per stream, or one table of all streams."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from finssim.localization.fusion.streams import DepthSample, ImuSample, Sample, 
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import Imu
 
-# Reading the tables of a log: columns of numbers by name, empty cells as NaN.
+# Tables of a log: columns of numbers by name, empty cells as NaN.
 
 Array = npt.NDArray[np.float64]
 
 TIME = ("t", "time", "time_s", "timestamp", "stamp", "seconds")
 TEXT_COLUMNS = ("image", "status", "reason")
-"""Columns that are words even where they look like numbers."""
+"""Columns that contain text even if they look like numbers."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 LONGEST_GAP = 2.0
-"""Longest time between two rates of turn that can be right [s]."""
+"""Longest plausible interval between two angular rates [s]."""
 TRUTH = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0}
 
 
@@ -40,15 +40,15 @@ class StreamTable:
     name: str
     """Name in messages."""
     t: Array
-    """Times as in the file, (n,) [s]."""
+    """Times as in the file [s], (n,)."""
     numbers: dict[str, Array]
-    """Column, in lower case -> values in the unit of the table, (n,)."""
+    """Column name in lower case -> values in the unit of the table, (n,)."""
     words: dict[str, list[str]]
-    """Columns that hold words."""
+    """Column name -> text cells."""
     notes: list[str] = field(default_factory=list)
 
     def has(self, *names: str) -> bool:
-        """Return whether all these columns hold a number somewhere."""
+        """Return whether each of these columns contains at least one number."""
         return all(name in self.numbers and np.isfinite(self.numbers[name]).any() for name in names)
 
     def columns(self, *names: str) -> Array:
@@ -56,7 +56,7 @@ class StreamTable:
         return np.stack([self.numbers[name] for name in names], axis=-1)
 
     def angle(self, name: str) -> Array:
-        """A column of angles in radians, or of degrees with `_deg` in its name [rad]; NaN where there is none."""
+        """Return a column of angles in radians, converted if its name ends in `_deg` [rad]; NaN if it is missing."""
         if name in self.numbers:
             return self.numbers[name]
         if f"{name}_deg" in self.numbers:
@@ -64,7 +64,8 @@ class StreamTable:
         return np.full(len(self.t), math.nan)
 
     def up(self) -> Array | None:
-        """Unit vectors upwards in the axes whose attitude the table holds, (n, 3); None where it holds none.
+        """Return unit vectors upwards in the axes to which the table's attitude refers, (n, 3); None without
+        an attitude.
 
         Raises:
             LocalizationError: Quaternions are not of unit length, or angles exceed a turn.
@@ -88,7 +89,7 @@ class StreamTable:
         return up_of(roll, pitch)
 
 
-# Samples over time, read at times between them and nowhere else.
+# Time series that are interpolated between samples and not extrapolated.
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,16 +97,17 @@ class Series:
     """Samples in the order of their times."""
 
     what: str
-    """Quantity such as `depth`, for messages."""
+    """Name of the quantity in messages, such as `depth`."""
     t: Array
-    """[s], rising, (n,)."""
+    """Times, increasing [s], (n,)."""
     values: Array
     """Values in the unit of the quantity, (n, k)."""
     longest_gap: float
     """Longest gap between samples that is interpolated [s]."""
 
     def between(self, times: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """The values at some times [s], in a straight line between two samples, (m, k), and whether they are known."""
+        """Return the values at times [s], interpolated linearly, (m, k), and a mask of the times at which
+        they are known."""
         k = np.clip(np.searchsorted(self.t, times), 1, max(len(self.t) - 1, 1))
         late = np.minimum(k, len(self.t) - 1)
         near = self.t[late] - self.t[k - 1] <= self.longest_gap
@@ -113,7 +115,7 @@ class Series:
         return np.column_stack(columns), (times >= self.t[0]) & (times <= self.t[-1]) & near
 
     def at(self, time: float) -> Array | str:
-        """The values at a time [s], in a straight line between two samples, (k,); or why they are not known there."""
+        """Return the values at a time [s], interpolated linearly, (k,); or the reason why they are unknown."""
         if not np.isfinite(time):
             return f"no {self.what} at the exposure: the picture has no time stamp"
         first, last = float(self.t[0]), float(self.t[-1])
@@ -130,12 +132,12 @@ class Series:
 
 
 def series(quantity: str, t: Array, values: Array, longest_gap: float, *, label: str) -> Series:
-    """Sort samples by time and leave out those without any number; of equal times the last is taken.
+    """Sort samples by time and leave out those without any number; of equal times the last is used.
 
     Times are in [s], values in the unit of the quantity.
 
     Raises:
-        LocalizationError: None is left.
+        LocalizationError: No sample remains.
     """
     order = np.argsort(t, kind="stable")
     t, values = t[order], values[order]
@@ -148,15 +150,16 @@ def series(quantity: str, t: Array, values: Array, longest_gap: float, *, label:
 
 
 def read_stream_table(path: str | Path) -> StreamTable:
-    """The columns of a CSV file with a line of names; separated by commas, semicolons or tabs; # begins a comment.
+    """Read a CSV file with a line of column names; cells are separated by commas, semicolons or tabs; #
+    begins a comment.
 
-    A last line that a crash cut short is left out, and so are others of the wrong length.
+    Rows of the wrong length, such as a last line that a crash cut short, are left out.
 
     Args:
         path: The file.
 
     Raises:
-        LocalizationError: Unreadable, without names, without a column of times, or without rows.
+        LocalizationError: The file is unreadable, or lacks names, a time column or rows.
     """
     text = read_text_table(path, LocalizationError)
     names = [name.lower() for name in text.names]
@@ -189,16 +192,17 @@ def read_stream_table(path: str | Path) -> StreamTable:
 
 
 def _number(cell: str, text: TextTable) -> float:
-    """The number in a cell; NaN where there is none. Infinities stay: the estimator refuses and counts them."""
+    """Return the number in a cell; NaN if there is none. Infinities are kept: the estimator refuses and
+    counts them."""
     value = text.number(cell)
     return TRUTH.get(cell.lower(), math.nan) if value is None else value
 
 
 RATES, FORCE = ("p", "q", "r"), ("ax", "ay", "az")
 SENSOR_RATES, SENSOR_FORCE = ("gyro_x", "gyro_y", "gyro_z"), ("accel_x", "accel_y", "accel_z")
-"""Names that say that the numbers are in the IMU's own axes."""
+"""Column names of vectors in the IMU's own axes."""
 HELD = 0.5
-"""A stream of whose rows more than this share repeat the one before was written into a faster table."""
+"""Fraction of repeated rows above which a slower stream is assumed to have been logged in a faster table [-]."""
 
 
 @dataclass(frozen=True)
@@ -217,25 +221,26 @@ class Log:
     samples: list[Sample] = field(default_factory=list)
     """Samples in the order of their arrival."""
     frames: list[Frame] = field(default_factory=list)
-    """Pictures with tags, in the order of their stamps, where the log has no fixes."""
+    """Pictures with tags, in the order of their stamps, if the log has no fixes."""
     missed: list[NoFix] = field(default_factory=list)
-    """Pictures that `finssim localize` refused."""
+    """Pictures in which `finssim localize` did not locate the vehicle."""
     truth: StreamTable | None = None
     """True pose of the vehicle: t, x, y, z [m], yaw [rad], pool frame."""
     notes: list[str] = field(default_factory=list)
-    """Repairs, and samples left out."""
+    """Remarks about repairs and excluded samples."""
 
 
 def load_log(path: str | Path, vehicle: Vehicle, *, latency: float = 0.0) -> Log:
     """Read a log.
 
     Args:
-        path: A folder with imu.csv, depth.csv, vision.csv or detections.csv, and perhaps truth.csv; or one table.
-        vehicle: Says how the IMU is mounted and how old samples are when they arrive.
-        latency: Of the camera: stamp of a picture minus the middle of its exposure [s].
+        path: A folder with imu.csv, depth.csv, vision.csv or detections.csv, and optionally truth.csv; or one
+            table.
+        vehicle: Vehicle whose file gives the mount of the IMU and the latencies of the sensors.
+        latency: Latency of the camera: stamp of a picture minus the middle of its exposure [s].
 
     Raises:
-        LocalizationError: Nothing there, or a table without the columns of its stream.
+        LocalizationError: There is no table, or one lacks the columns of its stream.
     """
     path = Path(path)
     log = Log()
@@ -276,7 +281,7 @@ _EXPECTED = {
 _MISSING = {
     "imu": "no IMU samples: the heading is the camera's alone, the vehicle counts as level, and is never ready",
     "depth": "no depth samples: height stays unknown, and the vehicle is never ready",
-    "vision": "no fixes and no detections: place and heading stay unknown",
+    "vision": "no fixes and no detections: position and heading stay unknown",
 }
 
 
@@ -300,15 +305,16 @@ class ImuColumns(NamedTuple):
 
 
 def imu_columns(table: StreamTable, sensor: Imu | None) -> ImuColumns:
-    """The columns of an IMU: `gyro_x`, `accel_x`, ... are in its own axes, and turned into the body's; `p`, `ax`, ...
-    are in the body's.
+    """Return the columns of an IMU in body axes.
+
+    `gyro_x`, `accel_x`, ... are in the IMU's own axes and are rotated; `p`, `ax`, ... are in body axes already.
 
     Args:
         table: The table.
-        sensor: How the IMU is mounted.
+        sensor: IMU with its mount.
 
     Raises:
-        LocalizationError: Columns are in the sensor's axes, whose mount is not known; or no attitude can be so.
+        LocalizationError: Columns are in the IMU's axes but its mount is unknown, or the attitude is invalid.
     """
     turned = table.has(*SENSOR_RATES) and not table.has(*RATES)
     if turned and sensor is None:
@@ -340,7 +346,7 @@ def _imu(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list
             f"{table.name}: rates of turn come every {interval:.3g} s, expected at most {LONGEST_GAP:g} s: are its "
             "times in seconds?"
         )
-    if len(rows) > 1:  # an attitude that was logged in separate rows is kept until the next rate
+    if len(rows) > 1:  # if attitudes are logged in separate rows, each is held until the next rate
         tilt = _carried(table.t, tilt)
     arrival = _arrival(table, 0.0 if sensor is None else sensor.latency)
     return [
@@ -356,7 +362,7 @@ def _imu(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> list
 
 
 def _carried(t: Array, values: Array) -> Array:
-    """Each row's values or, for at most 0.1 s, those of the row before."""
+    """Return each row's values or, for at most 0.1 s, those of the latest complete row."""
     rows = np.where(np.isfinite(values).all(axis=1), np.arange(len(t)), -1)
     last = np.maximum.accumulate(rows)
     fresh = (last >= 0) & (t - t[np.maximum(last, 0)] <= 0.1)
@@ -395,7 +401,7 @@ def _vision(table: StreamTable, vehicle: Vehicle, log: Log, latency: float) -> l
 
 
 def _covariance(table: StreamTable) -> Array:
-    """Covariance of x, y and yaw in each row, (n, 3, 3); NaN where the row has none."""
+    """Return the covariance of x, y and yaw in each row, (n, 3, 3); NaN in rows without standard deviations."""
     if not table.has("std_x", "std_y"):
         return np.full((len(table.t), 3, 3), np.nan)
     none = np.full(len(table.t), math.radians(180.0))  # a fix without yaw does not use its variance
@@ -409,17 +415,17 @@ def _covariance(table: StreamTable) -> Array:
 
 
 def counted(reason: str) -> str:
-    """A reason without its particulars, for counting."""
+    """Return a reason without its details, for counting."""
     return re.split(r"[:(]", reason, maxsplit=1)[0].strip() or "refused"
 
 
 def _arrival(table: StreamTable, latency: float) -> Array:
-    """When the rows came: column `arrival`, or the time plus the sensor's latency."""
+    """Return the arrival times of the rows: column `arrival`, or the time plus the sensor's latency."""
     return table.numbers["arrival"] if table.has("arrival") else table.t + latency
 
 
 def _thinned(rows: npt.NDArray[np.intp], values: Array, stream: str, log: Log) -> npt.NDArray[np.intp]:
-    """Rows without those that repeat the one before, if most do: a slow stream in a fast table."""
+    """Return rows without those that repeat the previous one, if most do: a slow stream in a fast table."""
     if len(rows) < 3:
         return rows
     new = np.append(True, (values[rows[1:]] != values[rows[:-1]]).any(axis=1))
@@ -435,5 +441,5 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def rows_of(R: Array) -> tuple[tuple[float, float, float], ...]:
-    """The rows of a matrix (3, 3) as plain numbers. The unit is kept."""
+    """Return the rows of a matrix (3, 3) as plain numbers, in its unit."""
     return tuple(_three(row) for row in R)

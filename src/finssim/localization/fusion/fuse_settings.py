@@ -1,4 +1,4 @@
-"""Everything that can be tuned in the fusion."""
+"""Settings of the fusion."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Aids:
-    """Errors of Doppler log and compass; those that last since power-on are a part of the error state."""
+    """Errors of Doppler log and compass; constant errors since power-on are part of the error state."""
 
     velocity_std: float = 0.01
     """Standard deviation of one sample, per axis [m/s]."""
     velocity_bias: float = 0.001
     """Standard deviation of the offset, per axis [m/s]."""
     velocity_scale: float = 0.001
-    """Standard deviation of the scale's error [-]."""
+    """Standard deviation of the scale error [-]."""
     velocity_walk: float = 0.0
     """Random walk of the offset [m/s²/√Hz]."""
     heading_std: float = 0.01
@@ -38,22 +38,22 @@ class Aids:
 
 @dataclass(frozen=True)
 class AgeLimits:
-    """Ages and delays of samples up to which they count [s]."""
+    """Limits of ages and delays of samples [s]."""
 
     fresh: float = 0.25
-    """Age of vision up to which the state is called fresh [s]."""
+    """Age of vision up to which the vision mode is `fresh` [s]."""
     coast: float = 0.75
-    """Time up to which velocity is extrapolated [s]."""
+    """Age of vision up to which velocity is extrapolated [s]."""
     hold: float = 3.0
-    """Time [s] up to which velocity decays; beyond it the position is constant and its covariance grows."""
+    """Age of vision [s] up to which velocity decays; beyond it the position is constant and its covariance grows."""
     imu_fresh: float = 0.10
-    """Age of an IMU's sample up to which it is called fresh [s]."""
+    """Age up to which an IMU sample is fresh [s]."""
     depth_fresh: float = 0.30
-    """Age of a depth up to which it is called fresh [s]."""
+    """Age up to which a depth sample is fresh [s]."""
     horizon: float = 1.0
-    """Greatest delay of a sample that is still inserted at its time [s]."""
+    """Greatest delay with which a sample is still inserted at its own time [s]."""
     jump: float = 1.0
-    """Greatest lead of a stamp over its arrival before the clock is doubted [s]."""
+    """Greatest jump of a time stamp relative to its arrival that is not treated as a clock jump [s]."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,15 @@ class ImuErrors:
 
     gyro: YawNoise = YawNoise()
     gyro_bias_std: float = 0.01
-    """Bias of the gyro at power-on [rad/s]."""
+    """Standard deviation of the gyro's bias at power-on [rad/s]."""
     blind_rate: float = 0.3
-    """Noise density of the yaw rate where the gyro is silent [rad/s/√Hz]."""
+    """Noise density of the yaw rate while the gyro delivers no samples [rad/s/√Hz]."""
     accel_noise: float = 0.02
     """Noise density of the accelerometer [m/s²/√Hz], vibration included."""
     accel_bias_walk: float = 1e-3
     """Random walk of the accelerometer's bias [m/s³/√Hz]."""
     accel_bias_std: float = 0.05
-    """Bias of the accelerometer at power-on [m/s²]."""
+    """Standard deviation of the accelerometer's bias at power-on [m/s²]."""
     tilt_std: float = 0.03
     """Standard deviation of roll and pitch at the start of the error-state filter [rad]."""
 
@@ -83,44 +83,45 @@ class Settings:
     gate: OutlierGate = OutlierGate()
     motion: MotionModel = MotionModel()
     half_life: float = 1.0
-    """Half-life of velocity while the state is held [s]."""
+    """Half-life of the velocity in the vision mode `hold` [s]."""
     speed_std: float = 0.3
-    """Speed per axis that the vehicle may have when nothing is known [m/s]."""
+    """Standard deviation of the velocity per axis without any measurement [m/s]."""
     largest_variance: float = 100.0
-    """Greatest variance of a position [m²], at which its growth ends."""
+    """Greatest variance of a position, at which its growth ends [m²]."""
     vision_std: tuple[float, float] = (0.02, 0.03)
     """Standard deviation of x and y [m] and of yaw [rad], if a measurement has no covariance."""
     vision_floor: tuple[float, float] = (0.002, 0.003)
-    """Added to a measurement's own standard deviations, in squares [m, rad]: errors that its covariance leaves out."""
+    """Standard deviation of x and y [m] and of yaw [rad] that is added in quadrature, for errors that the
+    measurement's own covariance omits."""
     depth_std: float = 0.01
-    """[m]"""
+    """Standard deviation of a depth [m]."""
     imu: ImuErrors = ImuErrors()
     ready_position: float = 0.04
-    """Largest variance of a position with which the state is ready [m²]."""
+    """Largest variance of a position with which the estimator is ready [m²]."""
     ready_yaw: float = 0.03
-    """And of yaw [rad²]."""
+    """Largest variance of yaw with which the estimator is ready [rad²]."""
     aids: Aids | None = None
-    """Noise of Doppler log and compass; None without them. Between fixes the position then drifts as its covariance
-    states, and is ready up to `largest_variance`."""
+    """Errors of Doppler log and compass; None without them. With them the position drifts between fixes, as its
+    covariance states, and is ready up to `largest_variance`."""
 
     @property
     def decay(self) -> float:
-        """Rate at which a held velocity dies away [1/s]."""
+        """Rate at which a held velocity decays [1/s]."""
         return math.log(2.0) / self.half_life
 
 
 LOST = 100.0
-"""Standard deviation per axis with which a vehicle that navigates by log and compass is lost [m]."""
+"""Standard deviation per axis beyond which a vehicle that navigates by log and compass is lost [m]."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """Numbers of pool and vehicle that the fusion needs."""
+    """Parameters of pool and vehicle that the fusion needs."""
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit normal of the still surface, upwards, pool frame."""
     offset: float = 0.0
-    """Height of a point p above the surface is up . p + offset [m]."""
+    """Offset of the height: a point p is up . p + offset above the surface [m]."""
     depth_port: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Pressure port, body frame [m]."""
     imu: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -128,15 +129,15 @@ class Site:
     dvl: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Doppler log, body frame [m]."""
     gravity: float = 9.81
-    """[m/s²]"""
+    """Acceleration of gravity [m/s²]."""
     R_wp: tuple[tuple[float, float, float], ...] = field(default=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
     """Rotation matrix from pool axes to world axes, for velocities in the report."""
 
 
 def site_of(pool: Pool | None, vehicle: Vehicle) -> Site:
-    """The site of a pool file and a vehicle file; without a pool file the pool frame is the world's.
+    """Return the site of a pool file and a vehicle file; without a pool file the pool frame is the world frame.
 
-    Heights are measured from the water plane itself, tilt included, where that plane is a surface; behind a wall from
+    Heights are measured from the water plane, tilt included, if that plane is a surface; if it is a wall, from
     the world frame's origin.
 
     Raises:
@@ -167,7 +168,8 @@ def site_of(pool: Pool | None, vehicle: Vehicle) -> Site:
 
 
 def settings_of(vehicle: Vehicle) -> Settings:
-    """Settings with the vehicle file's sensor noises, never below what mounting and sampling leave besides them."""
+    """Return settings with the vehicle file's sensor noise, bounded below by default values that cover
+    mounting and sampling."""
     settings, imu, depth = Settings(), vehicle.sensors.imu, vehicle.sensors.depth
     if imu is not None:
         least = settings.imu

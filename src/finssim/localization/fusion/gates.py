@@ -1,4 +1,4 @@
-"""Gates: decide which measurements are accepted, and when a run of refused ones replaces the state."""
+"""Outlier gates: decide which measurements are accepted, and when a run of refused ones replaces the state."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 LONGEST_SUPPORT = 200
-"""Largest count of accepted measurements."""
+"""Largest count of accepted measurements in a gate's memory."""
 
 OUTVOTED = 6
-"""Divisor of the support of a state carried by a gyro: a run of refused measurements needs that share of it."""
+"""Ratio of the support of a gyro-propagated state to the length of a run of refused measurements that replaces it."""
 
 
 @lru_cache(maxsize=64)
@@ -27,17 +27,17 @@ def _quantile(dimension: int, probability: float) -> float:
 
 @dataclass(frozen=True)
 class OutlierGate:
-    """Limit of an outlier, and conditions under which a run of refused measurements replaces the state."""
+    """Probability limit of an outlier, and conditions under which a run of refused measurements replaces the state."""
 
     probability: float = 0.999
-    """Share of measurements without gross error that pass."""
+    """Probability with which a measurement without gross error passes."""
     reacquire_after: float = 1.0
     """Duration after which refused measurements that agree with one another replace the state [s]; inf: never."""
     reacquire_samples: int = 5
     """Least number of these measurements."""
 
     def limit(self, dimension: int) -> float:
-        """Return the largest squared Mahalanobis distance that passes, for a measurement of that many numbers [-]."""
+        """Return the largest squared Mahalanobis distance that passes for a measurement of the given dimension [-]."""
         return _quantile(dimension, self.probability)
 
 
@@ -56,16 +56,17 @@ class Suspects:
     hits: int = 1
     """Number of measurements that agree."""
     misses: int = 0
-    """Number of refused measurements in between that agree with none of them."""
+    """Number of refused measurements in between that do not agree with the run."""
 
 
 def remember(
     suspects: Suspects | None, time: float, value: Array, covariance: Array, drift: float, gate: OutlierGate
 ) -> Suspects:
-    """Return the run with one more refused measurement.
+    """Return the run extended by one refused measurement.
 
-    The measurement belongs to the run if its distance to the latest is within their covariances and the quantity's
-    possible change meanwhile. A run that more measurements contradict than support is dropped for the newest.
+    The measurement belongs to the run if its distance to the latest is consistent with their covariances and
+    the possible change of the quantity in between. A run with more contradicting than supporting measurements
+    is replaced by the newest.
 
     Args:
         suspects: Run so far; None after an accepted measurement.
@@ -100,7 +101,7 @@ def due(suspects: Suspects, gate: OutlierGate) -> bool:
 
 @dataclass(frozen=True)
 class Rival:
-    """Replaced state, kept in case it was right."""
+    """State that was replaced, kept in case it was correct."""
 
     offset: float
     """Difference from the current state [units of the measurement]."""
@@ -142,21 +143,21 @@ def judge(
 ) -> tuple[str, GateMemory]:
     """Return whether a measurement is accepted or refused as an outlier, and the gate's memory after it.
 
-    A state that was started from one measurement is as uncertain as that measurement: until `reacquire_samples` others
-    support it, a run replaces it as soon as the run outnumbers its support.
+    A state that was started from one measurement is as uncertain as that measurement: until
+    `reacquire_samples` others support it, a run replaces it as soon as the run is longer than its support.
 
     Args:
         gate: The gate.
-        memory: Memory before; support 0 where there is no state yet.
+        memory: Memory before; support 0 without a state.
         time: Time of the measurement [s].
-        value: Number or numbers compared among refused measurements, in the unit of the measurement, (n,).
+        value: Quantity compared among refused measurements, in the unit of the measurement, (n,).
         covariance: Covariance of `value` in its unit, (n, n).
         distance: Squared Mahalanobis distance of the measurement from its prediction [-].
         drift: Largest rate of change of `value` [units/s].
 
     Returns:
-        `initialized` for the first, `accepted`, `gate` where it is refused, or `reacquired` where it ends a run that
-        replaces the state; and the memory.
+        `initialized` for the first measurement, `accepted`, `gate` if it is refused, or `reacquired` if it
+        completes a run that replaces the state; and the memory.
     """
     if memory.support == 0:
         return "initialized", GateMemory(1)
@@ -178,11 +179,12 @@ def judge_carried(
     distance: float,
     drift: float,
 ) -> tuple[str, GateMemory]:
-    """Return the result of `judge` for a state that another sensor carries, as a gyro carries yaw.
+    """Return the verdict, as `judge`, for a state that another sensor propagates, as a gyro propagates yaw.
 
-    Between two measurements such a state is right to a fraction of a degree: a jump is an error of the measurement, or
-    the state was wrong before. A state with long support gives way only to a run of a sixth of its support, and is kept
-    as a rival: a measurement that agrees with a rival of more support restores it at once.
+    Between two measurements such a state is accurate to a fraction of a degree: after a jump, either the
+    measurement is wrong or the state was wrong before. A state with long support is replaced only by a run of
+    a sixth of its support, and is kept as a rival: a measurement that agrees with a rival of greater support
+    restores it at once.
 
     Args:
         gate: The gate.

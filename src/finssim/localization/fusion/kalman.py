@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Number: TypeAlias = Any
-"""A float, or an array of one per run: formulas accept both, and plain floats take a tenth of the time."""
+"""A float, or an array with one value per run: formulas accept both; plain floats take a tenth of the time."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Innovation:
     mahalanobis: Number
     """Squared Mahalanobis distance, (...)."""
     gain: Any
-    """Gain of the Kalman filter, (..., n, m); two numbers for yaw."""
+    """Kalman gain, (..., n, m); two numbers for yaw."""
 
 
 class MatrixState:
-    """State of a filter with n errors and the covariance of them."""
+    """State of a filter with n errors and their covariance."""
 
     P: Array
     """Covariance of the errors in their units, (..., n, n)."""
@@ -44,7 +44,7 @@ class MatrixState:
         raise NotImplementedError
 
     def innovation(self, residual: Array, H: Array, R: Array) -> Innovation:
-        """Compare a measurement with its prediction.
+        """Return the innovation of a measurement.
 
         Args:
             residual: Measured minus predicted, in the unit of the measurement, (..., m).
@@ -72,7 +72,7 @@ class MatrixState:
 
 
 def _inverse(S: Array) -> Array:
-    """Return the inverse of symmetric matrices, (..., m, m); np.linalg takes four times as long for a small one."""
+    """Return the inverse of symmetric matrices, (..., m, m); for 2x2, np.linalg takes four times as long."""
     if S.shape[-1] == 1:
         return np.asarray(1.0 / S)
     if S.shape != (2, 2):
@@ -88,7 +88,8 @@ def _identity(n: int) -> Array:
 
 
 def bounded(P: Array, limits: Array) -> Array:
-    """Return a covariance (..., n, n) with variances up to `limits` (n,): rows and columns beyond are scaled down.
+    """Return a covariance (..., n, n) with variances of at most `limits` (n,): larger rows and columns are
+    scaled down.
 
     The units are those of the errors.
     """
@@ -100,7 +101,8 @@ def bounded(P: Array, limits: Array) -> Array:
 
 
 def isolated(P: Array, rows: list[int], block: Array) -> Array:
-    """Return a covariance (..., n, n) with some errors uncorrelated with the others, and `block` as their own.
+    """Return a covariance (..., n, n) in which some errors are uncorrelated with the others, with covariance
+    `block`.
 
     The units are those of the errors.
     """

@@ -46,14 +46,14 @@ class MotionModel:
 
         Q = q [dt³/3  dt²/2; dt²/2  dt].
 
-    With `decay` λ > 0 the velocity returns to zero, v_dot = -λ v + w, as water slows a vehicle: its variance then
-    settles at q / 2λ instead of growing for ever.
+    With `decay` λ > 0 the velocity decays to zero, v_dot = -λ v + w, as in water: its variance then
+    converges to q / 2λ instead of growing without bound.
     """
 
     density: tuple[float, float, float] = (0.05, 0.05, 0.02)
     """Spectral density q of the acceleration [m²/s³]."""
     decay: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Rate λ at which velocity dies away [1/s]."""
+    """Rate λ at which velocity decays [1/s]."""
 
 
 _I6 = np.eye(6)
@@ -61,7 +61,7 @@ _SHIFT = np.eye(6, k=3)
 
 
 def transition(dt: float, motion: MotionModel) -> Array:
-    """Matrix A of one step, (6, 6): [I, dt I; 0, I] where nothing decays (paper, eq. 14)."""
+    """Return the transition matrix A of one step, (6, 6): [I, dt I; 0, I] without decay (paper, eq. 14)."""
     if not any(motion.decay):
         return _I6 + dt * _SHIFT
     rate = np.array(motion.decay)
@@ -74,12 +74,12 @@ def transition(dt: float, motion: MotionModel) -> Array:
 
 
 def process_noise(dt: float, motion: MotionModel) -> Array:
-    """Covariance Q that one step adds, (6, 6); see `MotionModel`."""
+    """Return the process noise Q of one step, (6, 6); see `MotionModel`."""
     if not any(motion.decay):
         powers = np.array([dt, 0.5 * dt**2, dt**3 / 3.0])
         return np.asarray((powers @ _noise_powers(motion)).reshape(6, 6))
     q, rate = np.array(motion.density), np.array(motion.decay)
-    slow = rate * dt < 1e-4  # below it the closed form loses digits that the series keeps
+    slow = rate * dt < 1e-4  # below it, cancellation makes the closed form inaccurate
     l = np.where(slow, 1.0, rate)
     decayed = -np.expm1(-l * dt)
     vv = np.where(slow, dt, (1.0 - np.exp(-2.0 * l * dt)) / (2.0 * l))
@@ -108,7 +108,7 @@ def predict(state: S, dt: float, motion: MotionModel) -> S:
     x <- A x,  P <- A P A' + Q                                                        (paper, eq. 14)
 
     Args:
-        state: State before.
+        state: State before the step.
         dt: Length of the step [s], not negative.
         motion: Model of the vehicle's motion.
     """
@@ -121,12 +121,12 @@ def predict(state: S, dt: float, motion: MotionModel) -> S:
 
 
 def restarted(state: S, axes: list[int], value: Array, R: Array, speed_std: float) -> S:
-    """Discard some axes and start them at a measurement, at rest within `speed_std`.
+    """Restart some axes at a measurement, with zero velocity of standard deviation `speed_std`.
 
     Args:
-        state: State before.
+        state: State before the restart.
         axes: Position axes to restart, of 0, 1, 2.
-        value: Their positions [m], (..., n).
+        value: Positions of these axes [m], (..., n).
         R: Covariance of `value` [m²], (..., n, n).
         speed_std: Standard deviation of the velocity per axis [m/s].
     """
@@ -139,7 +139,8 @@ def restarted(state: S, axes: list[int], value: Array, R: Array, speed_std: floa
 
 
 def frozen(state: S, axes: list[int]) -> S:
-    """Stop some axes: their velocity becomes zero, and its square is added to its variance."""
+    """Return the state with some axes stopped: their velocity becomes zero, and its square is added to its
+    variance."""
     speeds = [axis + 3 for axis in axes]
     x, P = state.x.copy(), state.P.copy()
     P[..., speeds, speeds] += x[..., speeds] ** 2
@@ -148,7 +149,7 @@ def frozen(state: S, axes: list[int]) -> S:
 
 
 def capped(state: S, variance: float) -> S:
-    """Return the state with variances of position up to `variance` [m²]."""
+    """Return the state with position variances of at most `variance` [m²]."""
     if state.P.diagonal(0, -2, -1)[..., :3].max() <= variance:
         return state
     return changed(state, P=bounded(state.P, np.array([variance] * 3 + [np.inf] * (state.P.shape[-1] - 3))))

@@ -1,7 +1,7 @@
-"""Sensors of both filters in one table, and the update that each of its entries causes.
+"""Table of the sensors of both filters, and the update with a sample of each.
 
-A sensor reads one quantity that every filter predicts: its `reading` of a sample, less that prediction, is the
-residual; the filter gives the Jacobian and the sensor the noise. A new sensor is one entry of `SENSORS`.
+A sensor measures one quantity that every filter predicts: its `reading` of a sample, minus that prediction, is the
+residual; the filter provides the Jacobian and the sensor the noise. A new sensor is one entry of `SENSORS`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from finssim.localization.fusion.streams import (
 Array = npt.NDArray[np.float64]
 
 GYRO_HOLD = 0.3
-"""Duration for which the gyro's last rate is used where samples are missing [s]."""
+"""Duration for which the gyro's last rate is used if samples are missing [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,23 +42,23 @@ class SensorModel:
     stream: str
     """Stream of its samples."""
     quantity: str
-    """Quantity that it reads, a method of `Filter`: position, height, yaw, heading or velocity."""
+    """Measured quantity, a method of `Filter`: position, height, yaw, heading or velocity."""
     reading: Callable[[Any], tuple[float, ...] | None]
-    """Sample -> value of the quantity (m,), in its units; None where the sample has none."""
+    """Function of a sample that returns the value of the quantity (m,), in its units; None if the sample has none."""
     noise: Callable[[Any, Settings], Array]
-    """Sample and settings -> covariance of the reading, (m, m)."""
+    """Function of sample and settings that returns the covariance of the reading, (m, m)."""
     drift: float | None = None
     """Gate: largest rate of change among refused readings that agree [units/s]; None: `Settings.speed_std`."""
     axes: tuple[int, ...] = ()
-    """Position axes that the first reading, or a run of refused ones, starts."""
+    """Position axes that are restarted by the first reading, or by a run of refused ones."""
     angle: bool = False
-    """True for an angle [rad]: its residual is the short way round."""
+    """True for an angle [rad]: its residual is wrapped."""
     turns: bool = False
-    """True if the first reading, or a run of refused ones, starts yaw."""
+    """True if yaw is restarted by the first reading, or by a run of refused ones."""
 
     @property
     def starts(self) -> bool:
-        """Return whether a reading can start a part of the state."""
+        """Return whether a reading can initialize a part of the state."""
         return self.turns or bool(self.axes)
 
 
@@ -83,7 +83,7 @@ def _diagonal(std: tuple[float, float]) -> Array:
 
 
 def _aids(settings: Settings) -> Aids:
-    """Return the errors of log and compass, of a filter that predicts their readings."""
+    """Return the errors of log and compass; settings without them are a programming error."""
     assert settings.aids is not None
     return settings.aids
 
@@ -128,11 +128,11 @@ SENSORS: dict[str, SensorModel] = {
         drift=1.0,
     ),
 }
-"""Sensor -> model. Samples of one time are used in this order, after the IMU's."""
+"""Sensor -> model. Samples of equal time are applied in this order, after those of the IMU."""
 
 
 class Prediction(NamedTuple):
-    """Quantity that a filter predicts."""
+    """Predicted quantity of a filter."""
 
     value: Array
     """Value in the unit of the measurement, (m,)."""
@@ -142,14 +142,15 @@ class Prediction(NamedTuple):
     """Covariance of errors that the filter does not estimate, such as an offset of the sensor, in the unit of the
     measurement, (m, m); None: zero."""
     turning: float = 0.0
-    """Variance of a rotation that the filter does not estimate [rad²]; it is multiplied by the reading's square."""
+    """Variance of a rotation that the filter does not estimate [rad²]; it is multiplied by the squared norm
+    of the reading."""
     part: str = "state"
-    """State that is measured: the name of its field in the filter's track."""
+    """Name of the field of the filter's track that contains the measured state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterMemory:
-    """States of a filter, in fields of its own, with its memory; nothing else remembers."""
+    """Base of a filter's track: memory common to all filters; subclasses add the states."""
 
     gates: Mapping[str, GateMemory] = field(default_factory=dict)
     """Sensor -> memory of its gate."""
@@ -168,12 +169,12 @@ class FilterMemory:
         return self.gates[name].doubt if name in self.gates else 0.0
 
     def times(self) -> dict[str, float | None]:
-        """Return the times of the latest accepted samples [s], by their names in `PoseEstimate`."""
+        """Return the times of the latest accepted samples [s], by their field names in `PoseEstimate`."""
         seen = {f"{name}_time": self.seen.get(name) for name in ("vision", "depth", "velocity")}
         return {**seen, "imu_time": self.imu_time}
 
     def heard(self, time: float) -> bool:
-        """Return whether an IMU sample is recent at a time [s]."""
+        """Return whether an IMU sample is recent enough at a time [s]."""
         return self.imu_time is not None and time - self.imu_time <= GYRO_HOLD
 
 
@@ -183,36 +184,35 @@ T = TypeVar("T", bound=FilterMemory)
 class Filter(ABC, Generic[T]):
     """Filter of one vehicle: pure functions of its track, with settings and site fixed.
 
-    A subclass predicts between samples and gives the quantities that sensors read. A quantity is a `Prediction`, or the
-    reason in words why there is none.
+    A subclass predicts between samples and provides the quantities that sensors measure. A quantity is a
+    `Prediction`, or the reason for having none as text.
     """
 
     gate_of: ClassVar[Mapping[str, str | None]] = {}
-    """Sensor -> sensor whose gate judges its readings, where it is another; None: all are accepted."""
+    """Sensor -> sensor whose gate is used for its readings, if different; None: all are accepted."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """
-        Args:
-            settings: Settings of the estimator.
-            site: Numbers of pool and vehicle.
+        """Args:
+        settings: Settings of the estimator.
+        site: Parameters of pool and vehicle.
         """
         self.settings, self.site = settings, site
 
     @abstractmethod
     def start(self) -> T:
-        """Return the track before any sample."""
+        """Return the track before the first sample."""
 
     @abstractmethod
     def imu(self, track: T, sample: ImuSample) -> tuple[T, tuple[Outcome, ...]]:
-        """Return the track after an IMU sample, and the result of the sample."""
+        """Return the track after an IMU sample, and the outcome of the sample."""
 
     @abstractmethod
     def advanced(self, track: T, time: float) -> T:
-        """Return the track at a time [s]; it does not go backwards."""
+        """Return the track advanced to a time [s]; never to an earlier one."""
 
     @abstractmethod
     def estimate(self, track: T, time: float) -> PoseEstimate:
-        """Return the estimate at a time [s], not before the track's own; values not yet known are NaN."""
+        """Return the estimate at a time [s], or at the track's own time if later; unknown values are NaN."""
 
     @abstractmethod
     def tilt(self, track: T) -> tuple[float, float]:
@@ -240,14 +240,14 @@ class Filter(ABC, Generic[T]):
 
     @abstractmethod
     def restarted(self, track: T, axes: list[int], step: Array, R: Array) -> T:
-        """Start position axes: `step` [m] moves them to the measurement, whose covariance is `R` [m²]."""
+        """Restart position axes at a measurement, `step` [m] from the estimate, with covariance `R` [m²]."""
 
     @abstractmethod
     def turned(self, track: T, angle: float, variance: float) -> T:
-        """Start yaw: `angle` [rad] turns it to the measurement, whose variance is `variance` [rad²]."""
+        """Restart yaw at a measurement, `angle` [rad] from the estimate, with variance `variance` [rad²]."""
 
     def apply(self, track: T, sample: Sample) -> tuple[T, tuple[Outcome, ...]]:
-        """Return the track after a sample, and the result of each sensor that reads it."""
+        """Return the track after a sample, and the outcome for each sensor in it."""
         if isinstance(sample, ImuSample):
             return self.imu(track, sample)
         track, outcomes = self.advanced(track, sample.time), []
@@ -258,9 +258,9 @@ class Filter(ABC, Generic[T]):
         return track, tuple(outcomes)
 
     def update(self, track: T, name: str, sample: Sample, reading: Array) -> tuple[T, Outcome]:
-        """Return the track after a sensor's reading (m,), and the verdict of its gate.
+        """Return the track after a sensor's reading (m,), and the gate's verdict.
 
-        A run of refused readings starts what the sensor's entry names, or corrects where it names nothing.
+        A run of refused readings restarts the axes in the sensor's entry; without such axes it corrects the state.
 
         The reading has the unit of the sensor.
         """
@@ -306,13 +306,14 @@ class Filter(ABC, Generic[T]):
         memory = track.gates.get(name) or GateMemory(0 if rule.starts else 1)
         drift = self.settings.speed_std if rule.drift is None else rule.drift
         if rule.turns and track.heard(time):
-            # Flipped yaws agree with one another as distances from the prediction, which turns with the vehicle.
+            # Flipped yaws agree with one another only relative to the prediction, which turns with the vehicle.
             return judge_carried(gate, memory, time, float(value[0]), float(R[0, 0]), distance, drift)
         return judge(gate, memory, time, value, R, distance, drift)
 
 
 def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> MotionModel:
-    """Return the motion model in which axes without measurements slow down to rest, within `speed_std`."""
+    """Return the motion model in which the velocity of axes without measurements decays to zero, within
+    `speed_std`."""
     slows = (xy_slows, xy_slows, z_slows)
     rate, motion = settings.decay, settings.motion
     density = [
@@ -324,7 +325,7 @@ def motion_of(settings: Settings, xy_slows: bool, z_slows: bool) -> MotionModel:
 
 
 def steps(start: float, end: float, cuts: Iterable[float]) -> list[tuple[float, float]]:
-    """Return the lengths and middles of the steps from `start` to `end` [s], which are cut at `cuts`."""
+    """Return the lengths and midpoints of the steps from `start` to `end` [s], divided at `cuts`."""
     inside = {cut for cut in cuts if start < cut < end}
     if not inside:
         return [(end - start, 0.5 * (start + end))]

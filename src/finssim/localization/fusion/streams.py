@@ -1,4 +1,4 @@
-"""Samples of the sensors that reach the estimator, each with the time at which it was true and its arrival."""
+"""Samples of the sensors, each with the time of its measurement and of its arrival, and results of the estimator."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 
-# Records with some fields changed, hundreds of times a second.
+# Fast copies of records with some fields changed, made hundreds of times per second.
 
 T = TypeVar("T")
 
 
 def changed(record: T, **fields: Any) -> T:
-    """Return a changed frozen dataclass, faster than `dataclasses.replace`, if its constructor checks nothing.
+    """Return a changed copy of a frozen dataclass, faster than `dataclasses.replace`, without running its
+    constructor.
 
     Args:
-        record: The record, which stays as it is.
+        record: The record, which is not modified.
         fields: New values by field name.
     """
     new = object.__new__(type(record))
@@ -32,76 +33,76 @@ def changed(record: T, **fields: Any) -> T:
 
 @dataclass(frozen=True)
 class ImuSample:
-    """Angular rate, and the other readings of the unit."""
+    """Angular rate, and the other measurements of an IMU."""
 
     time: float
-    """When it was measured [s]."""
+    """Time of the measurement [s]."""
     omega: tuple[float, float, float]
     """Angular rate, body frame [rad/s]."""
     force: tuple[float, float, float] | None = None
     """Specific force at the accelerometer, body frame [m/s²]; +9.81 upwards at rest."""
     tilt: tuple[float, float] | None = None
-    """Roll and pitch from the unit's own filter [rad]; positive pitch is nose down."""
+    """Roll and pitch from the IMU's own filter [rad]; positive pitch is nose down."""
     arrival: float | None = None
-    """When it was delivered [s]; None: with its time."""
+    """Time of delivery [s]; None: equal to its time."""
     stream: str = field(default="imu", init=False)
 
 
 @dataclass(frozen=True)
 class DepthSample:
-    """Pressure depth."""
+    """Depth from pressure."""
 
     time: float
-    """When it was measured [s]."""
+    """Time of the measurement [s]."""
     depth: float
     """Depth of the pressure port below the surface, positive down [m]."""
     arrival: float | None = None
-    """When it was delivered [s]; None: with its time."""
+    """Time of delivery [s]; None: equal to its time."""
     stream: str = field(default="depth", init=False)
 
 
 @dataclass(frozen=True)
 class VisionSample:
-    """Pose of the vehicle by the camera, motion capture or an acoustic positioning system."""
+    """Pose of the vehicle from the camera, motion capture or an acoustic positioning system."""
 
     time: float
-    """Middle of the exposure [s]: the picture's stamp less the camera's latency."""
+    """Middle of the exposure [s]: the picture's stamp minus the camera's latency."""
     position: tuple[float, float]
     """x, y of the body origin, pool frame [m]."""
     yaw: float | None
-    """Left positive, pool frame [rad]; None where it is not known."""
+    """Yaw, positive to the left, pool frame [rad]; None if unknown."""
     covariance: tuple[tuple[float, float, float], ...] | None = None
     """Covariance of x, y [m] and yaw [rad], (3, 3); None: that of the settings."""
     arrival: float | None = None
-    """When it was delivered [s]; None: with its time."""
+    """Time of delivery [s]; None: equal to its time."""
     stream: str = field(default="vision", init=False)
 
 
 @dataclass(frozen=True)
 class VelocitySample:
-    """Velocity over the floor, of a Doppler velocity log."""
+    """Velocity over ground, from a Doppler velocity log."""
 
     time: float
-    """When it was measured [s]."""
+    """Time of the measurement [s]."""
     velocity: tuple[float, float, float]
     """Velocity at the log's position, body axes [m/s]."""
     arrival: float | None = None
-    """When it was delivered [s]; None: with its time."""
+    """Time of delivery [s]; None: equal to its time."""
     std: float = 0.0
-    """Standard deviation per axis [m/s], where it is greater than that of the vehicle's log."""
+    """Standard deviation per axis [m/s], used if greater than that of the vehicle's log."""
     stream: str = field(default="velocity", init=False)
 
 
 @dataclass(frozen=True)
 class HeadingSample:
-    """Heading of a compass."""
+    """Heading from a compass."""
 
     time: float
-    """When it was measured [s]."""
+    """Time of the measurement [s]."""
     yaw: float
-    """Left positive, pool frame [rad]."""
+    """Yaw, positive to the left, pool frame [rad]."""
     arrival: float | None = None
-    """When it was delivered [s]; None: with its time."""
+    """Time of delivery [s]; None: equal to its time."""
     stream: str = field(default="heading", init=False)
 
 
@@ -114,15 +115,15 @@ class Sample(Protocol):
 
     @property
     def arrival(self) -> float | None:
-        """Time of delivery [s]; None: with its time."""
+        """Time of delivery [s]; None: equal to its time."""
 
     @property
     def stream(self) -> str:
-        """Stream to which it belongs."""
+        """Stream to which the sample belongs."""
 
 
 def refusal(sample: Sample) -> str | None:
-    """Return why a sample cannot be used in any case, or None: text for counting, such as "not finite"."""
+    """Return the reason why a sample can never be used, such as "not finite", or None."""
     for name, value in vars(sample).items():
         if value is None or value.__class__ is str or name == "covariance":
             continue
@@ -133,7 +134,7 @@ def refusal(sample: Sample) -> str | None:
 
 
 def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
-    """Return whether rows are a symmetric matrix that can be a covariance with nothing known exactly."""
+    """Return whether rows form a symmetric, positive definite matrix."""
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         return False
     (a, d, e), (D, b, f), (E, F, c) = rows
@@ -142,12 +143,12 @@ def _covariance(rows: tuple[tuple[float, float, float], ...]) -> bool:
         return False
     if max(abs(d - D), abs(e - E), abs(f - F)) > 1e-6 * largest:
         return False
-    # Sylvester: positive where the leading minors are.
+    # Sylvester's criterion: positive definite if the leading minors are positive.
     second = a * b - d * d
     return a > 0.0 and second > 0.0 and c * second - a * f * f - b * e * e + 2.0 * d * e * f > 0.0
 
 
-# What comes out: what became of a sample, and where the vehicle is.
+# Results: the outcome of a sample, and the pose of the vehicle.
 
 
 USED = ("accepted", "initialized", "reacquired")
@@ -159,47 +160,48 @@ class Outcome:
     """Result of one sample."""
 
     stream: str
-    """`vision` (x and y), `yaw`, `depth` or `imu`."""
+    """Sensor: `vision` (x and y), `yaw`, `depth`, `imu`, `heading` or `velocity`."""
     verdict: str
-    """`accepted`, `initialized` or `reacquired`; else why it was refused: `gate`, `duplicate`, `too late`, ..."""
+    """`accepted`, `initialized` or `reacquired`; else the reason of the refusal: `gate`, `duplicate`, `too
+    late`, ..."""
     mahalanobis: float = math.nan
     """Squared Mahalanobis distance from the prediction [-]."""
     dimension: int = 0
 
     @property
     def used(self) -> bool:
-        """Return whether the state was updated by it."""
+        """Return whether the sample updated the state."""
         return self.verdict in USED
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Pose of the vehicle at one time. NaN: not known yet."""
+    """Pose of the vehicle at one time. NaN: not yet known."""
 
     time: float
     """Time of the pose [s]."""
     x: Array
     """Position [m] and velocity [m/s] of the body origin, pool frame, (6,)."""
     P: Array
-    """Covariance of `x` [m, m/s], (6, 6)."""
+    """Covariance of `x` [m, m/s, squared], (6, 6)."""
     yaw: float
-    """[rad]"""
+    """Yaw [rad]."""
     yaw_variance: float
     """Variance of yaw [rad²]."""
     yaw_rate: float
-    """[rad/s]"""
+    """Rate of yaw [rad/s]."""
     roll: float
-    """[rad]"""
+    """Roll [rad]."""
     pitch: float
-    """[rad]"""
+    """Pitch [rad]."""
     vision_time: float | None
-    """Time of the latest position fix that was believed [s]."""
+    """Time of the latest accepted position fix [s]."""
     depth_time: float | None
     """Time of the latest depth [s]."""
     imu_time: float | None
     """Time of the latest IMU sample [s]."""
     velocity_time: float | None = None
-    """Time of the latest Doppler velocity that was believed [s]."""
+    """Time of the latest accepted Doppler velocity [s]."""
 
     def std(self) -> Array:
         """Return the standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""

@@ -1,1 +1,1 @@
-"""Importers of lenses: a file for each kind of calibration program. See `finssim.localization.camera_file`."""
+"""Importers of lenses, one file per family of calibration programs. See `finssim.localization.camera_file`."""

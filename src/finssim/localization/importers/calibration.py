@@ -1,6 +1,6 @@
-"""Importers of the camera files that calibration programs write: ROS, Kalibr, OpenCV and MATLAB.
+"""Importers of camera files written by calibration programs: ROS, Kalibr, OpenCV and MATLAB.
 
-Pixels of ROS, Kalibr and OpenCV are ours: integers at pixel centres. MATLAB's first pixel is 1.
+ROS, Kalibr and OpenCV use FinsSim's pixel coordinates: integers at pixel centres. MATLAB's first pixel is 1.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from finssim.localization.camera_file import Fields, lens_of, model_of, only
 __all__ = ["KALIBR", "MATLAB", "OPENCV", "OTHER_KEYS", "ROS", "key_in", "read_tree", "refuse_strange"]
 
 LARGEST = 64 << 20
-"""Greatest size of a MATLAB file, and of a variable in it once unpacked [bytes]."""
+"""Greatest size of a MATLAB file, and of an uncompressed variable in it [bytes]."""
 COMPRESSED = 15
-"""Number of a packed variable in a MATLAB file."""
+"""Type number of a compressed variable in a MATLAB file."""
 PART_OF_PICTURE = ("binning_x", "binning_y", "roi")
-"""Keys of ROS that change what a pixel is, unless their numbers are 0 or 1."""
+"""Keys of ROS that change the meaning of a pixel, unless their numbers are 0 or 1."""
 OTHER_KEYS: dict[str, list[str]] = {
     program: keys.split()
     for program, keys in yaml.safe_load(
         Path(__file__).with_name("other_keys.yaml").read_text(encoding="utf-8")
     ).items()
 }
-"""Program -> keys of its files that are no part of the lens (`other_keys.yaml`)."""
+"""Program -> keys of its files that do not describe the lens (`other_keys.yaml`)."""
 OPENCV_WORDS = {
     "width": ("imagewidth", "width"), "height": ("imageheight", "height"),
     "matrix": ("cameramatrix", "k", "mtx", "intrinsicmatrix"),
     "distortion": ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d"),
     "model": ("distortionmodel", "cameramodel", "lensmodel", "model"), "fisheye": ("fisheyemodel",),
 }  # fmt: skip
-"""Part of a lens -> keys of files that programs write with OpenCV, as `_plain` writes them."""
+"""Part of a lens -> keys used by programs that write files with OpenCV, as `_plain` normalizes them."""
 
 
-# What the readers share.
+# Functions shared by the readers.
 
 
 def read_tree(path: Path) -> dict[Any, Any]:
     """Return the mapping of a YAML or JSON file, or of OpenCV's dialect of YAML.
 
     Raises:
-        LocalizationError: It cannot be read.
+        LocalizationError: The file cannot be read.
     """
 
     def standard(text: str) -> str:
@@ -67,18 +67,18 @@ def read_tree(path: Path) -> dict[Any, Any]:
 
 
 def key_in(head: bytes, *keys: str) -> bool:
-    """Return whether a text has one of the keys, with or without quotes, at any depth."""
+    """Return whether a text contains one of the keys, with or without quotes, at any depth."""
     words = "|".join(re.escape(key) for key in keys).encode()
     return re.search(rb"(^|[\s,{\"'])(" + words + rb")[\"']?\s*:", head) is not None
 
 
 def refuse_strange(tree: Mapping[Any, Any], known: Collection[str], label: str) -> None:
-    """Refuse numbers that would be left out although they may belong to the lens.
+    """Refuse unknown keys with numbers that might belong to the lens.
 
     Args:
         tree: Mapping of the file.
         known: Its known keys.
-        label: What a message calls the file.
+        label: Label of the file in messages.
     """
     for key, value in tree.items():
         if key in PART_OF_PICTURE:
@@ -117,7 +117,7 @@ def _pinhole(numbers: Sequence[float], key: str, label: str) -> dict[str, float]
     Args:
         numbers: The matrix, row by row.
         key: Its key.
-        label: What a message calls the file.
+        label: Label of the file in messages.
     """
     if len(numbers) != 9:
         raise LocalizationError(f"{label}: {key} holds {len(numbers)} numbers, expected 9")
@@ -133,7 +133,7 @@ def _pinhole(numbers: Sequence[float], key: str, label: str) -> dict[str, float]
 
 
 def _size(values: Sequence[Any], keys: str, label: str) -> dict[str, int]:
-    """Return width and height [px], whose keys a message names."""
+    """Return width and height [px]; the message about missing ones names `keys`."""
     if len(values) != 2 or any(value is None for value in values):
         raise LocalizationError(f"{label}: the size of the image is missing: add {keys}")
     width, height = (_flat(value, label)[0] for value in values)
@@ -150,7 +150,7 @@ ZEROS = "; zeros mean no distortion"
 
 
 def _perspective(distortion: Sequence[float]) -> str:
-    """Return the lens model of OpenCV's coefficients: with 8 it is the rational one."""
+    """Return the lens model for OpenCV's coefficients: rational if there are 8."""
     return "rational" if len(distortion) == 8 else "plumb_bob"
 
 
@@ -185,7 +185,7 @@ def read_ros(path: Path) -> Lens:
 
 
 def _read_ost(path: Path) -> Lens:
-    """Read the text of camera_calibration: headings, each with its numbers below it."""
+    """Read the text file of camera_calibration: headings, each followed by its numbers."""
     text = read_bytes(path, LocalizationError, limit=1 << 20).decode("utf-8", "replace")
     sections: dict[str, list[float]] = {}
     heading = ""
@@ -267,7 +267,7 @@ def read_kalibr(path: Path) -> Lens:
 
 
 def read_opencv(path: Path) -> Lens:
-    """Read what OpenCV's FileStorage writes, as YAML, JSON or XML, under the names of its samples.
+    """Read a YAML, JSON or XML file of OpenCV's FileStorage, with the key names of OpenCV's samples.
 
     Raises:
         LocalizationError: The file cannot be read.
@@ -298,7 +298,7 @@ def read_opencv(path: Path) -> Lens:
 
 
 def _model_of_opencv(plain: Mapping[str, Any], distortion: Sequence[float], label: str) -> str:
-    """Return the lens model by its word or its flag; the number of the coefficients alone shows those of 5 and 8."""
+    """Return the lens model by its name or flag; the number of coefficients alone identifies it only for 5 and 8."""
     word = next((plain[key] for key in OPENCV_WORDS["model"] if isinstance(plain.get(key), str)), None)
     if word is not None:
         model = model_of(word.lower(), label)
@@ -312,7 +312,7 @@ def _model_of_opencv(plain: Mapping[str, Any], distortion: Sequence[float], labe
 
 
 def _plain(key: Any) -> str:
-    """Return a key without its underscores and capitals: camera_matrix, Camera_Matrix and cameraMatrix are one."""
+    """Return a key without separators and in lower case: camera_matrix, Camera_Matrix and cameraMatrix are equal."""
     return str(key).replace("_", "").replace("-", "").lower()
 
 
@@ -323,7 +323,7 @@ def _opencv_tree(path: Path) -> dict[Any, Any]:
 
 
 def _value(element: Element) -> Any:
-    """Return what an element of OpenCV's XML holds: a mapping, a list, a number or a text."""
+    """Return the content of an element of OpenCV's XML: a mapping, a list, a number or a text."""
     if len(element):
         return {child.tag: _value(child) for child in element}
     words = (element.text or "").replace('"', " ").split()
@@ -352,7 +352,7 @@ def read_matlab(path: Path) -> Lens:
     refuse_strange(tree, OTHER_KEYS["matlab"], label)
     if tree.get("K") is not None:
         matrix = _flat(tree["K"], label)
-    elif tree.get("IntrinsicMatrix") is not None:  # the older one is transposed
+    elif tree.get("IntrinsicMatrix") is not None:  # older releases store the transpose
         older = _flat(tree["IntrinsicMatrix"], label)
         matrix = tuple(older[3 * j + i] for i in range(3) for j in range(3)) if len(older) == 9 else older
     else:
@@ -416,7 +416,7 @@ def _matlab_tree(path: Path) -> dict[Any, Any]:
 
 
 def _refuse_unpacked(data: bytes, path: Path) -> None:
-    """Refuse a MATLAB file with a variable that is larger than a lens needs once it is unpacked."""
+    """Refuse a MATLAB file with a variable that uncompresses to more than a lens can need."""
     order, offset = "<" if data[126:128] == b"IM" else ">", 128
     while offset + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, offset)

@@ -1,6 +1,7 @@
-"""Importers of lenses of programs that reconstruct scenes and paths from pictures: COLMAP, nerfstudio and ORB-SLAM.
+"""Importers of lenses from programs for 3D reconstruction and SLAM: COLMAP, nerfstudio and ORB-SLAM.
 
-COLMAP and nerfstudio count pixels from the corner of the first one, so that its centre is at 0.5; ORB-SLAM as OpenCV.
+COLMAP and nerfstudio measure pixels from the corner of the first one, so that its centre is at 0.5; ORB-SLAM
+follows OpenCV.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from finssim.localization.importers.calibration import OTHER_KEYS, key_in, read_
 __all__ = ["COLMAP", "NERFSTUDIO", "ORB_SLAM"]
 
 CORNER = 0.5
-"""Centre of the first pixel of COLMAP and nerfstudio [px]."""
+"""Coordinate of the centre of the first pixel in COLMAP and nerfstudio [px]."""
 LARGEST = 16 << 20
-"""Greatest size of COLMAP's cameras [bytes]."""
+"""Greatest size of COLMAP's camera file [bytes]."""
 MODELS = {
     "SIMPLE_PINHOLE": ("plumb_bob", "f cx cy"),
     "PINHOLE": ("plumb_bob", "fx fy cx cy"),
@@ -36,19 +37,19 @@ MODELS = {
     "RADIAL_FISHEYE": ("fisheye", "f cx cy k1 k2"),
     "THIN_PRISM_FISHEYE": ("", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
 }  # fmt: skip
-"""Model of COLMAP, in the order of its numbers -> ours, empty if there is none, and its parameters."""
+"""COLMAP's model, in the order of its ids -> our lens model (empty if none matches), and its parameters."""
 
 
 def _lens(
     model: str, size: tuple[int, int], values: Mapping[str, float], label: str, first: float = 0.0
 ) -> Lens:
-    """Return a lens of named values; coefficients that are not given are 0.
+    """Return a lens from named values; missing coefficients are 0.
 
     Args:
-        model: Our name.
+        model: Our name of the lens model.
         size: Width and height [px].
         values: fx, fy, cx, cy [px] and coefficients, by name.
-        label: What a message calls the camera.
+        label: Label of the camera in messages.
         first: Centre of the first pixel in the file [px].
     """
     order = COEFFICIENTS[model]
@@ -69,7 +70,7 @@ def _lens(
 
 
 def _model(name: str, refusal: str) -> tuple[str, str]:
-    """Return our model and the parameters of a model of COLMAP; a refusal begins with the text given."""
+    """Return our lens model and the parameter names of a COLMAP model; `refusal` begins the error message."""
     model, words = MODELS.get(name, ("", ""))
     if not model:
         readable = ", ".join(known for known, (ours, _) in MODELS.items() if ours)
@@ -153,7 +154,7 @@ OF_ONE = ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3"
 
 
 def read_nerfstudio(path: Path) -> Lens:
-    """Read `transforms.json`; where every frame has its own numbers, they must be equal.
+    """Read `transforms.json`; numbers given per frame must be equal in all frames.
 
     Raises:
         LocalizationError: The file cannot be read, or its frames have different lenses.
@@ -187,7 +188,7 @@ def read_orb_slam(path: Path) -> Lens:
     """Read the settings of ORB-SLAM2 or ORB-SLAM3 with one camera.
 
     Raises:
-        LocalizationError: The file cannot be read, has two cameras, or a word of a camera that is unknown.
+        LocalizationError: The file cannot be read, has two cameras, or has an unknown key of a camera.
     """
     tree, label = read_tree(path), str(path)
     if any(str(key).startswith("Camera2.") for key in tree):

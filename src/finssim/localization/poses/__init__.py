@@ -1,4 +1,4 @@
-"""The vehicle's pose from one picture, and prior knowledge of it."""
+"""Pose of the vehicle from one picture, and prior knowledge of it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Constraints:
-    """Height and tilt of the vehicle, from pressure and inertia.
+    """Prior knowledge of height and tilt of the vehicle, from pressure sensor and IMU.
 
-    They refer to the vertical `up`. Where the survey's z axis is not quite that of gravity, up is the normal of the
-    water; then `z_b` is the height of the body origin along it, up . t_pb.
+    Both refer to the vertical `up`. If the survey's z axis is not exactly vertical, `up` is the normal of the
+    water surface; `z_b` is then the height of the body origin along it, up . t_pb.
     """
 
     z_b: float
@@ -33,22 +33,22 @@ class Constraints:
     z_std: float = 0.01
     """Standard deviation of the height of `port` [m]."""
     roll: float = 0.0
-    """[rad]"""
+    """Roll [rad]."""
     pitch: float = 0.0
-    """[rad], positive nose down."""
+    """Pitch [rad], positive nose down."""
     tilt_std: float = math.radians(0.5)
     """Standard deviation of roll and of pitch [rad]."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector against gravity, pool frame."""
     port: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Body point whose height was measured [m]: an error of tilt also moves the origin relative to it."""
+    """Body point whose height was measured [m]: a tilt error also moves the origin relative to it."""
     shared_pixel_std: float = 0.0
-    """Error that all corners of a picture share, per axis [px]: waves, the camera's pose."""
+    """Standard deviation of an error common to all corners of a picture, per axis [px]: waves, the camera's pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurement:
-    """Pose of the vehicle from one picture, pool frame; NaN where it was refused."""
+    """Pose of the vehicle from one picture, pool frame; NaN if it was refused."""
 
     method: str
     """A key of `METHODS`."""
@@ -62,32 +62,32 @@ class PoseMeasurement:
     covariance: Array
     """Covariance of (x, y, yaw) [m, m, rad], (3, 3)."""
     residual_px: float
-    """Root mean square distance of the corners used from where the pose puts them [px]."""
+    """Root mean square reprojection error of the corners used [px]."""
     tags: tuple[int, ...] = ()
     """Tags used."""
     corners: int = 0
     """Corners used."""
     rejected: Mapping[str, int] = field(default_factory=dict)
-    """Corners not used, by reason."""
+    """Number of corners not used, by reason."""
     iterations: int = 0
     medium: str = ""
     """Medium of the corners: `water`, `air` or `both`."""
     pose_covariance: Array | None = None
-    """Covariance of position and a turn about pool axes [m, rad], (6, 6), from methods that measure all six."""
+    """Covariance of position and rotation about pool axes [m, rad], (6, 6), from methods that measure all six."""
 
     @property
     def x(self) -> float:
-        """[m]"""
+        """Position x [m]."""
         return float(self.position[0])
 
     @property
     def y(self) -> float:
-        """[m]"""
+        """Position y [m]."""
         return float(self.position[1])
 
     @property
     def z(self) -> float:
-        """[m]"""
+        """Position z [m]."""
         return float(self.position[2])
 
     @property
@@ -97,12 +97,12 @@ class PoseMeasurement:
 
     @property
     def pitch(self) -> float:
-        """[rad], positive nose down."""
+        """Pitch [rad], positive nose down."""
         return math.atan2(-self.rotation[2, 0], math.hypot(self.rotation[2, 1], self.rotation[2, 2]))
 
     @property
     def roll(self) -> float:
-        """[rad]"""
+        """Roll [rad]."""
         return math.atan2(self.rotation[2, 1], self.rotation[2, 2])
 
     @property
@@ -119,7 +119,7 @@ class PoseMeasurement:
 def refused(
     method: str, reason: str, rejected: Mapping[str, int] | None = None, *, tags: tuple[int, ...] = ()
 ) -> PoseMeasurement:
-    """The measurement that is none, and why."""
+    """Return a refused measurement with its reason."""
     position, matrix = np.full(3, np.nan), np.full((3, 3), np.nan)
     return PoseMeasurement(
         method, False, reason, position, matrix, matrix, math.nan, tags, 0, dict(rejected or {})
@@ -127,13 +127,13 @@ def refused(
 
 
 def tilt_matrix(roll: float, pitch: float) -> Array:
-    """R_y(pitch) R_x(roll) of angles [rad], (3, 3)."""
+    """Return R_y(pitch) R_x(roll) for angles in [rad], (3, 3)."""
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
 
 
 def about_up(angle: float) -> Array:
-    """Return the rotation matrix of a turn about z by an angle [rad], (3, 3)."""
+    """Return the rotation matrix about z by an angle [rad], (3, 3)."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -141,7 +141,7 @@ def about_up(angle: float) -> Array:
 def axes_of_up(up: npt.ArrayLike) -> Array:
     """Return the rotation matrix R_pg of a frame g with z along the vector `up`, (3, 3).
 
-    It is turned as little as possible from the pool frame; straight upside down it is a half turn about x.
+    It is the smallest rotation from the pool frame; if `up` points down, a half turn about x.
     """
     x, y, z = (float(a) for a in np.asarray(up, float))
     if z < -1.0 + 1e-12:
@@ -151,13 +151,14 @@ def axes_of_up(up: npt.ArrayLike) -> Array:
 
 
 def inflation(missed: Array, parameters: int, std: float) -> float:
-    """Return the factor [-] on a variance where misses are larger than noise explains.
+    """Return the factor [-] on a variance if residuals are larger than noise explains.
 
-    It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to it beyond.
+    It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to that
+    quantile beyond.
 
     Args:
-        missed: Distance of each point from its place [px], (n,).
-        parameters: Number of parameters that were fitted.
+        missed: Residual of each point, as a distance [px], (n,).
+        parameters: Number of fitted parameters.
         std: Standard deviation of a point, per axis [px].
     """
     dof = max(2 * len(missed) - parameters, 1)
@@ -166,31 +167,31 @@ def inflation(missed: Array, parameters: int, std: float) -> float:
     return max(1.0, float(missed @ missed) / std**2 / quantile)
 
 
-# Which corner of the vehicle each corner in a picture is.
+# Correspondences between corners in a picture and corners on the vehicle.
 
 UNKNOWN_TAG = "unknown tag"
 TWICE = "tag seen twice"
 NO_SQUARE = "corners not clockwise"
 SMALLEST = 4.0
-"""[px²]: a tag 2 px wide."""
+"""Least cross product of adjacent edges of a tag [px²]: that of a tag 2 px wide."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Corners with their places, four in a row for each tag."""
+    """Corners in the picture with their positions on the vehicle, four consecutive ones per tag."""
 
     pixels: Array
-    """(n, 2)"""
+    """Pixels (u, v), (n, 2)."""
     points_b: Array
-    """Body frame [m], (n, 3)."""
+    """Positions, body frame [m], (n, 3)."""
     tags: tuple[int, ...]
-    """Tag of each four corners."""
+    """Tag of each group of four corners."""
     rejected: Mapping[str, int]
-    """Corners left aside, by reason."""
+    """Number of excluded corners, by reason."""
 
     @property
     def too_few_reason(self) -> str:
-        """The sentence for a picture without any corner of the vehicle."""
+        """Sentence for a picture without any corner of the vehicle."""
         if NO_SQUARE in self.rejected:
             return (
                 "the corners of no known tag run clockwise around a square: expected top-left, top-right, "
@@ -202,10 +203,10 @@ class Correspondences:
 
 
 def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]) -> Correspondences:
-    """Pair the tags of a picture with those of a vehicle.
+    """Match the tags of a picture with those of a vehicle.
 
-    Tags that the vehicle has not are counted, and so are those whose corners do not run clockwise around a convex
-    quadrangle, as those of a tag seen from its printed side do; of an id seen twice the more certain one is taken.
+    Unknown tags are counted as rejected, and so are those whose corners do not run clockwise around a convex
+    quadrangle, as those of a tag seen from its printed side do; of an id seen twice, the more certain one is used.
 
     Args:
         detections: Tags of one picture.
@@ -235,8 +236,8 @@ def correspondences(detections: Iterable[Detection], tags_b: Mapping[int, Array]
 
 
 def _clockwise(corners: Array) -> bool:
-    """Return whether each corner turns right, by at least `SMALLEST` twice the area of its triangle, as seen with v
-    down."""
+    """Return whether the corners turn right (v down), each with a cross product of its edges of more than
+    `SMALLEST`."""
     if np.shape(corners) != (4, 2):
         return False
     (a, b), (c, d), (e, f), (g, h) = np.asarray(corners, float).tolist()

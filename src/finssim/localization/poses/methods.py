@@ -1,4 +1,4 @@
-"""Ways to measure a pose from the tags of one picture, by name."""
+"""Methods of measuring a pose from the tags of one picture, by name."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from finssim.vehicles.equipment import Tags
 
 Array = npt.NDArray[np.float64]
 
-# Pose from tags as if there were no water: the baseline, alone or with the height and tilt known.
+# Pose from tags without refraction: the baseline, alone or with known height and tilt.
 
 
 def pinhole(
@@ -56,8 +56,8 @@ def pinhole(
 ) -> PoseMeasurement:
     """Measure all six degrees of freedom with straight rays (perspective-n-point), as if there were no water.
 
-    Of two attitudes that a flat tag leaves open, the one with the smaller misses is taken; roll and pitch of
-    `constraints`, where they are given, count in it. Their height is not used.
+    A flat tag allows two attitudes; the one with the smaller residuals is selected. If `constraints` are
+    given, their roll and pitch contribute to this choice. Their height is not used.
 
     Args:
         detections: Tags of one picture.
@@ -84,15 +84,15 @@ def pinhole_depth(
     constraints: Constraints | None,
     pixel_std: float = 0.5,
 ) -> PoseMeasurement:
-    """Measure x, y [m] and yaw [rad] at a known height and tilt with straight rays, as if there were no water.
+    """Measure x, y [m] and yaw [rad] at known height and tilt with straight rays, as if there were no water.
 
-    It is `planar_fit` with rays that do not bend; arguments as of `planar_fit`.
+    It is `planar_fit` without refraction; arguments as in `planar_fit`.
     """
     return planar_fit(detections, pool, tags_b, constraints, pixel_std, straight=True)
 
 
 def pinhole_poses(pairs: Correspondences, camera: Camera, pixel_std: float) -> list[RefinedPose]:
-    """All distinct minima of the reprojection error without water, the best first."""
+    """Return all distinct minima of the reprojection error without refraction, the best first."""
     rays, valid = camera.lens.rays(pairs.pixels)
     rays_p = rays @ camera.R_pc.T
     starts = []
@@ -105,12 +105,12 @@ def pinhole_poses(pairs: Correspondences, camera: Camera, pixel_std: float) -> l
     )
 
 
-# All six degrees of freedom from tags through the water: neither depth nor inertia is needed.
+# All six degrees of freedom from tags through the water, without depth or IMU.
 
 SURE = 9.0
-"""A second attitude counts as excluded when its chi² is larger by this."""
+"""Difference of chi² from which a second attitude is excluded [-]."""
 NEAR = math.radians(30.0)
-"""Two attitudes within this angle are one measurement, whose covariance spans both."""
+"""Angle up to which two attitudes are one measurement, whose covariance spans both [rad]."""
 
 
 def refractive_bundle(
@@ -120,11 +120,12 @@ def refractive_bundle(
     constraints: Constraints | None,
     pixel_std: float = 0.5,
 ) -> PoseMeasurement:
-    """Measure all six degrees of freedom by the reprojection error through the water.
+    """Measure all six degrees of freedom by minimizing the reprojection error through the water.
 
-    Starts are the poses that a pinhole camera would see, moved to their true depth, the same mirrored at the line of
-    sight, and upright; the minima that they lead to are compared. A picture that two attitudes explain equally well is
-    refused as ambiguous, unless they are near to each other, or the roll and pitch of `constraints` decide.
+    Starts are the poses from a pinhole camera, moved to their true depth, their mirror images about the line
+    of sight, and upright poses; the minima reached from them are compared. A picture that two attitudes
+    explain equally well is refused as ambiguous, unless they are close to each other, or the roll and pitch
+    of `constraints` decide.
 
     Args:
         detections: Tags of one picture.
@@ -148,7 +149,7 @@ def refractive_bundle(
 
 
 def _doubt(choice: BestMinimum, pixel_std: float) -> str:
-    """Return why the best pose is doubtful; empty if it is not."""
+    """Return the reason why the best pose is not reliable; empty if it is."""
     best, second = choice.best, choice.second
     if not best.converged:
         return f"did not converge in {best.iterations} steps"
@@ -166,7 +167,7 @@ def _doubt(choice: BestMinimum, pixel_std: float) -> str:
 
 
 def _starts(pairs: Correspondences, pool: Pool, pixel_std: float) -> Iterator[tuple[Array, Array]]:
-    """Poses t_pb, R_pb to refine."""
+    """Return an iterator over initial poses t_pb, R_pb."""
     normal_b = np.cross(pairs.points_b[1] - pairs.points_b[0], pairs.points_b[3] - pairs.points_b[0])
     normal_b = normal_b / np.linalg.norm(normal_b)
     up = pool.interface.normal if pool.is_surface else np.array([0.0, 0.0, 1.0])
@@ -183,15 +184,15 @@ def _starts(pairs: Correspondences, pool: Pool, pixel_std: float) -> Iterator[tu
 
 
 def _upright(rotation: Array, up: Array) -> Array:
-    """The attitude without roll and pitch, of the same heading."""
+    """Return the attitude of the same heading with zero roll and pitch."""
     R_pg = axes_of_up(up)
     forward = R_pg.T @ rotation[:, 0]
     return np.asarray(R_pg @ about_up(math.atan2(forward[1], forward[0])))
 
 
 def _deepened(apparent_pose: RefinedPose, pairs: Correspondences, pool: Pool) -> tuple[Array, Array] | None:
-    """Return the pose of a body that appears at a pose: its corners, at their apparent depth times the ratio of the
-    indices on the refracted rays, and the rigid motion that fits these."""
+    """Return the true pose of a body from its apparent one: corners are placed on the refracted rays at their
+    apparent depth times the ratio of the refractive indices, and a rigid motion is fitted."""
     interface = pool.interface
     apparent = pairs.points_b @ apparent_pose.rotation.T + apparent_pose.position
     rays = back_project(pool.camera, interface, pairs.pixels)
@@ -208,13 +209,13 @@ def _deepened(apparent_pose: RefinedPose, pairs: Correspondences, pool: Pool) ->
     return np.asarray(middle_p - R @ middle_b), R
 
 
-# All six degrees of freedom from corners, depth and tilt together, each trusted as far as it is sure.
+# All six degrees of freedom from corners, depth and tilt jointly, each weighted by its uncertainty.
 
 METHOD = "refractive-weighted"
 HUBER = 2.5
-"""Miss in standard deviations from which on Huber's rho grows linearly."""
+"""Residual in standard deviations beyond which Huber's rho grows linearly."""
 SUREST = 1e-6
-"""Standard deviation of prior knowledge that is given as exact [m, rad, px]."""
+"""Smallest standard deviation of prior knowledge, used if it is given as exact [m, rad, px]."""
 MAX_STEPS = 30
 
 
@@ -225,12 +226,13 @@ def weighted_fit(
     constraints: Constraints | None,
     pixel_std: float = 0.5,
 ) -> PoseMeasurement:
-    """Measure a pose by the reprojection error through the water, and by how far it is from measured height and tilt.
+    """Measure a pose by minimizing the reprojection error through the water and the deviation from measured
+    height and tilt.
 
     Minimises sum_i rho(|u_i - s - pi(P_i)| / sigma_px) + ((up . (t + R port) - z) / sigma_z)²
-    + (|R' up x m| / sigma_tilt)² + (|s| / sigma_shared)², with m the direction of up in the body by the inertial unit
-    and s a shift that the whole picture shares. Where corners are sure they correct the depth; where waves blur them
-    the depth holds the scale.
+    + (|R' up x m| / sigma_tilt)² + (|s| / sigma_shared)², with m the direction of up in the body from the IMU
+    and s a shift of the complete picture. Accurate corners correct the depth; if waves blur them,
+    the depth determines the scale.
 
     Args:
         detections: Tags of one picture.
@@ -240,7 +242,7 @@ def weighted_fit(
         pixel_std: Standard deviation of a corner, per axis [px].
 
     Returns:
-        The measurement, or why there is none.
+        The measurement, or a refusal with its reason.
     """
     all_detections = list(detections)
     start = planar_fit(all_detections, pool, tags_b, constraints, pixel_std)
@@ -265,11 +267,10 @@ def weighted_fit(
 
 
 def _constraint_rows(constraints: Constraints, pixel_std: float) -> ExtraRows:
-    """Misses of height, tilt and shift, (6,), and their derivatives, in pixels: over their deviations, times that of a
-    pixel."""
+    """Return the function of residuals of height, tilt and shift, (6,), and their derivatives, scaled to pixels."""
     up, port_b = np.asarray(constraints.up, float), np.asarray(constraints.port, float)
     level = tilt_matrix(constraints.roll, constraints.pitch)
-    height, m = constraints.z_b + float((level @ port_b)[2]), level[2]  # of the port, as it was measured
+    height, m = constraints.z_b + float((level @ port_b)[2]), level[2]  # of the port, as measured
     std = [constraints.z_std, *3 * [constraints.tilt_std], *2 * [constraints.shared_pixel_std]]
     scale = pixel_std / np.maximum(std, SUREST)
 
@@ -289,9 +290,9 @@ def _constraint_rows(constraints: Constraints, pixel_std: float) -> ExtraRows:
 Method: TypeAlias = Callable[
     [Iterable[Detection], Pool, Mapping[int, Array], Constraints | None, float], PoseMeasurement
 ]
-"""Function of the tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), prior knowledge of height
-and tilt, and the standard deviation of a corner per axis [px] -> the measurement; it refuses a bad picture with a
-reason and raises nothing."""
+"""Function of the tags of one picture, pool, tag id -> corners in the body frame [m] (4, 3), prior knowledge
+of height and tilt, and the standard deviation of a corner per axis [px] that returns the measurement; it
+refuses a bad picture with a reason and raises no exception."""
 
 METHODS: dict[str, Method] = {
     "refractive": planar_fit,
@@ -305,30 +306,30 @@ NEEDS_DEPTH = frozenset({"refractive", "refractive-weighted", "pinhole-depth"})
 
 
 def check_method(method: str) -> None:
-    """Refuse a word that is no name of `METHODS`.
+    """Refuse an unknown method.
 
     Raises:
-        LocalizationError: It is none; the sentence lists them.
+        LocalizationError: The method is not in `METHODS`; the message lists them.
     """
     if method not in METHODS:
         raise LocalizationError(f"unknown method '{method}'; available: {', '.join(METHODS)}")
 
 
 class TagLocator:
-    """Measures poses of one vehicle before one camera by one method; it remembers nothing of them."""
+    """Pose measurement of one vehicle with one camera and one method; it keeps no state between pictures."""
 
     def __init__(
         self, pool: Pool, tags: Tags | None, *, method: str = "refractive", pixel_std: float = 0.5
     ) -> None:
-        """
-        Args:
+        """Args:
             pool: Camera and water.
-            tags: Of the vehicle; None is refused.
-            method: A name of `METHODS`.
+            tags: Tags of the vehicle; None is refused.
+            method: A name in `METHODS`.
             pixel_std: Standard deviation of a corner, per axis [px].
 
         Raises:
-            LocalizationError: Unknown method, a vehicle without tags, or no error at all.
+            LocalizationError: The method is unknown, the vehicle has no tags, or the standard deviation is
+                not positive.
         """
         check_method(method)
         if tags is None:
@@ -343,5 +344,5 @@ class TagLocator:
         self.tags_b, self.family, self._pixel_std = tag_corners_b(tags), tags.family, pixel_std
 
     def __call__(self, detections: Iterable[Detection], constraints: Constraints | None) -> PoseMeasurement:
-        """The pose in one picture, or why there is none."""
+        """Return the pose in one picture, or a refusal with its reason."""
         return METHODS[self.method](detections, self.pool, self.tags_b, constraints, self._pixel_std)

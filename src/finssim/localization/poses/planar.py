@@ -1,4 +1,4 @@
-"""Position and yaw of a vehicle of known height and tilt, from the rays on which the corners of its tags are seen."""
+"""Position and yaw of a vehicle of known height and tilt, from the viewing rays of the corners of its tags."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from finssim.localization.poses import (
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-# A rigid motion in the plane that lays one set of points on another, measured in pixels.
+# Rigid motion in the plane that aligns two sets of points, with residuals in pixels.
 
 _MAX_STEPS = 30
 _MAX_TURNS = 8
 _STILL_PLANE = 1e-13
-"""A step that changes the misses by less than the root of this [px²] is the last."""
+"""Change of the cost below which a step is the last [px²]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """The motion found, and what its uncertainty follows from."""
+    """Estimated rigid motion, and the quantities that determine its uncertainty."""
 
     xi: tuple[float, float, float]
-    """x, y [m], psi [rad]."""
+    """Motion x, y [m], psi [rad]."""
     inverse: Array
     """Inverse of the weighted J'J [m², rad² per px²], (3, 3)."""
     weighted_J: Array
-    """The curvature of rho times J [-, m], (n, 2, 3)."""
+    """Jacobian J weighted by the curvature of rho [-, m], (n, 2, 3)."""
     A: Array
-    """[px/m], (n, 2, 2)."""
+    """Scale from metres to pixels [px/m], (n, 2, 2)."""
     missed: Array
-    """Distance of each point from its place [px], (n,)."""
+    """Residual of each point, as a distance [px], (n,)."""
     iterations: int
     converged: bool
 
@@ -60,7 +60,7 @@ class RigidFit:
         return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
 
     def response(self, shared: Array) -> Array:
-        """Return how the motion changes with errors that move many points together.
+        """Return the sensitivity of the motion to errors that move many points jointly.
 
         Args:
             shared: Change of each point Q - P per unit of each error, (k, n, 2).
@@ -72,24 +72,24 @@ class RigidFit:
         return np.asarray(-self.inverse @ (in_pixels @ self.weighted_J.reshape(-1, 3)).T)
 
     def inflation(self, std: float) -> float:
-        """Factor on the variance where the misses are larger than noise of `std` [px] explains."""
+        """Return the factor on the variance if the residuals exceed noise of `std` [px]."""
         return inflation(self.missed, 3, std)
 
 
 def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | None:
-    """Find xi = (x, y, psi) that minimises sum_i rho(|A_i (Q_i - R(psi) points_i - [x, y])|).
+    """Estimate xi = (x, y, psi) that minimises sum_i rho(|A_i (Q_i - R(psi) points_i - [x, y])|).
 
-    Levenberg and Marquardt's method with the analytic Jacobian -A [I, R'(psi) points], from the minimum of the plain
-    sum of squares: where no point misses by `huber` or more, its first step is its last.
+    Levenberg-Marquardt with the analytic Jacobian -A [I, R'(psi) points], from the minimum of the plain
+    sum of squares: if all residuals are below `huber`, its first step is its last.
 
     Args:
-        Q: Where the points are seen [m], (n, 2).
-        points: Where they are on the body [m], (n, 2).
-        A: Metres to pixels [px/m], (n, 2, 2).
-        huber: Distance [px] from which on Huber's rho grows linearly.
+        Q: Observed positions of the points [m], (n, 2).
+        points: Positions of the points on the body [m], (n, 2).
+        A: Scale from metres to pixels [px/m], (n, 2, 2).
+        huber: Residual [px] beyond which Huber's rho grows linearly.
 
     Returns:
-        The fit, or None where the points are too close together to tell the angle.
+        The fit, or None if the points are too close together to determine the angle.
     """
 
     def linearise(now: _State) -> Step[_State]:
@@ -125,7 +125,8 @@ class _State:
 
 
 def _damped_inverse(H: Array, damping: float) -> Array | None:
-    """Inverse of H + damping diag(H) by its adjugate, None where it is singular: np.linalg costs four times as much."""
+    """Return the inverse of H + damping diag(H) by its adjugate, None if it is singular; np.linalg takes four
+    times as long."""
     (a, d, e), (_, b, f), (_, _, c) = H.tolist()
     scale = a * b * c
     a, b, c = a * (1.0 + damping), b * (1.0 + damping), c * (1.0 + damping)
@@ -138,7 +139,7 @@ def _damped_inverse(H: Array, damping: float) -> Array | None:
 
 
 def _procrustes(centre: Array, middle: Array, q: Array, p: Array) -> tuple[float, float, float]:
-    """The closed form for equal weights, of the middles of both sets of points and where they are from them."""
+    """Return the closed-form solution for equal weights, from the centroids of both sets and the centred points."""
     along = float(np.vdot(p, q))
     across = float(p[:, 0] @ q[:, 1] - p[:, 1] @ q[:, 0])
     psi = math.atan2(across, along)
@@ -151,10 +152,11 @@ def _procrustes(centre: Array, middle: Array, q: Array, p: Array) -> tuple[float
 
 
 def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, float]:
-    """The minimum of sum_i |A_i (Q_i - R(psi) points_i - [x, y])|², beside the closed form for equal weights.
+    """Return the minimum of sum_i |A_i (Q_i - R(psi) points_i - [x, y])|², starting from the closed form for
+    equal weights.
 
-    The misses are linear in (x, y, cos psi, sin psi), so the sum is a quadratic form. Without x and y, which it decides
-    for each psi, it is K over (cos psi, sin psi, 1): Newton's method finds its minimum in plain numbers.
+    The residuals are linear in (x, y, cos psi, sin psi), so the sum is a quadratic form. Eliminating x and y
+    leaves a quadratic form in (cos psi, sin psi, 1), which Newton's method minimizes with plain numbers.
     """
     n = len(Q)
     centre, middle = Q.sum(axis=0) / n, points.sum(axis=0) / n
@@ -170,7 +172,7 @@ def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, flo
     determinant = a * d - b * b
     if not determinant > 0.0:
         return _procrustes(centre, middle, q, p)
-    # Where x and y are for each of cos psi, sin psi, 1; and what is left of the form.
+    # x and y as linear functions of (cos psi, sin psi, 1); and the remaining quadratic form.
     x = [-(d * G[0][k] - b * G[1][k]) / determinant for k in (2, 3, 4)]
     y = [-(a * G[1][k] - b * G[0][k]) / determinant for k in (2, 3, 4)]
     cc, ss, cs, c1, s1 = (
@@ -185,7 +187,7 @@ def _least_squares(Q: Array, points: Array, A: Array) -> tuple[float, float, flo
         if not curvature > 0.0:
             return begin
         psi -= slope / curvature
-        if abs(slope) < 1e-8 * curvature:  # the error is the square of this, once the step is taken
+        if abs(slope) < 1e-8 * curvature:  # the error after this step is of second order
             break
     c, s = math.cos(psi), math.sin(psi)
     (qx, qy), (px, py) = centre.tolist(), middle.tolist()
@@ -211,7 +213,7 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     if missed.max() <= huber:
         return _State(xi, float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
     weight, cost = huber_weight(missed, huber), float(huber_loss(missed, huber).sum())
-    # Where rho grows linearly it curves across the miss only; with weights alone the steps would shrink but slowly.
+    # Where rho grows linearly, it curves only across the residual; weights alone would converge slowly.
     towards = np.where(missed > huber, 1.0 / np.maximum(missed, huber), 0.0)[:, None] * miss
     across = J - towards[:, :, None] * np.einsum("ij,ijk->ik", towards, J)[:, None, :]
     weighted = weight[:, None, None] * across
@@ -222,18 +224,19 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
 _UNIT, _ONES = np.eye(2), np.ones(2)
 
 
-# Where on its known height each corner lies that a picture shows: eq. 12 of the paper, in the medium it is in.
+# Position of each corner at its known height, from its pixel: eq. 12 of the paper, in water or air.
 
 _STEP = 0.1
-"""Step of the derivative with respect to the pixel [px]: optics change over hundreds of pixels: its error is 1e-4."""
+"""Step of the derivative with respect to the pixel [px]; its relative error is about 1e-4, since optics vary
+over hundreds of pixels."""
 _STEPS = np.array([[[0.0, 0.0]], [[_STEP, 0.0]], [[0.0, _STEP]]])
 _GRAZING = 1e-3
-"""Angle between a ray and the plane of heights below which the ray does not locate the corner [rad]."""
+"""Sine of the angle between a ray and the horizontal plane below which the ray does not locate the corner [-]."""
 
 
 @dataclass(frozen=True, eq=False)
 class CornerPoints:
-    """Corners on their heights, in a frame g whose z axis points up."""
+    """Horizontal positions of corners at their heights, in a frame g whose z axis points up."""
 
     Q: Array
     """Horizontal coordinates [m], (n, 2); NaN where the status is not OK."""
@@ -242,25 +245,25 @@ class CornerPoints:
     per_height: Array
     """dQ/dz [-], (n, 2)."""
     status: npt.NDArray[np.int8]
-    """(n,)"""
+    """Status of each ray, (n,)."""
     in_air: npt.NDArray[np.bool_]
     """True if the corner is on the camera's side of the water, (n,)."""
 
 
 def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, straight: bool) -> CornerPoints:
-    """Meet each pixel's ray with the plane on which its corner is.
+    """Intersect each pixel's ray with the horizontal plane of its corner.
 
     Q = S + (z - e3 . S) / (e3 . r) r                                                       (paper, eq. 12)
 
-    The ray is bent at the interface unless it meets the plane before it: then the corner is in the air, and the ray
-    straight.
+    The ray is refracted at the interface unless it meets the plane before it: then the corner is in the air,
+    and the ray straight.
 
     Args:
         pool: Camera and interface.
         R_pg: Rotation matrix from frame g, whose z axis points up, to the pool frame, (3, 3).
-        pixels: (n, 2).
-        heights: Along the z axis of g, from the pool's origin [m], (n,).
-        straight: Leave the water out.
+        pixels: Pixels (u, v), (n, 2).
+        heights: Heights along the z axis of g, from the pool's origin [m], (n,).
+        straight: True to ignore refraction.
     """
     beside = pixels + _STEPS
     with np.errstate(all="ignore"):
@@ -270,7 +273,7 @@ def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, str
         rays = back_project(pool.camera, pool.interface, beside)
         origin, direction = rays.origin @ R_pg, rays.direction @ R_pg
         centre = float(pool.camera.position @ R_pg[:, 2])
-        # Part of the way from the camera to the water at which the height is reached.
+        # Fraction of the distance from camera to water at which the height is reached.
         part = (heights - centre) / (origin[0, :, 2] - centre)
         in_air = (part > 0.0) & (part < 1.0)
         points, slope, status = _points(origin, direction, rays.status, heights)
@@ -281,7 +284,7 @@ def corner_points(pool: Pool, R_pg: Array, pixels: Array, heights: Array, *, str
 
 
 def _air(pool: Pool, R_pg: Array, pixels: Array) -> tuple[Array, Array, npt.NDArray[np.int8]]:
-    """Straight rays: origin, direction in g, status."""
+    """Return the origin, direction in g and status of straight rays."""
     rays, valid = pool.camera.lens.rays(pixels)
     status = np.where(valid, np.int8(Status.OK), np.int8(Status.NO_RAY)).astype(np.int8)
     return pool.camera.position @ R_pg, rays @ (pool.camera.R_pc.T @ R_pg), status
@@ -290,7 +293,7 @@ def _air(pool: Pool, R_pg: Array, pixels: Array) -> tuple[Array, Array, npt.NDAr
 def _points(
     origin: Array, direction: Array, status: npt.NDArray[np.int8], heights: Array
 ) -> tuple[Array, Array, npt.NDArray[np.int8]]:
-    """Horizontal coordinates (3, n, 2), their change with height (n, 2) and status (n,)."""
+    """Return horizontal coordinates (3, n, 2), their change with height (n, 2) and status (n,)."""
     steep = direction[..., 2]
     length = (heights - origin[..., 2]) / steep
     points = origin[..., :2] + length[..., None] * direction[..., :2]
@@ -313,11 +316,11 @@ def _corner_points(
 
 
 FEWEST = 3
-"""Corners without which there is no measurement."""
+"""Least number of corners of a measurement."""
 WORST = 4.0
-"""A corner that misses its place by more than this [px], and by more than 8 standard deviations, is an outlier."""
+"""Residual beyond which a corner is an outlier [px], if it also exceeds 8 standard deviations."""
 WORST_WITHOUT_WATER = 40.0
-"""Limit for methods without water, which alone may cost many pixels."""
+"""Limit for methods without refraction, whose residuals may be many pixels [px]."""
 _SUSPECTS = (
     "check the tag's id, edge and mount, the depth, the tilt and the pool file",
     "the tags contradict each other: check their ids and mounts, the depth, the tilt and the pool file",
@@ -335,12 +338,14 @@ def planar_fit(
 ) -> PoseMeasurement:
     """Measure x, y and yaw of a vehicle whose height, roll and pitch are known.
 
-    Each corner's height z_i = z_b + e3 . R_y(θ) R_x(φ) P_b,i does not depend on the yaw sought, so that its ray meets
-    its height once, at Q_i; then
+    Each corner's height z_i = z_b + e3 . R_y(θ) R_x(φ) P_b,i does not depend on the unknown yaw, so its ray meets
+    its height at one point Q_i; then
 
-        xi* = argmin sum_i rho(| A_i (Q_i - P_i(xi)) |),   P_i = R_z(psi) R_y R_x P_b,i + [x, y, z_b]   (paper, eq. 13)
+        xi* = argmin sum_i rho(| A_i (Q_i - P_i(xi)) |),   P_i = R_z(psi) R_y R_x P_b,i + [x, y, z_b]
+        (paper, eq. 13)
 
-    with A_i = (dQ_i/d(u, v))^-1, which counts the miss in the pixels where the detector made it, and Huber's rho.
+    with A_i = (dQ_i/d(u, v))^-1, which converts the residual to pixels, in which the detector's error arises,
+    and Huber's rho.
 
     Args:
         detections: Tags of one picture.
@@ -348,10 +353,10 @@ def planar_fit(
         tags_b: Tag id -> corners in the body frame [m], (4, 3).
         constraints: Height and tilt; without them the measurement is refused.
         pixel_std: Standard deviation of a corner, per axis [px].
-        straight: Leave the water out: the rays go straight through it.
+        straight: True to ignore refraction.
 
     Returns:
-        The measurement, with the covariance that pixels, height and tilt give it; or why there is none.
+        The measurement, with the covariance due to errors of pixels, height and tilt; or a refusal with its reason.
     """
     method = "pinhole-depth" if straight else "refractive"
     pairs = correspondences(detections, tags_b)
@@ -385,17 +390,17 @@ def planar_fit(
 
 @lru_cache(maxsize=16)
 def _frame_of(up: tuple[float, float, float]) -> Array:
-    """R_pg of `axes_of_up` for a direction of any length, (3, 3)."""
+    """Return R_pg of `axes_of_up` for a direction of any length, (3, 3)."""
     return axes_of_up(np.asarray(up) / np.linalg.norm(up))
 
 
 def _solve(
     corners: CornerPoints, level: Array, pixel_std: float, limit: float, tags: int
 ) -> tuple[RigidFit | str, Flags, dict[str, int]]:
-    """Fit the corners that have a point, once more without those that miss by far.
+    """Fit the corners that have a point, and once more without outliers.
 
     Returns:
-        The fit, or why there is none; which corners are in it; how many are not, by reason.
+        The fit, or the reason for having none; a mask of the corners used; the number of excluded ones by reason.
     """
     used = corners.status == 0
     reasons = count_rejections(corners.status)
@@ -434,7 +439,7 @@ def _without(used: Flags, far: Flags) -> Flags:
 def _without_a_tag(
     corners: CornerPoints, level: Array, used: Flags, pixel_std: float, limit: float, tags: int
 ) -> Flags | None:
-    """The corners without one tag, if they agree then, and do so for that tag only."""
+    """Return the corners without one tag, if the others then agree, and only for this tag."""
     agreeing = []
     for i in range(tags if tags > 1 else 0):
         retained = used.copy()
@@ -453,7 +458,7 @@ def _fit(corners: CornerPoints, level: Array, used: Flags, pixel_std: float) -> 
 
 
 def _inverse(D: Array) -> Array:
-    """Inverse of 2x2 matrices, (n, 2, 2)."""
+    """Return the inverse of 2x2 matrices, (n, 2, 2)."""
     out = np.empty_like(D)
     out[:, 0, 0], out[:, 1, 1], out[:, 0, 1], out[:, 1, 0] = D[:, 1, 1], D[:, 0, 0], -D[:, 0, 1], -D[:, 1, 0]
     with np.errstate(all="ignore"):
@@ -469,14 +474,14 @@ def _covariance(
     R_pg: Array,
     pixel_std: float,
 ) -> Array:
-    """Return the covariance of (x, y, yaw), pool frame: pixels, each independent; height and tilt, which move all
-    corners.
+    """Return the covariance of (x, y, yaw), pool frame, from independent errors of pixels and from errors of
+    height, tilt and a shared shift, which move all corners.
 
-    With the miss e_i = Q_i - P_i, an error δ that all share moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
+    With the residual e_i = Q_i - P_i, a shared error δ moves the solution by -H^-1 sum_i J_i' w_i A_i de_i/dδ.
     """
     slope, level = corners.per_height[used], level[used]
     cp, sp = math.cos(constraints.pitch), math.sin(constraints.pitch)
-    # Crossed with the axes of roll, R_y e1 = (cp, 0, -sp), and of pitch, e2: R_g p -> axis x R_g p, side by side.
+    # Cross products with the axes of roll, R_y e1 = (cp, 0, -sp), and pitch, e2: R_g p -> axis x R_g p, side by side.
     turned = (
         level
         @ np.array(
@@ -492,7 +497,7 @@ def _covariance(
         slope[:, None] * (turned[:, :, 2] + raised[1:3])[:, :, None] - turned[:, :, :2] @ turn.T
     ).transpose(1, 0, 2)
     shared[3:] = corners.per_pixel[used].transpose(2, 0, 1)
-    moved = np.empty((4, 5))  # x, y, psi, z_b by height, roll, pitch, u, v
+    moved = np.empty((4, 5))  # rows x, y, psi, z_b; columns height, roll, pitch, u, v
     moved[:3] = fit.response(shared)
     moved[3] = raised
     std = constraints.tilt_std

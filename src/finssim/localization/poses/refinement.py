@@ -1,4 +1,5 @@
-"""Poses with six degrees of freedom from corners: poses to start from, the nearest minimum, and the choice of one."""
+"""Six-degree-of-freedom poses from corners: initial poses, refinement to the nearest minimum, and choice of a
+minimum."""
 
 from __future__ import annotations
 
@@ -31,20 +32,21 @@ from finssim.localization.poses import (
 
 Array = npt.NDArray[np.float64]
 
-# Poses to start from: of a flat board from the rays to its points, without regard to water.
+# Initial poses of a flat board from the rays to its points, without refraction.
 
 
 def plane_pose(rays: Array, points: Array) -> tuple[Array, Array] | None:
-    """R and t of a plane before an eye, from the rays on which its points are seen.
+    """Return R and t of a plane relative to a camera, from the rays to its points.
 
-    Least squares of ray x H point = 0 with H = [r_1 r_2 t] up to a positive scale (Hartley and Zisserman 2004, 4.1).
+    Least squares of ray x H point = 0 with H = [r_1 r_2 t] up to a positive scale (Hartley and Zisserman
+    2004, 4.1).
 
     Args:
-        rays: Of any length and direction, frame of the eye [-], (n, 3), n >= 4.
-        points: On the plane, its own frame [m], (n, 2).
+        rays: Rays of any length and direction, camera frame [-], (n, 3), n >= 4.
+        points: Points on the plane, in its own frame [m], (n, 2).
 
     Returns:
-        R (3, 3) and t [m] (3,) of the plane in the frame of the eye; None where the points lie on one line.
+        R (3, 3) and t [m] (3,) of the plane in the camera frame; None if the points lie on one line.
     """
     centre = points.mean(axis=0)
     size = float(np.abs(points - centre).max())
@@ -63,9 +65,9 @@ def plane_pose(rays: Array, points: Array) -> tuple[Array, Array] | None:
 
 
 def tag_poses(rays_p: Array, centre_p: Array, points_b: Array) -> list[tuple[Array, Array]]:
-    """Both poses of a body that one tag on it shows, without regard to water.
+    """Return both poses of a body that are consistent with one of its tags, without refraction.
 
-    Seen from far, a flat tag looks the same with its attitude mirrored at the line of sight, which gives the other.
+    Seen from far, a flat tag looks the same with its attitude mirrored about the line of sight: the second pose.
 
     Args:
         rays_p: Unit rays to its corners, pool frame [-], (4, 3).
@@ -73,7 +75,7 @@ def tag_poses(rays_p: Array, centre_p: Array, points_b: Array) -> list[tuple[Arr
         points_b: Its corners, body frame [m], (4, 3).
 
     Returns:
-        t_pb [m] and R_pb of each; none where the corners show no square.
+        t_pb [m] and R_pb of each; empty if the corners do not form a square.
     """
     x, y = points_b[1] - points_b[0], points_b[0] - points_b[3]
     x, z = x / np.linalg.norm(x), np.cross(x, y)
@@ -87,12 +89,12 @@ def tag_poses(rays_p: Array, centre_p: Array, points_b: Array) -> list[tuple[Arr
 
 
 def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
-    """The other attitude in which something flat looks the same from far.
+    """Return the other attitude in which a flat object looks the same from far.
 
     Args:
-        R_pb: Rotation matrix of the one, (3, 3).
+        R_pb: Rotation matrix of the first attitude, (3, 3).
         sight_p: Unit vector along the line of sight, pool frame [-], (3,).
-        normal_b: Unit normal of the flat thing, body frame [-], (3,).
+        normal_b: Unit normal of the flat object, body frame [-], (3,).
     """
     return (
         (np.eye(3) - 2.0 * np.outer(sight_p, sight_p))
@@ -101,23 +103,24 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
     )
 
 
-# A pose with all six degrees of freedom that puts a body's points where the pixels are.
+# Refinement of a pose with all six degrees of freedom, by the reprojection error.
 
 See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
-"""Points, pool frame (n, 3) -> pixels (n, 2), derivatives by the point (n, 2, 3), and which are seen (n,)."""
+"""Function of points, pool frame (n, 3), that returns pixels (n, 2), derivatives by the point (n, 2, 3), and
+a visibility mask (n,)."""
 ExtraRows = Callable[[Array, Array, Array], tuple[Array, Array]]
-"""Function of t_pb, R_pb and a shift of the picture [px] -> residuals of prior knowledge (m,) and derivatives (m, 8),
-[px]."""
+"""Function of t_pb, R_pb and a shift of the picture [px] that returns residuals of prior knowledge (m,) and
+derivatives (m, 8), [px]."""
 
 _STILL = 1e-10
-"""A step that lowers the cost by less than this [px²] is the last,"""
+"""Decrease of the cost below which a step is the last [px²]."""
 _STILL_SHARE = 1e-6
-"""or by less than this share of it: a thousandth of the misses, and of a standard deviation."""
+"""Relative decrease of the cost below which a step is the last [-]: a thousandth of the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A minimum of the misses."""
+    """Pose at a minimum of the reprojection error."""
 
     position: Array
     """t_pb [m], (3,)."""
@@ -126,17 +129,17 @@ class RefinedPose:
     shift: Array
     """Shift of the complete picture [px], (2,); zero without prior knowledge."""
     cost: float
-    """Sum of Huber's rho over the points, and of the squares of prior knowledge [px²]."""
+    """Sum of Huber's rho over the points, and of the squared residuals of prior knowledge [px²]."""
     missed: Array
-    """Distance of each point from its pixel [px], (n,)."""
+    """Reprojection error of each point, as a distance [px], (n,)."""
     H: Array
-    """Weighted J'J by position [m], a turn about pool axes [rad] and, with prior knowledge, the shift, (6, 6) or (8,
-    8)."""
+    """Weighted J'J by position [m], rotation about pool axes [rad] and, with prior knowledge, the shift, (6,
+    6) or (8, 8)."""
     curvature: Array
-    """Matrix of the steps, as H: with prior knowledge it is without the part along the residual of far points, where
+    """Matrix of the steps, as H; with prior knowledge it omits the component along the residual of outliers, where
     Huber's rho is not curved. The units are those of `H`."""
     g: Array
-    """Slope of half the cost by the unknowns of `H`, per unit of these, (6,) or (8,)."""
+    """Gradient of half the cost by the unknowns of `H`, per unit of these, (6,) or (8,)."""
     iterations: int = 0
     converged: bool = False
 
@@ -146,9 +149,9 @@ class RefinedPose:
         return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
 
     def covariance(self, pixel_std: float) -> Array:
-        """Return the covariance of position [m] and a turn about pool axes [rad], (6, 6).
+        """Return the covariance of position [m] and rotation about pool axes [rad], (6, 6).
 
-        Without prior knowledge it is enlarged if the residuals exceed the noise by far.
+        Without prior knowledge it is enlarged if the residuals clearly exceed the noise.
         """
         factor = inflation(self.missed, 6, pixel_std) if len(self.H) == 6 else 1.0
         scale = 1.0 / np.sqrt(np.diagonal(self.H))
@@ -167,20 +170,20 @@ def refine_pose(
     extra_rows: ExtraRows | None = None,
     max_steps: int = 50,
 ) -> RefinedPose | None:
-    """Minimise the reprojection error by Levenberg and Marquardt's method, with analytic Jacobians and Huber's rho.
+    """Minimise the reprojection error by Levenberg-Marquardt, with analytic Jacobians and Huber's rho.
 
     Args:
-        see: Where points appear.
-        points_b: Body frame [m], (n, 3).
-        pixels: (n, 2).
-        position: t_pb to start from, pool frame [m], (3,).
-        rotation: R_pb to start from, (3, 3).
-        huber: Distance [px] from which on Huber's rho grows linearly.
-        extra_rows: What else counts; then a shift of the whole picture is sought too.
-        max_steps: Give up after so many.
+        see: Function that images points.
+        points_b: Points, body frame [m], (n, 3).
+        pixels: Pixels (u, v), (n, 2).
+        position: Initial t_pb, pool frame [m], (3,).
+        rotation: Initial R_pb, (3, 3).
+        huber: Residual [px] beyond which Huber's rho grows linearly.
+        extra_rows: Function of the residuals of prior knowledge; with it, a shift of the picture is estimated too.
+        max_steps: Greatest number of steps.
 
     Returns:
-        The minimum, or None where the start cannot be seen.
+        The minimum, or None if points are not visible from the initial pose.
     """
 
     def at(position: Array, rotation: Array, shift: Array) -> RefinedPose | None:
@@ -232,7 +235,7 @@ def _linearised(
     H, g = weighted.T @ J.reshape(-1, J.shape[-1]), weighted.T @ miss.ravel()
     curvature = H
     if extra_rows is not None:
-        # From nearby Newton's curvature is quicker; from afar, where most of the points are, weights alone are safer.
+        # Close to the minimum Newton's curvature converges faster; far away, weights alone are more robust.
         along = np.where(missed > huber, np.sqrt(weight) / np.maximum(missed, huber), 0.0)[:, None] * miss
         flat = np.einsum("ij,ijk->ik", along, J)
         r, K = extra_rows(position, rotation, shift)
@@ -242,13 +245,13 @@ def _linearised(
 
 
 def through_lens(lens: Lens, R: Array | None = None, position: Array | None = None) -> See:
-    """Return the function to image points without water: in the optical frame, or in one in which the camera has a
-    pose.
+    """Return the function that images points without refraction, in the optical frame or in one with a given
+    camera pose.
 
     Args:
-        lens: Of the camera.
+        lens: Lens of the camera.
         R: Rotation matrix from optical axes to those of the points, (3, 3).
-        position: Of the camera in their frame [m], (3,).
+        position: Position of the camera in the frame of the points [m], (3,).
     """
     R, position = np.eye(3) if R is None else R, np.zeros(3) if position is None else position
 
@@ -261,7 +264,7 @@ def through_lens(lens: Lens, R: Array | None = None, position: Array | None = No
 
 
 def through_water(pool: Pool) -> See:
-    """Return the function to image points: refracted at the interface, or straight on the camera's side of it."""
+    """Return the function that images points, refracted at the interface, or straight on the camera's side of it."""
     camera, interface = pool.camera, pool.interface
     straight = through_lens(camera.lens, camera.R_pc, camera.position)
 
@@ -276,11 +279,11 @@ def through_water(pool: Pool) -> See:
     return see
 
 
-# Which of several poses that explain a picture is the vehicle's.
+# Choice among several poses that explain a picture.
 
 
 def _distinct(poses: Iterable[RefinedPose | None]) -> list[RefinedPose]:
-    """The minima among what was found, each once, the best first."""
+    """Return the distinct minima among the poses, the best first."""
     minima: list[RefinedPose] = []
     for pose in sorted((pose for pose in poses if pose is not None), key=lambda pose: pose.cost):
         if all(_separation(pose, other) for other in minima):
@@ -291,13 +294,14 @@ def _distinct(poses: Iterable[RefinedPose | None]) -> list[RefinedPose]:
 def minima_from(
     see: See, pairs: Correspondences, starts: Iterable[tuple[Array, Array]], huber: float
 ) -> list[RefinedPose]:
-    """The distinct minima that starts lead to, the best first: a few steps each, to the end only where they differ.
+    """Return the distinct minima reached from the starts, the best first: after a few steps, only distinct
+    ones continue.
 
     Args:
-        see: Where points appear.
+        see: Function that images points.
         pairs: The corners.
-        starts: t_pb [m] and R_pb of each.
-        huber: Distance [px] from which on Huber's rho grows linearly.
+        starts: Initial poses t_pb [m] and R_pb.
+        huber: Residual [px] beyond which Huber's rho grows linearly.
     """
     points, pixels = pairs.points_b, pairs.pixels
     begun = _distinct(refine_pose(see, points, pixels, t, R, huber, max_steps=5) for t, R in starts)
@@ -311,7 +315,7 @@ class BestMinimum:
     best: RefinedPose
     second: RefinedPose | None
     gap: float
-    """Difference of chi² of the second solution; infinite if there is none [-]."""
+    """Difference of chi² to the second minimum; infinite if there is none [-]."""
 
     @property
     def turned(self) -> float:
@@ -319,8 +323,8 @@ class BestMinimum:
         return 0.0 if self.second is None else _angle(self.best.rotation, self.second.rotation)
 
     def covariance(self, pixel_std: float) -> Array:
-        """Return the covariance of position and a turn about pool axes, (6, 6): that of the best, and the probability
-        of the second.
+        """Return the covariance of position and rotation about pool axes, (6, 6), including the probability
+        of the second minimum.
 
         P = w1 P1 + w2 (P2 + d d'), w2/w1 = exp(-gap/2), with d from the best to the second.
         """
@@ -335,12 +339,12 @@ class BestMinimum:
 
 
 def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std: float) -> BestMinimum:
-    """The best of the minima and the next one.
+    """Return the best of the minima and the next one.
 
     Args:
-        minima: Not empty.
-        constraints: A known tilt counts with its standard deviation, no less than 3 degrees: water bends what the
-            pinhole sees.
+        minima: Minima; at least one.
+        constraints: Prior tilt, weighted with its standard deviation, but at least 3 degrees, since
+            refraction distorts pinhole poses.
         pixel_std: Standard deviation of a corner, per axis [px].
     """
     scored = []
@@ -359,7 +363,7 @@ def choose(minima: list[RefinedPose], constraints: Constraints | None, pixel_std
 def measured(
     method: str, pose: RefinedPose, covariance: Array, pairs: Correspondences, medium: str = ""
 ) -> PoseMeasurement:
-    """The measurement that a pose is, with its covariance (6, 6). The covariance is in [m] and [rad]."""
+    """Return the measurement of a pose with covariance (6, 6) in [m] and [rad]."""
     x, y, z = pose.rotation[:, 0]
     rows = np.zeros((3, 6))
     rows[0, 0] = rows[1, 1] = 1.0
@@ -382,7 +386,7 @@ def measured(
 
 
 def _lean(pose: RefinedPose, constraints: Constraints) -> float:
-    """Angle between up as the pose has it in the body, and as roll and pitch have it [rad]."""
+    """Return the angle between the body's up direction of the pose and that of roll and pitch [rad]."""
     R_pg = axes_of_up(constraints.up)
     up_b = pose.rotation.T @ R_pg[:, 2]
     up = tilt_matrix(constraints.roll, constraints.pitch)[2]
@@ -395,5 +399,5 @@ def _separation(a: RefinedPose, b: RefinedPose) -> bool:
 
 
 def _angle(a: Array, b: Array) -> float:
-    """Angle between two attitudes [rad]."""
+    """Return the angle between two attitudes [rad]."""
     return float(np.arccos(np.clip(0.5 * (np.trace(a.T @ b) - 1.0), -1.0, 1.0)))
