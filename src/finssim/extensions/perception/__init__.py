@@ -1,8 +1,8 @@
 """Perception: worlds as data, and the sensors that observe them: cameras, imaging sonars, altimeters, DVL beams.
 
-`WorldLayout`, `description` and `rays` need nothing beside the core; `WorldBatch` needs Newton
-(`pip install 'finssim[perception]'`). What computes is imported when it is first named: a robot that
-reads what its devices are starts without Warp.
+`WorldLayout`, `description` and `rays` need only the core; `WorldBatch` needs Newton
+(`pip install 'finssim[perception]'`). Modules that compute are imported when they are first used: a robot that
+only reads its device descriptions starts without Warp.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Docking by camera: the funnel is found in the picture."""
+"""Docking by camera: the funnel is located in the picture."""
 
 import math
 from collections.abc import Sequence
@@ -17,12 +17,14 @@ from finssim.tasks.terms import ObservationPart, Terms
 from finssim.vehicles import Vehicle
 
 MOUTH, THROAT, CONE, TUBE = 0.745, 0.32, 0.75, 0.93
-"""Inner radii of the funnel of the site `dock`, its length, and that of its tube up to the plate [m]."""
+"""Inner radii of the funnel of the site `dock` at mouth and throat, its length, and that of its tube up to
+the plate [m]."""
 
 
 @wp.func
 def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """The dock where the world has it, or where `Docking` draws it, and a vehicle at rest before its mouth."""
+    """Place the dock at its pose in the world, or as `Docking` draws it, and a vehicle at rest in front of
+    its mouth."""
     x = arrays.goal_position[w]
     q = arrays.goal_quaternion[w]
     start(state, arrays, p, key, w)
@@ -36,10 +38,10 @@ def start_at_site(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraDocking(SeeingTask, Docking):
-    """Docking into the dock of the site `dock`, whose pose, look and light differ in each episode.
+    """Docking into the dock of the site `dock`, whose pose, appearance and light differ in each episode.
 
-    The row of numbers holds attitude, velocity and depth alone: where the dock is, the picture shows. What `docking`
-    observes is `teacher`, for who may know it in training.
+    The observed numbers are only attitude, velocity and depth; the dock's position must be inferred from the
+    picture. The observation of `docking` is the privileged observation `teacher` for training.
     """
 
     title: ClassVar[str] = "dock by camera"
@@ -58,7 +60,7 @@ class CameraDocking(SeeingTask, Docking):
     tank: tuple[float, float] = (10.0, 6.0)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "CameraDocking":
-        """For the vehicle, if it fits into the dock."""
+        """Return the task for the vehicle, if it fits into the dock."""
         fitted = replace(self, hull=HullNumbers.of(vehicles[0]))
         if fitted.hull.girth > 0.95 * THROAT:
             raise EnvironmentSetupError(
@@ -68,14 +70,15 @@ class CameraDocking(SeeingTask, Docking):
         return fitted
 
     def dock(self) -> Dock:
-        """The funnel that the picture shows, with stiffness and damping as of `Docking`."""
+        """Return the funnel of the site, with stiffness and damping as in `Docking`."""
         return replace(
             super().dock(),
             mouth_radius=MOUTH, throat_radius=THROAT, cone_length=CONE, tube_length=TUBE, rim=0.06,
         )  # fmt: skip
 
     def arena(self) -> RectangularPool:
-        """Up to the quay and the bottom; without the world, where the dock looks any way, as wide as long."""
+        """Return the arena up to the quay and the bottom; without the world it is square, since the dock may
+        face any direction."""
         return replace(Docking.arena(self), length=24.0, width=7.8 if self.placed else 24.0, depth=4.95)
 
     def terms(self) -> Terms:

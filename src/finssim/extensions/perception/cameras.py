@@ -1,4 +1,5 @@
-"""Cameras of many vehicles: daylight, lamps, marine snow and the surface from below, to noisy 8-bit pictures."""
+"""Cameras of many vehicles: rendering of daylight, lamps, marine snow and the surface from below to noisy
+8-bit pictures."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ from finssim.vehicles.device_files import CameraDevice
 wp.set_module_options({"enable_backward": False})
 
 LEVELS = 4096
-"""Levels of the converter behind a camera's pixels (12 bits), before the numbers are encoded to 8."""
+"""Levels of the analog-to-digital converter (12 bits), before gamma encoding to 8 bits."""
 LAMP_STEPS = wp.constant(8)
 SNOW_STEPS = wp.constant(40)
 SNOW_SHARE = wp.constant(0.7)
-"""Share of the cells of marine snow's lattice that hold a particle; a ray is followed through twenty cells."""
+"""Fraction of the cells of the marine-snow lattice that contain a particle [-]; a ray is followed through
+twenty cells."""
 BLUR = 5
-"""Moments of an exposure that a blurred picture is the mean of."""
+"""Number of instants of an exposure that are averaged for motion blur."""
 AUTO_MEAN = 0.42
-"""Mean of a picture that automatic exposure aims at, as a share of the full scale after gamma."""
+"""Target mean of automatic exposure, as a fraction of the full scale after gamma [-]."""
 
 
 @wp.struct
 class Lamp:
-    """A vehicle's light: a point with a round, even beam that ends softly."""
+    """Light on a vehicle: a point source with a round beam whose edge is smooth."""
 
     position: wp.vec3  # body axes [m]
     axis: wp.vec3  # of its beam, body axes, unit
@@ -45,14 +47,14 @@ class Lamp:
 
 @wp.struct
 class Film:
-    """Everything behind the lens of a camera, for all views."""
+    """Sensor of a camera (everything behind the lens), for all views."""
 
-    lamps: wp.array(dtype=Lamp)  # of each vehicle
-    pixel: float  # angle from pixel to pixel [rad]
+    lamps: wp.array(dtype=Lamp)  # lamps on each vehicle
+    pixel: float  # angle between neighbouring pixels [rad]
     full_well: float  # [electrons]
     read_noise: float  # [electrons]
-    gain: wp.array(dtype=wp.vec3)  # by view: share of the full scale of radiance 1
-    code: wp.array(dtype=wp.uint8)  # numbers by level of the converter
+    gain: wp.array(dtype=wp.vec3)  # by view: fraction of the full scale at radiance 1
+    code: wp.array(dtype=wp.uint8)  # 8-bit values by converter level
     quantiles: wp.array(dtype=float)  # of the normal distribution [-]
     radiance: wp.array3d(dtype=wp.vec3)  # [-], or empty
     picture: wp.array4d(dtype=wp.uint8)
@@ -62,34 +64,32 @@ class Film:
 class WaterRay:
     """A ray in the water, up to a surface or the end of the water."""
 
-    origin: wp.vec3  # where it enters the water, world frame [m]
+    origin: wp.vec3  # point where it enters the water, world frame [m]
     direction: wp.vec3  # unit, world frame
     length: float  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Headlight:
-    """A light on the vehicle."""
+    """Light on the vehicle."""
 
     position: tuple[float, float, float]
-    """Body axes [m]."""
+    """Position, body axes [m]."""
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    """Axis of its beam, body axes, unit length."""
+    """Axis of the beam, body axes, unit length."""
     intensity: float = 0.5
-    """Irradiance at 1 m on its axis, without water, relative to daylight just below the surface [-]."""
+    """Irradiance at 1 m on the axis, without water, relative to daylight just below the surface [-]."""
     half_angle: float = 1.0
-    """Angle at which it has half of its intensity on the axis [rad]."""
+    """Angle from the axis at which the intensity is half of that on the axis [rad]."""
 
 
 @wp.func
 def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
-    """Random brightness at a point, about 0.
-
-    Brightness has no unit [-].
+    """Return a random relative brightness at a point, about 0 [-].
 
     Args:
-        local: Point in shape axes, in sizes of the pattern [-].
-        grain: A periodic field [-], sixteen patches along each side.
+        local: Point in shape axes, in units of the pattern size [-].
+        grain: Periodic field [-], sixteen patches along each side.
     """
     # Skewed along z, so that upright faces have a pattern too.
     u = (local[0] + 0.37 * local[2]) / 16.0
@@ -97,7 +97,7 @@ def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
     n = grain.shape[0]
     x = float(n) * (u - wp.floor(u))
     y = float(n) * (v - wp.floor(v))
-    a = wp.clamp(int(x), 0, n - 1)  # of a point that is no number too
+    a = wp.clamp(int(x), 0, n - 1)  # also valid for a point that is NaN
     b = wp.clamp(int(y), 0, n - 1)
     c = wp.where(a + 1 == n, 0, a + 1)
     d = wp.where(b + 1 == n, 0, b + 1)
@@ -109,16 +109,16 @@ def mottled(local: wp.vec3, grain: wp.array2d(dtype=float)) -> float:
 
 @wp.func
 def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contrast: float) -> wp.vec3:
-    """Reflectance at a point of squares, bands or tiles.
+    """Return the reflectance at a point of squares, bands or tiles [-].
 
     Args:
         kind: A value of `TEXTURES`.
-        local: The point, shape axes, in sizes of the pattern [-].
-        colour: Reflectance of the one.
-        second: Reflectance of the other, or of joints.
-        contrast: Contrast from tile to tile.
+        local: Point in shape axes, in units of the pattern size [-].
+        colour: Reflectance of the first colour.
+        second: Reflectance of the second colour, or of joints.
+        contrast: Contrast between tiles.
     """
-    # A hair inside the face, so that points on it fall on one side of the pattern.
+    # Shifted slightly inside the face, so that points on it fall on one side of the pattern.
     cx = int(wp.floor(local[0] + 1.0e-3))
     cy = int(wp.floor(local[1] + 1.0e-3))
     cz = int(wp.floor(local[2] + 1.0e-3))
@@ -126,7 +126,7 @@ def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contr
         return wp.where((cx + cy + cz) & 1 == 1, second, colour)
     if kind == 2:
         return wp.where(local[2] - float(cz) > 0.5, second, colour)
-    # On a face of an axis-aligned slab one coordinate is constant, perhaps at a joint: that one does not count.
+    # On a face of an axis-aligned slab one coordinate is constant, possibly at a joint: it is ignored.
     dx = wp.abs(local[0] - float(cx) - 0.5)
     dy = wp.abs(local[1] - float(cy) - 0.5)
     dz = wp.abs(local[2] - float(cz) - 0.5)
@@ -141,15 +141,15 @@ def patterned(kind: int, local: wp.vec3, colour: wp.vec3, second: wp.vec3, contr
 def painted(
     pictures: wp.array3d(dtype=wp.vec3), index: int, local: wp.vec3, normal: wp.vec3, aspect: float, base: wp.vec3
 ) -> wp.vec3:  # fmt: skip
-    """Reflectance at a point of a face with a picture in its middle.
+    """Return the reflectance at a point of a face with a picture in its middle [-].
 
     Args:
         pictures: All pictures, row 0 at the top.
-        index: Which.
-        local: The point, shape axes, in widths of the picture.
-        normal: Of the face, shape axes, unit [-].
-        aspect: Height of the picture over its width.
-        base: Reflectance beside it.
+        index: Index of the picture.
+        local: Point in shape axes, in units of the picture width [-].
+        normal: Unit normal of the face, shape axes [-].
+        aspect: Height of the picture divided by its width [-].
+        base: Reflectance outside the picture.
     """
     n = wp.vec3(wp.abs(normal[0]), wp.abs(normal[1]), wp.abs(normal[2]))
     u = wp.sign(normal[2]) * local[0]
@@ -179,14 +179,15 @@ def painted(
 
 @wp.func
 def below_surface(ray: wp.vec3, veil: wp.vec3, sky: wp.vec3) -> wp.vec3:
-    """Radiance that comes down through the still water surface, or is thrown back by it (Fresnel, Snell's window).
+    """Return the radiance transmitted and reflected by the still water surface, seen from below (Fresnel,
+    Snell's window).
 
     Radiances are relative to that of white paper [-].
 
     Args:
-        ray: Unit direction from the eye upwards, world frame [-].
+        ray: Unit direction from the camera upwards, world frame [-].
         veil: Radiance of the water itself [-].
-        sky: Radiance of what lies above [-].
+        sky: Radiance above the surface [-].
     """
     out = refracted(ray, wp.vec3(0.0, 0.0, -1.0), WATER_INDEX)
     if out[2] <= 0.0:
@@ -197,18 +198,18 @@ def below_surface(ray: wp.vec3, veil: wp.vec3, sky: wp.vec3) -> wp.vec3:
 
 @wp.func
 def lamp_light(point: wp.vec3, lamp: Lamp, position: wp.vec3, axis: wp.vec3, attenuation: wp.vec3) -> wp.vec4:
-    """Irradiance of a lamp at a point, and in the fourth number the distance.
+    """Return the irradiance of a lamp at a point, and its distance as fourth component.
 
     E = I f(angle) exp(-c r)/r², with f = 1/(1 + ((1 - cos angle)/(1 - cos half))²)
 
     Irradiance is relative to daylight [-], the distance in [m].
 
     Args:
-        point: World frame [m].
-        lamp: Its beam and intensity.
-        position: Of the lamp, world frame [m].
-        axis: Of its beam, world frame, unit [-].
-        attenuation: c [1/m].
+        point: Point, world frame [m].
+        lamp: Lamp with its beam and intensity.
+        position: Position of the lamp, world frame [m].
+        axis: Unit axis of its beam, world frame [-].
+        attenuation: Beam attenuation c [1/m].
     """
     way = point - position
     r = wp.max(wp.length(way), 0.05)
@@ -224,7 +225,7 @@ def lamp_light(point: wp.vec3, lamp: Lamp, position: wp.vec3, axis: wp.vec3, att
 
 @wp.func
 def rgb(light: wp.vec4) -> wp.vec3:
-    """Return the first three numbers of a light, in its unit."""
+    """Return the first three components of a light, in its unit."""
     return wp.vec3(light[0], light[1], light[2])
 
 
@@ -233,18 +234,19 @@ def lamps_seen(
     ray: WaterRay, normal: wp.vec3, reflectance: wp.vec3, c: wp.vec3, veil: wp.vec3, lamps: wp.array(dtype=Lamp),
     pose: wp.transform,
 ) -> wp.vec3:  # fmt: skip
-    """Return the light that the vehicle's lamps add to a ray: rho E e^(-c s) of the surface, and the veil between.
+    """Return the light that the vehicle's lamps add to a ray: rho E e^(-c s) from the surface, and
+    backscatter on the path.
 
-    The veil is the integral of c B E e^(-c s) along the ray, by the midpoint rule over equal shares of its logarithm:
-    the water scatters lamplight back as it does daylight.
+    The backscatter is the integral of c B E e^(-c s) along the ray, by the midpoint rule over steps of equal
+    length ratio: the water scatters lamplight back as it does daylight.
 
     Args:
         ray: The ray, of length s [m].
-        normal: Of the surface, world frame, unit [-].
-        reflectance: Reflectance rho; 0 where there is none.
+        normal: Unit normal of the surface, world frame [-].
+        reflectance: Reflectance rho; 0 without a surface.
         c: Beam attenuation [1/m].
         veil: Radiance B [-].
-        lamps: On the vehicle.
+        lamps: Lamps on the vehicle.
         pose: Pose of the vehicle, body to world [m, quaternion].
     """
     radiance = wp.vec3(0.0)
@@ -276,17 +278,19 @@ def lamps_seen(
 def snow_seen(
     sight: WaterRay, c: wp.vec3, daylight: wp.vec3, optics: Optics, film: Film, pose: wp.transform
 ) -> wp.vec4:
-    """Return the light that particles in the water add to a ray, and as fourth number the share that they cover.
+    """Return the light that particles in the water add to a ray, and the fraction that they cover as fourth
+    component.
 
-    Each cell of a lattice holds a particle or none, by a hash of the cell; it covers a²/s² e^(-(x/s)²) of a pixel that
-    it passes at x, a its radius and s² = a² + w² with the pixel's half width w there. Snow reflects 0.4 of its light.
+    A hash of each lattice cell decides whether it contains a particle, which covers a²/s² e^(-(x/s)²) of a
+    pixel whose ray passes it at distance x, with its radius a and s² = a² + w², w the pixel's half width
+    there. Snow reflects 0.4 of its light.
 
     Args:
         sight: The ray.
         c: Beam attenuation [1/m].
-        daylight: Irradiance at the eye's depth [-].
-        optics: Has the snow's density [1/m³] and size [m].
-        film: Has the lamps and the angle from pixel to pixel [rad].
+        daylight: Irradiance at the camera's depth [-].
+        optics: Water with the snow's density [1/m³] and size [m].
+        film: Sensor with the lamps and the angle between neighbouring pixels [rad].
         pose: Pose of the vehicle, body to world [m, quaternion].
     """
     ray = sight.direction
@@ -306,7 +310,7 @@ def snow_seen(
             inset = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
             particle = cell * (corner + wp.vec3(0.1) + 0.8 * inset)
             way = wp.dot(particle - sight.origin, ray)
-            # Half a cell's steps meet most cells twice: the step nearest to the particle counts.
+            # Steps of half a cell visit most cells twice: only the step nearest to the particle counts.
             if wp.abs(way - t) <= 0.25 * cell and way > 0.05:
                 a = 0.5 * optics.snow_size
                 w = 0.5 * film.pixel * way
@@ -327,7 +331,7 @@ def snow_seen(
 
 @wp.func
 def reflectance_at(scene: RayScene, shape: int, position: wp.vec3, normal: wp.vec3):
-    """Return the reflectance of a surface at a position of the world [m], with its texture."""
+    """Return the reflectance of a surface, with its texture, at a world position [m]."""
     reflectance = scene.surfaces[shape].colour
     kind = scene.surfaces[shape].texture
     if kind > 0:
@@ -350,20 +354,23 @@ def _take_picture(
     traced: Traced, poses: wp.array(dtype=wp.transform), scene: RayScene, film: Film, share: float, last: int, key: int,
     span: int,
 ):  # fmt: skip
-    """Radiance of every pixel, and its 8-bit numbers.
+    """Compute the radiance of every pixel, and its 8-bit values.
 
-    With the eye at depth h and the ray rising by u per metre, daylight at path s is D e^(K u s), D = e^(-K h). The
-    surface's radiance rho E and the veil gathered on the way (the integral of c B D e^(K u s) e^(-c s)) are together
+    With the camera at depth h and the ray rising by u per metre, daylight at path s is D e^(K u s), D = e^(-K
+    h). The surface's radiance rho E and the veil accumulated on the path (the integral of c B D e^(K u s)
+    e^(-c s)) are together
 
         L = D [ rho E e^(-(c - K u) s) + B c/(c - K u) (1 - e^(-(c - K u) s)) ]
 
-    which is `through_water` with c - K u in place of c. Daylight on a surface, relative to that on a level one, is of
-    the sun, of what lies above, and of the water below (d is the diffuse share, s the sun's direction):
+    which is `through_water` with c - K u in place of c. Daylight on a surface, relative to that on a
+    horizontal one, comes
+    from the sun, from above, and from the water below (d is the diffuse fraction, s the sun's direction):
 
         E = (1 - d) max(n . s, 0)/s_z + d (1 + n_z)/2 + B (1 - n_z)/2
 
-    Then charge with shot and read noise, 12 bits, and the code's 8. A thread takes `span` pixels of a row.
-    `radiance` may be empty; without noise, which a negative key means, a number is that of the mean charge.
+    Then follow charge with shot and read noise, 12-bit conversion and 8-bit encoding. A thread processes
+    `span` pixels of a row. `radiance` may be empty. A negative key means no noise: a value is then that of
+    the mean charge.
     """
     v, i, block = wp.tid()
     w = traced.worlds[v]
@@ -405,7 +412,7 @@ def _take_picture(
             glow = scene.surfaces[shape].glow
         elif ray[2] > 1.0e-6:
             start = below_surface(ray, veil, optics.sky[w])
-        # Light that falls off with depth takes K u from the exponent; a beacon's own light does not.
+        # Light that decreases with depth subtracts K u from the exponent; a beacon's own light does not.
         net = c - ray[2] * K
         net = wp.vec3(wp.max(net[0], 1.0e-6), wp.max(net[1], 1.0e-6), wp.max(net[2], 1.0e-6))
         colour = wp.cw_mul(dim, through_water(start, net, wp.cw_mul(veil, wp.cw_div(c, net)), path))
@@ -421,7 +428,7 @@ def _take_picture(
             flakes = snow_seen(sight, c, wp.cw_mul(dim, daylight), optics, film, pose)
             colour = (1.0 - flakes[3]) * colour + rgb(flakes)
         if wp.length_sq(ray) < 0.5:
-            colour = wp.vec3(0.0)  # the lens has no ray here
+            colour = wp.vec3(0.0)  # the lens has no ray for this pixel
         if keep:
             if share < 1.0:
                 colour = film.radiance[v, i, j] + share * colour
@@ -430,12 +437,13 @@ def _take_picture(
             continue
         bits = wp.uint32(0)
         if key >= 0:
-            # Numbers of the normal distribution by their quantiles, 10 bits each, from one hash of the pixel.
+            # Normally distributed numbers by their quantiles, 10 bits each, from one hash of the pixel.
             bits = wp.rand_init(key, (v * traced.depth.shape[1] + i) * traced.depth.shape[2] + j)
         for k in range(3):
             charge = wp.max(gains[k] * colour[k], 0.0)
             if key >= 0:
-                # Shot noise, of variance `charge`, is normal instead of Poisson; above 20 electrons they hardly differ.
+                # Shot noise, of variance `charge`, is normal instead of Poisson; above 20 electrons the two
+                # hardly differ.
                 drawn = film.quantiles[int(bits & wp.uint32(1023))]
                 bits = bits >> wp.uint32(11)
                 charge += drawn * wp.sqrt(charge + noise_floor)
@@ -443,7 +451,7 @@ def _take_picture(
             digit = int(wp.clamp(charge * digits, 0.0, float(last_digit)) + 0.5)
             film.picture[v, i, j, k] = film.code[
                 wp.clamp(digit, 0, last_digit)
-            ]  # of a charge that is no number too
+            ]  # also for a charge that is NaN
 
 
 @wp.kernel(enable_backward=False)
@@ -455,9 +463,10 @@ def _meter(
     balance: float,
     gain: wp.array(dtype=wp.vec3),
 ):
-    """Automatic exposure and white balance: move gains towards what would have given the last picture the target mean.
+    """Automatic exposure and white balance: move the gains towards those that give the last picture the
+    target mean.
 
-    Of the differences between the channels' means, the share `balance` is taken out (gray world).
+    The fraction `balance` of the differences between the channel means is removed (gray world).
     """
     v = wp.tid()
     if worlds[v] == SKIPPED:
@@ -475,7 +484,7 @@ def _meter(
     common = wp.max((mean[0] + mean[1] + mean[2]) / 3.0, 0.01)
     change = wp.clamp(wp.pow(target / common, gamma), 0.25, 4.0)
     old = gain[v]
-    # A channel's gain over their mean goes a third of the way to what the share asks for, within a factor of 4.
+    # A channel's gain relative to the mean gain moves a third of the way to its target, within a factor of 4.
     level = (old[0] + old[1] + old[2]) / 3.0
     new = wp.vec3(0.0)
     for k in range(3):
@@ -494,7 +503,7 @@ def _move(
     time: float,
     moved: wp.array(dtype=wp.transform),
 ):
-    """Poses a time [s] on, at the twists that the vehicles have."""
+    """Compute the poses after a time [s] at the vehicles' present twists."""
     i = wp.tid()
     nu = twists[i // twists.shape[1], i % twists.shape[1]]
     q = wp.transform_get_rotation(poses[i])
@@ -509,24 +518,24 @@ def _move(
 
 @wp.kernel(enable_backward=False)
 def _clear(worlds: wp.array(dtype=int), linear: wp.array3d(dtype=wp.vec3)):
-    """Begin an exposure."""
+    """Clear the accumulated radiance at the start of an exposure."""
     v, i, j = wp.tid()
     if worlds[v] != SKIPPED:
         linear[v, i, j] = wp.vec3(0.0)
 
 
 class CameraBatch(RayBatch):
-    """A camera on each of N vehicles.
+    """Camera on each of N vehicles.
 
     Args:
         batch: The worlds.
         camera: Lens, port, exposure, mount.
-        width: Of the pictures, in place of the camera's own [px]; their height follows.
-        vehicles: In each world.
+        width: Width of the pictures instead of the camera's own [px]; the height follows.
+        vehicles: Number of vehicles in each world.
         lamps: Lights on each vehicle.
-        linear: Keep the radiance too.
-        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`:
-            with the camera's exposure time, pictures blur; vec6 (worlds, vehicles).
+        linear: True to store the radiance too.
+        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, such as a simulator's
+            `state.velocity`; needed for motion blur by the camera's exposure time; vec6 (worlds, vehicles).
     """
 
     picture: wp.array
@@ -535,7 +544,7 @@ class CameraBatch(RayBatch):
     """Radiance before noise and gain [-], relative to white paper just below the surface; vec3 (N, height, width), or
     empty."""
     gain: wp.array
-    """Share of the full scale that radiance 1 reaches in red, green, blue; vec3 (N,)."""
+    """Fraction of the full scale at radiance 1 in red, green, blue; vec3 (N,)."""
 
     def __init__(
         self,
@@ -569,13 +578,13 @@ class CameraBatch(RayBatch):
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
     ) -> wp.array:
-        """Take a picture of each world.
+        """Render a picture for each vehicle.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
-            seed: Of the noise; None for none.
-            time: Of the pictures [s]: pictures of other times have other noise.
-            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
+            seed: Seed of the noise; None for no noise.
+            time: Time of the pictures [s]; it changes the noise.
+            mask: Vehicles that measure; the others keep their last picture. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
@@ -602,7 +611,7 @@ class CameraBatch(RayBatch):
     def _expose(
         self, poses: wp.array, seed: int | None, time: float, mask: wp.array | None, k: int, moments: int
     ) -> None:
-        """Add moment k of an exposure; after the last, encode it."""
+        """Add instant k of an exposure; after the last one, encode the picture."""
         self.cast(poses, mask)
         if moments > 1 and k == 0:
             wp.launch(_clear, self.radiance.shape, [self.worlds, self.radiance], device=self.device)

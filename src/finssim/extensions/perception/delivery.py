@@ -1,4 +1,4 @@
-"""When ray sensors measure and how late their readings arrive: rate, latency and loss, by the clocks of the worlds."""
+"""Rate, latency and loss of ray sensors, by the clocks of the worlds."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ STREAM = wp.constant(1000)
 
 @wp.struct
 class DeliverySchedule:
-    """Work of the sensors in a step, by view, and what remains of the steps before it."""
+    """Schedule of the sensors in a step, by view, with state carried between steps."""
 
-    begun: wp.array2d(dtype=int)  # episode that the sensor of (world, vehicle) has begun
+    begun: wp.array2d(dtype=int)  # episode in which the sensor of (world, vehicle) was last restarted
     due: wp.array(dtype=int)  # 1: measures in this step
-    stored: wp.array(dtype=int)  # slot of the ring that takes the reading; -1: none
-    arrived: wp.array(dtype=int)  # slot of the ring whose reading arrives; -1: none
-    age: wp.array2d(dtype=float)  # time since the reading on display was measured [s], by (world, vehicle)
+    stored: wp.array(dtype=int)  # ring slot that stores the new reading; -1: none
+    arrived: wp.array(dtype=int)  # ring slot of the arriving reading; -1: none
+    age: wp.array2d(dtype=float)  # age of the current reading [s], by (world, vehicle)
 
 
 @wp.kernel(enable_backward=False)
@@ -49,8 +49,8 @@ def _schedule(
     seed: int,
     schedule: DeliverySchedule,
 ):
-    """Write which sensors measure in this step, into which slot of their ring, and which slot's reading arrives; -1:
-    none."""
+    """Determine which sensors measure in this step, the ring slot that stores each reading, and the slot
+    whose reading arrives; -1: none."""
     w, v = wp.tid()
     step = steps[w]
     view = w * schedule.age.shape[1] + v
@@ -82,7 +82,7 @@ def _pass_on(
     ring: wp.array3d(dtype=wp.uint8),
     reading: wp.array2d(dtype=wp.uint8),
 ):
-    """Put what was measured on its way, and on display what arrives; a thread moves `span` bytes."""
+    """Store new readings in the ring, and copy arriving ones to the output; a thread moves `span` bytes."""
     view, block = wp.tid()
     last = wp.min(block * span + span, measured.shape[1])
     slot = schedule.stored[view]
@@ -96,30 +96,30 @@ def _pass_on(
 
 
 class DelayedSensor:
-    """A sensor that measures at its own rate, whose readings arrive late or not at all.
+    """Sensor that measures at its own rate and whose readings arrive late or are lost.
 
-        camera = Delivery(CameraBatch(batch, device), control_step=0.1, rate=5.0, latency=0.2, loss=0.02)
+        camera = DelayedSensor(CameraBatch(batch, device), control_step=0.1, rate=5.0, latency=0.2, loss=0.02)
         picture = camera.update(poses, simulator.state.steps, simulator.state.episode)
 
-    As with the sensors of `finssim.sim.sensors`: the first reading of an episode arrives at once, and a sensor
-    measures at ends of control steps alone. Call `update` after every control step.
+    As with the sensors of `finssim.sim.sensors`, the first reading of an episode arrives at once, and a sensor
+    measures only at the ends of control steps. Call `update` after every control step.
 
     Args:
         sensor: A `CameraBatch`, `SonarBatch` or `RangeBatch`.
-        control_step: Between updates [s].
-        rate: At which it measures [Hz]; at most once in a control step.
-        latency: Between measurement and arrival, to the nearest control step [s].
-        loss: Probability with which a reading never arrives.
-        seed: Of the sensor's noise and of what is lost.
+        control_step: Time between updates [s].
+        rate: Rate of measurements [Hz]; at most one per control step.
+        latency: Time from measurement to arrival, rounded to control steps [s].
+        loss: Probability that a reading is lost.
+        seed: Seed of the sensor's noise and of the losses.
 
     Raises:
         WorldError: A number is out of range.
     """
 
     reading: wp.array
-    """Reading that arrived last; zero before the first. Its type, shape and unit are the sensor's."""
+    """Latest reading that arrived; zero before the first. Its type, shape and unit are the sensor's."""
     age: wp.array
-    """Time since that was measured [s], infinite before the first; float (worlds, vehicles)."""
+    """Time since `reading` was measured [s], infinite before the first; float (worlds, vehicles)."""
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class DelayedSensor:
             [rate] * vehicles, [latency] * vehicles, worlds, control_step, self.device
         )
         self.updates = 0
-        """So far: noise differs from one to the next."""
+        """Number of updates so far, which changes the noise."""
         source, slots = sensor.reading, self.sampling.sent.shape[2]
         width = source.size * source.strides[-1] // sensor.count
         self.reading = wp.zeros_like(source)
@@ -163,7 +163,7 @@ class DelayedSensor:
         ]
 
     def update(self, poses: wp.array, steps: wp.array, episode: wp.array) -> wp.array:
-        """Measure what is due, and let arrive what has come.
+        """Measure with the sensors that are due, and deliver the readings that arrive.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
@@ -184,12 +184,13 @@ class DelayedSensor:
         return self.reading
 
     def restart(self, seed: int) -> None:
-        """Start noise and losses over with a seed; the next update is the first of an episode in every world."""
+        """Restart noise and losses with a seed; the next update is the first of an episode in every world."""
         self.seed, self.updates = seed, 0
         self._schedule.begun.fill_(-1)
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """The arrays that decide what arrives next, by name; with `updates`, and the sensor's own, they are all.
+        """Yield the arrays that determine the next readings, by name; with `updates` and the sensor's own,
+        they are the full state.
 
         Each has the unit of its attribute.
         """

@@ -1,7 +1,7 @@
-"""Worlds as data: YAML files that are read, checked and refused in one sentence each.
+"""Worlds as data: YAML files that are read and checked; every refusal is one sentence.
 
 World frame as everywhere: z up, z = 0 on the still water surface. Colours are reflectances and radiances of (red,
-green, blue); radiance 1 is that of white paper lying level just below the surface.
+green, blue); radiance 1 is that of horizontal white paper just below the surface.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ Array = NDArray[np.float64]
 
 SITES = Path(__file__).parent / "catalogue"
 LARGEST = 4096
-"""Shapes in one world."""
+"""Greatest number of shapes in one world."""
 FINEST = 1 << 20
-"""Heights of a seabed."""
+"""Greatest number of heights of a seabed."""
 
 
 class WorldError(ValueError):
-    """A world that is not possible: one sentence that states where, what and what to do."""
+    """World that is not possible; the message states in one sentence where, what and what to do."""
 
 
 def _within(low: float, high: float) -> AfterValidator:
@@ -79,23 +79,23 @@ NonNegative3 = Annotated[Vector3, _within(0.0, math.inf)]
 
 
 class Texture(Part):
-    """A pattern on a shape, drawn in the shape's own axes; a seabed's and a plane's lies in x and y."""
+    """Pattern on a shape, in the shape's own axes; on a seabed or a plane, in x and y."""
 
     kind: Literal["checker", "stripes", "tiles", "mottled", "picture", "tag"]
-    """Squares of two colours; bands along z; tiles with joints; patches of random brightness, as sand has; a picture or
-    a printed tag in the middle of each face, upright along z, on faces across z along y."""
+    """Squares of two colours; bands along z; tiles with joints; patches of random brightness, like sand; a
+    picture or a printed tag in the middle of each face, upright along z, on horizontal faces along y."""
     size: Annotated[float, Field(strict=True, ge=1e-4, le=1e6)]
-    """Size of a square, a pair of bands, a tile, a patch; width of a picture; edge of a tag's black border [m]."""
+    """Size of a square, a pair of bands, a tile or a patch; width of a picture; edge of a tag's black border [m]."""
     file: str | None = None
-    """File of a picture: PNG or JPEG beside the world file."""
+    """File of a picture: PNG or JPEG in the folder of the world file."""
     tag: Annotated[int, Field(strict=True, ge=0)] | None = None
-    """Number of a tag in its family."""
+    """Id of a tag in its family."""
     family: str = "apriltag_36h11"
     """Family of a tag: one of OpenCV's dictionaries, such as `apriltag_36h11` or `4x4_50`."""
     colour: Colour = Field(default_factory=lambda: zeros(3))
     """Colour of every other square or band, and of joints, which are 6 % of a tile wide."""
     contrast: Probability = 0.3
-    """Contrast of patches: greatest change of brightness as a share of it; of tiles: from tile to tile."""
+    """Contrast of patches: greatest relative change of brightness; of tiles: between tiles."""
 
     @model_validator(mode="after")
     def _complete(self) -> Texture:
@@ -119,14 +119,14 @@ class Finish(Part):
 
 
 class Variation(Part):
-    """Ranges by which an object's pose and size differ from the file, by world; poses are drawn uniformly."""
+    """Ranges in which an object's pose and size vary between worlds; poses are drawn uniformly."""
 
     position: NonNegative3 = Field(default_factory=lambda: zeros(3))
-    """Largest shift along x, y, z of its frame [m]."""
+    """Largest shift along x, y, z of the object's frame [m]."""
     yaw: NonNegative = 0.0
-    """Largest turn about z of its frame [rad]."""
+    """Largest rotation about z of the object's frame [rad]."""
     size: Annotated[float, Field(strict=True, ge=1.0, le=4.0)] = 1.0
-    """Largest factor by which it, and all that is in its frame, is drawn greater or smaller, log-uniformly."""
+    """Largest factor by which the object, and everything in its frame, is scaled up or down, log-uniformly."""
 
 
 class Repeat(Part):
@@ -147,11 +147,11 @@ SIZES = {
     "model": {"file"},
     "group": set(),
 }
-"""Kind of shape -> keys that it needs."""
+"""Kind of shape -> required keys."""
 
 
 class Object(Finish):
-    """A shape with its pose, or a group that is the frame of others."""
+    """Shape with its pose, or a group that is the frame of other objects."""
 
     shape: Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh", "model", "group"]
     position: Vector3
@@ -159,25 +159,25 @@ class Object(Finish):
     orientation: Quaternion | None = None
     """q_world<shape> (or q_frame<shape>), xyzw; at most one of orientation, axis and yaw."""
     axis: Vector3 | None = None
-    """Direction of the shape's z axis: along a cylinder or capsule, out of a plane; any length but 0 [-]."""
+    """Direction of the shape's z axis: along a cylinder or capsule, normal to a plane; any length but 0 [-]."""
     yaw: Number | None = None
-    """Turn about z [rad]."""
+    """Rotation about z [rad]."""
     frame: str | None = None
-    """An object before this one: this one's position is in its axes, and it moves with it."""
+    """Name of an earlier object: the position is in that object's axes, and this object moves with it."""
     size: Positive3 | None = None
     """Size of a box, along its axes [m]."""
     radius: Positive | None = None
-    """[m]"""
+    """Radius of a sphere, capsule or cylinder [m]."""
     length: Positive | None = None
     """Length of the cylinder, or of the straight part of a capsule [m]."""
     file: str | None = None
-    """Beside the world file: STL of a mesh [m]; of a model MJCF (.xml) or URDF (.urdf)."""
+    """File in the folder of the world file: STL of a mesh [m]; MJCF (.xml) or URDF (.urdf) of a model."""
     scale: Positive | None = None
     """Factor on the file's coordinates."""
     vary: Variation | None = None
     repeat: Repeat | None = None
     solid: bool = True
-    """True if vehicles collide with it; no meaning for a group."""
+    """True if vehicles collide with the object; not used for a group."""
 
     @model_validator(mode="after")
     def _complete(self) -> Object:
@@ -198,8 +198,8 @@ class Object(Finish):
 
     @property
     def quaternion(self) -> Array:
-        """Return the quaternion from shape to its frame, xyzw, (4,); a shape with an axis is turned to it the shortest
-        way."""
+        """Return the quaternion from the shape to its frame, xyzw, (4,); with an axis, the smallest rotation
+        of z to it."""
         if self.orientation is not None:
             return self.orientation
         if self.axis is None:
@@ -219,7 +219,7 @@ class Object(Finish):
 
 
 class WorldBasin(Finish):
-    """A rectangular tank: floor and four walls that reach above the water, centred on the world's z axis."""
+    """Rectangular tank: floor and four walls that extend above the water, centred on the world's z axis."""
 
     size: Positive3
     """Inner length along x, width along y, depth of the water [m]."""
@@ -228,29 +228,31 @@ class WorldBasin(Finish):
 
 
 class Roughness(Part):
-    """Heights as a sum of 48 sine waves of random direction and phase, amplitudes in proportion to their lengths."""
+    """Heights as a sum of 48 sine waves of random direction and phase, with amplitudes proportional to their
+    wavelengths."""
 
     rms: Positive
     """Root mean square of the height [m]."""
     wavelength: Positive
-    """The longest; the shortest is an eighth of it [m]."""
+    """Longest wavelength; the shortest is an eighth of it [m]."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
 
 
 class Seabed(Finish):
-    """The bottom: a plane, or a heightfield of a slope, roughness and a table of heights, which add up."""
+    """Seabed: a plane, or a heightfield of a slope, roughness and a table of heights, which are added."""
 
     depth: Positive
-    """Below the surface at x = y = 0, of the plane that the heights are added to [m]."""
+    """Depth at x = y = 0 of the plane to which heights are added [m]."""
     slope: Pair = (0.0, 0.0)
     """Slopes dz/dx, dz/dy of that plane [-]."""
     size: Pair | None = None
-    """Extent along x and y about the origin [m]; without it the bottom is a plane without end."""
+    """Extent along x and y about the origin [m]; None: an infinite plane."""
     spacing: Positive = 0.5
-    """Between heights [m]."""
+    """Distance between heights [m]."""
     roughness: Roughness | None = None
     heights: str | None = None
-    """CSV beside the world file: heights [m], one row for each y from least to greatest, stretched over `size`."""
+    """CSV file in the folder of the world file: heights [m], one row for each y in ascending order, stretched
+    over `size`."""
 
     @model_validator(mode="after")
     def _extent(self) -> Seabed:
@@ -276,40 +278,40 @@ JERLOV = {
     "7C": (0.480, 0.460, 0.710),
     "9C": (0.600, 0.630, 1.230),
 }
-"""Attenuation of downward daylight K_d at 600, 550 and 475 nm [1/m] (Jerlov, Marine Optics, 1976, table XXVII, as two
-public programs have it, which agree), for red, green and blue."""
+"""Attenuation of downward daylight K_d at 600, 550 and 475 nm [1/m] (Jerlov, Marine Optics, 1976, table
+XXVII, as in two public programs, which agree), for red, green and blue."""
 BEAM_OVER_DAYLIGHT = 1.5
-"""Beam attenuation over K_d if only a water type is given. A choice: the table has none, and most light that scatters
-forwards still arrives near its pixel, so a picture fades by less than a + b."""
+"""Ratio of beam attenuation to K_d if only a water type is given. A choice: the table contains none, and most
+light that scatters forwards still arrives near its pixel, so a picture fades by less than a + b."""
 
 
 class Snow(Part):
-    """Marine snow: particles in the water, lit by daylight and lamps; cameras see those near them."""
+    """Marine snow: particles in the water, lit by daylight and lamps, and visible near the camera."""
 
     density: Annotated[float, Field(strict=True, gt=0.0, le=1e5)]
-    """[1/m³]"""
+    """Number of particles per volume [1/m³]."""
     size: Annotated[float, Field(strict=True, gt=0.0, le=0.05)] = 0.001
-    """Diameter [m]."""
+    """Diameter of a particle [m]."""
 
 
 class WorldWater(Part):
-    """Water as light and sound meet it, the same everywhere in a world."""
+    """Optical and acoustic properties of the water, uniform in a world."""
 
     jerlov: Literal["I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"] | None = None
-    """Jerlov's water type: gives daylight_attenuation, and 1.5 times that as attenuation, where they are not given."""
+    """Jerlov's water type: sets daylight_attenuation, and attenuation to 1.5 times that, unless they are given."""
     snow: Snow | None = None
     attenuation: NonNegative3
     """Beam attenuation c of red, green, blue [1/m], (3,)."""
     veil: NonNegative3
-    """Radiance B [-] of water without end just below the surface: backscattered daylight, (3,)."""
+    """Radiance B [-] of infinitely deep water just below the surface: backscattered daylight, (3,)."""
     daylight_attenuation: NonNegative3
-    """K_d: daylight at depth h is exp(-K_d h) of that just below the surface [1/m], at most c, (3,)."""
+    """K_d [1/m], at most c: daylight at depth h is exp(-K_d h) times that just below the surface, (3,)."""
     temperature: Annotated[float, Field(strict=True, ge=-2.0, le=40.0)] = 15.0
-    """[°C], for the speed and the absorption of sound."""
+    """Temperature, for the speed and absorption of sound [°C]."""
     salinity: Annotated[float, Field(strict=True, ge=0.0, le=42.0)] = 0.0
-    """[g/kg], for the same."""
+    """Salinity, for the speed and absorption of sound [g/kg]."""
     vary: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
-    """Largest factor by which c and K_d of a world are drawn greater or smaller, log-uniformly."""
+    """Largest factor by which c and K_d vary between worlds, up or down, log-uniformly."""
 
     @model_validator(mode="before")
     @classmethod
@@ -330,7 +332,7 @@ class WorldWater(Part):
 
     @property
     def optical(self) -> WaterOptics:
-        """Return the water in the form of the overhead camera."""
+        """Return the water's optics in the form used by the overhead camera."""
         from finssim.sim.overhead_camera import WaterOptics  # which imports Warp
 
         return WaterOptics(attenuation=_triple(self.attenuation), veil=_triple(self.veil))
@@ -345,17 +347,17 @@ class WorldWater(Part):
         return 1449.2 + 4.6 * T - 0.055 * T**2 + 0.00029 * T**3 + (1.34 - 0.010 * T) * (S - 35.0)
 
     def sound_absorption(self, frequency: float, depth: float = 0.0) -> float:
-        """Absorption of sound [dB/m] (Ainslie & McColm 1998, at pH 8).
+        """Return the absorption of sound [dB/m] (Ainslie & McColm 1998, at pH 8).
 
         alpha = 0.106 f1 f²/(f1² + f²) + 0.52 (1 + T/43) (S/35) f2 f²/(f2² + f²) e^(-z/6)
                 + 0.00049 f² e^(-(T/27 + z/17))
 
-        in dB/km, with f in kHz, z in km, f1 = 0.78 sqrt(S/35) e^(T/26) of boric acid and f2 = 42 e^(T/17) of magnesium
-        sulphate; the last term is that of the water itself.
+        in dB/km, with f in kHz, z in km, f1 = 0.78 sqrt(S/35) e^(T/26) of boric acid and f2 = 42 e^(T/17) of
+        magnesium sulphate; the last term is that of the water itself.
 
         Args:
-            frequency: [Hz].
-            depth: [m].
+            frequency: Frequency [Hz].
+            depth: Depth [m].
         """
         T, S, f, z = self.temperature, self.salinity / 35.0, frequency / 1e3, depth / 1e3
         boric, sulphate = 0.78 * math.sqrt(S) * math.exp(T / 26.0), 42.0 * math.exp(T / 17.0)
@@ -366,25 +368,25 @@ class WorldWater(Part):
 
 
 class LightVariation(Part):
-    """Ranges of daylight, drawn by world."""
+    """Ranges in which daylight varies between worlds."""
 
     brightness: Annotated[float, Field(strict=True, ge=1.0, le=10.0)] = 1.0
-    """Largest factor by which daylight, veil and sky are drawn brighter or darker, log-uniformly."""
+    """Largest factor by which daylight, veil and sky are scaled up or down, log-uniformly."""
     sun: Annotated[float, Field(strict=True, ge=0.0, le=math.pi)] = 0.0
-    """Largest turn of the sun about the vertical, and in height, uniformly [rad]; it stays 5° above the horizon."""
+    """Largest change of the sun's azimuth and elevation, uniformly [rad]; it stays 5° above the horizon."""
 
 
 class Light(Part):
     """Daylight just below the surface."""
 
     daylight: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
-    """Irradiance of a level surface [-], relative to that which gives white paper radiance 1, (3,)."""
+    """Irradiance of a horizontal surface [-], relative to the irradiance at which white paper has radiance 1, (3,)."""
     sun: Vector3 = Field(default_factory=lambda: zeros(3) + np.array([0.3, 0.2, 0.93]))
     """Direction towards the sun as seen from below the surface, any length but 0 [-], (3,)."""
     diffuse: Probability = 0.5
-    """Share of the irradiance that comes evenly from above rather than from the sun."""
+    """Fraction of the irradiance that is diffuse from above rather than direct from the sun [-]."""
     sky: NonNegative3 = Field(default_factory=lambda: zeros(3) + 1.0)
-    """Radiance [-] of the sky, or the ceiling, as seen through the surface from below, (3,)."""
+    """Radiance [-] of the sky or ceiling, seen from below through the surface, (3,)."""
     vary: LightVariation = Field(default_factory=lambda: LightVariation())
 
     @model_validator(mode="after")
@@ -395,25 +397,25 @@ class Light(Part):
 
 
 class Contact(Part):
-    """Stiffness of basin, seabed and objects at a hull's points of contact: spring, damper and friction."""
+    """Contact of the hull with basin, seabed and objects: spring, damper and friction."""
 
     stiffness: Positive = 4000.0
-    """Per corner, or sphere, of the hull [N/m]."""
+    """Stiffness per corner, or sphere, of the hull [N/m]."""
     damping: NonNegative = 100.0
-    """Against approach [N s/m]."""
+    """Damping of the approach speed [N s/m]."""
     friction: NonNegative = 0.2
-    """Coulomb coefficient [-]."""
+    """Coulomb friction coefficient [-]."""
 
 
 class Viewpoint(Part):
-    """Pose from which `finssim worlds show` draws, and where a vehicle may start."""
+    """Viewpoint of `finssim worlds show`, and possible start of a vehicle."""
 
     position: Vector3
-    """[m]"""
+    """Position, world frame [m]."""
     yaw: Number = 0.0
-    """[rad]"""
+    """Yaw [rad]."""
     pitch: Number = 0.0
-    """[rad], nose down is positive."""
+    """Pitch, positive nose down [rad]."""
 
     @property
     def pose(self) -> Array:
@@ -422,21 +424,22 @@ class Viewpoint(Part):
 
 
 class Look(Part):
-    """Another look of a site, which a draw may give a world: water and surfaces in place of the file's own."""
+    """Alternative appearance of a site that a draw may select: water and surfaces in place of the file's own."""
 
     water: WorldWater | None = None
-    """For light alone: sound keeps the file's temperature and salinity."""
+    """Water for light only: sound uses the file's temperature and salinity."""
     surfaces: dict[str, Finish] = Field(default_factory=dict)
     """Finish by the name of an object, or `seabed` or `basin`, for light and echoes."""
     held_out: Annotated[bool, Field(strict=True)] = False
-    """Never drawn in training: what is learnt can be tried there."""
+    """True if the look is never drawn in training, so that learned policies can be tested with it."""
 
 
 class World(Part):
-    """A site: what light, sound and hulls meet there. `name` and `path` come from the file's own path."""
+    """Site: geometry, surfaces and water that light, sound and hulls interact with. `name` and `path` come
+    from the file's path."""
 
     about: str
-    """One line for lists."""
+    """Description in one line, for lists."""
     water: WorldWater
     light: Light = Field(default_factory=lambda: Light())
     basin: WorldBasin | None = None
@@ -445,13 +448,13 @@ class World(Part):
     contact: Contact = Field(default_factory=lambda: Contact())
     viewpoint: Viewpoint
     looks: dict[str, Look] = Field(default_factory=dict)
-    """Looks by name; a draw takes the file's own look or one of these, with equal probability."""
+    """Looks by name; a draw selects the file's own look or one of these, with equal probability."""
     colour_vary: Annotated[float, Field(strict=True, ge=1.0, le=4.0)] = 1.0
-    """Largest factor by which colour and glow of each object are drawn darker or brighter, log-uniformly."""
+    """Largest factor by which colour and glow of each object vary, up or down, log-uniformly."""
     name: str = Field(exclude=True)
     path: Path = Field(exclude=True)
     _models: dict[str, list[ModelPart]] = PrivateAttr(default_factory=dict)
-    """Object -> its shapes from a model file, which is read once."""
+    """Object -> its shapes from a model file, cached after the first reading."""
 
     @model_validator(mode="after")
     def _objects_fit(self) -> World:
@@ -477,16 +480,16 @@ class World(Part):
         return self
 
     def beside(self, file: str, key: str) -> Path:
-        """A file that the world names: it lies beside the world file.
+        """Return the path of a file named in the world file, which lies in the same folder.
 
         Args:
             file: Its name, never a path.
-            key: Who names it, for messages.
+            key: Key that names it, for messages.
         """
         return self.path.parent / plain_name(file, f"{self.path}: {key}", WorldError)
 
     def mesh(self, name: str) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices [m], shape axes, (n, 3), and faces (m, 3) of an object from a file."""
+        """Return the vertices [m], shape axes, (n, 3), and faces (m, 3) of an object from a file."""
         item = self.objects[name]
         path = self.beside(item.file or "", f"objects.{name}: file")
         try:
@@ -496,7 +499,7 @@ class World(Part):
         return self._reachable(vertices * (item.scale or 1.0), f"objects.{name}"), faces
 
     def model(self, name: str) -> list[ModelPart]:
-        """The shapes of an object from a model file, unscaled, in the object's axes."""
+        """Return the shapes of an object from a model file, unscaled, in the object's axes."""
         from finssim.extensions.perception.parts import PartsError, parts_of
 
         if name in self._models:
@@ -520,7 +523,7 @@ class World(Part):
         return self._models[name]
 
     def seabed_heights(self) -> Array | None:
-        """z of the seabed on a grid over its size [m], (ny, nx), row 0 at the least y; None for a plane."""
+        """Return z of the seabed on a grid over its size [m], (ny, nx), row 0 at the least y; None for a plane."""
         bed = self.seabed
         if bed is None or bed.size is None:
             return None
@@ -539,7 +542,7 @@ class World(Part):
         return self._reachable(z, "seabed")
 
     def _reachable(self, places: Array, label: str) -> Array:
-        """The places themselves [m], unless one is farther than worlds are computed."""
+        """Return the positions [m]; refuse one that is farther away than the greatest computed distance."""
         if not np.abs(places).max() <= GREATEST:
             raise WorldError(
                 f"{self.path}: {label}: reaches {np.abs(places).max():g} m, expected up to {GREATEST:g} m"
@@ -560,22 +563,22 @@ class World(Part):
             )
         return table
 
-    # What an environment, a simulator and a virtual pool make of a world; see the classes that are returned.
+    # Objects that environments, simulators and virtual pools create from a world; see the returned classes.
 
     def layout(self, worlds: int = 1, device: str = "cpu") -> WorldLayout:
-        """Return copies of the world, in which vehicles collide with its solids."""
+        """Return copies of the world, with whose solid objects vehicles collide."""
         from finssim.extensions.perception.layout import WorldLayout
 
         return WorldLayout(self, worlds, device)
 
     def sight(self, task: Task, simulator: Simulator, arrays: TaskArrays, seed: int) -> Sight:
-        """Return the world around the vehicle of a task, and what its sensors measure of it."""
+        """Return the world around the vehicle of a task, with its sensors' measurements."""
         from finssim.extensions.perception.sight import Sight
 
         return Sight(task, self, simulator, arrays, seed)
 
     def drawn_for(self, task: Task, arrays: TaskArrays, seed: int) -> WorldBatch:
-        """Return one copy, drawn as for a task's first episode, whose goal is set to the landmark."""
+        """Return one copy of the world, drawn as for a task's first episode, with the task's goal at the landmark."""
         from finssim.extensions.perception.sight import drawn_for
 
         return drawn_for(task, self, arrays, seed)
@@ -587,14 +590,15 @@ class World(Part):
         return OnboardPlan(vehicle=vehicle, world=self, seed=seed, solid=solid)
 
     def onlooker(self, environment: Environment, world: int = 0, width: int = 640) -> Onlooker:
-        """Return a camera that follows a vehicle of an environment; the world is drawn around tasks without one."""
+        """Return a camera that follows a vehicle of an environment; for tasks without a world, the world is
+        drawn around them."""
         from finssim.extensions.perception.onlooker import Onlooker
 
         return Onlooker(environment, self, world, width)
 
 
 def _stretched(table: Array, shape: tuple[int, ...]) -> Array:
-    """A table interpolated linearly to another number of rows and columns."""
+    """Return a table interpolated linearly to another number of rows and columns."""
     columns = np.linspace(0.0, table.shape[1] - 1.0, shape[1])
     wide = np.stack([np.interp(columns, np.arange(table.shape[1]), row) for row in table])
     rows = np.linspace(0.0, table.shape[0] - 1.0, shape[0])
@@ -609,7 +613,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def sites() -> list[str]:
-    """Names of the worlds that come with FinsSim."""
+    """Return the names of the worlds in the catalogue."""
     return names_in(SITES)
 
 
@@ -620,7 +624,7 @@ def load_world(name_or_path: str | os.PathLike[str]) -> World:
         name_or_path: A site of the catalogue such as `pool`, or the path of a YAML file.
 
     Raises:
-        WorldError: Unknown name, or a file that is refused; the message says where, what and what to do.
+        WorldError: The name is unknown or the file is refused; the message states where, what and what to do.
     """
     path, label = locate(name_or_path, SITES, "site", WorldError)
     tree = read_tree(path, label, "water: {attenuation: [0.4, 0.1, 0.08]}", WorldError)

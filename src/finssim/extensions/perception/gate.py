@@ -33,17 +33,19 @@ HALF, BAR = wp.constant(0.75), wp.constant(0.045)
 
 @wp.func
 def in_gate(state: State, arrays: TaskArrays, w: int) -> wp.vec3:
-    """The body origin from the gate's middle, gate axes: x through it, z up [m]."""
+    """Return the position of the body origin relative to the gate's middle, gate axes: x through it, z up [m]."""
     return wp.quat_rotate_inv(arrays.goal_quaternion[w], state.position[w, 0] - arrays.goal_position[w])
 
 
 @wp.func
 def from_bar(a: wp.vec3, b: wp.vec3, half: wp.vec3) -> float:
-    """Between a box and a straight bar [m]: the box's signed distance is convex along it, so thirds of it are left out.
+    """Return the distance between a box and a straight bar [m].
+
+    The box's signed distance is convex along the bar: its minimum is found by ternary search.
 
     Args:
-        a: One end, box axes [m].
-        b: The other [m].
+        a: One end of the bar, box axes [m].
+        b: Other end of the bar, box axes [m].
         half: Half extents of the box [m].
     """
     low = float(0.0)
@@ -64,7 +66,7 @@ def from_bar(a: wp.vec3, b: wp.vec3, half: wp.vec3) -> float:
 
 @wp.func
 def clearance(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> float:
-    """Between the vehicle's envelope and the nearest bar [m]; negative where it touches."""
+    """Return the distance between the vehicle's envelope and the nearest bar [m]; negative if it touches."""
     q = wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0]
     foot = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, -HALF) - place)
     port_top = wp.quat_rotate_inv(q, wp.vec3(0.0, HALF, HALF) - place)
@@ -76,7 +78,7 @@ def clearance(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) 
 
 @wp.func
 def approach(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> float:
-    """Speed towards a point behind the gate's middle as a part of `cruise`, at most 1."""
+    """Return the speed towards a point behind the gate's middle as a fraction of `cruise`, at most 1."""
     v = wp.quat_rotate_inv(arrays.goal_quaternion[w], world_velocity(state, w, 0))
     way = wp.normalize(wp.vec3(p.behind + 0.5, 0.0, 0.0) - place)
     return wp.clamp(wp.dot(v, way) / p.cruise, -1.0, 1.0)
@@ -84,43 +86,37 @@ def approach(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -
 
 @wp.func
 def off_axis(p: Any, place: wp.vec3) -> float:
-    """Return how far the vehicle is outside the cone that leads to the gate's middle [m]."""
+    """Return the distance of the vehicle outside the cone that leads to the gate's middle [m]."""
     return wp.max(wp.length(wp.vec2(place[1], place[2])) - 0.1 - 0.4 * wp.max(-place[0], 0.0), 0.0)
 
 
 @wp.func
 def near_bar(p: Any, room: float) -> float:
-    """Return 1 where a bar is touched, falling to 0 at `near_scale` [m] from the nearest one."""
+    """Return 1 if a bar is touched, falling to 0 at `near_scale` [m] from the nearest one."""
     return wp.max(1.0 - room / p.reward.near_scale, 0.0)
 
 
 @wp.func
 def touches(room: float) -> bool:
-    """Return whether the vehicle's envelope meets a bar.
-
-    The clearance is `room` [m].
-    """
+    """Return whether the vehicle's envelope touches a bar, from the clearance `room` [m]."""
     return room < 0.0
 
 
 @wp.func
 def misses(place: wp.vec3) -> bool:
-    """Return whether the body origin went past the gate, outside of it.
-
-    It is at `place` in gate axes [m].
-    """
+    """Return whether the body origin, at `place` in gate axes [m], passed the gate's plane outside the gate."""
     return place[0] >= 0.0 and not wp.max(wp.abs(place[1]), wp.abs(place[2])) < HALF
 
 
 @wp.func
 def passes(p: Any, place: wp.vec3) -> bool:
-    """Return whether the body origin is `behind` the gate; `place` is in gate axes [m]."""
+    """Return whether the body origin is at least `behind` past the gate; `place` is in gate axes [m]."""
     return place[0] >= p.behind
 
 
 @wp.func
 def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) -> bool:
-    """Half a length from the surface or the floor, or farther from the gate than an episode can need.
+    """Return whether the vehicle is within half a length of surface or floor, or too far from the gate.
 
     `place` is in [m].
     """
@@ -131,7 +127,8 @@ def is_lost(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec3) ->
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Start at rest before the gate, beside its axis and turned a little; without a world the gate's pose is drawn."""
+    """Start at rest in front of the gate, off its axis and slightly turned; without a world the gate's pose
+    is drawn."""
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
     z = wp.randf(rng, -0.625 * p.depth, -0.4375 * p.depth)
@@ -147,11 +144,11 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class GateReward:
-    """Weights of the reward; d: how far the vehicle is off the cone before the gate [m], θ: the attitude error [rad].
+    """Weights of the reward; d: distance outside the cone in front of the gate [m], θ: attitude error [rad].
 
     r = progress · min(speed towards a point behind the gate / cruise, 1) - corridor · d - turn · θ
         - near · max(1 - clearance / near_scale, 0) - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4)
-        + passed - loss, once, behind the gate; where a bar is touched, or the gate or the water is left beside
+        + passed (once, behind the gate) - loss (once, if a bar is touched, the gate missed or the vehicle lost)
     """
 
     progress: float = 1.0
@@ -168,9 +165,9 @@ class GateReward:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate(SeeingTask):
-    """Pass the nearer gate of the site `gate`, whose pose, look and light differ in each episode.
+    """Pass the nearer gate of the site `gate`, whose pose, appearance and light differ in each episode.
 
-    A bar is touched where the vehicle's envelope meets it; that ends the episode, so no force is needed.
+    Touching a bar with the vehicle's envelope ends the episode, so no contact force is computed.
     """
 
     succeeds: ClassVar[str] = "passed"
@@ -187,19 +184,19 @@ class Gate(SeeingTask):
     time_limit: float = 25.0
     """Length of an episode [s]."""
     hull: HullNumbers = HullNumbers()
-    """Hull of the vehicle; the environment sets it, ..."""
+    """Hull of the vehicle, set by the environment."""
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
-    """... and half the extents of its envelope, which the body origin is the middle of as in contacts [m]."""
+    """Half extents of the vehicle's envelope about the body origin, as in contacts [m]."""
     depth: float = 3.2
     """Depth of the water [m]."""
     begin: tuple[float, float] = (2.0, 4.0)
-    """So far before the gate at the start [m], ..."""
+    """Range of the distance in front of the gate at the start [m]."""
     aside: float = 0.3
-    """... beside its axis, as a share of that, ..."""
+    """Largest lateral offset from the gate's axis at the start, relative to the distance [-]."""
     over: float = 0.3
-    """... above or below it [m] at most, ..."""
+    """Largest vertical offset from the gate's axis at the start [m]."""
     turn: float = math.radians(15.0)
-    """... turned from it by this at most [rad]."""
+    """Largest heading error at the start [rad]."""
     reward: GateReward = field(default_factory=GateReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Gate":
@@ -209,12 +206,12 @@ class Gate(SeeingTask):
 
     @property
     def cruise(self) -> float:
-        """Return the speed towards the gate that gets all of its reward [m/s]."""
+        """Return the speed towards the gate at which the progress reward is full [m/s]."""
         return 0.6 * self.hull.speed
 
     @property
     def behind(self) -> float:
-        """The gate is passed with the body origin so far behind it [m]."""
+        """Distance of the body origin behind the gate at which it is passed [m]."""
         return 0.5 * self.hull.length
 
     def success_rule(self) -> str:

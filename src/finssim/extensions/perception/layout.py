@@ -1,4 +1,5 @@
-"""Shapes of a world and their poses in each of its copies. It does not need Newton, since collisions read it alone."""
+"""Shapes of a world and their poses in each of its copies. Newton is not needed, so that collisions work
+without it."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -24,35 +25,35 @@ class Shape:
     kind: str
     """A key of `SIZES` but group, or heightfield."""
     owner: str
-    """Name of its object; `basin` or `seabed` for those, which no draw moves."""
+    """Name of its object; `basin` or `seabed` for the shapes that no draw moves."""
     finish: Finish
     rest: np.ndarray
-    """Its pose [m, quaternion], in the axes of the object that it moves with or of the world, (7,)."""
+    """Pose [m, quaternion] in the axes of `anchor` or of the world, (7,)."""
     anchor: int = -1
-    """Index of the drawn object that it moves with; -1: none."""
+    """Index of the varied object with which the shape moves; -1: none."""
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Half extents of a box or a heightfield; radius and half length of the round ones [m]."""
+    """Half extents of a box or a heightfield; radius and half length of spheres, capsules and cylinders [m]."""
     vertices: np.ndarray | None = None
     """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
-    """Faces by index of their corners, (m, 3)."""
+    """Vertex indices of each face, (m, 3)."""
     heights: np.ndarray | None = None
-    """Heights of a heightfield: z [m], (ny, nx), row 0 at the least y."""
+    """Heights z of a heightfield [m], (ny, nx), row 0 at the least y."""
 
 
 class WorldLayout:
     """Poses and looks of all shapes in N separate copies of a world.
 
     Args:
-        world: A site of the catalogue, a path, or a world.
-        worlds: How many copies.
-        device: Where their arrays are: cpu or cuda.
+        world: Name of a site in the catalogue, a path, or a world.
+        worlds: Number of copies.
+        device: Device of their arrays: cpu or cuda.
     """
 
     transforms: wp.array
     """Shape to world of every shape [m, quaternion]; transform (worlds, shapes)."""
     scales: wp.array
-    """Factor on the size of every shape [-]; float (worlds, shapes)."""
+    """Scale factor of every shape [-]; float (worlds, shapes)."""
     draws: wp.array
     """Number of draws of each world; int (worlds,)."""
 
@@ -60,9 +61,10 @@ class WorldLayout:
         self.world = world if isinstance(world, World) else load_world(world)
         self.worlds, self.device = worlds, wp.get_device(device)
         self._varied: list[tuple[Object, int, np.ndarray]] = []
-        """Each object that draws move, the one before it that it moves with, and its pose in the axes of that."""
+        """Each object that draws move, the index of the varied object with which it moves, and its pose in
+        the axes of that."""
         self._moved: dict[int, np.ndarray] = {}
-        """Poses of varied objects that were put elsewhere, (worlds, 7)."""
+        """Poses of varied objects that were moved explicitly, (worlds, 7)."""
         self._objects = self._placed()
         self.shapes = [*self._fixed_shapes(), *self._object_shapes()]
         self._anchor = np.array([shape.anchor for shape in self.shapes], int)
@@ -73,7 +75,8 @@ class WorldLayout:
         self._scale = np.ones((len(self._varied) + 1, worlds))
         sizes = sum(item.vary.size > 1.0 for item, _, _ in self._varied)
         self._first = np.cumsum([1, 4 * len(self._varied), len(self._owners), sizes, 3])
-        """Columns of what is drawn: the water; from these on poses, colours, sizes, light; last their number."""
+        """First column of the drawn poses, colours, sizes and light (the water is column 0), and the number
+        of columns."""
         self._drawn = np.zeros((worlds, self._first[-1]))
         self._look = np.zeros(worlds, int)
         self.transforms = wp.zeros((worlds, len(self.shapes)), dtype=wp.transform, device=self.device)
@@ -82,17 +85,17 @@ class WorldLayout:
         WorldLayout._place(self, np.arange(worlds))
 
     def layout(self, worlds: int, device: str) -> WorldLayout:
-        """Return itself: where a world is asked for, its copies may be given."""
+        """Return this layout, so that existing copies can be passed instead of a world."""
         return self
 
     def draw(self, seed: ArrayLike, mask: ArrayLike | None = None, held_out: bool = False) -> None:
-        """Draw poses of objects, water, look and colours of worlds; world w depends on its seed and w alone.
+        """Draw poses of objects, water, look and colours of worlds; world w depends only on its seed and w.
 
         Args:
             seed: Seed of the draw, one for all worlds or one for each.
-            mask: Which worlds; all if None. (worlds,)
-            held_out: From the looks that the file holds out of training, in place of the others; the file's own look
-                where it holds out none.
+            mask: Worlds to draw; all if None. (worlds,)
+            held_out: Draw from the looks that the file holds out of training instead of the others; without any,
+                the file's own look.
         """
         rows = np.arange(self.worlds) if mask is None else np.flatnonzero(np.asarray(mask))
         if not len(rows):
@@ -114,7 +117,8 @@ class WorldLayout:
 
     @property
     def drawn(self) -> np.ndarray:
-        """Return the drawn numbers of the worlds, for another batch of the same world, (worlds, numbers)."""
+        """Return the drawn numbers of the worlds, with which another batch of the same world can be set,
+        (worlds, numbers)."""
         return np.column_stack([self._drawn, self._look])
 
     @drawn.setter
@@ -123,7 +127,7 @@ class WorldLayout:
         self._place(np.arange(self.worlds))
 
     def copy_draw(self, other: WorldLayout, world: int) -> None:
-        """Draw all worlds as one of another layout is drawn, whose world has the first of this one's objects."""
+        """Set all worlds to the draw of one world of another layout, whose objects are the first of this one's."""
         self._drawn[:], self._look[:] = 0.0, other._look[world]
         own, theirs = (np.concatenate([[0], layout._first]) for layout in (self, other))
         for here, there, count in zip(own, theirs, np.diff(theirs), strict=False):
@@ -131,24 +135,24 @@ class WorldLayout:
         self._place(np.arange(self.worlds))
 
     def move(self, name: str, poses: ArrayLike) -> None:
-        """Move an object that varies, with everything in its frame, to given poses.
+        """Move a varied object, with everything in its frame, to given poses.
 
         Args:
-            name: Of the object.
+            name: Name of the object.
             poses: Position [m] and attitude xyzw, world frame, (7,) or (worlds, 7).
         """
         self._moved[self._objects[name][0]] = np.broadcast_to(np.asarray(poses, float), (self.worlds, 7))
         self._place(np.arange(self.worlds))
 
     def _place(self, rows: np.ndarray) -> None:
-        """Set the poses of some worlds, (k,), from what is drawn of them.
+        """Set the poses of some worlds, (k,), from their drawn numbers.
 
-        Drawn are numbers in [-1, 1]: of the water, four of each varied object, of each object's colour, of each size
-        that varies, and three of the light.
+        The numbers are in [-1, 1]: one for the water, four for each varied object, one for each object's
+        colour and each size that varies, and three for the light.
         """
         drawn, n = self._drawn[rows], len(rows)
         frames = np.zeros((len(self._varied) + 1, n, 7))
-        frames[:, :, 6] = 1.0  # the last is the world's
+        frames[:, :, 6] = 1.0  # the last one is the world frame
         scale, size = np.ones((len(self._varied) + 1, n)), self._first[2]
         for i, (item, anchor, rest) in enumerate(self._varied):
             drawn_pose = drawn[:, 1 + 4 * i : 5 + 4 * i]
@@ -172,14 +176,16 @@ class WorldLayout:
         self.draws.assign(draws)
 
     def poses(self, name: str) -> np.ndarray:
-        """Position [m] and attitude xyzw of an object, of a row its first shape, world frame, (worlds, 7)."""
+        """Return position [m] and attitude xyzw of an object, or of the first shape of a row, world frame,
+        (worlds, 7)."""
         anchor, rest = self._objects[name]
         return _compose(self._frames[anchor], rest, self._scale[anchor])
 
     # ---- set-up
 
     def _placed(self) -> dict[str, tuple[int, np.ndarray]]:
-        """Objects by name: which varied one each moves with, and its pose in the axes of that, undrawn."""
+        """Return the objects by name: index of the varied object with which each moves, and its pose in the
+        axes of that."""
         objects: dict[str | None, tuple[int, np.ndarray]] = {None: (-1, _pose([0, 0, 0]))}
         for name, item in self.world.objects.items():
             anchor, frame = objects[item.frame]
@@ -192,7 +198,7 @@ class WorldLayout:
         return objects
 
     def _fixed_shapes(self) -> Iterator[Shape]:
-        """Basin and seabed, which no draw moves."""
+        """Yield the shapes of basin and seabed, which no draw moves."""
         basin, bed = self.world.basin, self.world.seabed
         if basin is not None:
             (length, width, depth), t = basin.size, WALL
@@ -218,7 +224,7 @@ class WorldLayout:
             yield Shape(kind="heightfield", owner="seabed", finish=bed, rest=rest, size=size, heights=heights)
 
     def _object_shapes(self) -> Iterator[Shape]:
-        """The shapes of the objects, in their order."""
+        """Yield the shapes of the objects, in their order."""
         for name, item in self.world.objects.items():
             if item.shape == "group":
                 continue
@@ -230,7 +236,7 @@ class WorldLayout:
                     yield replace(part, rest=_compose(_compose(rest, turned), part.rest), anchor=anchor)
 
     def _parts(self, name: str, item: Object) -> list[Shape]:
-        """The shapes of one object, in its axes."""
+        """Return the shapes of one object, in its axes."""
         if item.shape == "model":
             factor, shapes = item.scale or 1.0, []
             for part in self.world.model(name):
@@ -255,16 +261,17 @@ class WorldLayout:
 
 
 def _pose(position: ArrayLike, quaternion: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> np.ndarray:
-    """Position and attitude xyzw in one row, (7,)."""
+    """Return position and attitude xyzw as one row, (7,)."""
     return np.concatenate([np.asarray(position, float), np.asarray(quaternion, float)])
 
 
 def _compose(outer: np.ndarray, inner: np.ndarray, scale: ArrayLike = 1.0) -> np.ndarray:
-    """Pose of `inner`, which is given in the axes of `outer`, in the axes that `outer` is given in, (..., 7).
+    """Return the pose of `inner`, which is given in the axes of `outer`, in the reference axes of `outer`,
+    (..., 7).
 
     Args:
-        outer: (..., 7).
-        inner: Its position is multiplied by `scale`, (..., 7).
+        outer: Pose of the outer frame, (..., 7).
+        inner: Pose in the outer frame; its position is multiplied by `scale`, (..., 7).
         scale: Factor [-], (...).
     """
     q, way = outer[..., 3:], np.asarray(scale)[..., None] * inner[..., :3]
@@ -273,7 +280,8 @@ def _compose(outer: np.ndarray, inner: np.ndarray, scale: ArrayLike = 1.0) -> np
 
 
 def _uniform(seeds: np.ndarray, worlds: np.ndarray, count: int) -> np.ndarray:
-    """Numbers in [0, 1) by seed and world, (k, count): the counter-based generator SplitMix64 (Steele et al. 2014)."""
+    """Return numbers in [0, 1) by seed and world, (k, count): counter-based generator SplitMix64 (Steele et
+    al. 2014)."""
 
     def mixed(x: np.ndarray) -> np.ndarray:
         x = x + np.uint64(0x9E3779B97F4A7C15)

@@ -1,4 +1,4 @@
-"""Copies of one world side by side, as Newton's ray caster takes them, with what light and sound find on each shape."""
+"""Copies of one world side by side for Newton's ray caster, with the optical and acoustic properties of each shape."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
 
 SIDE = 256
-"""Pixels along each side of every picture, whatever its proportions."""
+"""Pixels along each side of every stored picture, whatever its aspect ratio."""
 PAPER, INK = 0.85, 0.04
-"""Reflectance of a tag's white and black."""
+"""Reflectances of a tag's white and black."""
 
 
 def picture_of(world: World, texture: Texture) -> tuple[np.ndarray, float, float]:
-    """A texture's picture.
+    """Return a texture's picture.
 
     Args:
-        world: Its file lies beside the picture's.
-        texture: Of kind picture or tag.
+        world: World whose file lies in the same folder as the picture.
+        texture: Texture of kind picture or tag.
 
     Returns:
         Reflectance of red, green, blue, row 0 at the top, (SIDE, SIDE, 3); width [m]; height over width [-].
@@ -66,7 +66,7 @@ def picture_of(world: World, texture: Texture) -> tuple[np.ndarray, float, float
 
 
 def _tag(cv2, world: World, texture: Texture) -> np.ndarray:
-    """Cells of a tag within and with its black border, True where white, row 0 at the top, (n, n)."""
+    """Return the cells of a tag including its black border, True for white, row 0 at the top, (n, n)."""
     code = getattr(cv2.aruco, f"DICT_{texture.family.upper()}".replace("APRILTAG_36H", "APRILTAG_36h"), None)
     dictionary = cv2.aruco.getPredefinedDictionary(code) if code is not None else None
     if dictionary is None or texture.tag >= len(dictionary.bytesList):
@@ -86,9 +86,9 @@ class Surface:
     colour: wp.vec3  # diffuse reflectance
     second: wp.vec3  # reflectance of every other square or band, and of joints
     texture: int  # a value of TEXTURES
-    size: float  # of the pattern [m]
-    contrast: float  # of a picture: its height over its width
-    picture: int  # which
+    size: float  # size of the pattern [m]
+    contrast: float  # contrast of the pattern; of a picture, its height over its width
+    picture: int  # index of the picture
     backscatter: float  # Lambert's parameter mu [-]
     glow: wp.vec3  # emitted radiance [-]
     inverse: wp.transform  # from world axes to the shape's [m, quaternion]
@@ -96,14 +96,14 @@ class Surface:
 
 @wp.struct
 class Optics:
-    """Water and daylight, by world where they differ."""
+    """Water and daylight, per world where they differ."""
 
     attenuation: wp.array(dtype=wp.vec3)  # c [1/m]
     daylight_attenuation: wp.array(dtype=wp.vec3)  # K_d [1/m]
     veil: wp.array(dtype=wp.vec3)  # B just below the surface [-]
-    daylight: wp.array(dtype=wp.vec3)  # irradiance there [-]
-    sun: wp.array(dtype=wp.vec3)  # unit vector towards it
-    diffuse: float  # share of the irradiance from everywhere above
+    daylight: wp.array(dtype=wp.vec3)  # irradiance just below the surface [-]
+    sun: wp.array(dtype=wp.vec3)  # unit vector towards the sun
+    diffuse: float  # diffuse fraction of the irradiance
     sky: wp.array(dtype=wp.vec3)  # radiance through the surface [-]
     snow: float  # particles per volume [1/m³]
     snow_size: float  # their diameter [m]
@@ -111,7 +111,7 @@ class Optics:
 
 @wp.struct
 class RayScene:
-    """Everything that light and sound meet in all worlds."""
+    """Optical and acoustic scene of all worlds, for ray kernels."""
 
     optics: Optics
     surfaces: wp.array(dtype=Surface)  # by shape
@@ -126,8 +126,8 @@ class WorldBatch(WorldLayout):
         batch.draw(seed=1)
 
     Args:
-        world: A site of the catalogue, a path, or a world.
-        worlds: How many copies.
+        world: Name of a site in the catalogue, a path, or a world.
+        worlds: Number of copies.
         device: Compute device: cpu or cuda.
     """
 
@@ -140,7 +140,7 @@ class WorldBatch(WorldLayout):
         self._add_shapes(single)
         builder.replicate(single, worlds)
         with wp.ScopedDevice(self.device), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of collisions between seabeds, which are not asked for
+            warnings.simplefilter("ignore")  # about collisions between seabeds, which are not used
             self.model = builder.finalize(device=self.device)
             self.state = self.model.state()
         self._sizes = self.model.shape_scale.numpy().copy()
@@ -167,7 +167,7 @@ class WorldBatch(WorldLayout):
         self._place(np.arange(worlds))
 
     def _place(self, rows: np.ndarray) -> None:
-        """Set water, surfaces and poses of some worlds, (k,), from what is drawn of them; see `WorldLayout`."""
+        """Set water, surfaces and poses of some worlds, (k,), from their drawn numbers; see `WorldLayout`."""
         super()._place(rows)
         drawn, look = self._drawn[rows], self._look[rows]
         waters = [
@@ -252,7 +252,7 @@ class WorldBatch(WorldLayout):
         return optics
 
     def _surfaces(self, look: Look | None) -> np.ndarray:
-        """The surfaces of one world's shapes in a look, poses left out."""
+        """Return the surfaces of one world's shapes in a look, without poses."""
         table = np.zeros(len(self.shapes), Surface.numpy_dtype())
         for row, shape in zip(table, self.shapes, strict=True):
             other = look.surfaces.get(shape.owner) if look is not None else None
@@ -270,14 +270,15 @@ class WorldBatch(WorldLayout):
         return table
 
     def sensors(self, vehicle: Vehicle, names: Sequence[str], seed: int) -> OnboardSensors:
-        """Return some of a vehicle's cameras and sonars in this world, which must be one; see `OnboardSensors`."""
+        """Return some of a vehicle's cameras and sonars in this batch, which must contain one world; see
+        `OnboardSensors`."""
         from finssim.extensions.perception.onboard import OnboardSensors
 
         return OnboardSensors(vehicle, self, names=names, seed=seed)
 
 
 def _suns(light: Light, drawn: np.ndarray) -> np.ndarray:
-    """Unit vectors towards the sun by numbers in [-1, 1], of its turn and its height, (k, 2); (k, 3)."""
+    """Return unit vectors towards the sun, (k, 3), from numbers in [-1, 1] for azimuth and elevation, (k, 2)."""
     x, y, z = light.sun / np.linalg.norm(light.sun)
     turn = math.atan2(y, x) + light.vary.sun * drawn[:, 0]
     lowest = min(math.radians(5.0), math.asin(z))
@@ -286,7 +287,8 @@ def _suns(light: Light, drawn: np.ndarray) -> np.ndarray:
 
 
 def _grain(side: int = 256, patches: int = 16) -> np.ndarray:
-    """A periodic random field of mean 0 and standard deviation 0.5 whose power falls with frequency, (side, side)."""
+    """Return a periodic random field of mean 0 and standard deviation 0.5 with falling power spectrum, (side,
+    side)."""
     random = np.random.default_rng(0)
     frequency = np.fft.fftfreq(side, 1.0 / side)
     cycles = np.hypot(frequency[:, None], frequency)

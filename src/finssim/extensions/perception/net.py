@@ -30,22 +30,22 @@ from finssim.tasks.terms import (
 from finssim.vehicles import Vehicle
 
 FOOT = 6.9
-"""Depth of the sinker tube along the net's foot, in the site `net` [m]."""
+"""Depth of the sinker tube along the net's lower edge, in the site `net` [m]."""
 RANGE_SCALE = 0.5
-"""The range below less the set height is divided by this in the observation [m]."""
+"""Scale of the range below minus the set height in the observation [m]."""
 BLEND = wp.constant(0.05)
-"""Two sides of the net are nearly as near where their distances differ by less than about this [m]."""
+"""Length scale of the blend between two sides of the net with similar distances [m]."""
 AHEAD = (0.0, 0.5, 1.0)
-"""The teacher sees the line so far to the left along the net [m]."""
+"""Distances along the net, to the left, at which the teacher observes the line [m]."""
 
 
 @wp.func
 def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
-    """Return the position of a point relative to the net: way to its nearest point along x and y of the goal's axes,
-    height z [m], and the heading that faces the net there [rad].
+    """Return the position of a point relative to the net: vector to its nearest point along x and y of the
+    goal's axes, height z [m], and the heading that faces the net there [rad].
 
-    The net hangs straight down along the line through `reference`; its first and last side go on without end. Where
-    two sides are nearly as near, the heading is between those that face the two.
+    The net hangs vertically along the line through `reference`; its first and last side are extended without
+    end. If two sides have similar distances, the heading is between those that face the two.
     """
     place = wp.quat_rotate_inv(arrays.goal_quaternion[w], x - arrays.goal_position[w])
     last = arrays.reference.position.shape[1] - 2
@@ -63,7 +63,8 @@ def by_net(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def to_side(arrays: TaskArrays, w: int, k: int, last: int, place: wp.vec3) -> wp.vec2:
-    """Return the way from a point to the nearest of one of the net's sides, along x and y of the goal's axes [m]."""
+    """Return the vector from a point to the nearest point of one of the net's sides, along x and y of the
+    goal's axes [m]."""
     a = arrays.reference.position[w, k]
     d = arrays.reference.position[w, k + 1] - a
     side = wp.vec2(d[0], d[1])
@@ -90,14 +91,14 @@ def distance_now(place: wp.vec4) -> float:
 
 @wp.func
 def facing(arrays: TaskArrays, w: int, place: wp.vec4) -> wp.quat:
-    """Attitude that faces the net, to world."""
+    """Return the attitude that faces the net, to world."""
     return arrays.goal_quaternion[w] * wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), place[3])
 
 
 @wp.func
 def ahead(arrays: TaskArrays, p: Any, w: int, k: int) -> vec6:
-    """Return the line along the net, `ahead` [k] to the left of the vehicle: the way there [m], and its direction, body
-    frame."""
+    """Return the point of the line along the net that is `ahead[k]` to the left of the vehicle: the vector to
+    it [m] and the direction that faces the net there, body frame."""
     x = arrays.position[w, 0]
     left = wp.quat_rotate(facing(arrays, w, by_net(arrays, w, x)), wp.vec3(0.0, 1.0, 0.0))
     x += p.ahead[k] * left
@@ -113,17 +114,19 @@ def ahead(arrays: TaskArrays, p: Any, w: int, k: int) -> vec6:
 
 @wp.func
 def misfacing(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
-    """Angle of the rotation from the vehicle's attitude to the one that faces the net [rad], in [0, π]."""
+    """Return the angle of the rotation from the vehicle's attitude to the one that faces the net [rad], in [0, π]."""
     d = wp.quat_inverse(state.quaternion[w, 0]) * facing(arrays, w, place)
     return 2.0 * wp.atan2(wp.length(wp.vec3(d[0], d[1], d[2])), wp.abs(d[3]))
 
 
 @wp.func
 def touches(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Return whether the vehicle's envelope, seen from above, comes as near to a side as growth on the net extends.
+    """Return whether the vehicle's envelope, seen from above, is within the thickness of the growth from a
+    side of the net.
 
-    It does not where along one of these directions there is more between the two: the nearest way from the vehicle's
-    middle to the side, the side's normal, those of the envelope's own edges.
+    By the separating axis test: it is not if the gap between the two is larger along one of these directions:
+    from the vehicle's middle to the nearest point of the side, the side's normal, or the edges of the
+    envelope.
     """
     place = wp.quat_rotate_inv(arrays.goal_quaternion[w], state.position[w, 0] - arrays.goal_position[w])
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.goal_quaternion[w]) * state.quaternion[w, 0])
@@ -154,7 +157,7 @@ def touches(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def along_speed(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> float:
-    """Speed to the left along the net [m/s]."""
+    """Return the speed to the left along the net [m/s]."""
     v = wp.quat_rotate_inv(facing(arrays, w, place), world_velocity(state, w, 0))
     return v[1]
 
@@ -163,16 +166,16 @@ def along_speed(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> flo
 def from_line(p: Any, place: wp.vec4, d: float) -> float:
     """Return the distance from the line along the net [m].
 
-    The vehicle is at `place`, as of `by_net`, at a distance `d` from the net [m].
+    The position `place` is that of `by_net`, at a distance `d` from the net [m].
     """
     return wp.length(wp.vec2(d - p.distance, place[2] - p.level))
 
 
 @wp.func
 def pace(p: Any, along: float) -> float:
-    """Return 1 at the set speed along the net, falling to 0 where the vehicle is at rest, or is twice as fast.
+    """Return 1 at the set speed along the net, falling to 0 at rest and at twice the speed.
 
-    The speed along it is in [m/s].
+    The speed along the net is in [m/s].
     """
     return wp.max(1.0 - wp.abs(along - p.speed) / p.speed, -1.0)
 
@@ -185,7 +188,7 @@ def is_lost(p: Any, e: float) -> bool:
 
 @wp.func
 def way_along(p: Any, was: float, along: float) -> float:
-    """Return how far along the net the vehicle has come, at its distance from it [m].
+    """Return the distance travelled along the net [m].
 
     The speed along it is in [m/s].
     """
@@ -203,21 +206,21 @@ def distance_error(p: Any, was: float, d: float) -> float:
 
 @wp.func
 def has_inspected(arrays: TaskArrays, p: Any, w: int, way: float, error: float) -> bool:
-    """Return whether `way` [m] is long enough and `error` [m s] small enough in the mean."""
+    """Return whether the distance `way` [m] is long enough and the mean of `error` [m s] small enough."""
     return way >= p.way and error <= p.tolerance * arrays.time[w]
 
 
 @wp.func
 def range_off(arrays: TaskArrays, p: Any, w: int) -> float:
-    """Return the measured range below, less the set height [m]."""
+    """Return the measured range below minus the set height [m]."""
     return arrays.ranges[w, 0] - p.height
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Start at rest before the net's right side, not quite on the line, turned a little.
+    """Start at rest in front of the net's right side, near the line and slightly turned.
 
-    Without a world the net is drawn: it has any heading, and sides that meet at angles as those of the site do.
+    Without a world the net is drawn: it has any heading, and its sides meet at angles like those of the site.
     """
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
@@ -243,7 +246,8 @@ class NetReward:
     """Weights of the reward, with e the distance from the line along the net [m] and θ the attitude error [rad].
 
     r = pace · max(1 - |speed along - speed| / speed, -1) + near · exp(-e / near_scale) - distance · e - turn · θ
-        - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4) - loss, once, where it touches or is lost
+        - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4) - loss (once, if it touches the net or
+            loses the line)
     """
 
     pace: float = 1.0
@@ -259,10 +263,11 @@ class NetReward:
 
 @dataclass(frozen=True, kw_only=True)
 class Net(SeeingTask):
-    """Inspect the net of the site `net`, which hangs otherwise in each episode, from right to left round its corners.
+    """Inspect the net of the site `net`, whose shape differs in each episode, from right to left around its
+    corners.
 
-    The row of numbers holds attitude, velocity and the altimeter's range to what lies below, the tube at the net's
-    foot; where the net is, the sonar's picture shows.
+    The observed numbers are attitude, velocity and the altimeter's range to the tube at the net's lower edge;
+    the net's position must be inferred from the sonar's picture.
     """
 
     succeeds: ClassVar[str] = "once"
@@ -304,35 +309,35 @@ class Net(SeeingTask):
     pictures: tuple[ObservedPicture, ...] = (ObservedPicture("sonar", bins=48),)
     time_limit: float = 36.0
     half: tuple[float, float, float] = (0.28, 0.19, 0.15)
-    """Half the extents of the vehicle's envelope [m]; the environment sets them."""
+    """Half extents of the vehicle's envelope, set by the environment [m]."""
     distance: float = 1.5
-    """Distance of the body origin from the net [m], ..."""
+    """Set distance of the body origin from the net [m]."""
     height: float = 4.4
-    """... and above its foot [m]."""
+    """Set height above the net's lower edge [m]."""
     speed: float = 0.2
-    """Along it [m/s]."""
+    """Set speed along the net [m/s]."""
     way: float = 6.0
-    """Success: so far along the net from where the episode began [m], ..."""
+    """Success: distance along the net from the start of the episode [m]."""
     tolerance: float = 0.1
-    """... with a mean error of the distance of at most this [m], without touching or losing it."""
+    """Success: largest mean error of the distance from the net [m]."""
     hold: float = 0.1
-    """For so long [s]."""
+    """Duration for which the success condition must be met [s]."""
     growth: float = 0.12
     """Thickness of the growth on the net [m]."""
     lost: float = 0.8
-    """The line is lost so far from it [m]."""
+    """Distance from the line at which it is lost [m]."""
     begin: tuple[float, float] = (-2.6, -2.1)
-    """Along the net from its first corner at the start [m], ..."""
+    """Range of the start's position along the net from its first corner [m]."""
     off: float = 0.4
-    """... nearer or farther [m], ..."""
+    """Largest error of the distance from the net at the start [m]."""
     over: float = 0.3
-    """... above or below the line [m] at most, ..."""
+    """Largest vertical distance from the line at the start [m]."""
     turn: float = math.radians(15.0)
-    """... turned from it by this at most [rad]."""
+    """Largest heading error at the start [rad]."""
     sides: tuple[float, float, float] = (3.0, 2.6, 3.6)
     """Lengths of the net's sides from right to left, in the site `net` [m]."""
     bend: float = math.radians(30.0)
-    """Two of them meet at an angle of at most this, to either side [rad]."""
+    """Largest angle between neighbouring sides, in either direction [rad]."""
     ahead: tuple[float, float, float] = AHEAD
     reward: NetReward = field(default_factory=NetReward)
 
@@ -343,7 +348,7 @@ class Net(SeeingTask):
 
     @property
     def level(self) -> float:
-        """z of the line [m]."""
+        """Height z of the line [m]."""
         return self.height - FOOT
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
@@ -360,8 +365,8 @@ class Net(SeeingTask):
         )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures; success, its time [s], way along the net and mean error of the distance [m],
-        touched and lost 0 or 1."""
+        """Return the measures of every task; success, its time [s], distance along the net and mean error of
+        the distance from it [m], touched and lost as 0 or 1."""
         measured = super().metrics(arrays)
         measured["error"] /= self.control_step * np.maximum(measured["length"], 1.0)
         return measured

@@ -16,18 +16,17 @@ from finssim.robot.messages import Picture
 from finssim.vehicles import Vehicle
 
 SETTLING = 3
-"""Pictures of automatic exposure before time begins."""
+"""Number of pictures of automatic exposure before the start."""
 
 
 class Shutters:
-    """When each sensor of a vehicle measures, and when its reading arrives."""
+    """Measurement and arrival times of each sensor of a vehicle."""
 
     def __init__(self, vehicle: Vehicle, names: Sequence[str], seed: int) -> None:
-        """
-        Args:
-            vehicle: Its `perception` has the sensors.
-            names: Of its sensors.
-            seed: Of losses.
+        """Args:
+        vehicle: Vehicle whose `perception` describes the sensors.
+        names: Names of the sensors.
+        seed: Seed of the losses.
         """
         self._shutters = {}
         for name in names:
@@ -38,7 +37,8 @@ class Shutters:
             )  # fmt: skip
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Return exposures as one `Shutter` does, by time; each with the sensor's name."""
+        """Return the exposures of all sensors, as of `Shutter`, ordered by time; each with the sensor's name
+        as source."""
         exposures = [
             replace(exposure, source=name)
             for name, shutter in self._shutters.items()
@@ -48,11 +48,11 @@ class Shutters:
 
 
 class OnboardSensors:
-    """The sensors of a vehicle's `perception` in one world; to a `VirtualPool` they are a camera.
+    """Sensors of a vehicle's `perception` in one world; a `VirtualPool` uses them as a camera.
 
     Attributes:
         batch: The world.
-        sensors: By name.
+        sensors: Sensors by name.
     """
 
     def __init__(
@@ -63,12 +63,11 @@ class OnboardSensors:
         names: Sequence[str] | None = None,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            vehicle: Carries the sensors.
-            world: A site of the catalogue or a path, which is drawn from the seed; or one world as it is.
-            names: Of the sensors to compute; all that the vehicle has if None.
-            seed: Of the draw, of noise and losses.
+        """Args:
+            vehicle: Vehicle that carries the sensors.
+            world: Name of a site in the catalogue or a path, drawn from the seed; or one world as it is.
+            names: Names of the sensors to compute; all of the vehicle if None.
+            seed: Seed of the draw, noise and losses.
 
         Raises:
             WorldError: There is no such world, sensor or device.
@@ -80,24 +79,25 @@ class OnboardSensors:
         names = list(vehicle.perception) if names is None else names
         self.sensors = {name: sensor_of(world, vehicle, name) for name in names}
         self._shutters, self._mail = Shutters(vehicle, names, seed), Mail()
-        # Kernels are compiled before time begins, and automatic exposure begins with a picture of the site.
+        # Kernels are compiled before the start, and automatic exposure begins with pictures of the site.
         here = world.world.viewpoint.pose
         for name in [*names] * SETTLING:
             self.develop(Exposure(0, 0.0, 0.0, (here[:3], here[3:]), (here[:3], here[3:]), name))
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
-        """Readings that arrive in (t0, t1], by time of arrival.
+        """Return the readings that arrive in (t0, t1], by time of arrival.
 
         Args:
-            t0: Where the last call ended [s].
-            t1: Now [s].
-            pose_at: Time in [t0, t1] -> position [m] and orientation (xyzw) of the body, world frame.
+            t0: End of the last call [s].
+            t1: Present time [s].
+            pose_at: Function of a time in [t0, t1] that returns position [m] and orientation (xyzw) of the
+                body, world frame.
         """
         self._mail.post(self._shutters.advance(t0, t1, pose_at))
         return [self.develop(exposure) for exposure in self._mail.arrived(t1)]
 
     def develop(self, exposure: Exposure) -> Picture:
-        """The reading of the sensor that an exposure names."""
+        """Return the reading of the sensor that an exposure names."""
         sensor = self.sensors[exposure.source]
         pose = wp.array([np.concatenate(exposure.start)], dtype=wp.transform, device=self.batch.device)
         seed = (self._seed + zlib.crc32(exposure.source.encode())) % 2**31

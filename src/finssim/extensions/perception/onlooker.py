@@ -1,4 +1,4 @@
-"""Pictures of one world of an environment for people: from behind and above its first vehicle, in its water."""
+"""Pictures of one world of an environment for human viewers: from behind and above its first vehicle, in its water."""
 
 from __future__ import annotations
 
@@ -21,25 +21,26 @@ PARTS: dict[str, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...] |
     "frame": ((0.0, 0.0, -0.22), (0.86, 0.86, 0.5), (0.12, 0.13, 0.15)),
     "dome": ((0.46, 0.0, -0.1), (0.1, 0.3, 0.3), (0.7, 0.9, 0.95)),
 }
-"""Boxes of a vehicle: middle and size as parts of its envelope, colour."""
+"""Boxes of a vehicle: middle and size relative to its envelope, and colour."""
 BEHIND, ABOVE = 3.2, 1.1
-"""The eye is so many vehicle lengths behind and above the vehicle."""
+"""Distance of the camera behind and above the vehicle [vehicle lengths]."""
 
 
 class Onlooker:
-    """Draws one world, with its vehicles as boxes, and a ball where the goal is unless the world shows it.
+    """Renderer of one world, with its vehicles as boxes, and a ball at the goal unless the world contains a
+    landmark.
 
-    A task without a world of its own is drawn in a tiled basin of its arena's size.
+    A task without a world is drawn in a tiled basin of its arena's size.
     """
 
     def __init__(self, environment: Environment, site: World, world: int = 0, width: int = 640) -> None:
-        """Build a copy of the world that also has the vehicles in it.
+        """Build a copy of the world that also contains the vehicles.
 
         Args:
-            environment: Whose.
+            environment: Environment that is shown.
             site: World that is drawn around a task without one.
-            world: Its number.
-            width: Of the pictures [px]; their height is 9/16 of it.
+            world: Index of the world.
+            width: Width of the pictures [px]; their height is 9/16 of it.
 
         Raises:
             EnvironmentSetupError: Newton is not installed.
@@ -88,7 +89,7 @@ class Onlooker:
         self._settled = False
 
     def picture(self) -> NDArray[np.uint8]:
-        """The present state of the world; uint8 (height, width, 3), row 0 at the top."""
+        """Return a picture of the present state of the world; uint8 (height, width, 3), row 0 at the top."""
         environment, w, batch = self._environment, self._index, self._batch
         state = environment.simulator.state
         x, q = state.position.numpy()[w].astype(float), state.quaternion.numpy()[w].astype(float)
@@ -103,7 +104,7 @@ class Onlooker:
         offset = self._length * np.array([-BEHIND, 0.0, ABOVE])
         eye = x[0] + quat_rotate(quat_from_yaw(yaw), offset)
         eye[2] = min(eye[2], -0.06)
-        if self._room is not None:  # inside, looking along the line to the vehicle
+        if self._room is not None:  # keep the camera inside the basin, looking towards the vehicle
             half = 0.5 * np.array(self._room[:2]) - 0.05
             eye[:2] = np.clip(eye[:2], -half, half)
             eye[2] = max(eye[2], 0.05 - self._room[2])

@@ -1,4 +1,4 @@
-"""Rigid models of other programs as parts of a world: MJCF and URDF, read by MuJoCo."""
+"""Rigid models of other programs as shapes of a world: MJCF and URDF, read by MuJoCo."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SUFFIXES = (".xml", ".mjcf", ".urdf")
 
 
 class PartsError(ValueError):
-    """A model file that cannot be used, in one sentence without the file's name."""
+    """Model file that cannot be used; the message is one sentence without the file's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,28 +30,28 @@ class ModelPart:
     kind: str
     """box, sphere, capsule, cylinder, plane or mesh."""
     position: np.ndarray
-    """[m], (3,)"""
+    """Position of the shape [m], (3,)."""
     quaternion: np.ndarray
-    """Shape to model, xyzw, (4,)."""
+    """Attitude of the shape relative to the model, xyzw, (4,)."""
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Half extents of a box; radius and half length of the round ones [m]."""
+    """Half extents of a box; radius and half length of spheres, capsules and cylinders [m]."""
     vertices: np.ndarray | None = None
     """Vertices of a mesh, shape axes [m], (n, 3)."""
     faces: np.ndarray | None = None
-    """Faces by index of their corners, (m, 3)."""
+    """Vertex indices of each face, (m, 3)."""
     colour: np.ndarray | None = None
-    """Diffuse reflectance of red, green and blue; None if the file gives none, (3,)."""
+    """Diffuse reflectance of red, green and blue, (3,); None if the file specifies none."""
 
 
 def parts_of(path: Path) -> list[ModelPart]:
-    """The shapes of a model file at rest, all joints at zero.
+    """Return the shapes of a model file at rest, with all joints at zero.
 
     Args:
         path: MJCF (`.xml`, `.mjcf`) or URDF (`.urdf`), which need `finssim[mujoco]`. Files that it names must be in
             its folder or below.
 
     Raises:
-        PartsError: It cannot be read, or has a shape that worlds do not have.
+        PartsError: The file cannot be read, or has a shape that worlds do not support.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -71,7 +71,7 @@ def parts_of(path: Path) -> list[ModelPart]:
 
 
 def _shapes(model: tuple[str, dict[str, bytes]]) -> list[dict[str, Any]]:
-    """The shapes of a model as plain data, in the child process: its name, and MuJoCo's files."""
+    """Return the shapes of a model as plain data, in the child process, from its name and MuJoCo's files."""
     return [dict(vars(part)) for part in _mujoco(*model)]
 
 
@@ -82,7 +82,7 @@ def _mujoco(name: str, files: dict[str, bytes]) -> Iterator[ModelPart]:
         raise PartsError("needs mujoco: pip install 'finssim[mujoco]'") from None
     try:
         text = files.pop(name).decode("utf-8", "replace")
-        model = mujoco.MjModel.from_xml_string(text, assets=files)  # a file system of these files alone
+        model = mujoco.MjModel.from_xml_string(text, assets=files)  # a file system with only these files
     except ValueError as error:
         raise PartsError(f"is not a model: {' '.join(str(error).split())[:160]}") from None
     data = mujoco.MjData(model)
@@ -110,10 +110,10 @@ def _mujoco(name: str, files: dict[str, bytes]) -> Iterator[ModelPart]:
 
 
 def _files_of(path: Path) -> dict[str, bytes]:
-    """The model and the files of its folder that it may name, by their paths below that folder.
+    """Return the model and the files of its folder that it may name, by their paths relative to that folder.
 
     Raises:
-        PartsError: A file names one outside the folder, or too much is included.
+        PartsError: A file outside the folder is named, or too much is included.
     """
     folder, files, sizes = path.parent, dict[str, bytes](), dict[str, int]()
 
@@ -130,7 +130,7 @@ def _files_of(path: Path) -> dict[str, bytes]:
         return True
 
     def elements_of(name: str, including: tuple[str, ...]) -> int:
-        """Elements of a model file, with those of the files that it includes; 0 if it is no model."""
+        """Count the elements of a model file and the files that it includes; 0 if it is not a model."""
         if name in including or len(including) > DEPTH:
             raise PartsError(f"includes '{name}' in itself or more than {DEPTH} deep: include each file once")
         if name in sizes:
@@ -169,5 +169,5 @@ def _files_of(path: Path) -> dict[str, bytes]:
 
 
 def _is_model(data: bytes) -> bool:
-    """Return whether a file may be XML: meshes and pictures are not."""
+    """Return whether a file may be XML rather than a mesh or a picture."""
     return data[:64].lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")

@@ -1,4 +1,4 @@
-"""Following a pipeline by camera: along it, at a height above it, whatever bends come."""
+"""Following a pipeline by camera: along it, at a set height above it, around unknown bends."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from finssim.tasks.terms import (
 from finssim.vehicles import Vehicle
 
 AHEAD = (0.0, 1.2, 2.5)
-"""The teacher sees where the pipe is so far ahead along it [m]."""
+"""Distances ahead along the pipe at which the teacher observes it [m]."""
 
 
 @wp.func
@@ -63,7 +63,7 @@ def beside(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def along_pipe(arrays: TaskArrays, w: int, way: float) -> wp.vec3:
-    """The point of the pipe's axis so far along it [m], in the axes of the pipeline."""
+    """Return the point of the pipe's axis at a distance `way` along it [m], in the axes of the pipeline."""
     rest = float(way)
     last = arrays.reference.position.shape[1] - 1
     out = arrays.reference.position[w, last]
@@ -79,7 +79,8 @@ def along_pipe(arrays: TaskArrays, w: int, way: float) -> wp.vec3:
 
 @wp.func
 def way_ahead(arrays: TaskArrays, p: Any, w: int, k: int, place: wp.vec4) -> wp.vec3:
-    """To the point above the pipe that is `ahead` [k] farther along it than the vehicle, body frame [m]."""
+    """Return the vector to the point above the pipe that is `ahead[k]` farther along it than the vehicle,
+    body frame [m]."""
     point = along_pipe(arrays, w, place[0] + p.ahead[k]) + wp.vec3(0.0, 0.0, p.height)
     world = arrays.goal_position[w] + wp.quat_rotate(arrays.goal_quaternion[w], point)
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], world - arrays.position[w, 0])
@@ -96,7 +97,7 @@ def heading_off(state: State, arrays: TaskArrays, w: int, place: wp.vec4) -> flo
 
 @wp.func
 def progress(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec4) -> float:
-    """Speed along the pipe as a part of `cruise`, at most 1."""
+    """Return the speed along the pipe as a fraction of `cruise`, at most 1."""
     v = wp.quat_rotate_inv(arrays.goal_quaternion[w], world_velocity(state, w, 0))
     return wp.clamp((v[0] * wp.cos(place[3]) + v[1] * wp.sin(place[3])) / p.cruise, -1.0, 1.0)
 
@@ -105,20 +106,21 @@ def progress(state: State, arrays: TaskArrays, p: Any, w: int, place: wp.vec4) -
 def from_line(p: Any, place: wp.vec4) -> float:
     """Return the distance from the line above the pipe [m].
 
-    The vehicle is at `place`, as of `beside`.
+    The position `place` is that of `beside`, in its units.
     """
     return wp.length(wp.vec2(place[1], place[2] - p.height))
 
 
 @wp.func
 def is_lost(p: Any, place: wp.vec4) -> bool:
-    """Return whether the line is lost, to a side or above or below; `place` is as of `beside`, in its units."""
+    """Return whether the line is lost sideways or vertically; the position `place` is that of `beside`, in
+    its units."""
     return wp.abs(place[1]) > p.lost[0] or wp.abs(place[2] - p.height) > p.lost[1]
 
 
 @wp.func
 def along_now(place: wp.vec4) -> float:
-    """Return how far along the pipe the vehicle is [m]."""
+    """Return the vehicle's position along the pipe [m]."""
     return place[0]
 
 
@@ -130,13 +132,13 @@ def worst(was: float, e: float) -> float:
 
 @wp.func
 def has_followed(p: Any, place: wp.vec4, begun: float) -> bool:
-    """Return whether the vehicle is `distance` farther along the pipe than where the episode began [m]."""
+    """Return whether the vehicle is `distance` farther along the pipe than at the start of the episode [m]."""
     return place[0] - begun >= p.distance
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Start at rest above the pipe, not quite over it, and turned a little; without a world its heading is drawn."""
+    """Start at rest above the pipe, off the line and slightly turned; without a world the pipe's heading is drawn."""
     rng = wp.rand_init(key, w)
     yaw = wp.randf(rng, -3.14159265, 3.14159265)
     if not p.placed:
@@ -156,7 +158,7 @@ class PipelineReward:
     """Weights of the reward, with e the distance from the line above the pipe [m] and θ the heading error [rad].
 
     r = progress · min(speed along / cruise, 1) + near · exp(-e / near_scale) - distance · e - turn · θ
-        - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4) - loss, once, where the pipe is lost
+        - action · mean(a²) - change · mean(Δa²) - rate · min(|ω|², 4) - loss (once, if the pipe is lost)
     """
 
     progress: float = 1.0
@@ -172,7 +174,7 @@ class PipelineReward:
 
 @dataclass(frozen=True, kw_only=True)
 class Pipeline(SeeingTask):
-    """Follow the pipeline of the site `pipeline`, which lies, looks and is lit otherwise in each episode."""
+    """Follow the pipeline of the site `pipeline`, whose position, appearance and light differ in each episode."""
 
     succeeds: ClassVar[str] = "once"
     fails: ClassVar[tuple[str, ...]] = ("lost",)
@@ -201,25 +203,25 @@ class Pipeline(SeeingTask):
     time_limit: float = 45.0
     """Length of an episode [s]."""
     hull: HullNumbers = HullNumbers()
-    """Hull of the vehicle; the environment sets it."""
+    """Hull of the vehicle, set by the environment."""
     height: float = 0.9
     """Height of the body origin above the pipe's axis [m]."""
     distance: float = 8.0
-    """Success: so far along the pipe from where the episode began [m], without having lost it."""
+    """Success: distance along the pipe from the start of the episode, without losing it [m]."""
     hold: float = 0.1
-    """For so long [s]."""
+    """Duration for which the success condition must be met [s]."""
     lost: tuple[float, float] = (1.2, 0.7)
-    """The pipe is lost so far to a side, or above or below the line [m]."""
+    """Horizontal and vertical distance from the line at which the pipe is lost [m]."""
     begin: tuple[float, float] = (2.0, 18.0)
-    """Along the pipe at the start [m], ..."""
+    """Range of the start's position along the pipe [m]."""
     aside: float = 0.5
-    """Greatest distance beside it [m], ..."""
+    """Largest lateral distance from the pipe at the start [m]."""
     over: float = 0.2
-    """... above or below the line [m] at most, ..."""
+    """Largest vertical distance from the line at the start [m]."""
     turn: float = math.radians(20.0)
-    """... turned from it by this at most [rad]."""
+    """Largest heading error at the start [rad]."""
     ahead: tuple[float, float, float] = AHEAD
-    """The teacher sees where the pipe is so far ahead along it [m]."""
+    """Distances ahead along the pipe at which the teacher observes it [m]."""
     reward: PipelineReward = field(default_factory=PipelineReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pipeline":
@@ -228,16 +230,16 @@ class Pipeline(SeeingTask):
 
     @property
     def cruise(self) -> float:
-        """Return the speed along the pipe that gets all of its reward [m/s]."""
+        """Return the speed along the pipe at which the progress reward is full [m/s]."""
         return 0.6 * self.hull.speed
 
     @property
     def bottom(self) -> float:
-        """z of the pipe without a world [m]."""
+        """Height z of the pipe without a world [m]."""
         return -11.86
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """The pipe's axis as a line of points, from the objects `pipe_...` of the site."""
+        """Set the pipe's axis as a line of points, from the objects `pipe_...` of the site."""
         pipes = [item for name, item in load_world("pipeline").objects.items() if name.startswith("pipe_")]
         halves = [
             0.5 * (one.length or 0.0) * np.asarray(one.axis) / np.linalg.norm(one.axis) for one in pipes
@@ -251,7 +253,8 @@ class Pipeline(SeeingTask):
         return f"{self.distance:g} m along the pipe without losing it"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures; success, its time [s], worst (distance from the line [m]), lost 0 or 1."""
+        """Return the measures of every task; success, its time [s], worst (distance from the line [m]), lost
+        as 0 or 1."""
         measured = super().metrics(arrays)
         del measured["begun"]
         return measured

@@ -23,7 +23,8 @@ def _take_ranges(
     traced: Traced, scene: RayScene, weight: wp.array(dtype=float), quantile: float, reach: wp.vec2, noise: float,
     key: int, ranges: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Range of each beam: where the given share of its echo has come; infinite beyond the device's reach."""
+    """Compute the range of each beam, at which a given fraction of its echo has arrived; infinite beyond the
+    device's reach."""
     v, b = wp.tid()
     if traced.worlds[v] == SKIPPED:
         return
@@ -53,7 +54,7 @@ def _take_ranges(
 def _ray_echo(
     traced: Traced, scene: RayScene, rotation: wp.quat, weight: wp.array(dtype=float), v: int, b: int, j: int
 ) -> float:
-    """Echo of one ray as `_echo_rays` has it, without absorption; 0 for a miss."""
+    """Return the echo of one ray as in `_echo_rays`, without absorption; 0 for a miss."""
     index = traced.shape_index[v, b, j]
     r = traced.depth[v, b, j]
     if index == MISS or r <= 0.0:
@@ -68,16 +69,16 @@ def _ray_echo(
 
 
 class RangeBatch(RayBatch):
-    """An altimeter, a rangefinder or a DVL's beams on each of N vehicles.
+    """Altimeter, rangefinder or DVL beams on each of N vehicles.
 
     Args:
         batch: The worlds.
         ranger: The device.
-        vehicles: In each world.
+        vehicles: Number of vehicles in each world.
     """
 
     ranges: wp.array
-    """Along each beam [m], infinite where nothing is within reach; float (N, beams)."""
+    """Ranges along each beam [m], infinite if nothing is within reach; float (N, beams)."""
 
     def __init__(self, batch: WorldBatch, ranger: RangeDevice, *, vehicles: int = 1) -> None:
         rays, weight = cones(ranger)
@@ -89,13 +90,13 @@ class RangeBatch(RayBatch):
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
     ) -> wp.array:
-        """Measure.
+        """Measure the ranges.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
-            seed: Of the noise; None for none.
-            time: Of the measurement [s]: others have other noise.
-            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
+            seed: Seed of the noise; None for no noise.
+            time: Time of the measurement [s]; it changes the noise.
+            mask: Vehicles that measure; the others keep their last reading. int (N,); all if None.
 
         Returns:
             `ranges` [m], which the next update overwrites.
@@ -113,9 +114,10 @@ def _take_velocities(
     traced: Traced, twists: wp.array2d(dtype=vec6), mount: wp.transform, noise: float, key: int,
     reading: wp.array2d(dtype=float), lock: wp.array2d(dtype=int),
 ):  # fmt: skip
-    """Speed along each beam that finds the bottom, and the velocity that fits them best.
+    """Measure the speed along each beam with a bottom echo, and fit the velocity by least squares.
 
-    s_b = d_b . v + noise;  v = (sum d d^T)^-1 sum d s  over the beams with an echo, of which there must be three
+    s_b = d_b . v + noise;  v = (sum d d^T)^-1 sum d s  over the beams with an echo, of which there must be at
+    least three
 
     Ranges are read from the last columns of `reading`: velocity, speeds, ranges.
     """
@@ -153,26 +155,27 @@ def _take_velocities(
 
 
 class DopplerBatch(RangeBatch):
-    """A DVL on each of N vehicles: bottom track by the ranges and speeds of its beams.
+    """DVL on each of N vehicles: bottom track by the ranges and speeds of its beams.
 
     Args:
         batch: The worlds.
-        device: At least three beams; the speeds are those along the beams' middles.
-        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, as a simulator's `state.velocity`;
-            vec6 (worlds, vehicles).
-        lock: Flags [0, 1] filled in place of its own; those of a `finssim.sim.sensors.DvlBatch` make that one lose the
-            bottom too.
+        device: Device with at least three beams; the speeds are those along the beam axes.
+        twists: nu of the vehicles, body frame [m/s, rad/s], read in each update, such as a simulator's
+            `state.velocity`; vec6 (worlds, vehicles).
+        lock: Array of flags [0, 1] to fill instead of a new one; with that of a
+            `finssim.sim.sensors.DvlBatch`, that sensor loses bottom lock too.
 
     Raises:
-        WorldError: The device has fewer beams.
+        WorldError: The device has fewer than three beams.
     """
 
     speeds: wp.array
-    """Velocity of the sensor along each beam, positive away from it [m/s], NaN without an echo; float (N, beams)."""
+    """Velocity of the sensor along each beam, positive in the beam's direction [m/s], NaN without an echo;
+    float (N, beams)."""
     velocity: wp.array
     """Velocity of the sensor, in its own axes [m/s], NaN without lock; float (N, 3)."""
     lock: wp.array
-    """Flag [-] of at least three beams finding the bottom; int (worlds, vehicles)."""
+    """Flag of bottom lock, that is, at least three beams have an echo [-]; int (worlds, vehicles)."""
 
     def __init__(
         self, batch: WorldBatch, device: RangeDevice, twists: wp.array, *, lock: wp.array | None = None
@@ -181,7 +184,7 @@ class DopplerBatch(RangeBatch):
             raise WorldError(f"a DVL of {device.beams} beams: give at least 3 for a velocity")
         super().__init__(batch, device, vehicles=twists.shape[1])
         beams, self.twists = device.beams, twists
-        # One row for each vehicle, so that all of it arrives together: velocity, speeds, ranges.
+        # One row for each vehicle, so that all of its values arrive together: velocity, speeds, ranges.
         self.reading = wp.zeros((self.count, 3 + 2 * beams), dtype=float, device=self.device)
         self.velocity, self.speeds = self.reading[:, :3], self.reading[:, 3 : 3 + beams]
         self.ranges = self.reading[:, 3 + beams :]
@@ -190,13 +193,13 @@ class DopplerBatch(RangeBatch):
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
     ) -> wp.array:
-        """Measure.
+        """Measure velocity, speeds and ranges.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
-            seed: Of the noise; None for none.
-            time: Of the measurement [s]: others have other noise.
-            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
+            seed: Seed of the noise; None for no noise.
+            time: Time of the measurement [s]; it changes the noise.
+            mask: Vehicles that measure; the others keep their last reading. int (N,); all if None.
 
         Returns:
             `reading`: velocity [m/s], speeds [m/s] and ranges [m] in a row; float (N, 3 + 2 beams).

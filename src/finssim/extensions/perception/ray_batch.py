@@ -1,13 +1,13 @@
-"""A bundle of rays on each of many vehicles: what cameras, imaging sonars, altimeters and the beams of a DVL share.
+"""Bundle of rays on each of many vehicles: the common part of cameras, imaging sonars, altimeters and DVL beams.
 
-Each takes the poses of N vehicles, and leaves arrays on the device:
+Each sensor reads the poses of N vehicles, and leaves its results in arrays on the device:
 
     batch = WorldBatch("dock", worlds=256)
     camera = CameraBatch(batch, load_device("low_light_camera"), width=64)
     picture = camera.update(poses, seed=step)      # uint8 (256, 48, 64, 3)
 
-Newton's ray caster gives depth, shape and normal of every ray; what light and sound make of them is in the sensors'
-modules. All sensors ask it for the same three outputs, so that its kernel is compiled once.
+Newton's ray caster computes depth, shape and normal of every ray; the sensors' modules compute light and sound from
+these. All sensors request the same three outputs, so that the ray caster's kernel is compiled only once.
 """
 # mypy: ignore-errors
 
@@ -26,19 +26,19 @@ wp.set_module_options({"enable_backward": False})
 
 MISS = wp.constant(wp.uint32(0xFFFFFFFF))
 SKIPPED = wp.constant(-101)
-"""World of a view whose outputs Newton leaves unchanged (`WorldRenderFlag.DISABLE_PRESERVE`)."""
+"""World index of a view whose outputs Newton leaves unchanged (`WorldRenderFlag.DISABLE_PRESERVE`)."""
 
 
 @wp.struct
 class Traced:
-    """A bundle of rays of many views, and what each of them met."""
+    """Bundle of rays of many views, and the hit of each ray."""
 
     rays: wp.array4d(dtype=wp.vec3)  # (rows, columns, 2): origin [m] and unit direction, sensor axes
     views: wp.array(dtype=wp.transform)  # sensor to world [m, quaternion]
-    worlds: wp.array(dtype=int)  # or SKIPPED
-    dimming: wp.array(dtype=wp.vec3)  # daylight at the view's depth as a share of that at the surface [-]
+    worlds: wp.array(dtype=int)  # world of each view, or SKIPPED
+    dimming: wp.array(dtype=wp.vec3)  # daylight at the view's depth as a fraction of that at the surface [-]
     depth: wp.array3d(dtype=float)  # along the ray [m]
-    shape_index: wp.array3d(dtype=wp.uint32)  # or MISS
+    shape_index: wp.array3d(dtype=wp.uint32)  # index of the shape, or MISS
     normal: wp.array3d(dtype=wp.vec3)  # world axes, unit
 
 
@@ -51,7 +51,7 @@ def _place_views(
     optics: Optics,
     traced: Traced,
 ):
-    """Place views: sensor poses, their worlds or SKIPPED, and daylight at their depths."""
+    """Compute the sensor poses of the views, their worlds or SKIPPED, and daylight at their depths."""
     v = wp.tid()
     traced.worlds[v] = SKIPPED
     if mask.shape[0] > 0:
@@ -73,11 +73,11 @@ def _join_poses(
 
 
 def poses_of(state: Any, poses: wp.array | None = None) -> wp.array:
-    """Poses of all vehicles of a simulator, as sensors take them.
+    """Return the poses of all vehicles of a simulator, in the form that sensors expect.
 
     Args:
-        state: Its `state`: `position` and `quaternion` by (world, vehicle).
-        poses: Array for the poses [m, quaternion], filled where given.
+        state: The simulator's `state`: `position` and `quaternion` by (world, vehicle).
+        poses: Array to fill with the poses [m, quaternion]; None: a new one.
 
     Returns:
         Body to world of each vehicle [m, quaternion], in order of world; transform (worlds · vehicles,).
@@ -90,17 +90,17 @@ def poses_of(state: Any, poses: wp.array | None = None) -> wp.array:
 
 
 class RayBatch:
-    """A bundle of rays for each of N vehicles: what all these sensors share.
+    """Bundle of rays for each of N vehicles, the base of all ray sensors.
 
     Args:
-        batch: The worlds. Vehicles are in order of world, as many in each.
+        batch: The worlds. Vehicles are ordered by world, with an equal number in each.
         rays: The bundle of unit vectors, sensor axes, (rows, columns, 2, 3).
-        mount: Where the sensor sits on its vehicle.
-        vehicles: In each world.
+        mount: Pose of the sensor on its vehicle.
+        vehicles: Number of vehicles in each world.
     """
 
     reading: wp.array
-    """Result of `update` in the unit of the sensor; one row for each vehicle."""
+    """Result of `update`, in the unit of the sensor; one row for each vehicle."""
 
     def __init__(self, batch: WorldBatch, rays: np.ndarray, mount: DeviceMount, vehicles: int = 1) -> None:
         self.batch, self.device, self.count = batch, batch.device, batch.worlds * vehicles
@@ -120,23 +120,24 @@ class RayBatch:
         self._mount = wp.transform(wp.vec3(*mount.position), wp.quat(*map(float, mount.quaternion)))
 
     def _span(self, columns: int) -> int:
-        """Elements of a row for a thread: neighbours are other threads on a GPU, and its own next on a processor."""
+        """Return the number of row elements per thread: one on a GPU, so that neighbours coalesce; the full
+        row on a CPU."""
         return 1 if self.device.is_cuda else columns
 
     def _blocks(self, array: wp.array) -> tuple[int, int, int]:
-        """Threads over an array of (views, rows, columns)."""
+        """Return the numbers of threads over an array of (views, rows, columns)."""
         views, rows, columns = array.shape[:3]
         return views, rows, columns // self._span(columns)
 
     def cast(self, poses: wp.array, mask: wp.array | None = None) -> None:
-        """Trace the rays: depth from where each enters the water [m], index of the shape, normal.
+        """Trace the rays: depth from the point where each enters the water [m], index of the shape, normal.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
-            mask: Which vehicles' sensors measure; the others' outputs stay. int (N,); all if None.
+            mask: Vehicles whose sensors measure; the outputs of the others stay unchanged. int (N,); all if None.
 
         Raises:
-            WorldError: Another number of vehicles.
+            WorldError: The number of poses differs from that of the vehicles.
         """
         if len(poses) != self.count:
             raise WorldError(

@@ -1,6 +1,7 @@
 """Bundles of rays, one for each reading of a sensor, in the sensor's axes: x along the view, y left, z up.
 
-Each is (rows, columns, 2, 3): where a ray enters the water [m], and its unit direction; a zero direction is no ray.
+Each is (rows, columns, 2, 3): the point where a ray enters the water [m], and its unit direction; a zero direction
+means no ray.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ Array = NDArray[np.float64]
 
 WATER_INDEX = 1.333
 ELEVATION_SPAN = 1.5
-"""Vertical extent of a sonar's rays over its beam width: the two-way pattern is 17 dB down at its ends."""
+"""Ratio of the vertical extent of a sonar's rays to its beam width: the two-way pattern is 17 dB down at the ends."""
 
 
 def camera_rays(lens: Lens, port: Port | None = None) -> Array:
     """Return the rays of a picture, row 0 at the top, (height, width, 2, 3).
 
     Args:
-        lens: Pinhole, with distortion, or fisheye; in the water itself, or behind a dome centred on it.
-        port: A flat window before it, at which the rays are refracted (Snell).
+        lens: Lens, pinhole with distortion or fisheye, in direct contact with the water or behind a
+            concentric dome.
+        port: Flat window in front of the lens, at which the rays are refracted (Snell).
     """
     pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
     if port is None:
@@ -51,7 +53,7 @@ def fan(device: SonarDevice, beams: int | None = None) -> Array:
 
     Args:
         device: The sonar.
-        beams: Over its sector, in place of its own.
+        beams: Number of beams over the sector, instead of the device's own.
     """
     count = beams or device.beams
     azimuth = device.sector * (0.5 - (np.arange(count) + 0.5) / count)
@@ -75,11 +77,12 @@ def ray_elevations(device: SonarDevice) -> Array:
 
 
 def cones(device: RangeDevice) -> tuple[Array, Array]:
-    """Rays of an altimeter or a DVL, (beams, rays, 2, 3), and how much of a beam's echo each one carries, (rays,).
+    """Return the rays of an altimeter or a DVL, (beams, rays, 2, 3), and the fraction of a beam's echo on
+    each, (rays,).
 
-    The rays of a beam share its solid angle evenly, out to twice its half-power angle, and weigh as its two-way pattern
-    exp(-2 · 4 ln 2 (angle / width)²). Beam k of several is turned by 2 pi (k + 1/2) / beams about x, from y (left)
-    towards z.
+    The rays of a beam cover its solid angle evenly, out to twice its half-power angle, with weights of its
+    two-way pattern exp(-2 · 4 ln 2 (angle / width)²). Beam k of several is rotated by 2 pi (k + 1/2) / beams
+    about x, from y (left) towards z.
     """
     n = device.rays if device.beam_width > 0.0 else 1
     share = (np.arange(n) + 0.5) / n if n > 1 else np.zeros(1)

@@ -1,4 +1,4 @@
-"""Common parts of tasks whose vehicle observes a site, whose pose, look and light differ in each episode."""
+"""Base of tasks with perception of a site, whose pose, appearance and light differ in each episode."""
 
 import math
 from dataclasses import dataclass
@@ -11,34 +11,34 @@ from finssim.tasks.task import Task
 from finssim.tasks.terms import ObservationPart, measured_depth, own_velocity, world_up
 
 DEPTH_SCALE = 5.0
-"""The depth is divided by this in the observation [m]."""
+"""Scale of the depth in the observation [m]."""
 
 OWN = (
     ObservationPart("up, body frame", 3, "1", term=world_up),
     *own_velocity(clip=2.0),
     ObservationPart("depth", 1, "m", scale=DEPTH_SCALE, term=measured_depth),
 )
-"""Parts of the observation from the vehicle's own sensors, in any place."""
+"""Observation from the vehicle's own sensors, independent of its position."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeeingTask(Task):
-    """Base of those tasks: in open water, by a front camera, unless they say otherwise."""
+    """Base of tasks with perception, by default in open water with a front camera."""
 
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave", "yaw")
     observation: tuple[ObservationPart, ...] = OWN
     pictures: tuple[ObservedPicture, ...] = (ObservedPicture("front_camera", 48),)
     held_out: bool = False
-    """Draw the looks of the site that are held out of training."""
+    """True to draw only looks of the site that are held out of training."""
     tilt: float = math.radians(4.0)
     """Largest roll and pitch at the start [rad]."""
     training_noise: MeasurementNoise = TRAINING
 
     @property
     def placed(self) -> bool:
-        """Return whether a world gives the place of the observed object; without one it is drawn."""
+        """Return whether a world determines the pose of the observed object; without a world it is drawn."""
         return bool(self.world)
 
     def arena(self) -> RectangularPool | None:
-        """Open water: an episode ends before floor and walls."""
+        """Return None for open water: an episode ends before floor and walls are reached."""
         return None

@@ -1,4 +1,4 @@
-"""The sensor of an entry of a vehicle's `perception`, whatever its kind."""
+"""Construction of the sensor for an entry of a vehicle's `perception`."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from finssim.vehicles.device_files import CameraDevice, SonarDevice, device_of
 def sensor_of(
     batch: WorldBatch, vehicle: Vehicle, name: str, *, vehicles: int = 1, lamps: tuple[Headlight, ...] = ()
 ) -> CameraBatch | SonarBatch | RangeBatch:
-    """The sensor of an entry of a vehicle's `perception`, on every vehicle of a batch.
+    """Return the sensor for an entry of a vehicle's `perception`, on every vehicle of a batch.
 
     Args:
         batch: The worlds.
-        vehicle: Its file has mount, rate, width and range cells.
-        name: Of the entry, such as `front_camera`.
-        vehicles: In each world.
+        vehicle: Vehicle whose file contains mount, rate, width and range cells.
+        name: Name of the entry, such as `front_camera`.
+        vehicles: Number of vehicles in each world.
         lamps: Lights on each vehicle, for cameras.
 
     Raises:

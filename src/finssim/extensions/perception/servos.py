@@ -1,4 +1,4 @@
-"""Baselines that see: classical controllers that find a dock, a gate, a pipeline or a net in pictures."""
+"""Classical baselines with perception: controllers that locate a dock, a gate, a pipeline or a net in pictures."""
 
 from __future__ import annotations
 
@@ -34,59 +34,60 @@ from finssim.vehicles.device_files import device_of
 
 
 def camera_of(vehicle: Vehicle, task: Task) -> dict[str, Any]:
-    """Return the camera of a task: focal length as a share of its width, and position, body axes [m]."""
+    """Return the camera of a task: focal length relative to the picture's width, and position, body axes [m]."""
     device = device_of(vehicle, task.pictures[0].name)
     return {"focal_share": device.focal_length / device.width, "eye": tuple(device.mount.position.tolist())}
 
 
 class SightMemory(NamedTuple):
-    """Memory of `LightServo`; the axes are level, at the start, with x in the vehicle's initial direction."""
+    """Memory of `LightServo`; its frame is level, with the origin at the start and x along the initial heading."""
 
     position: Array
-    """Position of the body origin, by its velocity and depth [m], (n, 3)."""
+    """Position of the body origin, dead-reckoned from velocity and depth [m], (n, 3)."""
     heading: Array
-    """[rad], (n,)."""
+    """Heading [rad], (n,)."""
     dock: Array
-    """Its throat [m] and heading [rad] as far as known, (n, 4)."""
+    """Estimated position of the dock's throat [m] and heading [rad], (n, 4)."""
     looks: Array
-    """Pictures that it is the mean of, (n,)."""
+    """Number of pictures in the estimate, (n,)."""
     pid: PidMemory
 
 
 @dataclass(frozen=True)
 class LightServo(DockingPid):
-    """`DockingPid` towards a dock whose pose comes from the four guide lights in the picture.
+    """`DockingPid` towards a dock whose pose is estimated from the four guide lights in the picture.
 
-    The upper two are white, the lower two red, in the corners of an upright square of known side. The height of each
-    pair in the picture gives its distance, their middle the bearing, the difference of the distances the dock's
-    heading. A picture counts where all four are in it; the estimate is the mean of the last dozen, and between them,
-    and in the funnel, the vehicle dead-reckons by its velocity.
+    The upper two are white, the lower two red, in the corners of an upright square of known side. The height
+    of each pair in the picture gives its distance, their middle the bearing, the difference of the distances
+    the dock's heading. Only pictures with all four lights are used; the estimate averages the last dozen, and
+    between them, and in the funnel, the vehicle dead-reckons with its velocity.
     """
 
     focal_share: float = 0.0
-    """Focal length as a share of the picture's width."""
+    """Focal length relative to the picture's width [-]."""
     eye: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the camera, body axes [m]."""
     side: float = 1.16
     """Side of the square of lights [m]."""
     before: float = 0.78
-    """Distance of the square before the throat [m]."""
+    """Distance of the square in front of the throat [m]."""
     first: float = 2.8
-    """Assumed distance of the dock until it has been found [m]."""
+    """Assumed distance of the dock before the first detection [m]."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> Any:
-        """For a vehicle with a `front_camera`, the dock of the site `dock`, and the time between two actions [s]."""
+        """Return the baseline for a vehicle with a `front_camera`, the dock of the site `dock` and a control
+        period [s]."""
         task = CameraDocking()
         return super().for_vehicle(vehicle, period, task, lead=0.4, **camera_of(vehicle, task))
 
     def reset(self, n: int) -> SightMemory:
-        """A dock straight ahead, unseen."""
+        """Return the initial memory: a dock straight ahead, not yet detected."""
         dock = np.tile([self.first, 0.0, 0.0, 0.0], (n, 1))
         return SightMemory(np.zeros((n, 3)), np.zeros(n), dock, np.zeros(n), self.pid.reset(n))
 
     def act(self, memory: SightMemory, observation: Rows, pictures: Pictures) -> tuple[Rows, SightMemory]:  # type: ignore[override]
-        """Actions for observations and pictures of docking by camera."""
+        """Return actions for observations and pictures of docking by camera."""
         o = np.asarray(observation, float)
         up, nu, depth = o[:, :3], o[:, 3:9], DEPTH_SCALE * o[:, 9]
         q, position = attitude_from(up, memory.heading), memory.position.copy()
@@ -111,15 +112,15 @@ class LightServo(DockingPid):
         return action, SightMemory(moved, turned, dock, count, pid)
 
     def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
-        """The square of lights in pictures.
+        """Locate the square of lights in pictures.
 
         Args:
             picture: uint8 (n, height, width, 3).
             up: World's up in the body [-], (n, 3).
 
         Returns:
-            Its middle from the camera, body frame [m], (n, 3); its heading from the vehicle's [rad], (n,); where all
-            four lights are in the picture, (n,).
+            Position of its middle from the camera, body frame [m], (n, 3); its heading relative to the
+            vehicle [rad], (n,); mask of pictures with all four lights, (n,).
         """
         red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
         rows, columns = np.mgrid[: red.shape[1], : red.shape[2]]
@@ -137,11 +138,12 @@ class LightServo(DockingPid):
         return self.locate(np.array(corners), visible, red.shape[1:])
 
     def locate(self, corners: Array, visible: Mask, shape: Sequence[int]) -> tuple[Array, Array, Mask]:
-        """The upright square in space.
+        """Locate the upright square in space.
 
         Args:
-            corners: Column and row of its upper left, upper right, lower left and lower right corner [px], (4, 2, n).
-            visible: Where all four are in the picture, (n,).
+            corners: Column and row of its upper left, upper right, lower left and lower right corner [px],
+                (4, 2, n).
+            visible: Mask of pictures with all four corners, (n,).
             shape: Height and width of the picture [px].
 
         Returns:
@@ -158,25 +160,26 @@ class LightServo(DockingPid):
         return ahead[:, None] * np.column_stack([np.ones_like(aside), aside, above]), heading, visible
 
 
-# Passing a gate the classical way: its posts are what is redder and greener than the rest of a row, in one column.
+# Classical gate passage: each post is the column that is redder or greener than the rest of its rows.
 
 
 @dataclass(frozen=True)
 class PostServo(LightServo):
     """`LightServo` through a gate, whose posts are the sides of the upright square: the left red, the right green.
 
-    A post is the column with the most of its colour above the median of each row; where both are in the picture from
-    head to foot their lengths give distance and heading.
+    A post is the column in which its colour exceeds the row medians most; if both posts are completely in the
+    picture, their lengths determine distance and heading.
     """
 
     side: float = 1.5
     before: float = 0.0
     least: float = 60.0
-    """Levels of its colour that a post has in its column, all rows together."""
+    """Least total level of its colour in a post's column, summed over the rows."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD, **more: Any) -> PostServo:
-        """For a vehicle with a `front_camera`, the gate of the site `gate`, and the time between two actions [s]."""
+        """Return the baseline for a vehicle with a `front_camera`, the gate of the site `gate` and a control
+        period [s]."""
         task = Gate().fitted([vehicle])
         length = task.hull.length
         return cls(
@@ -191,7 +194,7 @@ class PostServo(LightServo):
         )
 
     def measure(self, picture: NDArray[np.uint8], up: Array) -> tuple[Array, Array, Mask]:
-        """The square between the posts; see `LightServo`."""
+        """Locate the square between the posts; see `LightServo`."""
         red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
         n, height, width = red.shape
         ends, visible = [], np.ones(n, bool)
@@ -212,38 +215,39 @@ class PostServo(LightServo):
         return self.locate(np.array([first[0], right[0], first[1], right[1]]), visible, (height, width))
 
 
-# Following a pipeline the classical way: a line through what is yellower than its surroundings, and steer along it.
+# Classical pipeline following: fit a line to pixels that are yellower than their surroundings, and steer along it.
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineFollower(DriveBaseline):
-    """Fits a line over the bottom to the yellow pixels of the picture, and steers to it and along it.
+    """Pipeline follower that fits a line to the yellow pixels of the picture, and steers to it and along it.
 
-    Yellow is (red + green)/2 - blue above the median of a picture's row. A row below the horizon looks at the bottom at
-    one distance, which the pipe's charted depth tells; a straight line is fitted to all rows, weighted by the square of
-    the yellow, and its estimate is followed where a picture shows too little.
+    Yellow is (red + green)/2 - blue above the median of a picture's row. A row below the horizon views the
+    bottom at one distance, which follows from the pipe's charted depth; a straight line is fitted to all
+    rows, weighted by the square of the yellow level. Pictures with too little yellow do not change the
+    estimate.
     """
 
     cruise: float
-    """[m/s]"""
+    """Speed along the pipe [m/s]."""
     charted: float
     """Depth of the pipe's axis [m]."""
     height: float
-    """Above it [m]."""
+    """Height above the pipe's axis [m]."""
     focal_share: float
-    """Focal length as a share of the picture's width."""
+    """Focal length relative to the picture's width [-]."""
     eye: tuple[float, float, float]
     """Position of the camera, body axes [m]."""
     least: float = 60.0
-    """Squared numbers of yellow, summed over a picture, below which it shows too little."""
+    """Squared yellow level, summed over a picture, below which the picture is not used."""
     gain: float = 0.5
-    """Speed to the side and down per distance [1/s]."""
+    """Lateral and vertical speed per distance [1/s]."""
     memory_share: float = 0.8
-    """Share of the line before, in the next estimate."""
+    """Weight of the previous estimate in the next one [-]."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> LineFollower:
-        """For a vehicle with a `front_camera`, and the site `pipeline`."""
+        """Return the baseline for a vehicle with a `front_camera`, and the site `pipeline`."""
         task = Pipeline().fitted([vehicle])
         return cls(
             drive=DriveNumbers.of(vehicle), cruise=task.cruise, charted=-task.bottom, height=task.height,
@@ -251,11 +255,11 @@ class LineFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """Return the line straight below and ahead as of `line`, (n, 2)."""
+        """Return the initial line, straight below and ahead, as [m] and slope [-] like `line`, (n, 2)."""
         return np.zeros((n, 2))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
-        """Actions for observations and pictures of following a pipeline."""
+        """Return actions for observations and pictures of following a pipeline."""
         o = np.asarray(observation, float)
         depth = DEPTH_SCALE * o[:, 9]
         line, enough = self.line(next(iter(pictures.values())), o[:, :3], self.charted - depth)
@@ -273,7 +277,7 @@ class LineFollower(DriveBaseline):
         return self.drive.action(o[:, [3, 4, 5, 8]], target), line
 
     def line(self, picture: NDArray[np.uint8], up: Array, above: Array) -> tuple[Array, Mask]:
-        """The pipe in pictures.
+        """Locate the pipe in pictures.
 
         Args:
             picture: uint8 (n, height, width, 3).
@@ -281,8 +285,8 @@ class LineFollower(DriveBaseline):
             above: Height of the body origin above the pipe's axis [m], (n,).
 
         Returns:
-            How far it lies to the left below the vehicle [m], and its slope to the left, (n, 2); where there is enough
-            of it in the picture, (n,).
+            Its distance to the left of the vehicle [m] and its slope to the left, (n, 2); mask of pictures
+            with enough yellow, (n,).
         """
         red, green, blue = np.moveaxis(picture.astype(float), -1, 0)
         yellow = 0.5 * (red + green) - blue
@@ -290,7 +294,7 @@ class LineFollower(DriveBaseline):
         height, width = yellow.shape[1:]
         focal = self.focal_share * width
         down = (np.arange(height) - 0.5 * (height - 1)) / focal
-        fall = down + up[:, :1]  # of a row's rays per metre ahead, pitched by the vehicle
+        fall = down + up[:, :1]  # fall of a row's rays per metre ahead, including the vehicle's pitch
         ahead = np.where(fall > 0.15, (above + self.eye[2])[:, None] / np.maximum(fall, 0.15), 0.0)
         aside = ahead[:, :, None] * (0.5 * (width - 1) - np.arange(width)) / focal
         noise = 1.5 * np.median(np.abs(yellow), axis=(1, 2), keepdims=True)
@@ -304,30 +308,30 @@ class LineFollower(DriveBaseline):
         return np.column_stack([mean_y - slope * mean_x, slope]), total > self.least
 
 
-# Along a net the classical way: straight sides through the loudest echoes, and the altimeter for the height.
+# Classical net inspection: straight sides through the strongest echoes, and height from the altimeter.
 
 
 class NetSide(NamedTuple):
-    """A straight side of a net, as a ping shows it, in the plane of the body's x and y axes."""
+    """Straight side of a net, as observed by a ping, in the plane of the body's x and y axes."""
 
     angle: Array
-    """Angle of its normal, away from the vehicle [rad], (n,)."""
+    """Angle of its normal, pointing away from the vehicle [rad], (n,)."""
     distance: Array
-    """Along that, of its straight line [m], (n,)."""
+    """Distance of its straight line along the normal [m], (n,)."""
     right: Array
-    """Along the line to the left from the point nearest to the vehicle: where it begins [m], (n,), ..."""
+    """Start of the side, measured along the line to the left from the point nearest to the vehicle [m], (n,)."""
     left: Array
-    """... and where it ends [m]."""
+    """End of the side, measured likewise [m]."""
 
     @property
     def nearest(self) -> Array:
-        """Its point nearest to the vehicle [m], (n, 2)."""
+        """Point of the side nearest to the vehicle [m], (n, 2)."""
         along = np.where(self.right < self.left, np.clip(0.0, self.right - 0.1, self.left + 0.1), 0.0)
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.column_stack([self.distance * c - along * s, self.distance * s + along * c])
 
     def meets(self, other: NetSide, reach: float) -> Mask:
-        """Return whether the two lines cross within a distance beyond an end of each [m], at 3° to 40°, (n,)."""
+        """Return whether the two lines cross at 3° to 40° and within a distance of an end of each [m], (n,)."""
         turn = other.angle - self.angle
         sine = np.where(np.abs(turn) < 0.05, 1.0, np.sin(turn))
         beyond = np.zeros_like(turn)
@@ -339,57 +343,60 @@ class NetSide(NamedTuple):
 
 
 class SonarNumbers(NamedTuple):
-    """Sonar of a vehicle."""
+    """Parameters of a vehicle's sonar."""
 
     sector: float
-    """Its field of view [rad]."""
+    """Field of view [rad]."""
     bin_length: float
-    """[m]"""
+    """Length of a range cell [m]."""
     position: tuple[float, float, float]
-    """Body axes [m]."""
+    """Position, body axes [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallFollower(DriveBaseline):
-    """Finds the net's sides among the two loudest echoes of each beam, faces its nearest point and goes to the left.
+    """Net follower that fits the net's sides to the two strongest echoes of each beam, faces its nearest
+    point and moves left.
 
-    The side on which most echoes lie is the one with the most votes of a Hough transform, refined by least squares with
-    less weight on what is far off it, as fish are. Of what is left, a second and a third side are found likewise, and
-    believed where they meet the first near its end and theirs. The altimeter hears the tube at the net's foot, whose
-    slant range and the distance give the height; a range that does not fit is left out.
+    The dominant side is the one with the most votes of a Hough transform, refined by least squares with less
+    weight on outliers such as fish. From the remaining echoes, a second and a third side are estimated
+    likewise, and accepted if they meet the first near its end and their own. The altimeter measures the slant
+    range of the tube at the net's lower edge, which gives the height with the net's distance; an implausible
+    range is ignored.
     """
 
     speed: float
-    """Along the net [m/s]."""
+    """Speed along the net [m/s]."""
     distance: float
     """Distance from the net [m]."""
     height: float
-    """Above its foot [m]."""
+    """Height above the net's lower edge [m]."""
     sonar: SonarNumbers
     under: float
     """Distance of the altimeter below the body origin [m]."""
     least: float = 60.0
-    """Level of an echo in the picture that counts."""
+    """Least picture level of an echo that is used."""
     behind: float = 0.03
-    """The loudest echo of twine comes from so far behind the net's plane, from above or below the beam's middle [m]."""
+    """Distance of the strongest echo behind the net's plane, since it comes from above or below the beam's
+    middle [m]."""
     echoes: int = 12
     """Least number of echoes on a side for it to be used."""
     reach: float = 0.45
-    """Sides that meet do so at most this beyond the last echo on each [m]."""
+    """Largest distance from the last echo of each side to the point where two sides meet [m]."""
     tube: float = 0.14
-    """Radius of the tube at the net's foot [m]."""
+    """Radius of the tube at the net's lower edge [m]."""
     gain: float = 0.5
     """Speed per distance [1/s]."""
     integral: float = 0.3
-    """Integral gain of the error of the speed over ground [1/s], which compensates a stream."""
+    """Integral gain of the ground speed error [1/s], which compensates a current."""
     jump: float = 0.25
-    """Distance and heading change by less from ping to ping [m, rad]."""
+    """Largest change of distance and heading from ping to ping [m, rad]."""
     memory_share: float = 0.5
-    """Share of distance and heading before, in the next estimate."""
+    """Weight of the previous distance and heading in the next estimate [-]."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> WallFollower:
-        """For a vehicle with `sonar` and `altimeter`, and the site `net`."""
+        """Return the baseline for a vehicle with `sonar` and `altimeter`, and the site `net`."""
         task = Net()
         sonar: Any = task.pictures[0].device(vehicle)
         altimeter = device_of(vehicle, task.ranges[0])
@@ -400,11 +407,11 @@ class WallFollower(DriveBaseline):
         )  # fmt: skip
 
     def reset(self, n: int) -> Array:  # type: ignore[override]
-        """Return the net square ahead at its distance [m, rad], and no correction of the speeds [m/s], (n, 5)."""
+        """Return the net straight ahead at its set distance [m, rad], and zero speed corrections [m/s], (n, 5)."""
         return np.tile([self.distance, 0.0, 0.0, 0.0, 0.0], (n, 1))
 
     def act(self, memory: Array, observation: Rows, pictures: Pictures) -> tuple[Rows, Array]:  # type: ignore[override]
-        """Actions for observations and pictures of inspecting a net."""
+        """Return actions for observations and pictures of inspecting a net."""
         o = np.asarray(observation, float)
         point, enough = self.nearest(next(iter(pictures.values())), memory[:, 0])
         measured = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.arctan2(point[:, 1], point[:, 0])])
@@ -428,14 +435,15 @@ class WallFollower(DriveBaseline):
         return self.drive.action(o[:, [3, 4, 5, 8]], target), np.column_stack([line, lag])
 
     def nearest(self, picture: NDArray[np.uint8], before: Array) -> tuple[Array, Mask]:
-        """The net in pings.
+        """Locate the net in pings.
 
         Args:
             picture: uint8 (n, beams, range cells, 1).
-            before: Its distance before [m], (n,).
+            before: Previous distance of the net [m], (n,).
 
         Returns:
-            Its nearest point, from the body origin along x and y [m], (n, 2); where there is one, (n,).
+            Its nearest point, from the body origin along x and y [m], (n, 2); mask of pings in which it is
+            located, (n,).
         """
         levels = picture[..., 0].astype(float)
         count, cells = levels.shape[1:]
@@ -446,7 +454,7 @@ class WallFollower(DriveBaseline):
             r = (cell + 0.5) * self.sonar.bin_length - self.behind
             weight = r * (
                 levels.max(2) >= self.least
-            )  # the way along a side from beam to beam grows with the range
+            )  # the spacing of beams along a side grows with the range
             rows.append((r * np.cos(azimuth) + self.sonar.position[0], r * np.sin(azimuth), weight))
             levels = np.where(np.abs(np.arange(cells) - cell[..., None]) <= 3, 0.0, levels)
         x, y, weight = (np.concatenate(parts, 1) for parts in zip(*rows, strict=True))
@@ -462,12 +470,12 @@ class WallFollower(DriveBaseline):
         return point, found
 
     def side(self, x: Array, y: Array, weight: Array) -> tuple[NetSide, Mask]:
-        """The straight side on which the greatest weight lies, and which points lie on it.
+        """Return the straight side with the greatest weight, and a mask of the points on it.
 
         Args:
-            x: Of the points, from the body origin [m], (n, points).
-            y: Likewise [m].
-            weight: Likewise [-].
+            x: Points, forward from the body origin [m], (n, points).
+            y: Points, left of the body origin [m], (n, points).
+            weight: Weights of the points [-], (n, points).
         """
         n, angles, step, rows = len(x), np.radians(np.arange(-48.0, 49.0, 3.0)), 0.05, 80
         distance = x[..., None] * np.cos(angles) + y[..., None] * np.sin(angles)
@@ -491,6 +499,8 @@ class WallFollower(DriveBaseline):
         off = x * np.cos(angle)[:, None] + y * np.sin(angle)[:, None] - distance[:, None]
         on = (np.abs(off) < 0.12) & (weight > 0.0)
         along = y * np.cos(angle)[:, None] - x * np.sin(angle)[:, None]
-        right = np.sort(np.where(on, along, np.inf), 1)[:, 3]  # not the last: one fish may lie on the line
+        right = np.sort(np.where(on, along, np.inf), 1)[
+            :, 3
+        ]  # not the outermost point: one fish may lie on the line
         left = -np.sort(np.where(on, -along, np.inf), 1)[:, 3]
         return NetSide(angle, distance, right, left), on

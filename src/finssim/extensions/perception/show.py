@@ -1,4 +1,5 @@
-"""`finssim worlds`: the sites of the catalogue, one of them in numbers, and what a camera and a sonar make of it."""
+"""`finssim worlds`: the sites of the catalogue, the numbers of one of them, and simulated camera and sonar
+pictures."""
 
 from __future__ import annotations
 
@@ -17,11 +18,11 @@ from finssim.extensions.perception.description import World, WorldError, load_wo
 from finssim.vehicles.device_files import CameraDevice, SonarDevice, devices, load_device
 
 WIDTH = 800
-"""Width of the camera's part of a picture [px], each the mean of 2 x 2 rays."""
+"""Width of the camera's part of a picture [px]; each pixel is the mean of 2 x 2 rays."""
 SETTLING = 10
-"""Small pictures until automatic exposure has settled."""
+"""Number of small pictures until automatic exposure has settled."""
 LAMPS = ((0.15, 0.30, -0.05), (0.15, -0.30, -0.05))
-"""Places of a vehicle's two lights, body axes [m]."""
+"""Positions of a vehicle's two lights, body axes [m]."""
 
 
 def worlds_list() -> dict[str, Any]:
@@ -54,8 +55,8 @@ def worlds_show(
         camera (NAME|FILE): Camera in the catalogue, or path of its file.
         sonar (NAME|FILE): Imaging sonar in the catalogue, or path of its file.
         sonar_range: Longest range of its image, instead of that in its file [m].
-        lamps: Two lights on the vehicle, beside the camera.
-        seed: Seed for drawing objects and water; as in the file if not given.
+        lamps: Two lights on the vehicle, next to the camera.
+        seed: Seed for drawing objects and water; by default as in the file.
         out (FILE): Image to write: the camera's view and the sonar's fan (.png).
     """
     world = load_world(site)
@@ -139,7 +140,7 @@ def _draw(
 
 
 def tables_of(result: Mapping[str, Any]) -> Sequence[Table]:
-    """Names with what they are, or one site."""
+    """Return tables of sites and sensors with their descriptions, or of one site."""
     if "sites" in result:
         return [
             Table(

@@ -1,4 +1,4 @@
-"""Sensors of the site in a task: a world drawn for each episode, pictures of cameras and sonars, and ranges."""
+"""Perception of the site in a task: a world drawn for each episode, pictures of cameras and sonars, and ranges."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from finssim.tasks.task import Task
 
 DRAWS = 1_000_003
-"""Between the seeds of a world's draws from episode to episode."""
+"""Difference between the seeds of a world's draws of consecutive episodes."""
 SETTLING = 3
-"""Pictures that automatic exposure has taken before the first of an episode."""
+"""Number of pictures that automatic exposure takes before the first one of an episode."""
 
 
 def first_draw(seed: int) -> int:
-    """Seed of the draw of the first episode's worlds, from that of the environment."""
+    """Return the seed of the draw of the first episode's worlds, from that of the environment."""
     return seed + DRAWS
 
 
 def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
-    """Set a task's goal to the place of its landmark, if it has one, and the reference to the places of its marks."""
+    """Set a task's goal to the pose of its landmark, if any, and the reference to the positions of its marks."""
     if not task.landmark:
         return
     pose = layout.poses(task.landmark)
@@ -47,7 +47,7 @@ def put_goal(task: Task, layout: WorldLayout, arrays: TaskArrays) -> None:
 
 
 def drawn_for(task: Task, world: World, arrays: TaskArrays, seed: int) -> WorldBatch:
-    """Return one copy of a world, drawn as for the first episode of a task, whose goal is set to the landmark."""
+    """Return one copy of a world, drawn as for the first episode of a task, with the task's goal at the landmark."""
     from finssim.extensions.perception.model import WorldBatch
 
     batch = WorldBatch(world)
@@ -82,13 +82,13 @@ def _fill_masked(mask: wp.array(dtype=int), value: wp.vec3, out: wp.array(dtype=
 
 
 class Sight:
-    """The world around the vehicle of a task, in as many copies as there are, and what its sensors take of it.
+    """World around the vehicle of a task, one copy per simulated world, with the sensors' measurements.
 
     Attributes:
-        batch: The world's copies.
-        pictures: What has arrived by now, by name; uint8 (worlds, height, width, 3), of a sonar (worlds, beams, range
-            cells, 1), on the device.
-        final_pictures: The last of the episodes that ended last, the same shapes.
+        batch: Copies of the world.
+        pictures: Latest pictures that arrived, by name; uint8 (worlds, height, width, 3), of a sonar (worlds,
+            beams, range cells, 1), on the device.
+        final_pictures: Last pictures of the episodes that ended most recently, in the same shapes.
     """
 
     def __init__(self, task: Task, world: World, simulator: Simulator, arrays: TaskArrays, seed: int) -> None:
@@ -151,7 +151,7 @@ class Sight:
         )  # fmt: skip
 
     def restart(self, seed: int, mask: NDArray[np.bool_] | None = None) -> None:
-        """Start the draws of some worlds over with a seed, of all if mask is None, and noise with them."""
+        """Restart the draws of some worlds with a seed; if mask is None, of all worlds, and the noise too."""
         self.seed = seed
         self._episodes[slice(None) if mask is None else mask] = 0
         if mask is None:
@@ -159,7 +159,8 @@ class Sight:
                 sensor.restart(seed)
 
     def draw(self, mask: NDArray[np.bool_]) -> None:
-        """Draw worlds for the episodes that begin where mask is true, (worlds,); the goal is the task's `landmark`."""
+        """Draw worlds for the episodes that begin where mask is true, (worlds,); the goal is set to the
+        task's `landmark`."""
         self._episodes[mask] += 1
         seeds = first_draw(self.seed) + DRAWS * (self._episodes - 1)
         self.batch.draw(seeds, mask, held_out=self._task.held_out)
@@ -177,7 +178,8 @@ class Sight:
         self.take()
 
     def take(self) -> None:
-        """Measure what is due after a control step, and let arrive what has come; ranges go to the task's arrays."""
+        """Measure with the sensors that are due after a control step, deliver readings, and copy ranges to
+        the task's arrays."""
         poses = self._poses_of(self._state, self._poses)
         for sensor in self._sensors.values():
             sensor.update(poses, self._state.steps, self._state.episode)
@@ -185,7 +187,7 @@ class Sight:
             wp.copy(self._arrays.ranges[:, i], self._sensors[name].reading[:, 0])
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep the last observation of the episodes that end where mask is true, (worlds,)."""
+        """Store the last observation of the episodes that end where mask is true, (worlds,)."""
         self._mask.assign(mask.astype(np.int32))
         for name, picture in self.pictures.items():
             inputs = [self._mask, picture, self.final_pictures[name]]
@@ -195,7 +197,8 @@ class Sight:
         wp.launch(_copy_rows, rows.shape, inputs, device=rows.device)
 
     def shown(self, world: int) -> dict[str, NDArray[np.uint8]]:
-        """The pictures of one world for people, (height, width, 3): those of cameras, and a sonar's as a gray fan."""
+        """Return displayable pictures of one world, (height, width, 3): those of cameras, and a sonar's as a
+        gray fan."""
         from finssim.core.sonar_fan import fan_picture
 
         out = {}
@@ -208,24 +211,25 @@ class Sight:
         return out
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """The arrays on the device that decide what is seen next, by name. Each has the unit of its attribute."""
+        """Yield the arrays on the device that determine the next pictures, by name. Each has the unit of its
+        attribute."""
         yield from ((f"sight.{name}.gain", camera.gain) for name, camera in self._metered.items())
         for name, sensor in self._sensors.items():
             yield from ((f"sight.{name}.{key}", array) for key, array in sensor.arrays())
 
     def counters(self) -> dict[str, NDArray[Any]]:
-        """Return the remaining counts, as copies."""
+        """Return the remaining counts on the host, as copies."""
         updates = np.array([sensor.updates for sensor in self._sensors.values()])
         return {"drawn": self.batch.drawn, "episodes": self._episodes.copy(), "updates": updates}
 
     def load_counters(self, saved: dict[str, NDArray[Any]]) -> None:
-        """Take the counts that `counters` gave."""
+        """Restore the counts that `counters` returned."""
         self.batch.drawn, self._episodes[:] = saved["drawn"], saved["episodes"]
         for sensor, updates in zip(self._sensors.values(), saved["updates"], strict=True):
             sensor.updates = int(updates)
 
     def describe(self) -> dict[str, dict[str, Any]]:
-        """The pictures as a policy directory has them: device, shape, rate [Hz], latency [s]."""
+        """Return the description of the pictures for a policy directory: device, shape, rate [Hz], latency [s]."""
         entries = {name: self._vehicle.perception[name] for name in self.pictures}
         return {
             name: {

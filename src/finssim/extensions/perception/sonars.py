@@ -1,4 +1,4 @@
-"""Imaging, profiling and side-scan sonars of many vehicles: echoes of rays, gathered by beam and range cell."""
+"""Imaging, profiling and side-scan sonars of many vehicles: echoes of rays, accumulated by beam and range cell."""
 # mypy: ignore-errors
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Echoes:
-    """Echoes of the rays of many sonars, and what their receivers make of them."""
+    """Echoes of the rays of many sonars, and the signals of the receivers."""
 
     weight: wp.array(dtype=float)  # b² dW/pi, by elevation [-]
     absorption: float  # [dB/m]
-    steps: wp.vec2  # between rays along elevation and azimuth [rad]
-    bins_per_metre: float  # range cells [1/m]
+    steps: wp.vec2  # angles between rays along elevation and azimuth [rad]
+    bins_per_metre: float  # range cells per metre [1/m]
     noise: float  # power in a range cell before gain [-]
-    display: wp.vec2  # levels of 0 and 255 [dB]
+    display: wp.vec2  # levels shown as 0 and 255 [dB]
     taps: wp.array(dtype=float)  # pattern of a receiving beam [-]
     gain: wp.array(dtype=float)  # by range cell [-]
     quantiles: wp.array(dtype=float)  # of the exponential distribution [-]
-    energy: wp.array3d(dtype=float)  # in one range cell, by view, elevation and azimuth [-]
+    energy: wp.array3d(dtype=float)  # energy in one range cell, by view, elevation and azimuth [-]
     spread: wp.array3d(dtype=wp.vec2)  # first and last range cell [-]
     intensity: wp.array3d(dtype=float)  # power, by view, beam and range cell [-]
     picture: wp.array3d(dtype=wp.uint8)
@@ -38,16 +38,16 @@ class Echoes:
 
 @wp.kernel(enable_backward=False)
 def _echo_rays(traced: Traced, scene: RayScene, echoes: Echoes, span: int):
-    """Echo of every ray and the ranges it comes from.
+    """Compute the echo of every ray and its interval of ranges.
 
     A ray of solid angle dW that strikes a Lambertian surface of parameter mu at range r under cosine k returns
 
         e = b² dW mu k 10^(-2 alpha r/10)/r²,   from the sonar equation with A = dW r²/k and S_b = mu k²
 
-    relative to the source's level at 1 m. (Lambert's law: 10 log mu + 10 log k²; b² dW is `weight`.) It comes from the
-    ranges of its footprint: half-way to the rays above and below where they strike the same shape, else as far as the
-    normal says; so that no gaps open between rays on a slanting floor. `energy` is that of one range cell. What stands
-    above the water is not heard.
+    relative to the source's level at 1 m. (Lambert's law: 10 log mu + 10 log k²; b² dW is `weight`.) Its
+    ranges are those of its footprint: half-way to the rays above and below if they strike the same shape,
+    else as the normal implies, so that no gaps open between rays on a sloping floor. `energy` is that of one
+    range cell. Surfaces above the water give no echo.
     """
     v, i, block = wp.tid()
     if traced.worlds[v] == SKIPPED:
@@ -84,7 +84,8 @@ def _echo_rays(traced: Traced, scene: RayScene, echoes: Echoes, span: int):
                         high = wp.max(high, r + way)
                         count += 1
             if count < 2:
-                # At an edge: as far to the other side as the footprint lets it, but no farther than to this one.
+                # At an edge: extend to the other side as far as the footprint allows, but not farther than to
+                # this side.
                 low = wp.min(low, r - wp.min(half, wp.where(count == 0, half, high - r)))
                 high = wp.max(high, r + wp.min(half, wp.where(count == 0, half, r - low)))
             first = (low - across) * echoes.bins_per_metre
@@ -98,7 +99,8 @@ def _echo_rays(traced: Traced, scene: RayScene, echoes: Echoes, span: int):
 
 @wp.kernel(enable_backward=False)
 def _gather_echoes(worlds: wp.array(dtype=int), echoes: Echoes):
-    """Echo by beam and range cell: rays of the beam's own and the neighbouring directions, by its pattern."""
+    """Accumulate echoes by beam and range cell, from the beam's own and neighbouring directions, weighted by
+    its pattern."""
     v, b = wp.tid()
     if worlds[v] == SKIPPED:
         return
@@ -120,10 +122,11 @@ def _gather_echoes(worlds: wp.array(dtype=int), echoes: Echoes):
 
 @wp.kernel(enable_backward=False)
 def _receive(worlds: wp.array(dtype=int), echoes: Echoes, key: int, span: int):
-    """Noise and speckle, gain, and 8 bits of the level; a thread takes `span` range cells of a beam.
+    """Add noise and speckle, apply gain, and encode the level in 8 bits; a thread processes `span` range
+    cells of a beam.
 
-    Echoes of many scatterers and noise add as complex normal numbers: power is (I + N) times a draw of the exponential
-    distribution, amplitude Rayleigh. Without a seed (key < 0) it is I + N itself.
+    Echoes of many scatterers and noise add as complex normal numbers: power is (I + N) times a draw of the
+    exponential distribution, amplitude Rayleigh. Without a seed (key < 0) it is I + N itself.
     """
     v, b, block = wp.tid()
     if worlds[v] == SKIPPED:
@@ -149,7 +152,8 @@ def _detect(
     bin_length: float,
     ranges: wp.array2d(dtype=float),
 ):
-    """Range of the first cell of each beam that is loud enough and within 6 dB of its loudest: the cell's middle."""
+    """Find the first range cell of each beam above the threshold and within 6 dB of the beam's strongest;
+    return its middle."""
     v, b = wp.tid()
     if worlds[v] == SKIPPED:
         return
@@ -164,23 +168,23 @@ def _detect(
 
 
 class SonarBatch(RayBatch):
-    """An imaging, profiling or side-scan sonar on each of N vehicles.
+    """Imaging, profiling or side-scan sonar on each of N vehicles.
 
     Args:
-        batch: The worlds; their water's temperature and salinity give the absorption of sound.
+        batch: The worlds; their water's temperature and salinity determine the absorption of sound.
         sonar: The device.
-        beams: In place of its own, over the same sector.
-        bins: In place of its own, over the same range.
-        vehicles: In each world.
+        beams: Number of beams over the sector, instead of the device's own.
+        bins: Number of range cells over the range, instead of the device's own.
+        vehicles: Number of vehicles in each world.
     """
 
     intensity: wp.array
     """Power after gain [-], relative to the source's level at 1 m; float (N, beams, bins), beam 0 at the left."""
     picture: wp.array
-    """Picture: its level between the device's `display` levels; uint8 (N, beams, bins)."""
+    """Picture: power level, scaled between the device's `display` levels; uint8 (N, beams, bins)."""
     ranges: wp.array
-    """Range of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's loudest [m],
-    infinite if there is none; float (N, beams)."""
+    """Ranges of a profiling sonar: first range with a level of `detection_db` and within 6 dB of the beam's
+    strongest [m], infinite if there is none; float (N, beams)."""
 
     def __init__(
         self,
@@ -195,7 +199,7 @@ class SonarBatch(RayBatch):
         super().__init__(batch, rays, sonar.mount, vehicles)
         self.sonar, self.bins = sonar, bins or sonar.bins
         self.absorption = batch.world.water.sound_absorption(sonar.frequency)
-        """[dB/m]"""
+        """Absorption of sound [dB/m]."""
         count = rays.shape[1]
         elevation, spacing = ray_elevations(sonar), sonar.sector / count
         if sonar.mode == "side_scan":
@@ -231,13 +235,13 @@ class SonarBatch(RayBatch):
     def update(
         self, poses: wp.array, *, seed: int | None = None, time: float = 0.0, mask: wp.array | None = None
     ) -> wp.array:
-        """One ping of each vehicle.
+        """Simulate one ping of each vehicle.
 
         Args:
             poses: Body to world of each vehicle, xyzw; transform (N,) on the batch's device [m].
-            seed: Of speckle and noise; None for the mean power.
-            time: Of the ping [s]: pings of other times have other speckle.
-            mask: Which vehicles measure; the others keep their last. int (N,); all if None.
+            seed: Seed of speckle and noise; None for the mean power.
+            time: Time of the ping [s]; it changes the speckle.
+            mask: Vehicles that measure; the others keep their last picture. int (N,); all if None.
 
         Returns:
             `picture`, which the next update overwrites.
@@ -261,9 +265,9 @@ def beam_pattern(width: float, spacing: float, beams: int) -> np.ndarray:
     (odd,).
 
     Args:
-        width: Between half-power points [rad]: sinc²(0.443) = 1/2.
-        spacing: Of the beams [rad].
-        beams: How many; the pattern ends after its first side lobes, at 2.5 widths.
+        width: Width between half-power points [rad]: sinc²(0.443) = 1/2.
+        spacing: Angle between the beams [rad].
+        beams: Number of beams; the pattern ends after its first side lobes, at 2.5 widths.
     """
     reach = min(int(2.5 * width / spacing), beams - 1)
     taps = np.sinc(0.8859 * np.arange(-reach, reach + 1) * spacing / width) ** 2
