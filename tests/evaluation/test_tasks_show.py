@@ -49,7 +49,7 @@ def test_what_is_told_is_what_the_environment_has(name):
     assert told["observation"]["size"] == env.observation_size
     assert sum(part["size"] for part in told["observation"]["parts"]) == env.observation_size
     assert told["action"]["size"] == env.action_size and len(told["agents"]) == env.agents
-    assert told["title"] and told["success"] != "as metrics tells" and told["baselines"]
+    assert told["title"] and told["success"] != "as defined by metrics" and told["baselines"]
     assert len(told["reward"]["weights"]) > 4 and "\n" in told["reward"]["told"]
     first = told["action"]["components"][0]
     if told["action"]["mode"].startswith("course"):

@@ -103,7 +103,7 @@ def look_up(state: State, sky: int) -> bool:
 
 def test_a_term_that_takes_what_there_is_not_is_named():
     with pytest.raises(
-        EnvironmentSetupError, match=r"inside \(.*look_up\) takes 'sky', expected of: arrays, p"
+        EnvironmentSetupError, match=r"inside \(.*look_up\) has the argument 'sky', expected of: arrays, p"
     ):
         Environment(Wrong())
 

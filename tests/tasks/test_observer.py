@@ -111,7 +111,7 @@ def test_the_prey_of_a_pursuit_without_a_track_is_where_the_guide_is():
 def test_a_team_mate_that_nobody_tells_of_is_named():
     me = Track(np.zeros(3), quat_from_yaw(0.0), np.zeros(6))
     with pytest.raises(
-        ControlError, match="'team-pursuit' looks at 'left_netter', whose position is not known"
+        ControlError, match="'team-pursuit' needs the position of 'left_netter', which no source provides"
     ):
         Observer("team-pursuit", FINSROV).observe(me, Station((1.0, 0.0, -1.0), 0.0), 0.0)
 
@@ -152,9 +152,7 @@ def test_what_no_robot_knows_is_refused_before_it_runs(tmp_path, heave):
     """A memory that reward writes, and how long the tolerance was kept; in a simulation both are there."""
     name = in_torch(tmp_path, heave, "memory = {'last': 1}")
     assert np.isfinite(Environment(task_named(name), FINSROV, worlds=2, seed=1).reset()).all()
-    with pytest.raises(
-        ControlError, match="'keep-depth' cannot be observed on a robot: it looks at w"
-    ) as error:
+    with pytest.raises(ControlError, match="'keep-depth' cannot be observed on a robot: it reads w") as error:
         Observer(name, FINSROV)
     assert heave.partition("[:")[0] in str(error.value)
 

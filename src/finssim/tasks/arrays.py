@@ -1,4 +1,4 @@
-"""The arrays through which task, action and learner meet: all indexed by world."""
+"""Arrays shared by task, action and learner, all indexed by world."""
 
 from typing import Any
 
@@ -12,14 +12,14 @@ from finssim.physics.types import vec6
 
 @wp.struct
 class ReferenceTable:
-    """A wanted motion for every world: knots at equal times, between them a cubic with the knots' velocities."""
+    """Reference trajectory of every world: equally spaced knots, with cubic Hermite interpolation between them."""
 
     position: wp.array2d(dtype=wp.vec3)  # (worlds, knots), world frame [m]
-    velocity: wp.array2d(dtype=wp.vec3)  # there [m/s]
+    velocity: wp.array2d(dtype=wp.vec3)  # at the knots, world frame [m/s]
     spacing: float  # time between two knots [s]
-    duration: wp.array(dtype=float)  # time from progress 0 to 1; held from then on [s]
-    offset: wp.array(dtype=float)  # share of the way at the start
-    given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
+    duration: wp.array(dtype=float)  # time from progress 0 to 1; the end is held from then on [s]
+    offset: wp.array(dtype=float)  # progress at the start, fraction of the trajectory
+    given: wp.array(dtype=int)  # 1: filled by the caller; a new episode keeps it
 
 
 @wp.struct
@@ -27,8 +27,8 @@ class PathTable:
     """The path of every world: straight legs from point to point."""
 
     points: wp.array2d(dtype=wp.vec3)  # (worlds, points), world frame [m]
-    leg: wp.array(dtype=int)  # the leg that is followed now
-    given: wp.array(dtype=int)  # 1: filled from outside; an episode that starts keeps it
+    leg: wp.array(dtype=int)  # index of the leg that is currently followed
+    given: wp.array(dtype=int)  # 1: filled by the caller; a new episode keeps it
 
 
 @wp.struct
@@ -36,124 +36,130 @@ class TargetMotion:
     """Motion of the target of every world; its position is in `goal_position`."""
 
     velocity: wp.array(dtype=wp.vec3)  # world frame [m/s]
-    wanted: wp.array(dtype=wp.vec3)  # what the velocity goes to [m/s]
-    until: wp.array(dtype=float)  # time in the episode at which another is drawn [s]
+    wanted: wp.array(dtype=wp.vec3)  # velocity that the target accelerates to [m/s]
+    until: wp.array(dtype=float)  # time in the episode at which the next velocity is drawn [s]
     rng: wp.array(dtype=wp.uint32)  # the world's own random stream
 
 
 @wp.struct
 class MessageTable:
-    """Messages that the agents of a world have received, and those under way; see `communication`."""
+    """Messages that the agents of a world have received, and those in transit; see `communication`."""
 
-    on: int  # 0: everybody sees everybody
+    on: int  # 0: every agent observes all others directly
     period: int  # control steps between two messages of an agent
-    slots: int  # messages of one agent that can be under way together
+    slots: int  # messages of one agent that can be in transit at once
     processing: float  # [s]
     speed_of_sound: float  # [m/s]
-    loss: float  # probability, for every receiver
+    loss: float  # loss probability for each receiver
     control_step: float  # [s]
-    key: wp.array(dtype=int)  # of the world's random stream in this episode
+    key: wp.array(dtype=int)  # key of the world's random stream in this episode
     sent_position: wp.array2d(dtype=wp.vec3)  # (worlds, sender * slots + slot), world frame [m]
     sent_velocity: wp.array2d(dtype=wp.vec3)  # world frame [m/s]
     sent_step: wp.array2d(dtype=int)
     arrival: wp.array3d(dtype=int)  # (worlds, sender * slots + slot, receiver): control step; -1: never
-    position: wp.array2d(dtype=wp.vec3)  # places of the other agents as last heard, world frame [m]
+    position: wp.array2d(dtype=wp.vec3)  # last received positions of the other agents, world frame [m]
     velocity: wp.array2d(dtype=wp.vec3)
-    step: wp.array2d(dtype=int)  # control step at which that was sent
+    step: wp.array2d(dtype=int)  # control step in which they were sent
 
 
 @wp.struct
 class NetTable:
-    """A net that agents hold, and what drifts in the water to be caught with it."""
+    """A net that agents carry, and the drifting target that it catches."""
 
     target: wp.array(dtype=wp.vec3)  # world frame [m]
-    drift: wp.array(dtype=wp.vec3)  # its velocity while nothing holds it [m/s]
-    motion: wp.array(dtype=wp.vec3)  # its velocity now [m/s]
+    drift: wp.array(dtype=wp.vec3)  # velocity of the target while it drifts freely [m/s]
+    motion: wp.array(dtype=wp.vec3)  # current velocity of the target [m/s]
 
 
 @wp.struct
 class Answers:
-    """Answers of the functions of a task in plain torch, for the kernels that follow; see `torch_task`."""
+    """Results of the functions of a task in plain torch, for the kernels that follow; see `torch_task`."""
 
     reward: wp.array2d(dtype=float)  # reward, (worlds, agents)
     terminated: wp.array(dtype=int)
     inside: wp.array(dtype=int)  # 1: within the tolerance of success
-    counted: wp.array2d(dtype=float)  # (worlds, task.totals): what this step adds to them, in their units
-    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), where an episode would start; world frame [m]
+    counted: wp.array2d(
+        dtype=float
+    )  # (worlds, task.totals): increments of this step, in the units of the totals
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), at the start of an episode; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
     goal_position: wp.array(dtype=wp.vec3)
     goal_quaternion: wp.array(dtype=wp.quat)
     begun: wp.array2d(dtype=float)  # (worlds, numbers): memory at the start, in the units of the task
-    memory: wp.array2d(dtype=float)  # (worlds, numbers): what the task keeps within an episode, in its units
+    memory: wp.array2d(
+        dtype=float
+    )  # (worlds, numbers): variables of the task within an episode, in its units
 
 
 @wp.struct
 class TaskArrays:
     """Inputs and outputs of a task for every world.
 
-    The first vehicles of a world are the agents, those that learn; the task itself commands the others. Where there are
-    several agents, their numbers lie one after the other: number i of agent a is [w, a * size + i].
+    The first vehicles of a world are the agents, which learn; the task itself commands the others. The numbers of
+    several agents are concatenated: number i of agent a is [w, a * size + i].
     """
 
     action: wp.array2d(dtype=float)  # (worlds, agents * size), each in [-1, 1]
-    action_size: int  # of one vehicle
+    action_size: int  # numbers in the action of one vehicle
     previous_action: wp.array2d(dtype=float)
-    time: wp.array(dtype=float)  # in the episode [s]
+    time: wp.array(dtype=float)  # time in the episode [s]
     scripted: wp.array2d(dtype=float)  # (worlds, others * size): actions of the vehicles that do not learn
     observation: wp.array2d(dtype=float)  # observation, (worlds, agents * size)
     taught: wp.array2d(dtype=float)  # (worlds, agents * size): observation of a teacher
-    final_observation: wp.array2d(dtype=float)  # last observation of the episode that ended in this step
-    reward: wp.array(dtype=float)  # reward of all agents together: their mean
-    agent_reward: wp.array2d(dtype=float)  # (worlds, agents); of a single agent the same memory as `reward`
-    terminated: wp.array(dtype=int)  # 1: ended by the task (left the pool, broke)
+    final_observation: wp.array2d(dtype=float)  # last observation of the latest finished episode
+    reward: wp.array(dtype=float)  # reward, mean over all agents
+    agent_reward: wp.array2d(dtype=float)  # (worlds, agents); the same memory as `reward` for a single agent
+    terminated: wp.array(dtype=int)  # 1: ended by the task (left the pool, diverged)
     truncated: wp.array(dtype=int)  # 1: ended by the time limit
     done: wp.array(dtype=int)  # terminated or truncated: reset in this step
-    episode_return: wp.array(dtype=float)  # sum of rewards of the running episode
-    final_return: wp.array(dtype=float)  # sum of rewards of the episode that ended last
-    final_length: wp.array(dtype=int)  # its control steps
-    held: wp.array(dtype=float)  # time inside the success tolerance so far [s]
-    final_held: wp.array(dtype=float)  # the same when the last episode ended [s]
-    totals: wp.array2d(dtype=float)  # (worlds, task.totals): what the task counts in the episode, from 0
-    final_totals: wp.array2d(dtype=float)  # the same when the last episode ended, in their units
+    episode_return: wp.array(dtype=float)  # sum of rewards of the current episode
+    final_return: wp.array(dtype=float)  # sum of rewards of the latest finished episode
+    final_length: wp.array(dtype=int)  # its length in control steps
+    held: wp.array(dtype=float)  # time so far within the success tolerance without a break [s]
+    final_held: wp.array(dtype=float)  # the same at the end of the latest finished episode [s]
+    totals: wp.array2d(dtype=float)  # (worlds, task.totals): totals of the episode, from 0, in their units
+    final_totals: wp.array2d(dtype=float)  # the same of the latest finished episode, in their units
     earned: wp.array2d(
         dtype=float
-    )  # (worlds, rewards and ends): what each added to the return, mean over agents
-    final_earned: wp.array2d(dtype=float)  # the same rewards when the last episode ended
+    )  # (worlds, rewards and ends): contribution of each to the return, mean over agents
+    final_earned: wp.array2d(dtype=float)  # the same rewards of the latest finished episode
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
-    reference: ReferenceTable  # of tasks that follow one
-    current: wp.array(dtype=wp.vec3)  # of the water at the surface, world frame [m/s]: the simulator's
+    reference: ReferenceTable  # only for tasks that follow a reference
+    current: wp.array(dtype=wp.vec3)  # current at the surface, world frame [m/s]: the simulator's array
     seabed: wp.array2d(
         dtype=wp.vec4
-    )  # (worlds, ripples) of tasks over a seabed: height [m], wave number [rad/m],
+    )  # (worlds, ripples), for tasks over a seabed: height [m], wave number [rad/m],
     # direction [rad] and phase [rad] of each
-    path: PathTable  # of tasks along a path in space
-    target: TargetMotion  # of tasks whose goal moves
-    funnel: Funnel  # of tasks with a dock: the simulator's; its pose is the goal's
-    steering: wp.array2d(dtype=Memory)  # (worlds, vehicles): memory of autopilots [m, rad, N, N m, m/s]
-    messages: MessageTable  # of tasks whose agents talk to each other
-    net: NetTable  # of tasks whose agents hold a net
-    answers: Answers  # of tasks in plain torch
-    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured, maybe with noise; world frame [m]
+    path: PathTable  # only for tasks along a path in space
+    target: TargetMotion  # only for tasks with a moving goal
+    funnel: Funnel  # only for tasks with a dock: the simulator's struct; its pose is the goal's
+    steering: wp.array2d(dtype=Memory)  # (worlds, vehicles): state of the autopilots [m, rad, N, N m, m/s]
+    messages: MessageTable  # only for tasks with communication between agents
+    net: NetTable  # only for tasks with a net
+    answers: Answers  # only for tasks in plain torch
+    position: wp.array2d(
+        dtype=wp.vec3
+    )  # (worlds, vehicles), as measured, possibly with noise; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
-    ranges: wp.array2d(
+    ranges: wp.array2d(dtype=float)  # (worlds, task.ranges), as measured [m]; infinite without an echo
+    privileged: wp.array2d(
         dtype=float
-    )  # (worlds, task.ranges), as measured [m]; infinite where nothing is in reach
-    privileged: wp.array2d(dtype=float)  # (worlds, agents * P): what was drawn, from nominal, unit scale
-    final_privileged: wp.array2d(dtype=float)  # the same of the episode that ended last [-]
+    )  # (worlds, agents * P): drawn parameters, scaled deviation from nominal [-]
+    final_privileged: wp.array2d(dtype=float)  # the same of the latest finished episode [-]
 
 
 def allocated(kind: Any, worlds: int, device: wp.Device, **columns: int | tuple[int, ...]) -> Any:
-    """A struct of arrays by world, all zero.
+    """Return a struct of arrays by world, all zero.
 
     Args:
         kind: The struct.
-        worlds: How many.
-        device: Where.
-        columns: Sizes of the dimensions after the worlds, by the name of an array. Arrays with such dimensions that are
-            not named are left for who fills or aliases them.
+        worlds: Number of worlds.
+        device: Warp device of the arrays.
+        columns: Sizes of the dimensions after the worlds, by the name of an array. Arrays with further dimensions that
+            are not named are not allocated: the caller fills or aliases them.
     """
     out = kind()
     for name, variable in kind.vars.items():

@@ -1,4 +1,4 @@
-"""Scores of several worlds at once on a processor: see `finssim.physics.lanes`."""
+"""Evaluation of a task for several worlds at once on a CPU: see `finssim.physics.lanes`."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def evaluate_in_blocks(score: Any, inputs: list[Any]) -> wp.Kernel | None:
     """Return the kernel `evaluate` of a task for blocks of worlds; None if a term cannot be traced.
 
     Args:
-        score: Function of a world's step, traced.
+        score: Function that evaluates one step of a world, to be traced.
         inputs: Inputs of the kernel `evaluate`.
     """
     state, arrays, p, weights = inputs

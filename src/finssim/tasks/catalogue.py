@@ -1,4 +1,4 @@
-"""Every task by name, tasks of one's own, and `finssim.make`: any task's batched environment, from names."""
+"""All tasks by name, user-defined tasks, and `finssim.make`: the batched environment of a task."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
-# Tasks of one's own by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of what Python can import.
+# User-defined tasks by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of an importable module.
 
 
 def own_task(reference: str, **settings: Any) -> Task:
-    """The task that a class (or any other callable) of a file or module makes.
+    """Return the task that a class (or any other callable) of a file or module creates.
 
     Args:
         reference: FILE.py:NAME or MODULE:NAME.
-        settings: Its arguments.
+        settings: Arguments of the class.
 
     Raises:
-        EnvironmentSetupError: There is no such file, module or name; its code fails; or it makes no task.
+        EnvironmentSetupError: There is no such file, module or name; its code fails; or it does not create a task.
     """
     return _made(reference, own_class(reference, Task, "task"), settings)
 
 
 def _made(reference: str, factory: Any, settings: Mapping[str, Any]) -> Task:
-    """Return the task that a class or function makes; `reference` is its name in messages."""
+    """Return the task that a class or function creates; `reference` is its name in messages."""
     try:
         task = factory(**settings)
     except TypeError as error:
@@ -54,8 +54,8 @@ def own_class(reference: str, base: type, kind: str) -> Any:
 
     Args:
         reference: FILE.py:NAME or MODULE:NAME.
-        base: Class whose subclasses are listed where there is no such name.
-        kind: What it is, in messages.
+        base: Base class, whose subclasses are listed in the message if there is no such name.
+        kind: Kind of class, for messages.
 
     Raises:
         EnvironmentSetupError: There is no such file, module or name, or its code fails.
@@ -76,11 +76,11 @@ def own_class(reference: str, base: type, kind: str) -> Any:
 
 
 def _of_file(path: Path) -> ModuleType:
-    """Return the module of a file, run once; files beside it can be imported by it."""
+    """Return the module of a file, executed once; it can import other files of its folder."""
     if not path.is_file():
         raise EnvironmentSetupError(f"there is no file {path}: give FILE.py:CLASS")
     full_path = path.resolve()
-    # A unique name: two files of one name are two modules, and Warp keeps kernels by module.
+    # A unique name: two files with the same name are two modules, and Warp caches kernels by module.
     name = f"{full_path.stem}_{hashlib.sha256(str(full_path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
@@ -107,19 +107,19 @@ def _of_import(name: str) -> ModuleType:
 
 
 def numeric_tasks() -> list[str]:
-    """Return the names of the tasks that observe no pictures; those that cannot be imported are left out."""
+    """Return the names of the tasks without pictures; those that cannot be imported are omitted."""
     return [name for name, kind in TASKS.usable().items() if not kind().pictures]
 
 
 def check_registered(name: str, task: Any) -> None:
-    """Refuse what makes no task.
+    """Refuse a registered object that does not create a task.
 
     Args:
         name: Name of the task.
         task: The object that is registered under it.
 
     Raises:
-        EnvironmentSetupError: It is no callable, or a class that is not derived from `Task`.
+        EnvironmentSetupError: It is not callable, or a class that is not derived from `Task`.
     """
     if not callable(task) or (isinstance(task, type) and not issubclass(task, Task)):
         raise EnvironmentSetupError(
@@ -132,14 +132,14 @@ OBSERVED: dict[str, MeasurementNoise | Sensing] = {
     "estimator": ESTIMATOR,
     "sensors": Sensing(),
 }
-"""Observation of a controller by name; besides them `training`, the noise that a task is trained with."""
+"""Observations of a controller by name; there is also `training`, with the noise that a task is trained with."""
 
 
 def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
-    """Return the observation of a controller by its name, in a task; or with the fixes of a file.
+    """Return the observation of a controller by its name, for a task, or by a file of position fixes.
 
     Raises:
-        EnvironmentSetupError: There is no such name, or the file is wrong.
+        EnvironmentSetupError: There is no such name, or the file is invalid.
     """
     available = {**OBSERVED, **({} if task is None else {"training": task.training_noise})}
     if name not in available and name.endswith((".yaml", ".yml")):
@@ -152,10 +152,10 @@ def observed(name: str, task: Task | None = None) -> MeasurementNoise | Sensing:
 
 
 def task_named(task: str | Task, **settings: Any) -> Task:
-    """Return a task by its name, or a user's task by FILE.py:CLASS or MODULE:CLASS, with given settings.
+    """Return a task by its name, or a user-defined task by FILE.py:CLASS or MODULE:CLASS, with the given settings.
 
     Raises:
-        EnvironmentSetupError: There is none of that name.
+        EnvironmentSetupError: No task has that name.
     """
     if isinstance(task, Task):
         return task
@@ -183,27 +183,27 @@ def make(
     observe: MeasurementNoise | Sensing | str = "truth",
     **options: Any,
 ) -> Environment:
-    """The batched environment of a task; every adapter takes the same arguments.
+    """Return the batched environment of a task; every adapter has the same arguments.
 
     Args:
         task: A task or its name.
-        worlds: How many at once.
+        worlds: Number of worlds.
         vehicle: A vehicle, a catalogue name or a file; or one for each of the task's vehicles.
         hydrodynamics: calibrated, mesh or simplified.
         action: thruster8, wrench6, wrench4, pilot6 (ArduSub's axes), surfaces, course or course_pitch; the task's
             own if None.
-        randomize: Ranges, or the name or file of some, from which vehicle and water are drawn in every episode.
-        observe: What the controller sees: truth, estimator (noise, offset and delay of the robot's own localization),
-            training (the noise that the task is trained with), sensors (what the vehicle's own sensors and position
-            fixes say, through a filter), a file of fixes (.yaml) for the same on another site, or a noise or `Sensing`
-            of one's own.
-        options: The rest of what `Environment` takes: seed, device, threads, water, pool, tether, ...
+        randomize: Ranges, or their name or file, from which vehicle and water are drawn in every episode.
+        observe: Observation of the controller: truth, estimator (noise, offset and delay of the robot's own
+            localization), training (the noise that the task is trained with), sensors (the vehicle's own sensors and
+            position fixes, fused by a filter), a file of fixes (.yaml) for the same at another site, or a
+            `MeasurementNoise` or `Sensing`.
+        options: Other arguments of `Environment`: seed, device, threads, water, pool, tether, ...
 
     Returns:
         The environment.
 
     Raises:
-        EnvironmentSetupError: A name that does not exist, or vehicles that do not fit the task.
+        EnvironmentSetupError: A name does not exist, or vehicles do not fit the task.
     """
     chosen = task_named(task)
     if isinstance(observe, str):

@@ -1,4 +1,4 @@
-"""`check_task`: the usual mistakes in a task of one's own, found by playing it for a few short episodes."""
+"""`check_task`: search a user-defined task for common mistakes by running a few short episodes."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
 LARGEST = 20.0
-"""An observation beyond this is called unbounded: networks want numbers of order one."""
+"""Magnitude above which an observation counts as unbounded: networks need numbers of order one."""
 
 WORLDS = 8
-"""Worlds that are played."""
+"""Number of worlds in the check."""
 
 EPISODE = 10
-"""Control steps of an episode in a check; as many episodes are played as `EPISODES`."""
+"""Control steps of an episode in the check; there are `EPISODES` episodes."""
 
 EPISODES = 3
 
 
 class TaskError(ValueError):
-    """A task with mistakes; one sentence for each."""
+    """A task has mistakes; the message has one sentence for each."""
 
 
 class Played(NamedTuple):
-    """Results of the steps, by step and world."""
+    """Recorded results, by step and world."""
 
     observation: NDArray[np.float32]
     """(steps, worlds, numbers of all agents)"""
@@ -39,7 +39,7 @@ class Played(NamedTuple):
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     metrics: dict[str, NDArray[np.float64]]
-    """Values at the end, in the units of the metrics."""
+    """Metrics at the end, in their units."""
 
     @property
     def ended(self) -> NDArray[np.bool_]:
@@ -50,16 +50,16 @@ class Played(NamedTuple):
 def check_task(
     task: Task, vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov", **options: Any
 ) -> None:
-    """Play a task with random actions and look for mistakes.
+    """Run a task with random actions and check for mistakes.
 
-    Observations that are not finite, grow without bound or leave their clip; runs that differ under equal seeds or with
-    the number of worlds; episodes that do not end, or end twice; rewards and observations that know of the episode
-    before; starts that are all the same; metrics that are not those of the steps.
+    Mistakes are: observations that are not finite, unbounded or outside their clip; results that differ for equal seeds
+    or with the number of worlds; episodes that do not end, or end twice; rewards and observations that depend on the
+    previous episode; identical starts; metrics that contradict the steps.
 
     Args:
         task: The task.
-        vehicle: Who does it: one for all, or one for each of the task's vehicles.
-        options: More arguments of `Environment`.
+        vehicle: One vehicle for all roles of the task, or one for each.
+        options: Further arguments of `Environment`.
 
     Raises:
         TaskError: There are mistakes.
@@ -105,7 +105,7 @@ def _play(environment: Environment, actions: NDArray[np.float32]) -> Played:
 
 
 def _observation(played: Played, task: Task, agents: int) -> Iterator[str]:
-    """Finite and of order one, part by part; rewards finite."""
+    """Yield findings on observations, which must be finite and of order one, part by part, and on rewards."""
     if not np.isfinite(played.reward).all():
         yield "a reward is not finite"
     first, table = 0, played.observation.reshape(*played.observation.shape[:2], agents, -1)
@@ -123,7 +123,7 @@ def _observation(played: Played, task: Task, agents: int) -> Iterator[str]:
 
 
 def _ends(played: Played) -> Iterator[str]:
-    """Every episode ends by its time limit, as one thing or the other."""
+    """Yield findings on ends: every episode must end by its time limit, either terminated or truncated."""
     if (played.terminated & played.truncated).any():
         yield "an episode is terminated and truncated at once: a failure at the time limit is a failure"
     for world in range(played.ended.shape[1]):
@@ -134,7 +134,7 @@ def _ends(played: Played) -> Iterator[str]:
 
 
 def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
-    """Equal seeds, equal numbers, for any number of worlds."""
+    """Yield findings on repeatability: equal seeds must give equal numbers, for any number of worlds."""
     if not _equal(first, again):
         yield "equal seeds give other numbers: draw from wp.rand_init(key, world) or w.uniform alone"
         return
@@ -146,13 +146,13 @@ def _repeats(first: Played, again: Played, many: Played) -> Iterator[str]:
 
 
 def _equal(first: Played, other: Played) -> bool:
-    """Return whether the first worlds of another play gave the same numbers."""
+    """Return whether the first worlds of another run have the same numbers."""
     pairs = zip(first[:4], other[:4], strict=True)
     return all(np.array_equal(a, b[:, :WORLDS], equal_nan=a.dtype.kind == "f") for a, b in pairs)
 
 
 def _leaks(first: Played, past: Played) -> Iterator[str]:
-    """An episode after another one that went differently is the same episode."""
+    """Yield findings on leaks: an episode must not depend on the previous one."""
     full = [p.ended[EPISODE - 1] & ~p.ended[: EPISODE - 1].any(axis=0) for p in (first, past)]
     worlds = full[0] & full[1]
     second = slice(EPISODE, 2 * EPISODE)
@@ -171,7 +171,7 @@ def _starts(played: Played) -> Iterator[str]:
 
 
 def _metrics(played: Played) -> Iterator[str]:
-    """Return and length are those of the last episode; all are by world."""
+    """Yield findings on metrics: return and length must be those of the last episode, and all metrics by world."""
     steps, worlds = played.ended.shape
     for name, values in played.metrics.items():
         if np.shape(values) != (worlds,):

@@ -1,4 +1,4 @@
-"""Acoustic messages between agents: sent every so often, under way at the speed of sound, sometimes lost."""
+"""Acoustic messages between agents: sent periodically, delayed by the speed of sound, with losses."""
 
 import math
 from dataclasses import dataclass
@@ -11,17 +11,17 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import measured_velocity
 
 MOST_UNDER_WAY = 32
-"""Greatest number of messages of one agent that can be under way."""
+"""Greatest number of messages of one agent that can be in transit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """Settings of the messages between agents. A message holds the sender's measured position and velocity."""
+    """Settings of the messages between agents. A message contains the sender's measured position and velocity."""
 
     period: float = 1.0
-    """Time between two messages of an agent [s]; agents take turns within it."""
+    """Time between two messages of an agent [s]; within it, agents transmit in turn."""
     processing: float = 0.1
-    """Time from the measurement to its use, besides the way through the water [s]."""
+    """Time from the measurement to its use, besides the travel time through the water [s]."""
     loss: float = 0.1
     """Probability that a receiver misses a message, independently for each receiver."""
     speed_of_sound: float = 1500.0
@@ -48,18 +48,18 @@ def message_table(
     reach: float,
     device: wp.Device,
 ) -> MessageTable:
-    """Room for the messages of every world; without communication, everybody sees everybody.
+    """Return the message table of every world; without communication, every agent observes all others directly.
 
     Args:
-        communication: How they talk, or None.
-        worlds: How many.
-        agents: In each world.
+        communication: Settings of the messages, or None.
+        worlds: Number of worlds.
+        agents: Number of agents in each world.
         control_step: [s]
         reach: Greatest distance between two agents [m].
-        device: Where.
+        device: Warp device of the table.
 
     Raises:
-        EnvironmentSetupError: More messages would be under way at once than there is room for.
+        EnvironmentSetupError: More messages would be in transit at once than the table can store.
     """
     if communication is None:
         return MessageTable()
@@ -84,7 +84,7 @@ def message_table(
 
 @wp.func
 def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Return the position of agent b as agent a knows it, world frame [m]: that of the newest message received."""
+    """Return the position of agent b in the newest message that agent a received, world frame [m]."""
     x = arrays.position[w, b]
     if arrays.messages.on != 0 and a != b:
         x = arrays.messages.position[w, a * arrays.agent_reward.shape[1] + b]
@@ -93,7 +93,7 @@ def mate_position(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
 
 @wp.func
 def mate_velocity(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Return the velocity of agent b as agent a knows it, world frame [m/s]."""
+    """Return the velocity of agent b in the newest message that agent a received, world frame [m/s]."""
     v = measured_velocity(arrays, w, b)
     if arrays.messages.on != 0 and a != b:
         v = arrays.messages.velocity[w, a * arrays.agent_reward.shape[1] + b]
@@ -102,14 +102,15 @@ def mate_velocity(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
 
 @wp.func
 def key_messages(arrays: TaskArrays, key: int, w: int):
-    """Give the episode's losses a random stream of their own; a part of spawning."""
+    """Set the key of the episode's message losses; part of spawning."""
     if arrays.messages.on != 0:
         arrays.messages.key[w] = key + 11
 
 
 @wp.func
 def open_messages(arrays: TaskArrays, w: int):
-    """Start an episode: everybody knows where the others start, and nothing is under way; a part of observing."""
+    """Start an episode: every agent knows the others' initial states, and no message is in transit; part of
+    observing."""
     if arrays.messages.on == 0:
         return
     agents = arrays.agent_reward.shape[1]
@@ -124,7 +125,7 @@ def open_messages(arrays: TaskArrays, w: int):
 
 @wp.func
 def send(state: State, arrays: TaskArrays, w: int, b: int, step: int):
-    """Agent b sends what it measures of itself; when it arrives at each of the others is settled here."""
+    """Send agent b's measurement of its own state, and determine its arrival at each of the others."""
     m = arrays.messages
     agents = arrays.agent_reward.shape[1]
     k = b * m.slots + (step // m.period) % m.slots
@@ -141,7 +142,8 @@ def send(state: State, arrays: TaskArrays, w: int, b: int, step: int):
 
 @wp.func
 def exchange_messages(state: State, arrays: TaskArrays, w: int):
-    """After a control step: those whose turn it is send, and what arrives now is heard; a part of evaluating."""
+    """Exchange messages after a control step: agents whose turn it is send, and due messages arrive; part of
+    evaluation."""
     if arrays.messages.on == 0:
         return
     m = arrays.messages
@@ -154,7 +156,7 @@ def exchange_messages(state: State, arrays: TaskArrays, w: int):
         for slot in range(m.slots):
             k = b * m.slots + slot
             for a in range(agents):
-                # A message that a newer one overtook is left unread.
+                # A message that was overtaken by a newer one is ignored.
                 if m.arrival[w, k, a] == step and m.sent_step[w, k] > m.step[w, a * agents + b]:
                     m.position[w, a * agents + b] = m.sent_position[w, k]
                     m.velocity[w, a * agents + b] = m.sent_velocity[w, k]

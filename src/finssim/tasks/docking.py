@@ -33,19 +33,19 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.capability import coefficients_of, terminal_speeds
 
 DISTANCE_SCALE = 3.0
-"""Distances are divided by this in the observation [m]."""
+"""Scale of distances in the observation [m]."""
 
 
 @wp.func
 def in_dock(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, q: wp.quat) -> wp.vec3:
-    """The nose of a vehicle with its origin at x and attitude q, in dock axes, from the throat [m]."""
+    """Return the nose of a vehicle with its origin at x and attitude q, in dock axes, from the throat [m]."""
     nose = x + wp.quat_rotate(q, wp.vec3(0.5 * p.hull.length, 0.0, 0.0))
     return wp.quat_rotate_inv(arrays.goal_quaternion[w], nose - arrays.goal_position[w])
 
 
 @wp.func
 def berth_offset(arrays: TaskArrays, p: Any, w: int, nose: wp.vec3) -> wp.vec3:
-    """Return the way from the nose to its berth, body frame [m]."""
+    """Return the vector from the nose to its berth, body frame [m]."""
     R = wp.quat_to_matrix(wp.quat_inverse(arrays.quaternion[w, 0]) * arrays.goal_quaternion[w])
     return R * (wp.vec3(p.berth * p.funnel.tube_length, 0.0, 0.0) - nose)
 
@@ -61,12 +61,12 @@ OBSERVATION = (
 )
 
 BRISK = 0.9
-"""Docks are built for this many vehicle lengths a second, or the vehicle's greatest speed if that is less [1/s]."""
+"""Design speed of docks in vehicle lengths per second, or the vehicle's greatest speed if that is less [1/s]."""
 
 
 @dataclass(frozen=True)
 class HullNumbers:
-    """Numbers of the vehicle that the task uses; the environment sets it. The defaults are FinsROV's, rounded."""
+    """Properties of the vehicle that the task uses; the environment sets them. The defaults are FinsROV's, rounded."""
 
     length: float = 0.56
     """[m]"""
@@ -75,13 +75,13 @@ class HullNumbers:
     inertia: float = 27.1
     """Inertia in surge, with added mass [kg]."""
     speed: float = 0.476
-    """Forward speed that the dock is built for [m/s]."""
+    """Forward speed for which the dock is designed [m/s]."""
     thrust: float = 19.8
-    """Greatest, forwards [N]."""
+    """Greatest forward thrust [N]."""
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> "HullNumbers":
-        """Return the numbers of a vehicle's file."""
+        """Return the properties of a vehicle's file."""
         length, width, height = map(float, vehicle.body.size)
         model = coefficients_of(vehicle)
         return cls(
@@ -97,17 +97,18 @@ class HullNumbers:
 class DockingReward:
     """Weights of the reward; each term has one reason.
 
-    e: from the nose to its berth; off: how far the nose is outside the cone that leads there; both in vehicle
-    lengths. θ: attitude error [rad].
+    e: distance of the nose from its berth; off: distance of the nose outside the approach cone; both in vehicle
+    lengths.
+    θ: attitude error [rad].
 
     r = position · exp(-e / position_scale)      a slope that does not vanish at the berth
       - distance · e                             a slope everywhere: the dock is approached
-      - corridor · off                           from the front: the straight way may end at the block's outside
-      + heading · exp(-θ / heading_scale) - turn · θ     nose first, and straight
-      - contact · min(force / limit, 1)          touching is allowed, pushing is not the way
-      - action · mean(a²)                        the cheapest thrusts that do it
+      - corridor · off                           from the front: the direct path may hit the block's outside
+      + heading · exp(-θ / heading_scale) - turn · θ     nose first, and aligned
+      - contact · min(force / limit, 1)          touching is allowed, pushing through is not
+      - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
-      - rate · min(|ω|², 4)                      no spinning on the way
+      - rate · min(|ω|², 4)                      no spinning
       - loss                                     once, on a crash or on getting lost: more than a bad episode costs
     """
 
@@ -127,20 +128,20 @@ class DockingReward:
 
 @wp.func
 def off_corridor(p: Any, x: wp.vec3) -> float:
-    """Return how far the nose at x [m] is outside the cone that leads to the berth [vehicle lengths]."""
+    """Return the distance of the nose at x [m] outside the approach cone of the berth [vehicle lengths]."""
     room = p.gap + wp.tan(p.cone) * wp.max(-x[0], 0.0)
     return wp.max(wp.length(wp.vec2(x[1], x[2])) - room, 0.0) / p.hull.length
 
 
 @wp.func
 def nose(state: State, arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """The nose in dock axes [m]."""
+    """Return the nose in dock axes [m]."""
     return in_dock(arrays, p, w, state.position[w, 0], state.quaternion[w, 0])
 
 
 @wp.func
 def seen_nose(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """The nose in dock axes, as measured [m]."""
+    """Return the nose in dock axes, as measured [m]."""
     return in_dock(arrays, p, w, arrays.position[w, 0], arrays.quaternion[w, 0])
 
 
@@ -167,7 +168,7 @@ def contact_force(arrays: TaskArrays, w: int) -> float:
 
 @wp.func
 def contact(p: Any, force: float) -> float:
-    """Return the greatest contact force in the step as a part of the one that ends the episode, at most 1.
+    """Return the greatest contact force in the step as a fraction of the limit that ends the episode, at most 1.
 
     The force is in [N].
     """
@@ -194,7 +195,7 @@ def peak_force(was: float, force: float) -> float:
 
 @wp.func
 def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Half a length out of the water, or farther from the dock than the tank is wide."""
+    """Return True if the vehicle is half a length out of the water, or farther from the dock than the tank is wide."""
     x = state.position[w, 0]
     away = wp.length(x - arrays.goal_position[w])
     return x[2] > 0.5 * p.hull.length or away > p.tank[0] * p.hull.length
@@ -202,7 +203,7 @@ def is_lost(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
-    """The nose far enough in the tube, and slow. `x` is in [m]."""
+    """Return True if the nose at `x` [m] is far enough in the tube, and the vehicle is slow."""
     nu = state.velocity[w, 0]
     still = wp.length(wp.vec3(nu[0], nu[1], nu[2])) <= p.slow * p.hull.speed
     deep = x[0] >= p.inside * p.funnel.tube_length
@@ -211,13 +212,13 @@ def is_docked(state: State, p: Any, w: int, x: wp.vec3) -> bool:
 
 @wp.func
 def docked_gently(p: Any, docked: bool, force: float) -> bool:
-    """Return whether the nose is in the tube, slow, and the contact force [N] ends no episode."""
+    """Return True if the vehicle is docked and the contact force [N] is within its limit."""
     return docked and not force > p.force_limit
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A dock somewhere, and a vehicle at rest before its mouth."""
+    """Start an episode with a dock at a random pose, and a vehicle at rest in front of its mouth."""
     length = p.hull.length
     rng = wp.rand_init(key, 4 * w + 3)
     q_d = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.randf(rng, -3.14159265, 3.14159265))
@@ -244,10 +245,9 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class Docking(Task):
-    """Docking. Lengths are in vehicle lengths, unless stated otherwise; the dock's section in shares of the vehicle's
-    girth.
+    """Docking. Times in seconds; lengths in vehicle lengths, unless stated otherwise, and in girths across the dock.
 
-    An episode goes on when it has succeeded: staying in is what pays. Sizes are ours: nothing is published.
+    An episode continues after success: staying docked is rewarded. Sizes are our own choice; none are published.
     """
 
     succeeds: ClassVar[str] = "once"
@@ -271,37 +271,37 @@ class Docking(Task):
     rim: float = 0.5
     """Thickness of the block [girths]."""
     give: float = 0.15
-    """Depth to which a hull point sinks in at the speed that the dock is built for [girths]."""
+    """Penetration depth of a hull point at the design speed of the dock [girths]."""
     damping: float = 0.2
-    """Damping of a contact point that carries the vehicle's mass, as a share of the critical damping."""
+    """Damping of a contact point that carries the vehicle's mass, as a fraction of the critical damping."""
     berth: float = 0.75
-    """Final place of the nose, as a share of the tube from the throat."""
+    """Final position of the nose, as a fraction of the tube's length from the throat."""
     inside: float = 0.5
-    """Place from which it counts as inside, as a share of the tube."""
+    """Position from which the nose counts as inside, as a fraction of the tube's length."""
     dock_spread: tuple[float, float, float] = (1.5, 1.5, 0.8)
     """Greatest distance of the dock from the middle of the tank [lengths]."""
     start: tuple[float, float] = (1.5, 4.0)
-    """The nose starts this far before the mouth [lengths], ..."""
+    """Range of the nose's starting distance before the mouth [lengths]."""
     start_aside: tuple[float, float] = (1.5, 0.8)
-    """... this far beside the axis and above or below it at most [lengths], ..."""
+    """Largest starting distance beside the axis, and above or below it [lengths]."""
     turn: float = math.radians(60.0)
-    """... turned away from it by this at most [rad]."""
+    """Largest starting angle from the axis [rad]."""
     tilt: float = math.radians(10.0)
     """Largest roll and pitch at the start [rad]."""
     tank: tuple[float, float] = (18.0, 6.0)
     """Width and depth of the tank [lengths]."""
     slow: float = 0.1
-    """Success: the nose inside, at most this fast, as a share of the speed the dock is built for, ..."""
+    """Greatest speed for success with the nose inside, as a fraction of the design speed of the dock."""
     hold: float = 2.0
-    """... for this long [s]."""
+    """Time for which the vehicle must stay docked for success [s]."""
     hard: float = 0.5
-    """A contact force ends the episode above that of a hit at this part of the speed the dock is built for, and of a
-    press with all the vehicle's thrust on top."""
+    """Impact speed at which the contact force ends the episode, as a fraction of the dock's design speed; the limit
+    also includes the vehicle's full thrust."""
     reward: DockingReward = field(default_factory=DockingReward)
     training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Docking":
-        """Return the task with a dock that fits the vehicle."""
+        """Return the task with a dock scaled to the vehicle."""
         return replace(self, hull=HullNumbers.of(vehicles[0]))
 
     @property
@@ -311,9 +311,9 @@ class Docking(Task):
         return self.hull.thrust + hit
 
     def dock(self) -> Dock:
-        """The dock's shape and stiffness [m, N/m, N s/m]."""
+        """Return the dock with its shape and stiffness [m, N/m, N s/m]."""
         girth, length, inertia = self.hull.girth, self.hull.length, self.hull.inertia
-        # m v² = k give²: all the energy of the greatest speed in one point's spring.
+        # m v² = k give²: the spring of one point absorbs the energy at the greatest speed.
         stiffness = inertia * (self.hull.speed / (self.give * girth)) ** 2
         return Dock(
             mouth_radius=self.mouth * girth,
@@ -327,7 +327,7 @@ class Docking(Task):
         )
 
     def arena(self) -> RectangularPool:
-        """A tank with walls as stiff as the dock."""
+        """Return a tank with walls as stiff as the dock."""
         dock, (width, depth) = self.dock(), self.tank
         return RectangularPool(
             length=width * self.hull.length, width=width * self.hull.length, depth=depth * self.hull.length,
@@ -341,15 +341,15 @@ class Docking(Task):
 
     @property
     def gap(self) -> float:
-        """Between the envelope's corners and the tube [m]."""
+        """Distance between the envelope's corners and the tube [m]."""
         return self.dock().throat_radius - self.hull.girth
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         return f"nose in the tube, slow, for {self.hold:g} s, without a crash"
 
     def terms(self) -> Terms:
-        """See `DockingReward`."""
+        """Return the terms; see `DockingReward`."""
         r = self.reward
         return Terms(
             start=start,

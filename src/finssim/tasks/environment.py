@@ -30,13 +30,13 @@ from finssim.tasks.task import Batch, Task
 from finssim.vehicles import Vehicle
 
 GREATEST_SEED = 2**31 - 1
-"""Kernels take seeds as 32-bit integers."""
+"""Greatest seed; kernels use 32-bit integers."""
 GPU_FROZEN_CHECK = 100
-"""Steps between looks for frozen worlds on a GPU."""
+"""Steps between checks for frozen worlds on a GPU."""
 
 
 MOST_REPORTS = 3
-"""Worlds that froze whose last states are written; the others are counted."""
+"""Greatest number of frozen worlds whose last states are written; further ones are only counted."""
 
 
 @dataclass(frozen=True)
@@ -44,22 +44,22 @@ class Step:
     """Result of one step; NumPy views of the environment's own arrays, valid until the next step."""
 
     observation: Any
-    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. Of a
-    task that sees a dictionary: `state`, which is that, and by each picture's name uint8 (worlds, height, width, 3),
-    or of a sonar (worlds, beams, range cells, 1)."""
+    """(worlds, size), or (worlds, agents, size) of several agents; the first of the new episode where one ended. For a
+    task with pictures it is a dictionary: `state`, as above, and by each picture's name uint8 (worlds, height, width,
+    3), or for a sonar (worlds, beams, range cells, 1)."""
     reward: NDArray[np.float32]
     """Rewards, (worlds,), or (worlds, agents)."""
     terminated: NDArray[np.bool_]
-    """Ended by the task, (worlds,)."""
+    """True where the task ended the episode, (worlds,)."""
     truncated: NDArray[np.bool_]
-    """Ended by the time limit, (worlds,)."""
+    """True where the time limit ended the episode, (worlds,)."""
     final_observation: Any
-    """Last observation of the episodes that ended in this step; older rows elsewhere."""
+    """Last observation of the episodes that ended in this step; other rows are outdated."""
 
 
 @wp.func
 def component(arrays: TaskArrays, w: int, v: int, k: int, agents: int, size: int) -> float:
-    """Return component k of an agent's own action, or of the task's action for one of the other vehicles."""
+    """Return component k of an agent's action, or of the task's action for one of the other vehicles."""
     if v < agents:
         return arrays.action[w, v * size + k]
     return arrays.scripted[w, (v - agents) * size + k]
@@ -90,7 +90,8 @@ def act_by_shares(
     agents: int,
     world_offset: int,
 ):
-    """`act` for modes whose components are shares of the thrusters' limits: the same, in less code."""
+    """Write the thrusts as `act` does, with less code, for modes with components as fractions of the thrusters'
+    limits."""
     i, v = wp.tid()
     w = world_offset + i
     x = vec8()
@@ -108,7 +109,7 @@ def act_by_course(
     by_pitch: int,
     world_offset: int,
 ):
-    """Write the channels of every vehicle by its autopilot, which sees what the agent sees."""
+    """Write the channels of every vehicle by its autopilot, which uses the same measurements as the agent."""
     i, v = wp.tid()
     w = world_offset + i
     order = order_of(
@@ -121,17 +122,17 @@ def act_by_course(
 
 
 class Environment:
-    """The task's agents, which are the first vehicles of every world, act; the task commands the others.
+    """Batched environment of a task: its agents are the first vehicles of every world; the task commands the others.
 
     Attributes:
-        task: What is done, fitted to the vehicles.
-        agents: How many agents a world has.
-        nominal: The vehicles as their controllers know them.
+        task: The task, scaled to the vehicles.
+        agents: Number of agents in a world.
+        nominal: The vehicles as modelled by their controllers.
         simulator: The worlds.
         arrays: Actions, observations, rewards and goals, as Warp arrays by world.
-        draws: What randomisation draws; None without it.
-        schedule: How its ranges grow; None where they do not.
-        privileged_names: Of the privileged numbers of an agent, in order; empty unless they were asked for.
+        draws: Draws of the randomisation; None without it.
+        schedule: Schedule that widens its ranges; None for constant ranges.
+        privileged_names: Names of the privileged numbers of an agent, in order; empty unless requested.
     """
 
     def __init__(
@@ -160,30 +161,32 @@ class Environment:
         """Set up the worlds and start an episode in each.
 
         Args:
-            task: What to do.
-            vehicle: Who does it: a vehicle, a catalogue name or a file; or one for each of the task's vehicles.
-            nominal: The same as its controller knows it: its limits scale the actions, its allocation makes thruster
-                forces of wrenches, and the task is fitted to it; `vehicle` then only delivers. `vehicle` if None.
-            worlds: How many at once.
+            task: The task.
+            vehicle: A vehicle, a catalogue name or a file; or one for each of the task's vehicles.
+            nominal: The same vehicles as modelled by their controllers: their limits scale the actions, their
+                allocation maps wrenches to thruster forces, and the task is scaled to them; `vehicle` then only
+                delivers the forces. `vehicle` if None.
+            worlds: Number of worlds.
             hydrodynamics: calibrated, mesh or simplified.
             action: thruster8, wrench6, wrench4, pilot6 (ArduSub's axes), surfaces, course or course_pitch; the task's
                 own if None.
-            wrench_scale: Part of each wrench limit that action 1 of an agent stands for, one number or (6,).
-            randomization: Drawn anew for every episode; none if None.
-            noise: On what the controller sees, or the sensors that it sees with; none if None.
+            wrench_scale: Fraction of each wrench limit that an agent's action of 1 commands, one number or (6,).
+            randomization: Randomisation of every episode; none if None.
+            noise: Noise of the controller's observations, or its sensors; none if None.
             water: Currents and waves.
             pool: Walls and floor; the task's own if None.
-            tether: On the vehicle.
+            tether: Tether of the vehicle.
             integrator: midpoint or rk4.
             device: cpu or cuda.
             threads: Threads on a CPU.
-            seed: Of goals, starts, randomisation and noise; 0 to 2³¹ - 1.
-            crash_directory: Where the last states of a world that froze are written.
+            seed: Seed of goals, starts, randomisation and noise; 0 to 2³¹ - 1.
+            crash_directory: Folder for the last states of frozen worlds.
             auto_reset: Start a new episode where one ended, in the same step.
-            privileged: Tell in `arrays.privileged` what was drawn, for critics that may know it; `privileged_names`.
+            privileged: Write the drawn parameters to `arrays.privileged`, for privileged critics; see
+                `privileged_names`.
 
         Raises:
-            EnvironmentSetupError: unknown action mode, vehicles that do not fit the task, or a seed out of range.
+            EnvironmentSetupError: The action mode is unknown, vehicles do not fit the task, or a seed is out of range.
         """
         self.action_mode, self.seed = action or task.action, checked_seed(seed)
         self.crash_directory, self.auto_reset = crash_directory, auto_reset
@@ -231,7 +234,7 @@ class Environment:
         self._measured = sensed or off_by.present or drawn
         connect_measured(self._measured, self.simulator.state, self.arrays)
         self.sensing: SensingBatch | None = None
-        """Instruments and filters, where the controller sees with those."""
+        """Instruments and filters, if the controller observes their estimates; otherwise None."""
         if isinstance(self.noise, Sensing):
             if randomization and randomization.changes_velocities:
                 raise EnvironmentSetupError(
@@ -250,12 +253,12 @@ class Environment:
             )
         self._draw(randomization, privileged)
         self.sight = self._sight() if task.pictures else None
-        """The world that the vehicle sees, and its pictures; None of a task that does not see."""
+        """Rendered world and its pictures; None for a task without pictures."""
         self._build()
         self.reset(seed=self.seed)
 
     def _autopilots(self) -> CourseData:
-        """Return the autopilots of the nominal vehicles, which carry out orders of a mode by course."""
+        """Return the autopilots of the nominal vehicles, which execute the commands of a course mode."""
         try:
             names, models = [one.name for one in self.nominal], [linear_model(one) for one in self.nominal]
             return course_data(models, names, self.task.control_step, self.device)
@@ -263,11 +266,11 @@ class Environment:
             raise EnvironmentSetupError(f"action mode '{self.action_mode}': {error}") from error
 
     def _sight(self) -> Any:
-        """The world that the vehicle sees, with the sensors that the task observes."""
+        """Return the rendered world, with the sensors that the task observes."""
         return described_world(self.task.world).sight(self.task, self.simulator, self.arrays, self.seed)
 
     def _draw(self, randomization: Randomization | None, privileged: bool) -> None:
-        """Set up what the randomisation needs, and the arrays of the privileged numbers."""
+        """Set up the randomisation, and the arrays of the privileged numbers."""
         self.draws: Draws | None = None
         self.schedule: Schedule | None = None
         self.privileged_names: list[str] = []
@@ -298,8 +301,8 @@ class Environment:
         self._batch = batch = Batch(self.simulator.state, self.arrays, self.seed)
         if self.task.others:
             self.task.add_command(self._step, batch)
-        # Controllers know the nominal limits and allocation; what the simulated thrusters deliver may differ. What the
-        # task commands is in parts of all of the limits, however gently the agents are to act.
+        # Controllers know the nominal limits and allocation; the simulated thrusters may deliver something else.
+        # Commands of the task itself refer to the full limits, even if the agents' limits are reduced.
         agent_scale = self.wrench_scale if MODES[self.action_mode].wrench else 1.0
         scales = [agent_scale if v < self.agents else 1.0 for v in range(len(self.nominal))]
         command, kind = self.simulator.command.array, MODES[self.action_mode]
@@ -325,13 +328,13 @@ class Environment:
         self._start = self.simulator.pipeline()
         self._add_start(self._start, self._mask)
         self._look = self.simulator.pipeline()
-        """Of a task whose row has ranges, which are measured after the step."""
+        """Pipeline of a task whose observation contains ranges, which are measured after the step."""
         if self.task.ranges and self.sight is not None:
             everywhere = wp.ones(self.worlds, dtype=wp.int32, device=self.device)
             self.task.add_observe(self._look, batch, everywhere)
 
     def _add_measure(self, pipeline: Any, mask: wp.array | None = None) -> None:
-        """Append what is seen: after a step, or where an episode starts and mask is not 0."""
+        """Append the measurements: after a step, or at the start of an episode where mask is not 0."""
         if self.sensing is not None:
             self.sensing.add(pipeline, self.seed, mask)
         elif self._measured:
@@ -358,14 +361,14 @@ class Environment:
         """Start new episodes.
 
         Args:
-            mask: In which worlds, bool by world; in all if None.
-            seed: Start the random streams over with this seed, as if the environment had just been made.
+            mask: Worlds to reset, bool by world; all if None.
+            seed: Restart the random streams with this seed, as in a new environment.
 
         Returns:
-            Observations, as `Step` has them.
+            Observations, in the form of `Step.observation`.
 
         Raises:
-            EnvironmentSetupError: the seed is out of range.
+            EnvironmentSetupError: The seed is out of range.
         """
         if seed is not None:
             if checked_seed(seed) != self.seed:
@@ -383,10 +386,10 @@ class Environment:
         return self._observed("")
 
     def _check_starts(self, mask: NDArray[np.bool_]) -> None:
-        """Refuse starts outside the arena, from which walls would throw a vehicle out.
+        """Refuse starts outside the arena, from which walls would eject a vehicle.
 
         Raises:
-            EnvironmentSetupError: With the coordinates of the first.
+            EnvironmentSetupError: A start is outside; the message has the coordinates of the first.
         """
         if self._arena is None:
             return
@@ -413,7 +416,7 @@ class Environment:
             self._look.run()
 
     def _numpy(self, array: wp.array) -> NDArray[Any]:
-        """Return a NumPy array of an array of this environment: on a processor a view, which is made once."""
+        """Return a NumPy array of an array of this environment: on a CPU a view, which is created once."""
         if not self.device.is_cpu:
             return array.numpy()
         if array.ptr not in self._views:
@@ -421,7 +424,7 @@ class Environment:
         return self._views[array.ptr]
 
     def _observed(self, which: str) -> Any:
-        """Observations, or with which = `final_` the last of the episodes that ended last; views."""
+        """Return observations as views; with which = `final_`, the last ones of the latest finished episodes."""
         rows = self._numpy(getattr(self.arrays, f"{which}observation"))
         rows = rows if self.agents == 1 else rows.reshape(self.worlds, self.agents, -1)
         if self.sight is None:
@@ -432,7 +435,7 @@ class Environment:
     def start(
         self, position: ArrayLike, quaternion: ArrayLike, goal_position: ArrayLike, goal_quaternion: ArrayLike
     ) -> NDArray[np.float32]:
-        """Start an episode in every world with vehicle 0 at given poses at rest, towards given goals.
+        """Start an episode in every world with vehicle 0 at rest at given poses, with given goals.
 
         Args:
             position: World frame [m], broadcastable to (worlds, 3).
@@ -460,13 +463,13 @@ class Environment:
         return self.arrays.observation.numpy()
 
     def step(self, action: ArrayLike) -> Step:
-        """Act for one control step.
+        """Simulate one control step with the given actions.
 
         Args:
-            action: (worlds, size), or (worlds, agents, size) of several agents, each in [-1, 1]; beyond is limited.
+            action: (worlds, size), or (worlds, agents, size) of several agents, each clipped to [-1, 1].
 
         Raises:
-            EnvironmentSetupError: the shape is wrong or a number is not finite.
+            EnvironmentSetupError: The shape is wrong or a number is not finite.
         """
         checked = checked_action(action, self.worlds, self.agents, self.action_size)
         if self.device.is_cpu:
@@ -477,7 +480,7 @@ class Environment:
         return self.outcome()
 
     def advance(self) -> None:
-        """One control step with the actions that are in `arrays.action` already (no check, no copy)."""
+        """Simulate one control step with the actions already in `arrays.action` (no check, no copy)."""
         self._step.run()
         self._steps += 1
         if self.schedule is not None:
@@ -490,18 +493,18 @@ class Environment:
                 self.sight.keep(ended)
                 if self.auto_reset:
                     self._begin(self._restart, ended)
-        # On a GPU the look costs a copy, so frozen worlds wait there for a while, reported as terminated meanwhile.
+        # On a GPU the check costs a copy, so frozen worlds wait for the next check, reported as terminated meanwhile.
         inspect = self.device.is_cpu or self._steps % GPU_FROZEN_CHECK == 0
         if inspect and self._numpy(self.simulator.state.frozen).any():
             self._revive()
 
     def set_progress(self, done: float) -> None:
-        """Take how much of the training is done, in [0, 1]: ranges may grow with it."""
+        """Set the completed fraction of the training, in [0, 1], with which ranges may grow."""
         if self.schedule is not None:
             self.schedule.progress(done)
 
     def _revive(self) -> None:
-        """Report the worlds that froze, then start new episodes there; their step counts as terminated."""
+        """Report frozen worlds, then start new episodes in them; their step counts as terminated."""
         frozen = self.simulator.state.frozen.numpy() != 0
         before, self._reported = self._reported, self._reported + int(frozen.sum())
         try:
@@ -509,14 +512,14 @@ class Environment:
             notes = [f"last states in {path}" for path in paths]
             if before <= MOST_REPORTS < self._reported:
                 notes.append(f"more worlds than {MOST_REPORTS}: the states of the others are not written")
-        except OSError as error:  # a report that cannot be written must not end a long training
+        except OSError as error:  # a report that cannot be written must not abort a long training
             notes = [f"its last states could not be written: {error}"]
         for note in notes:
             print(f"finssim: a number stopped being finite; {note}", file=sys.stderr, flush=True)
         self.reset(mask=frozen)
 
     def outcome(self) -> Step:
-        """The result of the last step."""
+        """Return the result of the last step."""
         a = self.arrays
         reward = a.reward if self.agents == 1 else a.agent_reward
         return Step(
@@ -524,10 +527,10 @@ class Environment:
             self._observed("final_"),
         )  # fmt: skip
 
-    # The complete state, as NumPy arrays: a run that continues from them is the same run.
+    # The complete state, as NumPy arrays: a run restored from it continues identically.
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Copies of the vehicles' states, delay lines, water, the task's arrays and all counters; see `load_state`.
+        """Return copies of vehicle states, delay lines, water, the task's arrays and all counters; see `load_state`.
 
         Returns:
             Arrays by name, such as `state.position` or `plant.mass`; the counters under `counters.`.
@@ -542,12 +545,12 @@ class Environment:
         return {**saved, "counters.reported": reported.reshape(-1, 2)}
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from the `state()` of an environment made with the same arguments, bit for bit.
+        """Restore the `state()` of an environment created with the same arguments, bit for bit.
 
         Each array has the unit of its attribute.
 
         Raises:
-            EnvironmentSetupError: It was made with other arguments: a name or shape does not fit.
+            EnvironmentSetupError: That environment had other arguments: a name or shape does not fit.
         """
         refused, remedy = "saved state does not fit: ", "make the environment with the same arguments"
         if int(state["counters.seed"]) != self.seed:
@@ -574,7 +577,7 @@ class Environment:
         self.simulator._reported = {(int(w), int(e)) for w, e in state["counters.reported"]}
 
     def _members(self) -> Iterator[tuple[str, wp.array]]:
-        """Every array that a step or a reset reads from an earlier one, by name."""
+        """Yield every array that persists between steps and resets, by name."""
         simulator = self.simulator
         for name, packed in (("plant", simulator.plant), ("command", simulator.command)):
             yield from ((f"{name}.{field}", array) for field, array in packed.fields.items())
@@ -592,7 +595,7 @@ class Environment:
 
 
 def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicle]) -> None:
-    """Refuse vehicles whose thrusters are not those that their controllers command.
+    """Refuse vehicles whose thrusters differ from those that their controllers command.
 
     Raises:
         EnvironmentSetupError: They differ in number, name or order.
@@ -607,10 +610,10 @@ def refuse_other_thrusters(vehicles: Sequence[Vehicle], nominal: Sequence[Vehicl
 
 
 def checked_seed(seed: int) -> int:
-    """Return the seed, if the kernels can take it.
+    """Return the seed if it is within the range of the kernels.
 
     Raises:
-        EnvironmentSetupError: They cannot.
+        EnvironmentSetupError: It is out of range.
     """
     if not 0 <= seed <= GREATEST_SEED:
         raise EnvironmentSetupError(f"seed is {seed}, expected 0 to {GREATEST_SEED}")
@@ -618,7 +621,7 @@ def checked_seed(seed: int) -> int:
 
 
 def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> NDArray[np.float32]:
-    """Actions as rows of worlds, (worlds, agents * size).
+    """Return actions as rows of worlds, (worlds, agents * size).
 
     Raises:
         EnvironmentSetupError: The shape is wrong or a number is not finite.
@@ -629,7 +632,7 @@ def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> ND
         row_of = "world" if agents == 1 else "agent"
         raise EnvironmentSetupError(f"action has shape {a.shape}, expected {expected}: one row per {row_of}")
     a = a.reshape(worlds, -1)
-    # A sum of squares is finite if all numbers are, and quicker; where it overflows, they are looked at one by one.
+    # A sum of squares is finite if all numbers are, and faster; if it overflows, the numbers are checked one by one.
     if not np.isfinite(np.vdot(a, a)) and not np.isfinite(a).all():
         world = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
         raise EnvironmentSetupError(
@@ -639,7 +642,8 @@ def checked_action(action: ArrayLike, worlds: int, agents: int, size: int) -> ND
 
 
 def _members(prefix: str, struct: Any) -> Iterator[tuple[str, wp.array]]:
-    """The arrays of a Warp struct and of the structs in it; those of structs are left to the views of their fields."""
+    """Yield the arrays of a Warp struct and of nested structs; arrays of structs are covered by the views of their
+    fields."""
     for name in struct._cls.vars:
         value = getattr(struct, name)
         if isinstance(value, wp.array):

@@ -1,4 +1,4 @@
-"""Sizes and speeds of a task for a vehicle: lengths and speeds that are the published ones for the paper's vehicle."""
+"""Scaling of a task's lengths and speeds to a vehicle; those of the paper's vehicle are the published ones."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from finssim.vehicles.defaults import POOL, room
 Array = NDArray[np.float64]
 
 SLOWEST_SPEED = 0.22
-"""Terminal speed of FinsROV's slowest direction, heave [m/s]: the published speeds are a part of it."""
+"""Terminal speed of FinsROV in heave, its slowest direction [m/s]: reference of the published speeds."""
 
 ACCELERATION, TURNING = 1.0, 20.0
-"""Largest acceleration that an agent may ask for [m/s², rad/s²]: somewhat more than FinsROV's limits give it, 0.45 to
+"""Largest acceleration that an agent can command [m/s², rad/s²]: slightly more than FinsROV's limits allow, 0.45 to
 0.72 m/s² and 8 to 17 rad/s²."""
 
 MASS = 12.11
-"""FinsROV's [kg]."""
+"""Mass of FinsROV [kg]."""
 
 
 @dataclass(frozen=True)
 class TaskScaling:
-    """Factors on what a task is for FinsROV."""
+    """Factors on a task's dimensions relative to FinsROV."""
 
     size: float = 1.0
     """Factor on lengths."""
@@ -43,7 +43,7 @@ class TaskScaling:
     """Factor on masses and stiffnesses."""
 
     def pool(self) -> RectangularPool:
-        """The paper's pool, in proportion, with walls as stiff for the vehicle as they are for FinsROV."""
+        """Return the paper's pool, scaled, with walls of the same relative stiffness as for FinsROV."""
         length, width, depth = (self.size * side for side in POOL)
         return RectangularPool(
             length=length,
@@ -55,11 +55,11 @@ class TaskScaling:
 
 
 def authority(vehicle: Vehicle) -> Array:
-    """Return the share of each wrench limit that an agent's action of 1 means, (6,), up to 1.
+    """Return the fraction of each wrench limit that corresponds to an action of 1, (6,), at most 1.
 
-    What accelerates the vehicle, added mass included, by `ACCELERATION` times its `room`, or turns it by `TURNING`: all
-    of FinsROV's limits, and a fifth of those of a vehicle that is five times as strong for its mass. With all of them
-    gains are learnt that ring on estimates, which lag.
+    It is the wrench that accelerates the vehicle, with added mass, by `ACCELERATION` times its `room`, or rotates it by
+    `TURNING`: all of FinsROV's limits, and a fifth of the limits of a vehicle that is five times as strong for its
+    mass. With the full limits, policies learn gains that oscillate on delayed estimates.
     """
     limits = np.asarray(vehicle.wrench_limits)
     limit = np.array([ACCELERATION * room(vehicle.body.size)] * 3 + [TURNING] * 3)
@@ -68,14 +68,15 @@ def authority(vehicle: Vehicle) -> Array:
 
 
 def driven_axes(vehicle: Vehicle) -> tuple[int, ...]:
-    """Return which of surge, sway and heave the thrusters control."""
+    """Return the indices of surge, sway and heave that the thrusters control."""
     names = ("surge", "sway", "heave")
     limits = vehicle.wrench_limits
     return tuple(i for i, name in enumerate(names) if limits[i] > 0.0 and name in vehicle.controlled_axes)
 
 
 def fit(vehicle: Vehicle) -> TaskScaling:
-    """Room in proportion to the vehicle's length, speeds in proportion to the room or to what it can do, the lesser."""
+    """Return the scaling of a task: lengths by the vehicle's length, speeds by that or by its terminal speed, the
+    lesser."""
     size = room(vehicle.body.size)
     speeds = terminal_speeds(vehicle, coefficients_of(vehicle))[list(driven_axes(vehicle))]
     slowest = float(speeds.min()) if len(speeds) else 0.0
@@ -84,36 +85,36 @@ def fit(vehicle: Vehicle) -> TaskScaling:
 
 @dataclass(frozen=True, kw_only=True)
 class FittedTask(Task):
-    """Base of the tasks in the paper's pool: as large and as fast as suits the vehicle."""
+    """Base class of the tasks in the paper's pool, with lengths and speeds scaled to the vehicle."""
 
     needs: ClassVar[tuple[str, ...]] = ("surge", "sway", "heave")
 
     fit: TaskScaling = TaskScaling()
-    """Factors of the vehicle; the environment sets them."""
+    """Scaling factors for the vehicle; the environment sets them."""
     tilt: float = math.radians(20.0)
     """Largest roll and pitch at the start [rad]."""
     ceiling: float = 0.3
-    """Rising above this height ends the episode [m]."""
+    """Height above which the episode ends [m]."""
     training_noise: MeasurementNoise = TRAINING
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> FittedTask:
-        """Return the task in the size and speed that suit the vehicle."""
+        """Return the task with lengths and speeds scaled to the vehicle."""
         return replace(self, fit=fit(vehicles[0]))
 
     def arena(self) -> RectangularPool:
-        """See `TaskScaling.pool`."""
+        """Return the pool; see `TaskScaling.pool`."""
         return self.fit.pool()
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolTask(FittedTask):
-    """Base of those that start anywhere in the pool."""
+    """Base class of the tasks that start at a random position in the pool."""
 
     spawn_low: tuple[float, float, float] = (-1.4, -0.6, -0.80)
-    """The vehicle starts in this box, with any heading [m]."""
+    """Corner of the box in which the vehicle starts, with any heading [m]."""
     spawn_high: tuple[float, float, float] = (1.4, 0.6, -0.20)
     """Opposite corner of this box [m]."""
     bounds: tuple[float, float] = (2.5, 1.5)
-    """Leaving |x|, |y| beyond these ends the episode [m]."""
+    """Limits of |x| and |y| beyond which the episode ends [m]."""
     depth: float = 1.5
-    """So does sinking below this depth [m]."""
+    """Depth below which the episode ends [m]."""

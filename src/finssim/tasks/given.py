@@ -1,4 +1,4 @@
-"""Checks of an environment's vehicles, seeds and actions, and the result of a step."""
+"""Validation of an environment's vehicles."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 
 class EnvironmentSetupError(ValueError):
-    """An environment that cannot be set up, or an action or saved state it cannot take."""
+    """An environment cannot be set up, or an action or saved state does not fit it."""
 
 
 def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: str) -> list[Vehicle]:
-    """The vehicles of a world: those that are given, or one of a kind for every place.
+    """Return the vehicles of a world: those given, or one vehicle repeated for every role of the task.
 
     Raises:
-        EnvironmentSetupError: Another number than the task has places, a vehicle with too few controlled axes, or
-            thrusters that do not fit the action mode.
+        EnvironmentSetupError: Their number differs from that of the task's roles, a vehicle lacks a controlled axis, or
+            its thrusters do not fit the action mode.
     """
     stated = [vehicle] * len(task.vehicles) if isinstance(vehicle, Vehicle | str) else list(vehicle)
     if len(stated) != len(task.vehicles):
@@ -32,13 +32,13 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
         if missing:
             raise EnvironmentSetupError(
                 f"vehicle '{vehicle_or_name.name}' does not control {', '.join(missing)}, which task '{task.name}' "
-                f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes) or 'no axis'}; take another "
+                f"needs: its thrusters control {', '.join(vehicle_or_name.controlled_axes) or 'no axis'}; use another "
                 "vehicle"
             )
         if not vehicle_or_name.thrusters and mode != "surfaces" and not mode.startswith("course"):
             raise EnvironmentSetupError(
                 f"vehicle '{vehicle_or_name.name}' does not control any axis by thrusters, as action mode '{mode}' "
-                "does: take mode surfaces, or another vehicle"
+                "does: use mode surfaces, or another vehicle"
             )
     if mode not in ("wrench6", "wrench4", "pilot6") and task.others:
         raise EnvironmentSetupError(
@@ -49,6 +49,6 @@ def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: s
     if mode in ("thruster8", "surfaces") and len(counts) > 1:
         raise EnvironmentSetupError(
             f"vehicles have {', '.join(map(str, sorted(counts)))} thrusters, expected equal numbers for actions by "
-            "thruster: take wrench6 or wrench4"
+            "thruster: use wrench6 or wrench4"
         )
     return vehicles

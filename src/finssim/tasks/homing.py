@@ -1,4 +1,4 @@
-"""A task for vehicles that must move to steer: into the mouth of a dock, by its bearing and along its axis."""
+"""Homing, a task for vehicles that steer by moving: into the mouth of a dock, by its bearing and along its axis."""
 
 import math
 from dataclasses import dataclass, field
@@ -39,58 +39,61 @@ from finssim.tasks.terms import (
 
 @wp.func
 def bearing(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """Direction to the dock, body frame, as a USBL on the vehicle measures it [-]."""
+    """Return the direction to the dock, body frame, as measured by a USBL on the vehicle [-]."""
     way = wp.normalize(arrays.path.points[w, 1] - arrays.position[w, 0])
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], way)
 
 
 @wp.func
 def homing_speed(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Speed towards the dock as a part of cruising speed, at most 1."""
+    """Return the speed towards the dock as a fraction of cruising speed, at most 1."""
     way = wp.normalize(arrays.path.points[w, 1] - state.position[w, 0])
     return wp.min(wp.dot(world_velocity(state, w, 0), way) / p.fit.speed, 1.0)
 
 
 @wp.func
 def off_axis(state: State, arrays: TaskArrays, e: float, w: int) -> float:
-    """Angle between the way to the dock and its axis, from the distance `e` to that [m], [rad]."""
+    """Return the angle between the direction to the dock and its axis, from the distance `e` to the axis [m],
+    [rad]."""
     return wp.atan2(e, wp.max(beside_leg(arrays.path, w, state.position[w, 0])[3], 0.01))
 
 
 @wp.func
 def turned_away(state: State, arrays: TaskArrays, w: int) -> float:
-    """Angle between the velocity over ground and the axis of the dock [rad]."""
+    """Return the angle between the velocity over ground and the axis of the dock [rad]."""
     v = wp.normalize(world_velocity(state, w, 0))
     return wp.acos(wp.clamp(wp.dot(v, leg_direction(arrays.path, w, 0)), -1.0, 1.0))
 
 
 @wp.func
 def at_mouth(state: State, arrays: TaskArrays, w: int) -> bool:
-    """The plane of the mouth is reached."""
+    """Return True if the plane of the mouth is reached."""
     return beside_leg(arrays.path, w, state.position[w, 0])[3] <= 0.0
 
 
 @wp.func
 def has_docked(at: bool, e: float, angle: float, p: Any) -> bool:
-    """Through the mouth, at a distance `e` [m] from its middle and an `angle` [rad] from its axis that count."""
+    """Return True if the vehicle is at the mouth, with its distance `e` [m] and `angle` [rad] within the
+    tolerances."""
     return at and e <= p.fit.size * p.radius and angle <= p.slant
 
 
 @wp.func
 def has_missed(at: bool, e: float, angle: float, p: Any) -> bool:
-    """At the plane of the mouth, but at another distance `e` [m] or `angle` [rad]."""
+    """Return True if the vehicle is at the plane of the mouth, but `e` [m] or `angle` [rad] is too large."""
     return at and (e > p.fit.size * p.radius or angle > p.slant)
 
 
 @wp.func
 def latest(e: float) -> float:
-    """Distance to the axis now [m]: at the end of an episode that of the mouth."""
+    """Return the current distance to the axis [m]: at the end of an episode, that at the mouth."""
     return e
 
 
 @wp.func
 def start_homing(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A dock that faces anywhere, unless one is given, and a vehicle before it that heads about towards it."""
+    """Start an episode with a dock of random direction, unless one is given, and a vehicle that roughly heads for
+    it."""
     pi = 3.14159265
     rng = wp.rand_init(key, 4 * w)
     size = p.fit.size
@@ -128,13 +131,13 @@ OBSERVATION = (
 
 @dataclass(frozen=True, kw_only=True)
 class Homing(PathFollowing):
-    """Swim into the mouth of a dock by its bearing, along its axis, by orders to the autopilot.
+    """Swim into the mouth of a dock by its bearing, along its axis, by autopilot commands.
 
-    Lengths as for `PathFollowing`. A dock that is missed is not tried again.
+    Lengths as for `PathFollowing`. After a miss there is no second attempt.
 
-    r = advance · (speed towards the dock)       adds up to the way: nothing is gained by taking longer
-      - distance · (angle of the way to it from its axis)     from the front
-      - action · mean(a²) - change · mean(Δa²)   orders that a vehicle can follow, no chatter
+    r = advance · (speed towards the dock)       integrates to the distance: taking longer gains nothing
+      - distance · (angle between its direction and its axis)     approach from the front
+      - action · mean(a²) - change · mean(Δa²)   commands that a vehicle can follow, no chatter
       + finish, - loss                           once, in the dock, and on missing or leaving it
     """
 
@@ -146,44 +149,44 @@ class Homing(PathFollowing):
     time_limit: float = 60.0
     legs: int = 1
     line: float = 40.0
-    """Length of the axis before the mouth [m]."""
+    """Length of the axis in front of the mouth [m]."""
     radius: float = 0.5
     """Radius of the mouth [m]."""
     slant: float = math.radians(20.0)
     """Largest angle between the velocity over ground and the axis in the mouth [rad]."""
     far: tuple[float, float] = (25.0, 40.0)
-    """Distance of the start from the mouth, drawn from this range [m]."""
+    """Range of the starting distance from the mouth [m]."""
     aspect: float = math.radians(50.0)
-    """Largest angle between the axis and the way to the mouth at the start [rad]."""
+    """Largest angle between the axis and the direction to the mouth at the start [rad]."""
     offset: float = 2.0
     """Largest height of the start above or below the mouth [m]."""
     yaw: float = math.radians(45.0)
-    """Largest angle between the heading and the way to the mouth at the start [rad]."""
+    """Largest angle between the heading and the direction to the mouth at the start [rad]."""
     depth: float = -15.0
     """Height of the mouth [m]."""
     corridor: float = 45.0
-    """Farther than this from the axis the episode ends [m]."""
+    """Distance from the axis beyond which the episode ends [m]."""
     reward: PathReward = field(default_factory=lambda: PathReward(advance=1.0, distance=0.5, finish=50.0))
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         radius, angle = self.fit.size * self.radius, math.degrees(self.slant)
         return f"through the mouth, within {radius:.3g} m of its middle and {angle:.3g} degrees of its axis"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures, and the error: distance to the axis at the end [m]."""
+        """Return the metrics of every task, and the error: distance to the axis at the end [m]."""
         measured = Task.metrics(self, arrays)
         error = measured.pop("miss")
         return {**measured, "error": error}
 
     def straight(self, here: NDArray[np.float64], goal: Reference) -> NDArray[np.float64]:
-        """Return the axis to a goal, whose yaw is that of a vehicle in the dock, [m], (2, 3)."""
+        """Return the axis to a goal, whose yaw is that of a docked vehicle, [m], (2, 3)."""
         axis = np.array([math.cos(goal.yaw), math.sin(goal.yaw), 0.0])
         mouth = np.asarray(goal.position, float)
         return np.stack([mouth - self.fit.size * self.line * axis, mouth])
 
     def terms(self) -> Terms:
-        """See the class."""
+        """Return the terms; see the class."""
         r = self.reward
         return Terms(
             start=start_homing,

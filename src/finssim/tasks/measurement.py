@@ -1,4 +1,4 @@
-"""Measurements that the controller observes: the truth, or the truth with errors as of localization."""
+"""Measurements that the controller observes: the true state, optionally with errors like those of localization."""
 
 import math
 from dataclasses import dataclass, fields
@@ -13,12 +13,12 @@ from finssim.sim.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays
 
 LONGEST_DELAY = 2.0
-"""Greatest age of what a controller observes [s]; states are kept for 50 control steps."""
+"""Greatest age of an observation [s]; states are stored for 50 control steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementNoise:
-    """Errors of what the controller observes: white noise, an offset by episode, gaps and a delay."""
+    """Errors of the controller's observations: white noise, an offset per episode, dropouts and a delay."""
 
     position_std: float = 0.0
     """Standard deviation of the noise, drawn every control step, per axis [m]."""
@@ -39,9 +39,9 @@ class MeasurementNoise:
     dropout: float = 0.0
     """Probability that a control step has no new sample, below 1."""
     delay: float = 0.0
-    """Age of the measurement [s], rounded to the nearest control step; nothing is older than the episode."""
+    """Age of the measurement [s], rounded to the nearest control step; never older than the episode."""
     graded: bool = False
-    """True if the errors grow from zero in the first world to all of them in the last."""
+    """True if the errors increase from zero in the first world to their full size in the last."""
 
     def __post_init__(self) -> None:
         values = tuple(getattr(self, field.name) for field in fields(self))
@@ -61,7 +61,7 @@ class MeasurementNoise:
 
 
 TRAINING = MeasurementNoise(position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02)
-"""About what an estimate is off by: with exact states, gains are learnt that chatter on measured ones."""
+"""Approximate errors of an estimate: with exact states, policies learn gains that chatter on measured ones."""
 ESTIMATOR = MeasurementNoise(
     position_std=0.003,
     yaw_std=math.radians(0.15),
@@ -71,11 +71,11 @@ ESTIMATOR = MeasurementNoise(
     yaw_bias=math.radians(0.2),
     delay=0.1,
 )
-"""About what the robot's own localization and fusion are off by in a virtual pool of severity realistic."""
+"""Approximate errors of the robot's own localization and fusion in a virtual pool of severity realistic."""
 
 
 def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
-    """Give the task arrays for what is measured: without noise those of the state itself, so that nothing is copied."""
+    """Set the task's arrays of measurements; without noise they are those of the state, without a copy."""
     if not present:
         arrays.position, arrays.quaternion, arrays.velocity = state.position, state.quaternion, state.velocity
         return
@@ -86,7 +86,7 @@ def connect_measured(present: bool, state: State, arrays: TaskArrays) -> None:
 
 
 def measurements(noise: MeasurementNoise, shape: tuple[int, int], device: wp.Device) -> Packed:
-    """The errors of every vehicle of every world, (worlds, vehicles); randomisation writes others."""
+    """Return the errors of every vehicle of every world, (worlds, vehicles); randomisation overwrites them."""
     packed = Packed(MeasurementErrors, shape, device)
     part = np.linspace(0.0, 1.0, shape[0])[:, None] if noise.graded and shape[0] > 1 else 1.0
     for name, array in packed.fields.items():
@@ -103,7 +103,7 @@ def measure(
     seed: int,
     world_offset: int,
 ):
-    """Write what is observed of every vehicle; the draw depends on seed, world, vehicle, episode and step alone."""
+    """Write the measurements of every vehicle; the draw depends only on seed, world, vehicle, episode and step."""
     i, v = wp.tid()
     w = world_offset + i
     m = measurement[w, v]
@@ -113,13 +113,13 @@ def measure(
     step = state.steps[w]
     late = wp.min(int(wp.rint(m.delay / control_step)), wp.static(HISTORY - 1))
     if late > 0 and step > 0:
-        # The history's slot k holds the state after step k + 1; the start of an episode is not in it.
+        # Slot k of the history contains the state after step k + 1; the start of an episode is not in it.
         past = state.history[wp.max(step - 1 - late, 0) % wp.static(HISTORY), w, v]
         x = wp.vec3(past[0], past[1], past[2])
         q = wp.quat(past[3], past[4], past[5], past[6])
         for k in range(6):
             nu[k] = past[7 + k]
-    # Wrapping around at 32 bits is what makes streams of neighbours differ.
+    # Overflow at 32 bits makes the streams of neighbouring seeds differ.
     vehicle_seed = wp.rand_init(seed + 104729 * state.episode[w] + 1 + 15485867 * v, w)
     bias = wp.rand_init(wp.randi(vehicle_seed), -1)
     rng = wp.rand_init(wp.randi(vehicle_seed), step)
@@ -138,7 +138,7 @@ def measure(
         for k in range(3):
             nu[k + 3] = nu[k + 3] + m.rate_bias * wp.randn(bias)
     if step > 0 and wp.randf(rng) < m.dropout:
-        return  # what was seen last is seen again
+        return  # the previous measurement is kept
     arrays.position[w, v] = x + m.position_std * n + m.position_bias * lasting
     arrays.quaternion[w, v] = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle) * q
     arrays.velocity[w, v] = nu

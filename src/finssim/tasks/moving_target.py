@@ -1,4 +1,4 @@
-"""T3, moving target: stay with something that changes its course every few seconds."""
+"""T3, moving target: stay close to a target that changes its course every few seconds."""
 
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -28,14 +28,14 @@ from finssim.tasks.terms import (
 )
 
 DISTANCE_SCALE = 3.0
-"""Distances are divided by this in the observation [m]."""
+"""Scale of distances in the observation [m]."""
 TARGET_SCALE = 0.2
-"""The target's velocity is divided by this in the observation [m/s]."""
+"""Scale of the target's velocity in the observation [m/s]."""
 
 
 @wp.func
 def target_drift(arrays: TaskArrays, w: int) -> wp.vec3:
-    """Velocity of the target, in the measured body frame [m/s]."""
+    """Return the velocity of the target, in the measured body frame [m/s]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], arrays.target.velocity[w])
 
 
@@ -56,10 +56,10 @@ class TargetReward:
     near = exp(-e / near_scale), e the distance to the target, u the speed relative to it
 
     r = near_weight · near                       a slope that does not vanish at the target: centimetres count
-      - distance · e                             a slope everywhere: a far target is caught up with
-      + match · near · exp(-u / match_scale)     go as it goes, but only beside it: elsewhere it is to be reached
-      - spin · min(|ω|, 2)                       the attitude is not observed and free; turning all the time is not
-      - action · mean(a²)                        the cheapest thrusts that do it
+      - distance · e                             a slope everywhere: a distant target is caught up with
+      + match · near · exp(-u / match_scale)     match the target's velocity, but only close to it: approach it first
+      - spin · min(|ω|, 2)                       the attitude is free and not observed; continuous turning is not wanted
+      - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
       - loss                                     once, on leaving the pool: more than a bad episode costs
     """
@@ -77,7 +77,7 @@ class TargetReward:
 
 @wp.func
 def new_course(arrays: TaskArrays, p: Any, w: int, t: float):
-    """Draw a velocity that the target is to have, and until when; from the world's own stream.
+    """Draw the target's next velocity and the time at which it ends, from the world's own random stream.
 
     `t` is the time [s].
     """
@@ -93,7 +93,7 @@ def new_course(arrays: TaskArrays, p: Any, w: int, t: float):
 
 @wp.func
 def move_target(arrays: TaskArrays, p: Any, w: int):
-    """Take the target through the control step that ends now; outside its box it is on its way back."""
+    """Move the target over the control step that ends now; outside its box its velocity points back."""
     t = arrays.time[w]
     if t >= arrays.target.until[w]:
         new_course(arrays, p, w, t)
@@ -115,7 +115,7 @@ def move_target(arrays: TaskArrays, p: Any, w: int):
 
 @wp.func
 def slip(state: State, arrays: TaskArrays, w: int) -> float:
-    """u: speed relative to the target [m/s]."""
+    """Return u, the speed relative to the target [m/s]."""
     nu = state.velocity[w, 0]
     drift = wp.quat_rotate_inv(state.quaternion[w, 0], arrays.target.velocity[w])
     return wp.length(wp.vec3(nu[0], nu[1], nu[2]) - drift)
@@ -123,7 +123,7 @@ def slip(state: State, arrays: TaskArrays, w: int) -> float:
 
 @wp.func
 def closeness(p: Any, e: float) -> float:
-    """Return 1 at the target, 1/e at a distance `e` of `near_scale` [m] in proportion to the vehicle."""
+    """Return 1 at the target, 1/e at a distance `e` of `near_scale` [m], scaled to the vehicle."""
     return wp.exp(-e / (p.fit.size * p.reward.near_scale))
 
 
@@ -135,26 +135,26 @@ def matching(p: Any, close: float, u: float) -> float:
 
 @wp.func
 def spinning(turn: float) -> float:
-    """Return the size of the angular velocity, at most 2 [rad/s]."""
+    """Return the magnitude of the angular velocity, at most 2 [rad/s]."""
     return wp.min(turn, 2.0)
 
 
 @wp.func
 def with_target(p: Any, e: float, u: float, turn: float) -> bool:
-    """Return whether the vehicle is near the target, as fast as it, and not turning [m, m/s, rad/s]."""
+    """Return True if distance, relative speed and turn rate are within their tolerances [m, m/s, rad/s]."""
     return e <= p.fit.size * p.tolerance and u <= p.fit.pace * p.slip_tolerance and turn <= p.rate_tolerance
 
 
 @wp.func
 def squared_error(arrays: TaskArrays, p: Any, w: int, e: float, was: float) -> float:
-    """Mean of e² after `settle` [m²]."""
+    """Return the mean of e² after `settle` [m²]."""
     k = wp.floor((arrays.time[w] - p.settle) / p.control_step + 0.5)
     return wp.where(k >= 1.0, was + (e * e - was) / wp.max(k, 1.0), was)
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Start with a target at rest, and a vehicle elsewhere in the pool."""
+    """Start an episode with a target at rest, and a vehicle elsewhere in the pool."""
     size = p.fit.size
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.low, size * p.high)
     arrays.goal_quaternion[w] = wp.quat_identity()
@@ -168,10 +168,10 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class MovingTarget(PoolTask):
-    """T3. Lengths in metres, world frame with z up and 0 on the water, as for FinsROV.
+    """T3. Lengths in metres, world frame with z up and 0 on the water, for FinsROV.
 
-    A longer vehicle has everything `fit.size` times as large, and `fit.pace` times as fast. The target's speed, courses
-    and tolerances are the published ones; across the pool its box is what the walls leave (published: 2.5 m).
+    For other vehicles, lengths are scaled by `fit.size` and speeds by `fit.pace`. The target's speed, courses and
+    tolerances are the published ones; across the pool its box is limited by the walls (published: 2.5 m).
     """
 
     succeeds: ClassVar[str] = "once"
@@ -182,46 +182,47 @@ class MovingTarget(PoolTask):
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
     low: tuple[float, float, float] = (-1.25, -0.50, -0.675)
-    """The target starts in this box [m], and turns back where it leaves it; with 0.08 m/s² it needs 0.06 m for that."""
+    """Corner of the box in which the target starts [m]; it turns back at the box's faces, within 0.06 m at 0.08
+    m/s²."""
     high: tuple[float, float, float] = (1.25, 0.50, -0.325)
     fastest: float = 0.10
-    """Its speed is drawn up to this [m/s] ..."""
+    """Greatest drawn speed of the target [m/s]."""
     acceleration: float = 0.08
-    """... and changes by this at most [m/s²]."""
+    """Greatest acceleration of the target [m/s²]."""
     vertical: float = 0.4
-    """Part of the drawn speed that is left upwards and downwards."""
+    """Factor on the vertical component of the drawn velocity."""
     retarget: tuple[float, float] = (1.5, 4.0)
-    """Another velocity is drawn after a time from this range [s]."""
+    """Range of the time between two draws of the velocity [s]."""
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
     tolerance: float = 0.25
-    """Success: within this distance [m], ..."""
+    """Greatest distance for success [m]."""
     slip_tolerance: float = 0.12
-    """... with at most this speed relative to the target [m/s] ..."""
+    """Greatest speed relative to the target for success [m/s]."""
     rate_tolerance: float = 0.3
-    """... and at most this turn rate [rad/s], ..."""
+    """Greatest turn rate for success [rad/s]."""
     hold: float = 1.0
-    """... for this long: 10 steps [s]."""
+    """Time within these tolerances for success [s]: 10 steps."""
     settle: float = 10.0
-    """The error of an episode is counted from here [s]."""
+    """Time from which the error of an episode is measured [s]."""
     reward: TargetReward = field(default_factory=TargetReward)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for every target's motion."""
+        """Allocate the motion of every target."""
         arrays.target = allocated(TargetMotion, worlds, device)
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         return (
             f"{self.tolerance:g} m, {self.slip_tolerance:g} m/s and {self.rate_tolerance:g} rad/s from the target for "
             f"{self.hold:g} s"
         )
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures; success (10 steps in tolerance at any time), its time [s], error after `settle`
-        (RMS) [m].
+        """Return the metrics of every task, with success (10 steps in tolerance at any time), its time [s] and the RMS
+        error after `settle` [m].
 
-        `success_time` is not a number where there was none, nor `error` where the episode was shorter.
+        `success_time` is nan without a success, and `error` is nan for a shorter episode.
         """
         measured = super().metrics(arrays)
         squared = measured.pop("squared_error")
@@ -229,7 +230,7 @@ class MovingTarget(PoolTask):
         return {**measured, "error": np.where(long, np.sqrt(squared), np.nan)}
 
     def terms(self) -> Terms:
-        """See `TargetReward`."""
+        """Return the terms; see `TargetReward`."""
         r = self.reward
         return Terms(
             start=start,

@@ -1,4 +1,4 @@
-"""Observation of a policy on a robot: that of its task, by the kernels of training, of one world on the CPU."""
+"""Observation of a policy on a robot: computed by the training kernels of its task, for one world on the CPU."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ Array = NDArray[np.float64]
 def fitted_task(
     task: str | Task, vehicle: Vehicle | Sequence[Vehicle | str], action: str | None = None
 ) -> Task:
-    """A task as these vehicles do it.
+    """Return a task scaled to these vehicles.
 
     Args:
-        task: A task, its name, or FILE.py:CLASS of one's own.
-        vehicle: One for all of its places, or one for each.
-        action: Mode; the task's own if None.
+        task: A task, its name, or FILE.py:CLASS of a user-defined one.
+        vehicle: One for all roles of the task, or one for each.
+        action: Action mode; the task's own if None.
 
     Raises:
-        ControlError: There is no such task, or the vehicle cannot do it.
+        ControlError: There is no such task, or it does not fit the vehicle.
     """
     try:
         named = task_named(task)
@@ -52,18 +52,17 @@ def fitted_task(
 
 
 class Observer:
-    """The task's own `observe`, fed with a reading in place of a simulator's state.
+    """The task's own `observe`, applied to a reading instead of a simulator's state.
 
-    What the vehicle senses of itself is the reading. Where the task has it go is the guide: the pose to hold, the
-    reference to follow, the target, the dock. Vehicles that are not this one are the reading's `tracks`, by the name of
-    their place in the task; the one that a task commands itself, such as a prey, is where the guide is if it has no
-    track.
+    The reading supplies the vehicle's own measurements. The guide supplies the goal: the pose to hold, the reference to
+    follow, the target or the dock. Other vehicles are the reading's `tracks`, by the name of their role in the task; a
+    vehicle that the task commands itself, such as a prey, is at the guide's position if it has no track.
 
     Attributes:
-        task: Fitted to the vehicle.
-        agent: Place of this vehicle in the task.
-        schema: Which quantity stands where, in which unit and scale.
-        beside: Distance to the path that is followed [m] and its course [rad] at the last observation; None of a task
+        task: The task, scaled to the vehicle.
+        agent: Role of this vehicle in the task.
+        schema: Quantities of the observation with their indices, units and scales.
+        beside: Distance to the path that is followed [m] and its course [rad] at the last observation; None for a task
             without a path.
     """
 
@@ -75,16 +74,17 @@ class Observer:
         agent: str | None = None,
         action: str | None = None,
     ) -> None:
-        """
+        """Build the observation of one world.
+
         Args:
-            task: A task, its name, or FILE.py:CLASS of one's own.
-            vehicle: This one, or one for each of the task's places.
-            agent: Its place in the task, of several; the first if None.
-            action: Mode of its actions; the task's own if None.
+            task: A task, its name, or FILE.py:CLASS of a user-defined one.
+            vehicle: This vehicle, or one for each role of the task.
+            agent: Role of this vehicle, if there are several; the first if None.
+            action: Action mode; the task's own if None.
 
         Raises:
-            ControlError: There is no such task or place, the vehicle cannot do it, or what it sees cannot be told on a
-                robot.
+            ControlError: There is no such task or role, it does not fit the vehicle, or its observation is not
+                available on a robot.
         """
         self.task = task = fitted_task(task, vehicle, action)
         self.agent = agent or task.agents[0]
@@ -102,15 +102,15 @@ class Observer:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Names of tracks that are needed besides those of vehicles."""
+        """Names of tracks that are required besides those of vehicles."""
         return () if self._arrays.net.target is None else ("target",)
 
     def describe(self) -> dict[str, Any]:
-        """The task as `Policy.load` compares it."""
+        """Return the description of the task that `Policy.load` compares."""
         return {"name": self.task.name, "observation": self.schema.model_dump(mode="json")}
 
     def restart(self) -> None:
-        """Forget the guide: the next observation is the first of an episode."""
+        """Discard the guide: the next observation is the first of an episode."""
         self._guide = None
 
     def observe(
@@ -123,19 +123,20 @@ class Observer:
         turn: float = math.inf,
         ranges: Sequence[float] = (),
     ) -> NDArray[np.float32]:
-        """The observation, (schema.size,).
+        """Return the observation, (schema.size,).
 
         Args:
-            reading: The vehicle's state, and others' as its `tracks`, where it has some.
-            guide: Where to go.
+            reading: The vehicle's state, and those of others as its `tracks`, if any.
+            guide: Motion to follow.
             t: Time since the guide's start [s].
-            previous: The action before, in [-1, 1], (size,), for tasks that look at it; zeros if None.
-            reach: A goal farther away than this is seen as one so far ahead on the straight way to it [m].
-            turn: A heading farther away than this is seen as one so far round on the way to it [rad].
-            ranges: Of the sensors in the task's `ranges` [m].
+            previous: The previous action, in [-1, 1], (size,), for tasks that observe it; zeros if None.
+            reach: Greatest observed distance to the goal; a farther goal is moved to this distance in its direction
+                [m].
+            turn: Greatest observed heading difference; a larger one is limited to this angle [rad].
+            ranges: Ranges of the sensors in the task's `ranges` [m].
 
         Raises:
-            ControlError: The place of a vehicle that the task needs is not known.
+            ControlError: The position of a vehicle that the task needs is unknown.
         """
         if guide is not self._guide:
             self._guide = guide
@@ -168,7 +169,7 @@ class Observer:
         return rows[self._place].copy()
 
     def _remember(self, action: Array) -> None:
-        """Keep the last action, as the observation finds it: a task in torch is asked before the step is stored."""
+        """Store the last action as the observation expects it: torch tasks are evaluated before the step is stored."""
         columns = slice(self._place * self._action_size, (self._place + 1) * self._action_size)
         a = self._arrays
         done = a.action.numpy()[0, columns].copy()
@@ -176,13 +177,13 @@ class Observer:
         a.previous_action.numpy()[0, columns] = done if self._in_torch else action
 
     def _build(self, task: Task) -> None:
-        """Arrays of one world, and what observes it; nothing is scored there."""
+        """Create the arrays of one world and the pipeline that observes it, without scoring."""
         state, self._arrays = one_world(task, self._action_size)
         self._in_torch = unscored(self._arrays)
         self._steps = state.steps.numpy()
         self._pipeline = KernelSequence(1, state.steps.device)
         everywhere = wp.ones(1, dtype=wp.int32, device=state.steps.device)
-        # In an episode's first observation, what has been received of the others is all that is known of them.
+        # In the first observation of an episode, received messages are the only information about the others.
         task.add_observe(self._pipeline, Batch(state, self._arrays, 0), everywhere)
         try:
             self._pipeline.run()  # a robot's first decision must not wait for the compiler
@@ -199,7 +200,7 @@ class Observer:
         fill_table(self._arrays.reference, [guide])
 
     def _follow(self, guide: Guide, here: Array) -> None:
-        """Lay the path of a task along that of a guide, from point to point for waypoints, or straight to a station."""
+        """Set the task's path to that of a guide: its path, its waypoints, or a straight line to a station."""
         if self._arrays.path.points is None:
             return
         task: Any = self.task
@@ -239,12 +240,12 @@ class Observer:
             a.net.motion.numpy()[0] = _velocity(target)
 
     def _track(self, name: str, tracks: Mapping[str, Measured], otherwise: Reference | None) -> Measured:
-        """The track of that name; the guide's motion where there is none and that will do."""
+        """Return the track with that name; if there is none, the guide's motion, if given."""
         if name in tracks:
             return tracks[name]
         if otherwise is None:
             raise ControlError(
-                f"task '{self.task.name}' looks at '{name}', whose position is not known; known: "
+                f"task '{self.task.name}' needs the position of '{name}', which no source provides; available: "
                 f"{', '.join(tracks) or 'none'}"
             )
         q = quat_from_yaw(otherwise.yaw)
@@ -253,12 +254,13 @@ class Observer:
 
 
 def _velocity(track: Measured) -> Array:
-    """World frame [m/s], (3,)."""
+    """Return the velocity of a track, world frame [m/s], (3,)."""
     return quat_rotate(np.asarray(track.quaternion), np.asarray(track.nu)[:3])
 
 
 def unscored(arrays: TaskArrays) -> bool:
-    """Take from a task in torch what only a scored episode has: who looks at it is then refused; whether it is one."""
+    """Remove the buffers that only a scored episode provides, so that reading them is refused. Return whether there
+    were any."""
     if arrays.answers.memory is None:
         return False
     arrays.answers.memory = None
@@ -266,10 +268,11 @@ def unscored(arrays: TaskArrays) -> bool:
 
 
 def one_world(task: Task, action_size: int) -> tuple[State, TaskArrays]:
-    """State and arrays of one world of a task on the CPU, without a simulator: what is true is what is measured.
+    """Return state and arrays of one world of a task on the CPU, without a simulator: true and measured state are
+    equal.
 
     Args:
-        task: Fitted to its vehicles.
+        task: Task scaled to its vehicles.
         action_size: Numbers in the action of a vehicle.
     """
     device, vehicles = wp.get_device("cpu"), len(task.vehicles)

@@ -1,4 +1,4 @@
-"""Tasks along a path in space, for vehicles that must move to steer: a winding path, and a tour of waypoints."""
+"""Path tasks in space, for vehicles that steer by moving: a winding path, and a tour of waypoints."""
 
 import math
 from collections.abc import Sequence
@@ -33,28 +33,28 @@ from finssim.tasks.terms import (
 from finssim.vehicles import Vehicle
 
 ERROR_SCALE = 3.0
-"""Errors beside the path are divided by this in the observation, in proportion to the vehicle's speed [m]."""
+"""Scale of cross-track errors in the observation, multiplied by the factor of the vehicle's speed [m]."""
 AHEAD = (0.0, 1.0, 3.0)
-"""The direction of the path is seen where the vehicle is, and this much later at cruising speed [s]."""
+"""Preview times at cruising speed of the observed path directions [s]."""
 PACE = 1.5
-"""Cruising speed of a vehicle for which lengths are as they are stated [m/s]."""
+"""Cruising speed of a vehicle for which lengths apply unscaled [m/s]."""
 
 
-# Where a vehicle is beside the legs of a path.
+# Position of a vehicle relative to the legs of a path.
 
 
 @wp.func
 def leg_direction(path: PathTable, w: int, k: int) -> wp.vec3:
-    """Unit vector along a leg, world frame."""
+    """Return the unit vector along a leg, world frame."""
     return wp.normalize(path.points[w, k + 1] - path.points[w, k])
 
 
 @wp.func
 def beside_leg(path: PathTable, w: int, x: wp.vec3) -> wp.vec4:
-    """Return where a point [m] is beside the leg that is followed: the numbers of `Waypoints.errors`.
+    """Return the position of a point [m] relative to the current leg, as in `Waypoints.errors`.
 
     Returns:
-        Way along the leg, distance to its left, distance above it, and way that remains of it [m].
+        Along-track distance, distance to the left of the leg, distance above it, and remaining distance [m].
     """
     k = path.leg[w]
     e = leg_direction(path, w, k)
@@ -74,26 +74,26 @@ def leg_is_done(path: PathTable, w: int, x: wp.vec3, radius: float) -> bool:
 
 @wp.func
 def change_legs(state: State, arrays: TaskArrays, p: Any, w: int):
-    """Change to the leg after those that are done."""
+    """Switch to the first leg that is not yet done."""
     x = state.position[w, 0]
     for _i in range(4):
         if arrays.path.leg[w] < p.legs - 1 and leg_is_done(arrays.path, w, x, p.fit.size * p.radius):
             arrays.path.leg[w] = arrays.path.leg[w] + 1
 
 
-# What is seen, rewarded and counted.
+# Observations, rewards and totals.
 
 
 @wp.func
 def measured_errors(arrays: TaskArrays, p: Any, w: int) -> wp.vec2:
-    """Distances to the left of the leg and above it [m], for a vehicle that cruises at `PACE`."""
+    """Return the distances to the left of the leg and above it [m], scaled to a vehicle that cruises at `PACE`."""
     found = beside_leg(arrays.path, w, arrays.position[w, 0])
     return wp.vec2(found[1], found[2]) / p.fit.size
 
 
 @wp.func
 def path_direction(arrays: TaskArrays, p: Any, w: int, k: int) -> wp.vec3:
-    """Direction of the path as far ahead as cruising takes in the k-th time of `AHEAD`, body frame."""
+    """Return the direction of the path at the k-th preview time of `AHEAD` at cruising speed, body frame [-]."""
     leg = int(arrays.path.leg[w])
     way = float(p.fit.speed * p.ahead[k] - beside_leg(arrays.path, w, arrays.position[w, 0])[3])
     while way > 0.0 and leg < p.legs - 1:
@@ -104,47 +104,47 @@ def path_direction(arrays: TaskArrays, p: Any, w: int, k: int) -> wp.vec3:
 
 @wp.func
 def ground_velocity(arrays: TaskArrays, p: Any, w: int) -> wp.vec3:
-    """Measured velocity as a part of cruising speed, body frame."""
+    """Return the measured velocity as a fraction of cruising speed, body frame."""
     nu = arrays.velocity[w, 0]
     return wp.vec3(nu[0], nu[1], nu[2]) / p.fit.speed
 
 
 @wp.func
 def path_error(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Distance to the path [m]."""
+    """Return the distance to the path [m]."""
     found = beside_leg(arrays.path, w, state.position[w, 0])
     return wp.sqrt(found[1] * found[1] + found[2] * found[2])
 
 
 @wp.func
 def on_path(p: Any, e: float) -> float:
-    """Return 1 on the path, 1/e at an error `e` [m] of `reward.track_scale`, in proportion to the vehicle's speed."""
+    """Return 1 on the path, 1/e at an error `e` [m] of `reward.track_scale`, scaled to the vehicle's speed."""
     return wp.exp(-e / (p.fit.size * p.reward.track_scale))
 
 
 @wp.func
 def path_advance(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Speed along the path as a part of cruising speed."""
+    """Return the speed along the path as a fraction of cruising speed."""
     e = leg_direction(arrays.path, w, arrays.path.leg[w])
     return wp.dot(world_velocity(state, w, 0), e) / p.fit.speed
 
 
 @wp.func
 def has_finished(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """The last leg is done."""
+    """Return True if the last leg is done."""
     last = arrays.path.leg[w] >= p.legs - 1
     return last and leg_is_done(arrays.path, w, state.position[w, 0], p.fit.size * p.radius)
 
 
 @wp.func
 def has_left(p: Any, e: float) -> bool:
-    """Farther than `corridor` from the path, in proportion to the vehicle's speed. The error `e` is in [m]."""
+    """Return True if the error `e` [m] exceeds `corridor`, scaled to the vehicle's speed."""
     return e > p.fit.size * p.corridor
 
 
 @wp.func
 def mean_square(arrays: TaskArrays, p: Any, e: float, w: int, was: float) -> float:
-    """Mean of the squared distance to the path after `settle` [m²]."""
+    """Return the mean of the squared distance to the path after `settle` [m²]."""
     k = wp.floor((arrays.time[w] - p.settle) / p.control_step + 0.5)
     return wp.where(k >= 1.0, was + (e * e - was) / wp.max(k, 1.0), was)
 
@@ -154,7 +154,7 @@ def mean_square(arrays: TaskArrays, p: Any, e: float, w: int, was: float) -> flo
 
 @wp.func
 def winding(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
-    """Write a path whose curvature and slope change smoothly, from phases that are drawn."""
+    """Write a path whose curvature and slope change smoothly, with random phases."""
     pi = 3.14159265
     course = float(wp.randf(rng, -pi, pi))
     first = wp.randf(rng, -pi, pi)
@@ -174,14 +174,14 @@ def winding(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
 
 @wp.func
 def touring(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
-    """Write waypoints: lengths, turns and slopes of the legs are drawn."""
+    """Write waypoints with random lengths, turns and slopes of the legs."""
     pi = 3.14159265
     course = float(wp.randf(rng, -pi, pi))
     x = wp.vec3(0.0, 0.0, p.fit.size * p.depth)
     for k in range(p.legs + 1):
         arrays.path.points[w, k] = x
         slope = wp.randf(rng, -p.slope, p.slope)
-        # Back towards the depth of the start, so that the surface is not reached.
+        # Back towards the starting depth, so that the surface is not reached.
         slope = wp.where((x[2] - p.fit.size * p.depth) * slope < 0.0, -slope, slope)
         way = p.fit.size * wp.randf(rng, p.leg[0], p.leg[1])
         x += way * wp.vec3(wp.cos(slope) * wp.cos(course), wp.cos(slope) * wp.sin(course), -wp.sin(slope))
@@ -190,7 +190,7 @@ def touring(arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
 
 @wp.func
 def start_beside(state: State, arrays: TaskArrays, p: Any, rng: wp.uint32, w: int):
-    """Put the vehicle near the start of the path, about along it, at cruising speed through the water."""
+    """Place the vehicle near the start of the path, roughly along it, at cruising speed through the water."""
     arrays.path.leg[w] = 0
     e = leg_direction(arrays.path, w, 0)
     away = wp.vec3(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0))
@@ -206,7 +206,7 @@ def start_beside(state: State, arrays: TaskArrays, p: Any, rng: wp.uint32, w: in
 
 @wp.func
 def start_path(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A winding path, unless one is given, and a start beside it."""
+    """Start an episode beside a winding path, unless a path is given."""
     if arrays.path.given[w] == 0:
         winding(arrays, p, wp.rand_init(key, 4 * w), w)
     start_beside(state, arrays, p, wp.rand_init(key, 4 * w + 1), w)
@@ -214,7 +214,7 @@ def start_path(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @wp.func
 def start_tour(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Waypoints, unless some are given, and a start beside the first leg."""
+    """Start an episode beside the first leg of random waypoints, unless waypoints are given."""
     if arrays.path.given[w] == 0:
         touring(arrays, p, wp.rand_init(key, 4 * w), w)
     start_beside(state, arrays, p, wp.rand_init(key, 4 * w + 1), w)
@@ -244,7 +244,7 @@ OBSERVATION = (
 
 @dataclass(frozen=True)
 class Cruise:
-    """Cruising speed of a vehicle, and the factor on lengths that follows from it."""
+    """Cruising speed of a vehicle, and the resulting scale of lengths."""
 
     speed: float = PACE
     """[m/s]"""
@@ -252,7 +252,7 @@ class Cruise:
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> "Cruise":
-        """Return the speed in the middle of what the autopilot can ask for: action 0 of mode `course`."""
+        """Return the middle of the autopilot's speed range, action 0 of mode `course`."""
         speeds = course_speeds(vehicle)
         speed = 0.5 * float(speeds[0] + speeds[-1])
         return cls(speed, speed / PACE)
@@ -263,9 +263,9 @@ class PathReward:
     """Weights of the reward; each term has one reason.
 
     r = track · exp(-e / track_scale)            on the path: centimetres count
-      - distance · e                             a slope everywhere: a far path is returned to
+      - distance · e                             a slope everywhere: return to a distant path
       + advance · (speed along the path)         do not stop: it costs more than an error
-      - action · mean(a²) - change · mean(Δa²)   orders that a vehicle can follow, no chatter
+      - action · mean(a²) - change · mean(Δa²)   commands that a vehicle can follow, no chatter
       + finish, - loss                           once, at the end of the path, and on leaving it
     """
 
@@ -281,10 +281,10 @@ class PathReward:
 
 @dataclass(frozen=True, kw_only=True)
 class PathFollowing(Task):
-    """Follow a winding path in space, in whatever current there is, by orders to the autopilot.
+    """Follow a winding path in space, in any current, by autopilot commands.
 
-    Lengths in metres, angles in radians, times in seconds. Lengths are as stated for a vehicle that cruises at 1.5 m/s,
-    and in proportion to the speed for others.
+    Lengths in metres, angles in radians, times in seconds. Lengths apply to a vehicle that cruises at 1.5 m/s, and
+    scale with the speed of others.
     """
 
     succeeds: ClassVar[str] = "finished"
@@ -298,31 +298,31 @@ class PathFollowing(Task):
     fit: Cruise = Cruise()
     """Speed of the vehicle; the environment sets it."""
     ahead: tuple[float, float, float] = AHEAD
-    """Times of the directions that are seen [s]."""
+    """Preview times of the observed path directions [s]."""
     legs: int = 90
     """Number of legs."""
     spacing: float = 1.0
     """Length of a leg [m]."""
     radius: float = 0.01
-    """A leg is done this close to its end, or beyond it [m]."""
+    """Distance from the end of a leg at which the leg is done [m]; it is also done beyond its end."""
     wave: tuple[float, float] = (40.0, 80.0)
-    """Length of the waves of the path's curvature and slope, drawn from this range [m]."""
+    """Range of the wavelength of the path's curvature and slope [m]."""
     bend_radius: float = 18.0
     """Least radius of the path's bends [m]."""
     slope: float = math.radians(12.0)
-    """Steepest part of the path [rad]."""
+    """Steepest slope of the path [rad]."""
     depth: float = -15.0
-    """Height of its start [m]."""
+    """Height of the start of the path [m]."""
     offset: float = 1.0
-    """Largest distance of the start from that of the path, per axis [m]."""
+    """Largest offset of the vehicle from the start of the path, per axis [m]."""
     yaw: float = math.radians(20.0)
     """Largest angle between the heading and the path at the start [rad]."""
     corridor: float = 2.5
-    """Farther than this from the path the episode ends [m]."""
+    """Distance from the path beyond which the episode ends [m]."""
     settle: float = 10.0
-    """The error of an episode is counted from here [s]."""
+    """Time from which the error of an episode is measured [s]."""
     tolerance: float = 0.5
-    """A success has no greater error than this [m]."""
+    """Greatest error of a success [m]."""
     reward: PathReward = field(default_factory=PathReward)
 
     begins: ClassVar[Any] = start_path
@@ -333,22 +333,22 @@ class PathFollowing(Task):
         return replace(self, fit=Cruise.of(vehicles[0]))
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for every world's path."""
+        """Allocate the path of every world."""
         arrays.path = allocated(PathTable, worlds, device, points=self.legs + 1)
 
     def straight(self, here: NDArray[np.float64], goal: Reference) -> NDArray[np.float64]:
-        """Return the path from a place to a goal [m], (2, 3), for a robot that is sent to a station."""
+        """Return the straight path from a position to a goal [m], (2, 3), for a robot that is sent to a station."""
         return np.stack([here, np.asarray(goal.position, float)])
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         lengths = (self.fit.size * length for length in (self.tolerance, self.corridor))
         return "the end of the path, {:.3g} m from it (RMS), never more than {:.3g} m".format(*lengths)
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures, and the error: RMS distance to the path after `settle` [m].
+        """Return the metrics of every task, and the error: RMS distance to the path after `settle` [m].
 
-        The error is not a number where the episode was shorter.
+        The error is nan for an episode that is shorter than that.
         """
         measured = super().metrics(arrays)
         squared = measured.pop("squared_error")
@@ -360,7 +360,7 @@ class PathFollowing(Task):
         return {**measured, "error": error}
 
     def terms(self) -> Terms:
-        """See `PathReward`."""
+        """Return the terms; see `PathReward`."""
         r = self.reward
         return Terms(
             start=self.begins,
@@ -380,7 +380,7 @@ class PathFollowing(Task):
 
 @dataclass(frozen=True, kw_only=True)
 class WaypointTour(PathFollowing):
-    """Pass a number of waypoints, one after the other, within a radius of acceptance.
+    """Pass a number of waypoints, one after the other, each within the acceptance radius.
 
     Lengths as for `PathFollowing`.
     """
@@ -392,9 +392,9 @@ class WaypointTour(PathFollowing):
     legs: int = 4
     radius: float = 2.0
     leg: tuple[float, float] = (20.0, 30.0)
-    """Length of a leg, drawn from this range [m]."""
+    """Range of the length of a leg [m]."""
     turn: float = math.radians(100.0)
-    """Largest turn from leg to leg [rad]."""
+    """Largest turn between two legs [rad]."""
     offset: float = 3.0
     yaw: float = math.radians(90.0)
     corridor: float = 15.0
@@ -403,7 +403,7 @@ class WaypointTour(PathFollowing):
     begins: ClassVar[Any] = start_tour
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         return f"every waypoint passed within {self.fit.size * self.radius:.3g} m, or beside it beyond its leg's end"
 
 
@@ -411,14 +411,14 @@ def follow_path(environment: Environment, paths: Sequence[Waypoints]) -> NDArray
     """Start an episode in every world beside the first leg of its path; world i follows paths[i] from then on.
 
     Args:
-        environment: Of a task along a path, such as `WaypointTour`, with as many legs.
-        paths: One per world; the radius of acceptance is the task's.
+        environment: Environment of a task along a path, such as `WaypointTour`, with as many legs.
+        paths: One per world; the acceptance radius is the task's.
 
     Returns:
         Observations [-], (worlds, size).
 
     Raises:
-        EnvironmentSetupError: Another number of paths, or of legs.
+        EnvironmentSetupError: The number of paths, or of their legs, does not fit.
     """
     table = environment.arrays.path
     if len(paths) != environment.worlds or table.points is None:

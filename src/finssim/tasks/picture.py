@@ -1,4 +1,4 @@
-"""Pictures that a task observes besides its row of numbers."""
+"""Pictures that a task observes besides its numbers."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice
 
 @dataclass(frozen=True)
 class ObservedPicture:
-    """A picture that a task observes: of a camera in colours, of a sonar the echoes by beam and range."""
+    """A picture that a task observes: a colour image of a camera, or the echoes of a sonar by beam and range."""
 
     name: str
     """Name of the entry in the vehicle's `perception`, such as `front_camera`."""
     width: int | None = None
-    """Columns of a camera's [px], in place of the entry's; the height follows."""
+    """Columns of a camera's image [px], instead of those of the entry; the height follows."""
     bins: int | None = None
-    """The nearest range cells of a sonar, so many; all if None."""
+    """Number of range cells of a sonar, from the nearest; all if None."""
 
     def device(self, vehicle: Vehicle) -> CameraDevice | SonarDevice:
-        """Return the device that takes it, a sonar with the range of its cells.
+        """Return the device of the picture, a sonar with the range of the selected cells.
 
         Raises:
-            EnvironmentSetupError: The vehicle's sensor takes no pictures.
-            DeviceError: The vehicle has no such sensor, or it is refused.
+            EnvironmentSetupError: The vehicle's sensor does not produce pictures.
+            DeviceError: The vehicle has no such sensor, or its description is invalid.
         """
         device = device_of(vehicle, self.name)
         if isinstance(device, RangeDevice):
@@ -38,7 +38,7 @@ class ObservedPicture:
         return device.model_copy(update={"bins": bins, "range": device.range * bins / device.bins})
 
     def shape(self, vehicle: Vehicle) -> tuple[int, int, int]:
-        """(height, width, 3), row 0 at the top; of a sonar (beams, range cells, 1), beam 0 at the left."""
+        """Return (height, width, 3), row 0 at the top; for a sonar (beams, range cells, 1), beam 0 at the left."""
         device = self.device(vehicle)
         if isinstance(device, SonarDevice):
             return device.beams, device.bins, 1

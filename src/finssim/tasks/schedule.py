@@ -1,4 +1,4 @@
-"""Ranges that grow while a policy learns: with the training's progress, its steps, or success."""
+"""Curriculum: ranges that grow during training, with its progress, its steps, or the success rate."""
 
 from collections.abc import Iterator
 
@@ -13,17 +13,17 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
 
 LOOK = 50
-"""Control steps between two looks at the successes."""
+"""Control steps between two evaluations of the curriculum."""
 
 
 @wp.struct
 class Counts:
-    """Episodes and successes since the last look, by world, as worlds run on several threads."""
+    """Episodes and successes since the last evaluation, by world, because worlds run on several threads."""
 
     tried: wp.array(dtype=int)
     succeeded: wp.array(dtype=int)
-    held: float  # a success has held at least this [s] ...
-    episode_return: float  # ... and earned at least this sum of rewards
+    held: float  # least hold time of a success [s]
+    episode_return: float  # least sum of rewards of a success
 
 
 @wp.kernel(enable_backward=False)
@@ -63,11 +63,11 @@ class Schedule:
 
     @property
     def width(self) -> float:
-        """Part of the full width that is drawn from now."""
+        """Fraction of the full width that is currently drawn."""
         return float(self._width.numpy()[0])
 
     def restart(self) -> None:
-        """Back to the narrow ranges."""
+        """Return to the narrow ranges."""
         self._forget()
         self._steps = 0
         self._set(self.plan.start)
@@ -78,12 +78,12 @@ class Schedule:
             pipeline.add(count_successes, [arrays, self.counts])
 
     def progress(self, done: float) -> None:
-        """The share of the training that is done, in [0, 1]."""
+        """Set the completed fraction of the training, in [0, 1]."""
         if self.plan.by == "progress":
             self._set(self.plan.width(done))
 
     def after_step(self) -> None:
-        """Called after every control step; looks every `LOOK` of them."""
+        """Update the width after a control step; evaluated every `LOOK` steps."""
         self._steps += 1
         if self._steps % LOOK:
             return
@@ -93,7 +93,7 @@ class Schedule:
             self._set(self.plan.width(float(self._steps * self._draws.simulator.worlds)))
 
     def arrays(self) -> Iterator[tuple[str, wp.array]]:
-        """Yield the arrays that determine its further course, by name. Each has the unit of its attribute."""
+        """Yield the arrays that determine the further schedule, by name. Each has the unit of its attribute."""
         counts, table = self.counts, self._draws.table
         yield from (("width", self._width), ("tried", counts.tried), ("succeeded", counts.succeeded))
         yield from (("ends", table.ends), ("probability", table.probability))
@@ -124,7 +124,7 @@ def _success(plan: Curriculum, task: Task) -> Success:
     if hold:
         return Success(held=hold)
     if plan.by != "success":
-        return Success(episode_return=0.0)  # nothing is counted
+        return Success(episode_return=0.0)  # the curriculum does not count successes
     raise EnvironmentSetupError(
         f"task '{task.name}' has no hold time: define success, such as success: {{episode_return: 10}}"
     )

@@ -1,10 +1,10 @@
-"""Readings of the vehicle's own instruments and position fixes, combined by a filter in the batch, world by world.
+"""Readings of the vehicle's own instruments and position fixes, fused by a filter in the batch, world by world.
 
-Gyro and accelerometer give rates, roll and pitch (the complementary filter of `localization.fusion.attitude`); fixes
-from outside give x, y and yaw, and z where there is no pressure gauge; a DVL gives velocity where there is one.
-Position and velocity of each axis follow white acceleration and yaw the gyro with an unknown bias (the paper's
-equations 14 and 15, as `localization.fusion` has them), each a Kalman filter of two states: the same equations.
-A measurement that comes late is compared with the estimate of its own time and moves the path since.
+Gyroscope and accelerometer give rates, roll and pitch (the complementary filter of `localization.fusion.attitude`);
+external fixes give x, y and yaw, and z if there is no pressure sensor; a DVL gives velocity if there is one. Each axis
+has a Kalman filter of two states, as in `localization.fusion`: position and velocity with white acceleration, and yaw
+with an unknown bias of the gyroscope (the paper's equations 14 and 15). A delayed measurement is compared with the
+estimate of its own time, and corrects all estimates since then.
 """
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator,attr-defined"
 
@@ -51,32 +51,32 @@ from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
 from finssim.vehicles import Vehicle
 
 FIX = 100
-"""Number of the fixes in the random key, different from those of the kinds of sensor."""
+"""Number of the fixes in the key of random numbers, different from those of the sensors."""
 STANDING = 400
-"""Control steps after which a filter's doubt has settled."""
+"""Control steps after which the covariance of a filter has settled."""
 FASTEST = 0.3
-"""Standard deviation of a vehicle's speed per axis without any measurement of it [m/s], as in `localization.fusion`."""
+"""Standard deviation of a vehicle's speed per axis without any measurement [m/s], as in `localization.fusion`."""
 MOUNT = ("position", "orientation")
 PER_FIX = ("position_std", "yaw_std", "position_bias", "yaw_bias", "dropout", "delay")
-"""Fields of a measurement noise that a fix has."""
+"""Fields of a measurement noise that apply to a fix."""
 
 _q, _gyro, _tilt = MotionModel().density, YawNoise(), TiltGains()
 ACCELERATION = wp.vec3(*_q)
-"""Spectral density of the acceleration that a vehicle may have, world axes [m²/s³]."""
+"""Spectral density of a vehicle's acceleration, world axes [m²/s³]."""
 GYRO_FLOOR, GYRO_WALK = _gyro.rate, _gyro.bias_walk
-"""Least noise density of a rate [rad/s/√Hz], which mounting and sampling leave, and walk of its bias."""
+"""Least noise density of a rate [rad/s/√Hz], due to mounting and sampling, and random walk of its bias."""
 TILT_P, TILT_I, TILT_TOLERANCE = _tilt.proportional, _tilt.integral, _tilt.tolerance
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensing:
-    """The sensors of the vehicle files, and position fixes from outside; see `finssim.tasks.sensing`.
+    """Sensors of the vehicle files, and external position fixes; see `finssim.tasks.sensing`.
 
-    The defaults are about those of the overhead camera of a virtual pool of severity realistic.
+    The defaults are roughly those of the overhead camera of a virtual pool of severity realistic.
     """
 
     rate: float = 30.0
-    """Fixes a second [Hz]; 0: none, from a known start on."""
+    """Rate of the fixes [Hz]; 0: none, only a known start."""
     fixes: MeasurementNoise = MeasurementNoise(
         position_std=0.0035,
         yaw_std=math.radians(0.18),
@@ -85,7 +85,7 @@ class Sensing:
         dropout=0.005,
         delay=0.045,
     )
-    """Noise of a fix, an offset by episode, the chance that it is lost, and how late it comes."""
+    """Noise of a fix, its offset per episode, its dropout probability and its delay."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate >= 0.0):
@@ -99,10 +99,10 @@ class Sensing:
 
 
 def load_sensing(path: str | Path) -> Sensing:
-    """Fixes of a site from a YAML file: `rate`, and under `fixes` what is not 0 of a fix.
+    """Read the fixes of a site from a YAML file: `rate`, and under `fixes` the nonzero errors of a fix.
 
     Raises:
-        EnvironmentSetupError: The file is not there or wrong; names it and the key.
+        EnvironmentSetupError: The file is missing or invalid; the message names the file and the key.
     """
     data = read_mapping(Path(path), EnvironmentSetupError, such_as="rate: 1.0")
     fixes = data.get("fixes", {})
@@ -125,8 +125,8 @@ def load_sensing(path: str | Path) -> Sensing:
 
 
 def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, Any]:
-    """Return the observation of a controller as plain data: errors, or fixes and the sensors aboard; no mounts, nothing
-    that is 0."""
+    """Return the observation of a controller as plain data: errors, or fixes and on-board sensors, without mounting
+    poses and zeros."""
     if isinstance(noise, MeasurementNoise):
         return {name: value for name, value in asdict(noise).items() if value}
     fixes = {"rate": noise.rate, **seen_with(noise.fixes, vehicle)} if noise.rate else None
@@ -142,32 +142,33 @@ def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, 
 
 @wp.struct
 class FilterState:
-    """State of the filter of one vehicle: a doubt is variance, covariance, variance of a value and its rate."""
+    """State of the filter of one vehicle; a covariance is (variance, covariance, variance) of a value and its rate."""
 
-    gauge: wp.bool  # whether z comes from a pressure gauge
-    plane: wp.vec3  # settled doubt of x, and of y [m², m²/s, m²/s²]
-    height: wp.vec3  # of z [m², m²/s, m²/s²]
-    yaw: wp.vec3  # of yaw [rad², rad²/s, rad²/s²]
+    gauge: wp.bool  # True if z is measured by a pressure sensor
+    plane: wp.vec3  # settled covariance of x, and of y [m², m²/s, m²/s²]
+    height: wp.vec3  # covariance of z [m², m²/s, m²/s²]
+    yaw: wp.vec3  # covariance of yaw [rad², rad²/s, rad²/s²]
 
 
 @wp.struct
 class Estimates:
-    """Memory of the filters, by (world, vehicle); position, velocity and attitude of the last control steps, a ring."""
+    """State of the filters, by (world, vehicle); position, velocity and attitude of recent control steps in a ring
+    buffer."""
 
     aboard: wp.array(dtype=FilterState)  # by vehicle
     position: wp.array3d(dtype=wp.vec3)  # world frame [m]
     velocity: wp.array3d(dtype=wp.vec3)  # world frame [m/s]
     quaternion: wp.array3d(dtype=wp.quat)  # body to world
-    bias: wp.array2d(dtype=wp.vec3)  # of the gyro, body frame [rad/s]
-    rate: wp.array2d(dtype=wp.vec3)  # of turn, a step ago, body frame [rad/s]
-    plane: wp.array2d(dtype=wp.vec3)  # doubts, as in `FilterState`
+    bias: wp.array2d(dtype=wp.vec3)  # bias of the gyroscope, body frame [rad/s]
+    rate: wp.array2d(dtype=wp.vec3)  # angular rate in the previous step, body frame [rad/s]
+    plane: wp.array2d(dtype=wp.vec3)  # covariances, as in `FilterState`
     height: wp.array2d(dtype=wp.vec3)
     yaw: wp.array2d(dtype=wp.vec3)
 
 
 @wp.struct
 class InstrumentReadings:
-    """Readings of the instruments; arrays of a kind that no vehicle has are empty. Fixes are drawn when they arrive."""
+    """Readings of the instruments; arrays of a kind that no vehicle has are empty. Fixes are drawn on arrival."""
 
     control_step: float  # [s]
     fix_errors: wp.array2d(dtype=MeasurementErrors)  # by (world, vehicle)
@@ -185,7 +186,7 @@ class InstrumentReadings:
 
 @wp.func
 def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
-    """Doubt of a value and its rate a time later, P <- A P A' + Q, of a rate driven by white noise of density q.
+    """Propagate the covariance of a value and its rate, P <- A P A' + Q, for a rate driven by white noise of density q.
 
     `dt` is in [s]; P and q have the unit of the value squared.
     """
@@ -198,33 +199,35 @@ def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
 
 @wp.func
 def value_gain(P: wp.vec3, R: float) -> wp.vec2:
-    """Gain of value and rate for a measured value of variance R. P and R have the unit of the value squared."""
+    """Return the gain of value and rate for a measured value of variance R. P and R have the unit of the value
+    squared."""
     return wp.vec2(P[0], P[1]) / (P[0] + R)
 
 
 @wp.func
 def value_known(P: wp.vec3, R: float) -> wp.vec3:
-    """Doubt after it. P and R have the unit of the value squared."""
+    """Return the covariance after a measured value of variance R. P and R have the unit of the value squared."""
     s = P[0] + R
     return wp.vec3(P[0] * R / s, P[1] * R / s, P[2] - P[1] * P[1] / s)
 
 
 @wp.func
 def rate_gain(P: wp.vec3, R: float) -> wp.vec2:
-    """Gain of value and rate for a measured rate of variance R. P and R have the unit of the value squared."""
+    """Return the gain of value and rate for a measured rate of variance R. P and R have the unit of the value
+    squared."""
     return wp.vec2(P[1], P[2]) / (P[2] + R)
 
 
 @wp.func
 def rate_known(P: wp.vec3, R: float) -> wp.vec3:
-    """Doubt after it. P and R have the unit of the value squared."""
+    """Return the covariance after a measured rate of variance R. P and R have the unit of the value squared."""
     s = P[2] + R
     return wp.vec3(P[0] - P[1] * P[1] / s, P[1] * R / s, P[2] * R / s)
 
 
 @wp.func
 def counted(noise: float, quantum: float) -> float:
-    """Variance of what has this noise and is rounded to a multiple of the quantum; never 0.
+    """Return the variance of a measurement with noise that is rounded to a multiple of the quantum; never 0.
 
     Noise and quantum have one unit.
     """
@@ -233,13 +236,13 @@ def counted(noise: float, quantum: float) -> float:
 
 @wp.func
 def about_z(angle: float) -> wp.quat:
-    """Rotation about world z [rad]."""
+    """Return the rotation about world z by an angle [rad]."""
     return wp.quat(0.0, 0.0, wp.sin(0.5 * angle), wp.cos(0.5 * angle))
 
 
 @wp.func
 def turned_by(rotation: wp.vec3) -> wp.quat:
-    """Rotation vector of less than half a turn to a quaternion."""
+    """Return the quaternion of a rotation vector of less than half a turn."""
     angle = wp.length(rotation)
     k = 0.5 - angle * angle / 48.0
     if angle > 1.0e-3:
@@ -249,14 +252,14 @@ def turned_by(rotation: wp.vec3) -> wp.quat:
 
 @wp.func
 def turn_about_z(q: wp.quat, p: wp.quat) -> float:
-    """Yaw of attitude q beyond p, the short way round [rad]."""
+    """Return the yaw difference of attitude q from p, wrapped to half a turn [rad]."""
     d = q * wp.quat_inverse(p)
     return 2.0 * wp.atan2(wp.where(d[3] < 0.0, -d[2], d[2]), wp.abs(d[3]))
 
 
 @wp.func
 def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
-    """Errors of value and rate with the covariance P, from two standard normal numbers."""
+    """Return errors of value and rate with the covariance P, from two standard normal numbers."""
     std = wp.sqrt(wp.max(P[0], 1.0e-12))
     return wp.vec2(std * a, P[1] / std * a + wp.sqrt(wp.max(P[2] - P[1] * P[1] / (std * std), 0.0)) * b)
 
@@ -271,7 +274,7 @@ def begin(
     w: int,
     v: int,
 ):
-    """Start where the filter would be had it run before: off by its settled doubt and by what lasts."""
+    """Start the filter in its steady state: with errors of its settled covariance and with the persistent offsets."""
     key = sample_key(seed, FIX, w, v, state.episode[w], 0)
     aboard = e.aboard[v]
     x = state.position[w, v]
@@ -306,8 +309,8 @@ def begin(
 
 @wp.func
 def go_on(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """Advance the state by a control step: the gyro turns it, the accelerometer gives the vertical, velocity is
-    integrated.
+    """Propagate the state by a control step: attitude from the gyroscope, tilt corrected by the accelerometer, position
+    from the velocity.
 
     `dt` is in [s].
     """
@@ -337,7 +340,7 @@ def go_on(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: 
 
 @wp.func
 def measured_at(e: Estimates, latency: int, step: int) -> int:
-    """Control step of a measurement that is so many steps old, within what is kept and what the episode has."""
+    """Return the control step of a measurement of a given latency, limited to the stored steps and to the episode."""
     return step - wp.min(wp.min(latency, e.position.shape[2] - 1), step)
 
 
@@ -347,12 +350,12 @@ class Correction:
 
     position: wp.vec3  # world frame [m]
     velocity: wp.vec3  # world frame [m/s]
-    turn: wp.vec2  # about the vertical, and of the gyro's bias about it [rad, rad/s]
+    turn: wp.vec2  # correction of yaw, and of the gyroscope's bias about the vertical [rad, rad/s]
 
 
 @wp.func
 def moved(position: wp.vec3, velocity: wp.vec3) -> Correction:
-    """Correction of position [m] and velocity [m/s] alone, world frame."""
+    """Return a correction of position [m] and velocity [m/s] alone, world frame."""
     c = Correction()
     c.position = position
     c.velocity = velocity
@@ -361,7 +364,7 @@ def moved(position: wp.vec3, velocity: wp.vec3) -> Correction:
 
 @wp.func
 def correct(e: Estimates, w: int, v: int, at: int, step: int, dt: float, c: Correction):
-    """Apply a correction of control step `at`: offsets, which have grown since then, and the gyro's bias.
+    """Apply a correction of control step `at` to all estimates since then, and to the gyroscope's bias.
 
     `dt` is in [s].
     """
@@ -378,7 +381,7 @@ def correct(e: Estimates, w: int, v: int, at: int, step: int, dt: float, c: Corr
 
 @wp.func
 def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: int, v: int):
-    """Apply the fixes of their delay ago, if any arrived: of several in a control step the mean."""
+    """Apply the fixes that arrive in this step, the mean of several in a control step."""
     m = r.fix_errors[w, v]
     dt = r.control_step
     step = state.steps[w]
@@ -421,7 +424,7 @@ def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: in
 
 @wp.func
 def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """A depth that has come: of the gauge's port, -z - (R r)_z. `dt` is in [s]."""
+    """Apply a depth reading: -z - (R r)_z at the sensor's port. `dt` is in [s]."""
     at = measured_at(e, r.gauge_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
     gauge = r.gauge_errors[w, v]
@@ -435,7 +438,7 @@ def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int
 
 @wp.func
 def take_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
-    """A velocity of the DVL that has come: of the body's origin, v = R_bs z - ω × r, in world axes.
+    """Apply a velocity reading of the DVL: velocity of the body's origin, v = R_bs z - ω × r, in world axes.
 
     `dt` is in [s].
     """
@@ -460,7 +463,7 @@ def estimate(
     state: State, arrays: TaskArrays, r: InstrumentReadings, e: Estimates, seed: int, mask: wp.array(dtype=int),
     starting: bool, world_offset: int,
 ):  # fmt: skip
-    """Write every vehicle's estimate: after a control step of all, or where an episode starts and mask is not 0."""
+    """Write the estimates of all vehicles after a control step, or those of starting episodes where mask is not 0."""
     i, v = wp.tid()
     w = world_offset + i
     if mask[w] == 0 or state.frozen[w] != 0:
@@ -486,7 +489,7 @@ def estimate(
 
 
 class SensingBatch:
-    """The instruments and filters of all vehicles of all worlds of one environment."""
+    """Instruments and filters of all vehicles of all worlds of one environment."""
 
     def __init__(
         self,
@@ -498,15 +501,16 @@ class SensingBatch:
         seed: int,
         drawn: bool,
     ) -> None:
-        """
+        """Allocate instruments and filters.
+
         Args:
-            sensing: The fixes.
+            sensing: Settings of the fixes.
             simulator: The worlds.
-            arrays: Where what is known goes.
+            arrays: Arrays that receive the estimates.
             measurement: Noise of the fixes by (world, vehicle).
-            floor_depth: Of the water, for a DVL [m]; None is out of reach of nothing.
-            seed: Of all errors.
-            drawn: Whether noise and delay of the fixes are drawn.
+            floor_depth: Depth of the floor, for a DVL [m]; the floor is always in range if None.
+            seed: Seed of all errors.
+            drawn: True if noise and delay of the fixes are randomised.
 
         Raises:
             EnvironmentSetupError: A vehicle has no IMU.
@@ -544,7 +548,7 @@ class SensingBatch:
         self.estimates.aboard = wp.array(aboard, dtype=FilterState, device=simulator.device)
 
     def add(self, pipeline: KernelSequence, seed: int, mask: wp.array | None = None) -> None:
-        """Append what comes after a control step; or where an episode starts, in the worlds where mask is not 0."""
+        """Append the update after a control step, or the start of episodes in the worlds where mask is not 0."""
         state, count = self._simulator.state, len(self._simulator.vehicles)
         for batch in self.suite.batches:
             batch.seed = seed
@@ -560,12 +564,12 @@ class SensingBatch:
         )
 
     def structs(self) -> dict[str, Any]:
-        """All that decides what is seen next, by name; parameters that `suite` was given are not in it."""
+        """Return the state that determines later estimates, by name; without the parameters of `suite`."""
         return {"estimates": self.estimates, "readings": self.readings}
 
 
 def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
-    """Return the initial state of the filter of a vehicle; its doubt is that after many control steps."""
+    """Return the initial state of the filter of a vehicle, with its covariance after many control steps."""
     sensors, fixes = vehicle.sensors, sensing.fixes
     aboard = FilterState()
     aboard.gauge = sensors.depth is not None
@@ -587,7 +591,7 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
         if sensors.dvl is not None and _due(sensors.dvl.rate, step, dt):
             R = counted(sensors.dvl.noise_std, sensors.dvl.quantisation) + sensors.dvl.bias_initial**2
             plane, height = rate_known(plane, R), rate_known(height, R)
-    if not sensing.rate:  # without a measurement of the position, it starts at its known start
+    if not sensing.rate:  # without fixes, the start is known and only velocities are uncertain
         plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
         if not aboard.gauge:
             height = wp.vec3(0.0, 0.0, min(height[2], FASTEST**2))
@@ -596,5 +600,5 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
 
 
 def _due(rate: float, step: int, dt: float) -> int:
-    """Samples that fall due in a control step."""
+    """Return the number of samples due in a control step."""
     return math.floor(step * rate * dt + 1e-6) - math.floor((step - 1) * rate * dt + 1e-6)

@@ -30,7 +30,7 @@ from finssim.tasks.terms import (
 )
 
 DISTANCE_SCALE = 3.0
-"""Distances are divided by this in the observation [m]."""
+"""Scale of distances in the observation [m]."""
 
 OBSERVATION = (
     ObservationPart("goal offset, body frame", 3, "m", scale=DISTANCE_SCALE, term="offset", errors=(0, 1, 2)),
@@ -47,14 +47,14 @@ class Reward:
     """Weights of the reward; each term has one reason.
 
     r = position · exp(-e / position_scale)      a slope that does not vanish at the goal: centimetres count
-      - distance · e                             a slope everywhere: far goals are approached. A weight of 0.3 was too
-                                                 little: with random buoyancy, lying on the floor was learnt
+      - distance · e                             a slope everywhere: distant goals. A weight of 0.3 was too small:
+                                                 with random buoyancy, policies learned to lie on the floor
       + heading · exp(-θ / heading_scale) - turn · θ     the same for the attitude error θ, roll and pitch included
-      - leaning · clip(2 tilt / max_tilt - 1, 0, 2)   no pitching over on the way, where a bridge would stop. To end the
-                                                 episode there taught to capsize at once: an end ends the losses
-      - action · mean(a²)                        the cheapest thrusts that do it
+      - leaning · clip(2 tilt / max_tilt - 1, 0, 2)   avoid tilts at which a bridge stops. If this ended the episode,
+                                                 policies learned to capsize at once, to end the losses
+      - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
-      - rate · min(|ω|², 4)                      no spinning on the way
+      - rate · min(|ω|², 4)                      no spinning
       - loss                                     once, on leaving the pool: more than a bad episode costs
     """
 
@@ -73,20 +73,20 @@ class Reward:
 
 @wp.func
 def heading(q: wp.quat) -> float:
-    """Yaw of the body x axis about world z [rad]."""
+    """Return the yaw of the body x axis about world z [rad]."""
     x = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
     return wp.atan2(x[1], x[0])
 
 
 @wp.func
 def wrapped(angle: float) -> float:
-    """An angle [rad] in (-2π, 2π), brought to [-π, π]."""
+    """Wrap an angle [rad] in (-2π, 2π) to [-π, π]."""
     return angle - wp.sign(angle) * wp.where(wp.abs(angle) > 3.14159265, 6.2831853, 0.0)
 
 
 @wp.func
 def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Every axis within `tolerance`, and yaw within `yaw_tolerance`."""
+    """Return True if every axis is within `tolerance`, and yaw within `yaw_tolerance`."""
     error = arrays.goal_position[w] - state.position[w, 0]
     off = wp.max(wp.max(wp.abs(error[0]), wp.abs(error[1])), wp.abs(error[2]))
     turn = wp.abs(wrapped(heading(arrays.goal_quaternion[w]) - heading(state.quaternion[w, 0])))
@@ -95,19 +95,19 @@ def within_tolerance(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
 
 @wp.func
 def at_goal(p: Any, e: float) -> float:
-    """Return 1 at the goal, 1/e at an error `e` of `position_scale` [m] in proportion to the vehicle."""
+    """Return 1 at the goal, 1/e at an error `e` of `position_scale` [m], scaled to the vehicle."""
     return wp.exp(-e / (p.fit.size * p.reward.position_scale))
 
 
 @wp.func
 def leaning(state: State, p: Any, w: int) -> float:
-    """0 up to half of `max_tilt`, 1 at `max_tilt`, 2 from half beyond it [1]: the tilt at which a bridge stops."""
+    """Return 0 up to half of `max_tilt`, 1 at `max_tilt`, at most 2 [1]; a bridge stops at `max_tilt`."""
     return wp.clamp(2.0 * tilt_angle(state, w) / p.max_tilt - 1.0, 0.0, 2.0)
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A goal pose, a start pose and velocity."""
+    """Start an episode with a random goal pose, start pose and velocity."""
     pi = 3.14159265
     size = p.fit.size
     arrays.goal_position[w] = uniform3(wp.rand_init(key, 4 * w), size * p.goal_low, size * p.goal_high)
@@ -129,8 +129,9 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 class StationKeeping(PoolTask):
     """T1. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
-    A longer vehicle has goals, starts and pool `fit.size` times as large; the tolerance stays. Success here is to hold
-    at the end of an episode; a trial of `finssim evaluate` is judged by `finssim.evaluation.metrics`, as the paper's.
+    For a longer vehicle, goals, starts and pool are scaled by `fit.size`; the tolerance is not. Success here means
+    holding the goal at the end of an episode; `finssim.evaluation.metrics` judges a trial of `finssim evaluate`, as in
+    the paper.
     """
 
     succeeds: ClassVar[str] = "held"
@@ -140,38 +141,39 @@ class StationKeeping(PoolTask):
     name: str = "t1"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     goal_low: tuple[float, float, float] = (-1.2, -0.5, -0.82)
-    """Goals are uniform in this box [m]; yaw is uniform over the circle, roll and pitch are level."""
+    """Lower corner of the box of the goals [m]; yaw is uniform over the circle, roll and pitch are 0."""
     goal_high: tuple[float, float, float] = (1.2, 0.5, -0.28)
     max_tilt: float = math.radians(45.0)
-    """Tilt that the vehicle should stay well below [rad]: the default `safety.max_tilt`, where a bridge stops it."""
+    """Tilt that the vehicle should stay well below [rad]: the default `safety.max_tilt`, at which a bridge stops
+    it."""
     speed: float = 0.30
     """Largest starting speed per axis [m/s]."""
     rate: float = 0.35
     """Largest starting turn rate per axis [rad/s]."""
     approach: ClassVar[float] = 1.2
-    """A robot is shown a goal farther away than this as one so far ahead on the straight way to it: training saw few
-    that were farther, and a policy that hurries to one leans beyond what its sensors bear [m]."""
+    """Greatest observed distance to the goal on a robot [m]; a farther goal is moved to this distance in its direction,
+    because distant goals are rare in training, and policies then tilt beyond the limits of the sensors."""
     tolerance: float = 0.10
-    """Success: every axis within this [m] ..."""
+    """Greatest error per axis for success [m]."""
     yaw_tolerance: float = math.radians(10.0)
-    """... and yaw within this [rad] ..."""
+    """Greatest yaw error for success [rad]."""
     hold: float = 10.0
-    """... for this long [s]."""
+    """Time within these tolerances for success [s]."""
     reward: Reward = field(default_factory=Reward)
     training_noise: MeasurementNoise = MeasurementNoise(
         position_std=0.01, yaw_std=math.radians(1.0), velocity_std=0.02, rate_std=0.02, delay=0.1, graded=True
     )
-    """Delay and noise larger than an estimate's, from none in the first world to all in the last: with exact states
-    alone, policies learn gains that oscillate; with noise alone, vehicles with little damping in turning are held only
-    during noise."""
+    """Delay and noise, larger than an estimate's, increasing from none in the first world to all in the last: with
+    exact states alone, policies learn gains that oscillate; with noise alone, they hold vehicles with little rotational
+    damping only under noise."""
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         turn = math.degrees(self.yaw_tolerance)
         return f"{self.tolerance:g} m per axis and {turn:g}° in yaw for {self.hold:g} s, at the end"
 
     def terms(self) -> Terms:
-        """See `Reward`."""
+        """Return the terms; see `Reward`."""
         r = self.reward
         return Terms(
             start=start,

@@ -32,7 +32,7 @@ from finssim.vehicles import Vehicle
 
 
 class Batch(NamedTuple):
-    """Objects that the parts of a task use in one environment."""
+    """State, arrays and seed of one environment, for the kernels of a task."""
 
     state: State
     arrays: TaskArrays
@@ -41,7 +41,8 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Base of every task: plain data, and the terms that make kernels of it; see `finssim.tasks.terms`."""
+    """Base class of every task: plain data, and the terms from which its kernels are generated; see
+    `finssim.tasks.terms`."""
 
     agents: ClassVar[tuple[str, ...]] = ("vehicle",)
     """Names of the vehicles that learn, in the order of the world's vehicles."""
@@ -50,35 +51,36 @@ class Task:
     title: ClassVar[str] = ""
     """Title of the task, in a few words."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """Axes that every vehicle of the task must control; another is refused before anything is trained."""
+    """Axes that every vehicle of the task must control; other vehicles are refused before training starts."""
     action: ClassVar[str] = "wrench6"
-    """Action mode, unless another is asked for."""
+    """Default action mode."""
     pool: ClassVar[RectangularPool | None] = RectangularPool()
-    """Walls and floor, unless others are asked for; None is open water."""
+    """Default walls and floor; None is open water."""
     moving: ClassVar[bool] = False
-    """True if the goal moves: a robot is then given a trajectory, otherwise a pose."""
+    """True if the goal moves: a robot then needs a trajectory, otherwise a pose."""
     world: ClassVar[str] = ""
-    """Site that its vehicle sees, of the catalogue or a file; empty: nothing."""
+    """Site that the vehicle's cameras and sonars render, of the catalogue or a file; empty: none."""
     pictures: ClassVar[tuple[ObservedPicture, ...]] = ()
-    """Pictures that are observed besides the row of numbers."""
+    """Pictures that are observed besides the numbers."""
     ranges: ClassVar[tuple[str, ...]] = ()
-    """Altimeters and rangefinders of the vehicle's `perception` whose range the row has, as `arrays.ranges[w, i]`."""
+    """Altimeters and rangefinders of the vehicle's `perception` whose ranges are observed, as `arrays.ranges[w,
+    i]`."""
     landmark: ClassVar[str] = ""
     """Object of the world whose pose is the goal's."""
     marks: ClassVar[tuple[str, ...]] = ()
-    """Objects whose places in the goal's axes are in `reference.position`, one after the other."""
+    """Objects whose positions in the goal's axes are in `reference.position`, one after the other."""
     held_out: ClassVar[bool] = False
-    """True if the looks of the world that are held out of training are drawn."""
+    """True if the world's appearances are drawn from those that are held out of training."""
     teacher: ClassVar[tuple[ObservationPart, ...]] = ()
-    """Observation of a teacher in training, in place of the row and the pictures."""
+    """Observation of a teacher in training, instead of the numbers and pictures."""
     succeeds: ClassVar[str] = ""
-    """When an episode is a success: `held`, for `hold` seconds at its end; `once`, for `hold` seconds at any time; or
-    the name of an end. Empty: nothing is."""
+    """Criterion of success: `held`, for `hold` seconds at the end of an episode; `once`, for `hold` seconds at any
+    time; or the name of an end. Empty: no success is defined."""
     fails: ClassVar[tuple[str, ...]] = ()
-    """Ends after which the episode is no success, whatever came before."""
+    """Ends that exclude a success, even if its criterion was met before."""
     baselines: ClassVar[Mapping[str, str | Callable[..., Any]]] = {}
-    """Classical controllers that see what a policy sees, by name: `module:class`, made by its `for_vehicle`, or a
-    function of a vehicle that returns the controller (`finssim.agents.baselines.Baseline`)."""
+    """Classical controllers with the observation of a policy, by name: `module:class`, created by its `for_vehicle`, or
+    a function that returns the controller of a vehicle (`finssim.agents.baselines.Baseline`)."""
 
     name: str
     observation: tuple[ObservationPart, ...] = field(repr=False)
@@ -89,7 +91,7 @@ class Task:
     time_limit: float = 20.0
     """Length of an episode in training [s]."""
     training_noise: MeasurementNoise = field(default_factory=MeasurementNoise)
-    """Errors of what the controller observes in training."""
+    """Errors of the controller's observations in training."""
 
     def _repr_html_(self) -> str:
         rows = [(part.name, str(part.size), part.unit, f"{part.scale:g}") for part in self.observation]
@@ -101,19 +103,19 @@ class Task:
         raise TypeError(f"task '{self.name}' has no terms: define terms()")
 
     def settings_class(self) -> type:
-        """The class whose settings its kernels take: tasks of one such class and equal terms share kernels."""
+        """Return the class of the kernels' settings: tasks with the same class and equal terms share kernels."""
         return type(self)
 
     @property
     def totals(self) -> tuple[str, ...]:
-        """Names of what is counted in an episode, a part of `metrics`: success, the terms' totals, the ends."""
+        """Names of the quantities counted in an episode, among its `metrics`: success, the terms' totals, the ends."""
         terms = self.terms()
         first = ("success", "success_time") if self.succeeds == "once" else ()
         return (*first, *(total.name for total in terms.totals), *(end.name for end in terms.ends))
 
     @property
     def earnings(self) -> tuple[str, ...]:
-        """Names of what adds to the return: the rewards, then the ends."""
+        """Names of the contributions to the return: the rewards, then the ends."""
         terms = self.terms()
         return (*(reward.name for reward in terms.rewards), *(end.name for end in terms.ends))
 
@@ -123,13 +125,13 @@ class Task:
         return sum(part.size for part in self.observation)
 
     def for_teacher(self) -> "Task":
-        """Return the same task for a teacher, who observes the `teacher` parts and no picture."""
+        """Return the same task for a teacher, which observes the `teacher` parts and no pictures."""
         blind: dict[str, Any] = {"observation": self.teacher, "world": "", "pictures": ()}
         return replace(self, **blind)
 
     @property
     def errors(self) -> tuple[int, ...]:
-        """Elements of an agent's observation that are 0 where the task wants it, by the parts' `errors`."""
+        """Elements of an agent's observation that are 0 at the goal, by the parts' `errors`."""
         firsts = itertools.accumulate((part.size for part in self.observation), initial=0)
         return tuple(
             first + i for first, part in zip(firsts, self.observation, strict=False) for i in part.errors
@@ -137,7 +139,7 @@ class Task:
 
     @property
     def schema(self) -> ObservationSchema:
-        """Return the observation of an agent in the form of a policy directory, part by part."""
+        """Observation of an agent in the form of a policy directory, part by part."""
         entries, first = [], 0
         for part in self.observation:
             clip = None if part.clip is None else (-part.clip, part.clip)
@@ -149,7 +151,7 @@ class Task:
         return ObservationSchema(size=first, entries=tuple(entries))
 
     def record(self) -> dict[str, Any]:
-        """The settings as plain data: ranges, limits, reward weights."""
+        """Return the settings as plain data: ranges, limits, reward weights."""
 
         def plain(v: Any) -> Any:
             if isinstance(v, tuple):
@@ -168,23 +170,24 @@ class Task:
         return (*self.agents, *self.others)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Task":
-        """The task as these vehicles do it: itself, unless sizes and speeds follow from the vehicles."""
+        """Return the task scaled to these vehicles: the task itself, unless sizes and speeds depend on the
+        vehicles."""
         return self
 
     def arena(self) -> RectangularPool | None:
-        """Walls and floor, unless others are asked for; None is open water."""
+        """Return the default walls and floor; None is open water."""
         return self.pool
 
     def dock(self) -> Dock | None:
-        """Return the dock in every world for the vehicle to enter, whose pose is the goal's; None without one."""
+        """Return the dock that the vehicle enters, one in every world, whose pose is the goal's; None without one."""
         return None
 
     def site(self, arrays: TaskArrays, seed: int) -> Any:
-        """Return the described world that an episode has drawn, in which a virtual site's sensors measure; or None.
+        """Return the described world drawn for an episode, in which a virtual site's sensors measure; or None.
 
         Args:
-            arrays: Of the episode.
-            seed: Of noise in the world.
+            arrays: Arrays of the episode.
+            seed: Seed of noise in the world.
         """
         return None
 
@@ -192,12 +195,12 @@ class Task:
         """Allocate the arrays that only this task uses; none by default."""
 
     def arrays(self, worlds: int, action_size: int, device: wp.Device) -> TaskArrays:
-        """Zero arrays of the right size; the measured ones are left for the environment to fill or alias.
+        """Return zeroed arrays; the environment fills or aliases the measured ones.
 
         Args:
-            worlds: How many.
+            worlds: Number of worlds.
             action_size: Numbers in the action of a vehicle.
-            device: Where.
+            device: Warp device of the arrays.
         """
         agents, totals, earned = len(self.agents), len(self.totals), len(self.earnings)
         observation, action = agents * self.observation_size, agents * action_size
@@ -215,16 +218,16 @@ class Task:
         return out
 
     def success_rule(self) -> str:
-        """Return the rule of success, with its numbers, in a few words."""
+        """Return the criterion of success, with its numbers, in a few words."""
         hold = getattr(self, "hold", None)
-        return "as metrics tells" if hold is None else f"within its tolerance for {hold:g} s, at the end"
+        return "as defined by metrics" if hold is None else f"within its tolerance for {hold:g} s, at the end"
 
     def add_command(self, pipeline: KernelSequence, batch: Batch) -> None:
-        """Append what commands the `others`, before each step."""
+        """Append the kernel that commands the `others`, before each step."""
         pipeline.add(kernels_of(self).command, [batch.state, batch.arrays, settings_of(self), batch.seed])
 
     def add_evaluate(self, pipeline: KernelSequence, batch: Batch) -> None:
-        """Append what comes after each step: reward, ends, observation."""
+        """Append the kernel that follows each step: reward, ends, observation."""
         kernels, terms = kernels_of(self), self.terms()
         weights = [reward.weight for reward in terms.rewards] + [end.reward for end in terms.ends]
         inputs = [batch.state, batch.arrays, settings_of(self), kernels.weights(*(weights or [0.0]))]
@@ -240,12 +243,12 @@ class Task:
         pipeline.add(kernels_of(self).observe, [batch.arrays, settings_of(self), mask])
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return the measures of the episode that ended last, by world.
+        """Return the metrics of the last finished episode, by world.
 
         Returns:
-            Name to numbers (worlds,): return, length in control steps, time held inside the tolerance at the end [s],
-            the task's `totals`, and, of a task with success, success (0 or 1) and, unless it is to hold to the end,
-            success_time [s], nan where there was none.
+            Name -> numbers (worlds,): return, length in control steps, time within the tolerance at the end [s], the
+            task's `totals`, and, of a task with success, success (0 or 1) and, unless it must hold to the end,
+            success_time [s], which is nan without a success.
         """
         totals = arrays.final_totals.numpy()
         columns = {
@@ -270,28 +273,29 @@ class Task:
         return out
 
     def earned(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return what each reward and end added to the return of the episode that ended last, (worlds,) by name."""
+        """Return the contribution of each reward and end to the return of the last finished episode, (worlds,) by
+        name."""
         columns = arrays.final_earned.numpy()
         return {name: np.array(columns[:, i], dtype=np.float64) for i, name in enumerate(self.earnings)}
 
 
-# The kernels of a task, written from its terms; and the struct of its settings that they take.
+# The kernels of a task, generated from its terms, and the struct of its settings for the kernels.
 #
-# Each stage of an episode is one kernel for all tasks but for the terms that it calls: what every task does at the
-# start, in each step and at the end of an episode is here once. A term is called by the names of its arguments:
+# Each stage of an episode is one kernel, common to all tasks except for the terms that it calls: what every task does
+# at the start, in each step and at the end of an episode is defined once. The arguments of a term have these names:
 #
-#     state   the truth                           a     number of the agent; a reward without it is the team's
-#     arrays  what is measured, wanted, counted   k     the index given with the term
+#     state   the true state                      a     number of the agent; a reward without it is the team's
+#     arrays  measurements, goals, counts         k     the index given with the term
 #     p       the task's settings                 key   of an episode's draws, at its start
 #     w       number of the world                 seed  of all draws
 #
-# and after a step any of the task's totals by its name, as it was before, `was` for the total's own, and `held`: the
-# time within the tolerance of success without a break [s]; and whatever the task shares between its terms, by name. A
-# term may also be the name of a value alone.
+# After a step there are also: any of the task's totals by its name, before the step; `was` for a term's own total;
+# `held`, the uninterrupted time within the tolerance of success [s]; and every shared value by its name. Instead of a
+# function, a term may be the name of such a value.
 
 
 APART = ("name", "observation", "training_noise", "communication")
-"""Fields of a task that its kernels do not take."""
+"""Fields of a task that are not settings of its kernels."""
 VECTORS = {
     (float, 2): wp.vec2, (float, 3): wp.vec3, (float, 4): wp.vec4,
     (int, 2): wp.vec2i, (int, 3): wp.vec3i, (int, 4): wp.vec4i,
@@ -303,9 +307,9 @@ STAGES = {
     "observe": "arrays: TaskArrays, p: P, mask: wp.array(dtype=int), world_offset: int",
     "command": "state: State, arrays: TaskArrays, p: P, seed: int, world_offset: int",
 }
-"""The kernels and what they take."""
+"""The kernels and their arguments."""
 SCORE = "score(state: State, arrays: TaskArrays, p: P, weights: W, w: int) -> bool"
-"""Function of a step of a world that is not frozen, and whether its episode ends."""
+"""Function that evaluates a step of a world that is not frozen, and returns whether its episode ends."""
 EVALUATE = [
     "w = world_offset + wp.tid()",
     "if state.frozen[w] != 0:",
@@ -317,30 +321,30 @@ KEY = "seed + 15485863 * state.episode[w]"
 
 
 class Kernels(NamedTuple):
-    """The stages of a task's episodes, each over worlds; see `STAGES`."""
+    """The stages of a task's episodes, each a kernel over worlds; see `STAGES`."""
 
     weights: Any
-    """Type of the vector of reward weights: of the terms, then of the ends."""
+    """Type of the vector of reward weights: those of the terms, then of the ends."""
     score: Any
-    """Function of a world's step; see `SCORE`."""
+    """Function that evaluates a world's step; see `SCORE`."""
     evaluate: wp.Kernel
-    """After each step."""
+    """Kernel after each step."""
     spawn: wp.Kernel
     """Kernel at the start of an episode."""
     observe: wp.Kernel
-    """Its first observation."""
+    """Kernel of the first observation of an episode."""
     command: wp.Kernel | None = None
-    """Kernel before each step, of a task with scripted vehicles."""
+    """Kernel before each step, for a task with scripted vehicles."""
 
 
 _made: dict[tuple[Any, ...], Kernels] = {}
 
 
 def kernels_of(task: Task) -> Kernels:
-    """The kernels of a task; of equal terms the same.
+    """Return the kernels of a task; tasks with equal terms share them.
 
     Raises:
-        EnvironmentSetupError: A term takes what there is not.
+        EnvironmentSetupError: A term has an unknown argument.
     """
     writer = _Writer(task)
     text = writer.text()
@@ -351,7 +355,7 @@ def kernels_of(task: Task) -> Kernels:
 
 
 class _Writer:
-    """Writes the source of a task's kernels."""
+    """Generator of the source of a task's kernels."""
 
     def __init__(self, task: Task) -> None:
         self.task, self.terms = task, task.terms()
@@ -361,7 +365,7 @@ class _Writer:
         self._agents = f"for a in range({len(task.agents)}):"
 
     def text(self) -> str:
-        """All of it."""
+        """Return the complete source."""
         stages = {name: getattr(self, f"_{name}")() for name in STAGES if name != "evaluate"}
         stages = {"evaluate": EVALUATE, **stages}
         sources = [_function(f"{name}({STAGES[name]})", lines) for name, lines in stages.items() if lines]
@@ -369,7 +373,7 @@ class _Writer:
         return "\n".join([look, _function(SCORE, self._score()), *sources])
 
     def _value(self, term: Any, role: str, **values: str) -> str:
-        """Return a term in the source: a call with its arguments by name, or a value by its name."""
+        """Return the expression of a term in the source: a call with its arguments by name, or a value by its name."""
         where = f"task '{self.task.name}': {role}"
         if isinstance(term, str) and term in values:
             return values[term]
@@ -383,7 +387,7 @@ class _Writer:
         for name in names:
             if name not in scope:
                 raise EnvironmentSetupError(
-                    f"{where} ({term.key}) takes '{name}', expected of: {', '.join(scope)}"
+                    f"{where} ({term.key}) has the argument '{name}', expected of: {', '.join(scope)}"
                 )
         label = next(
             (n for n, f in self.functions.items() if f is term), f"t{len(self.functions)}_{term.key}"
@@ -392,7 +396,7 @@ class _Writer:
         return f"{label}({', '.join(scope[name] for name in names)})"
 
     def _shared(self, terms: Mapping[str, Any], scope: dict[str, str]) -> tuple[list[str], dict[str, str]]:
-        """Return the lines that compute what terms share, and the names defined by them."""
+        """Return the lines that compute shared values, and the scope with their names."""
         lines, scope = [], dict(scope)
         for name, term in terms.items():
             lines.append(f"s_{name} = {self._value(term, f'shared {name!r}', **scope)}")
@@ -400,7 +404,7 @@ class _Writer:
         return lines, scope
 
     def _look(self) -> list[str]:
-        """The observation of every agent."""
+        """Return the lines that write the observation of every agent."""
         values, shared = self._shared(self.terms.seen, {})
         writes: list[str] = []
         rows = {"observation": self.task.observation if self.terms.shown else (), "taught": self.task.teacher}
@@ -421,7 +425,8 @@ class _Writer:
         return [self._agents, *_indented([*values, *writes] or ["pass"])]
 
     def _score(self) -> list[str]:
-        """All terms are computed before anything is written, so that the compiler does what they share only once."""
+        """Return the lines of a step; all terms precede all writes, so that the compiler evaluates common
+        expressions once."""
         terms, scope = self.terms, {"state": "state", **self._totals}
         advance = [] if terms.advance is None else [self._value(terms.advance, "advance", **scope)]
         shared, scope = self._shared(terms.shared, scope)
@@ -457,8 +462,8 @@ class _Writer:
         ]
 
     def _rewards(self, scope: Mapping[str, str]) -> list[str]:
-        """Return the lines that compute every reward once, for all agents or for each; their sum, and each over the
-        episode."""
+        """Return the lines that compute every reward once, for all agents or for each, their sum, and their sums over
+        the episode."""
         values = [self._value(term.term, f"reward {term.name!r}", **scope) for term in self.terms.rewards] + [
             f"wp.where(e{i}, 1.0, 0.0)" for i, _ in enumerate(self.terms.ends)
         ]
@@ -484,7 +489,7 @@ class _Writer:
         ]
 
     def _counts(self, scope: Mapping[str, str]) -> tuple[list[str], list[str]]:
-        """The totals, each from what all were before; then how they are written."""
+        """Return the lines that compute the totals, each from all previous ones, and the lines that write them."""
         values, writes, totals = [], [], self._totals
         if self.task.succeeds == "once":
             writes += [
@@ -537,13 +542,13 @@ _numbers = itertools.count()
 
 
 def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
-    """Kernels of a source, in a module of Warp's of their own."""
+    """Compile the kernels of a source, in a separate Warp module."""
     kind = task.settings_class()
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     name = f"{kind.__module__}.{kind.__qualname__}_{digest}"
     if any(
         kernels.evaluate.module.name == name for kernels in _made.values()
-    ):  # other functions of the same names
+    ):  # other functions with the same names
         name = f"{name}_{next(_numbers)}"
     path = f"<kernels of {name}>"
     linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)  # Warp reads the source
@@ -564,13 +569,13 @@ def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
 
 
 def settings_of(task: Task) -> Any:
-    """The struct of a task's settings: its numbers, those of its parts, and what follows from them.
+    """Return the struct of a task's settings: its numbers, those of nested dataclasses, and derived properties.
 
-    Every field and property with an annotation of float, int, bool, a tuple of two to four of these, or a dataclass of
-    such, under its own name.
+    It contains every field and property with an annotation of float, int, bool, a tuple of two to four of these, or a
+    dataclass of these, under its own name.
 
     Raises:
-        EnvironmentSetupError: It is not fitted to vehicles.
+        EnvironmentSetupError: The task is not fitted to vehicles.
     """
     return _filled(task, task.settings_class(), f"task '{task.name}'")
 
@@ -590,7 +595,7 @@ def _filled(owner_value: Any, kind: type, owner: str) -> Any:
 
 @cache
 def _struct(kind: type) -> Any:
-    """Warp's struct of what kernels can take of a dataclass; None if that is nothing."""
+    """Return the Warp struct of the fields of a dataclass that kernels support; None if there are none."""
     annotations = _hints(kind)
     hints = {member.name: annotations.get(member.name) for member in fields(kind) if member.name not in APART}
     for name, value in inspect.getmembers(kind, lambda member: isinstance(member, property)):
@@ -602,7 +607,7 @@ def _struct(kind: type) -> Any:
     if not types:
         return None
     struct = type(kind.__name__, (), {"__annotations__": types, "__module__": kind.__module__})
-    # Classes of one name that functions make are not one class.
+    # Local classes of the same name are different classes.
     struct.__qualname__ = f"{kind.__qualname__}Settings" + (
         str(next(_numbers)) if "<" in kind.__qualname__ else ""
     )
@@ -610,7 +615,8 @@ def _struct(kind: type) -> Any:
 
 
 def _hints(annotated: Any) -> dict[str, Any]:
-    """Annotations of a class or function; none where they name what is imported for type checkers alone."""
+    """Return the annotations of a class or function; none if they use names that are only imported for type
+    checking."""
     try:
         return get_type_hints(annotated)
     except NameError:
@@ -618,7 +624,7 @@ def _hints(annotated: Any) -> dict[str, Any]:
 
 
 def _kernel_type(hint: Any) -> Any:
-    """Return the type in a kernel, of a dataclass also if it may be None; None if kernels cannot take it."""
+    """Return the type in a kernel, also for an optional dataclass; None if kernels do not support it."""
     parts = get_args(hint)
     if get_origin(hint) in (Union, UnionType):
         rest = [part for part in parts if part is not type(None)]

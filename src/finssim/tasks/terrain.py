@@ -1,4 +1,4 @@
-"""A task over a seabed, for vehicles that must move to steer: a constant altitude along a line."""
+"""Terrain following, a task for vehicles that steer by moving: a constant altitude above a seabed along a line."""
 
 import math
 from collections.abc import Sequence
@@ -48,14 +48,14 @@ from finssim.vehicles.device_files import RangeDevice, device_of
 RIPPLES = 4
 """Number of waves that are summed to a seabed."""
 FARTHEST_RANGE = 60.0
-"""Range beyond which a beam sees nothing: it is shown as this far [m]."""
+"""Greatest range of a beam, also reported without an echo [m]."""
 SPACING = 1.0
-"""Grid of the seabed as a described world [m]."""
+"""Grid spacing of the seabed as a described world [m]."""
 
 
 @wp.func
 def seabed_height(arrays: TaskArrays, p: Any, w: int, x: wp.vec3) -> float:
-    """Return the height of the seabed below or above a point, world frame [m]."""
+    """Return the height of the seabed at a horizontal position, world frame [m]."""
     height = float(p.fit.size * p.floor)
     for i in range(arrays.seabed.shape[1]):
         ripple = arrays.seabed[w, i]
@@ -66,7 +66,7 @@ def seabed_height(arrays: TaskArrays, p: Any, w: int, x: wp.vec3) -> float:
 
 @wp.func
 def seabed_normal(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec3:
-    """Return the unit normal of the seabed below or above a point, upwards, world frame [-]."""
+    """Return the upward unit normal of the seabed at a horizontal position, world frame [-]."""
     slope = wp.vec3(0.0, 0.0, 1.0)
     for i in range(arrays.seabed.shape[1]):
         ripple = arrays.seabed[w, i]
@@ -78,11 +78,11 @@ def seabed_normal(arrays: TaskArrays, w: int, x: wp.vec3) -> wp.vec3:
 
 @wp.func
 def echo_angle(beta: float, beam: Any) -> float:
-    """Return the angle from a plane's normal at which a beam's echo is taken [rad], of a beam at an angle from it.
+    """Return the angle from a plane's normal at which the echo of a beam is detected [rad].
 
-    A plane returns from the angle ψ to its normal, at the range h / cos ψ, a share cos³ ψ exp(-u²/2σ²), u = β - ψ. To
-    first order that is a Gaussian of variance s² = σ² / (1 + 3σ²), nearer to the normal by 3s² tan ψ; across it, the
-    quantile q of the angle is at sqrt(-2s² ln(1 - q)) where the beam is along the normal.
+    At the angle ψ from its normal and the range h / cos ψ, a plane reflects a fraction cos³ ψ exp(-u²/2σ²), u = β - ψ.
+    To first order that is a Gaussian of variance s² = σ² / (1 + 3σ²), shifted towards the normal by 3s² tan ψ; for a
+    beam along the normal, the quantile q of the angle is at sqrt(-2s² ln(1 - q)).
 
     Args:
         beta: Angle of the beam's axis from the normal [rad].
@@ -95,14 +95,14 @@ def echo_angle(beta: float, beam: Any) -> float:
 
 @wp.func
 def beam_range(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, direction: wp.vec3) -> float:
-    """Return the range of the seabed along a ray [m], by fixed-point steps.
+    """Return the range of the seabed along a ray [m], by fixed-point iteration.
 
     Args:
-        arrays: With the seabed.
+        arrays: Arrays with the seabed.
         p: Settings of the task.
         w: Number of the world.
         x: Start of the beam, world frame [m].
-        direction: Of the beam, world frame [-].
+        direction: Direction of the beam, world frame [-].
     """
     far = float(0.0)
     for _i in range(10):
@@ -114,7 +114,7 @@ def beam_range(arrays: TaskArrays, p: Any, w: int, x: wp.vec3, direction: wp.vec
 
 @wp.func
 def sounded(state: State, arrays: TaskArrays, p: Any, w: int, beam: Any) -> float:
-    """Range that an altimeter measures [m]."""
+    """Return the range that an altimeter measures [m]."""
     x, q = state.position[w, 0], state.quaternion[w, 0]
     start, direction = x + wp.quat_rotate(q, beam.position), wp.quat_rotate(q, beam.direction)
     far = beam_range(arrays, p, w, start, direction)
@@ -132,58 +132,58 @@ def sound(state: State, arrays: TaskArrays, p: Any, w: int):
 
 @wp.func
 def go_on(state: State, arrays: TaskArrays, p: Any, w: int):
-    """Change legs, and measure the ranges."""
+    """Switch legs, and measure the ranges."""
     change_legs(state, arrays, p, w)
     sound(state, arrays, p, w)
 
 
 @wp.func
 def seen_range(arrays: TaskArrays, p: Any, w: int, k: int) -> float:
-    """Measured range [m] in proportion to the vehicle's speed: 0 is that of the altimeter below, 1 of that ahead."""
+    """Return a measured range [m], scaled to the vehicle's speed: 0 is the altimeter below, 1 the one ahead."""
     return wp.min(arrays.ranges[w, k], wp.static(FARTHEST_RANGE)) / p.fit.size
 
 
 @wp.func
 def depth_by_size(arrays: TaskArrays, p: Any, w: int, a: int) -> float:
-    """Measured depth [m] in proportion to the vehicle's speed."""
+    """Return the measured depth [m], scaled to the vehicle's speed."""
     return measured_depth(arrays, w, a) / p.fit.size
 
 
 @wp.func
 def seen_across(arrays: TaskArrays, p: Any, w: int) -> float:
-    """Distance to the left of the line [m] in proportion to the vehicle's speed."""
+    """Return the distance to the left of the line [m], scaled to the vehicle's speed."""
     return beside_leg(arrays.path, w, arrays.position[w, 0])[1] / p.fit.size
 
 
 @wp.func
 def altitude_error(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Altitude above the seabed less the wanted one, as a size [m]."""
+    """Return the magnitude of the altitude error above the seabed [m]."""
     x = state.position[w, 0]
     return wp.abs(x[2] - seabed_height(arrays, p, w, x) - p.fit.size * p.altitude)
 
 
 @wp.func
 def beside_line(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """Distance beside the line [m]."""
+    """Return the horizontal distance from the line [m]."""
     return wp.abs(beside_leg(arrays.path, w, state.position[w, 0])[1])
 
 
 @wp.func
 def is_grounded(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Closer to the seabed than `clearance` [m], in proportion to the vehicle's speed."""
+    """Return True if the seabed is closer than `clearance` [m], scaled to the vehicle's speed."""
     x = state.position[w, 0]
     return x[2] - seabed_height(arrays, p, w, x) < p.fit.size * p.clearance
 
 
 @wp.func
 def is_off(e: float, across: float, p: Any) -> bool:
-    """Farther than `corridor` from the altitude [m], or than `width` from the line [m]."""
+    """Return True if the altitude error exceeds `corridor` [m], or the distance from the line exceeds `width` [m]."""
     return e > p.fit.size * p.corridor or across > p.fit.size * p.width
 
 
 @wp.func
 def start_over(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A seabed, a line over it, and a start near the altitude above its first point."""
+    """Start an episode with a random seabed, a line above it, and a vehicle near the altitude at its first point."""
     pi = 3.14159265
     size = p.fit.size
     rng = wp.rand_init(key, 4 * w)
@@ -223,9 +223,9 @@ class Beam:
     direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
     """Unit vector."""
     lead: float = 0.0
-    """Angle towards the normal of a surface at which the echo is taken [rad], see `echo_angle`; 0 for a ray."""
+    """Angle towards the normal of a surface at which the echo is detected [rad], see `echo_angle`; 0 for a ray."""
     least: float = 0.0
-    """Angle from the normal at which the echo is taken, of a beam along the normal [rad]."""
+    """Angle from the normal at which the echo of a beam along the normal is detected [rad]."""
     variance: float = 0.0
     """Variance s² of the echo over the angle, see `echo_angle` [rad²]."""
 
@@ -236,7 +236,7 @@ class Beam:
         return np.hypot(aside, self.least)
 
     def on(self, vehicle: Vehicle, name: str) -> "Beam":
-        """Return the beam of an altimeter in the vehicle's `perception`; this one if it has none of that name."""
+        """Return the beam of an altimeter in the vehicle's `perception`; this one if there is none with that name."""
         if name not in vehicle.perception:
             return self
         device = device_of(vehicle, name)
@@ -245,7 +245,7 @@ class Beam:
                 f"{vehicle.name}: perception.{name} is no altimeter of one beam, as task 'terrain' expects"
             )
         along = quat_rotate(device.mount.quaternion, [1.0, 0.0, 0.0])
-        # Two ways, a pattern of half power at half the width is exp(-8 ln 2 (angle / width)²); rays end at the width.
+        # Two-way, a pattern with half power at half the width is exp(-8 ln 2 (angle / width)²); rays end at the width.
         width = device.beam_width if device.rays > 1 else 0.0
         pattern = width**2 / (16.0 * math.log(2.0))
         variance = pattern / (1.0 + 3.0 * pattern)
@@ -262,9 +262,9 @@ class Beam:
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainFollowing(PathFollowing):
-    """Keep an altitude over a seabed that two altimeters see, along a straight line, by orders to the autopilot.
+    """Keep an altitude above a seabed measured by two altimeters, along a straight line, by autopilot commands.
 
-    Lengths in metres, angles in radians, times in seconds. Lengths as for `PathFollowing`.
+    Lengths in metres, angles in radians, times in seconds. Lengths scale as for `PathFollowing`.
     """
 
     title: ClassVar[str] = "keep an altitude over a seabed"
@@ -276,23 +276,24 @@ class TerrainFollowing(PathFollowing):
     line: float = 90.0
     """Length of the line [m]."""
     altitude: float = 4.0
-    """To keep above the seabed [m]."""
+    """Commanded altitude above the seabed [m]."""
     floor: float = -25.0
     """Mean height of the seabed [m]."""
     wave: tuple[float, float] = (20.0, 60.0)
-    """Length of the waves of the seabed, drawn from this range [m]."""
+    """Range of the wavelengths of the seabed [m]."""
     steepness: float = 0.12
     """Greatest slope of one wave [-]; a seabed has four."""
     clearance: float = 0.7
-    """Closer to the seabed than this the episode ends [m]."""
+    """Distance to the seabed below which the episode ends [m]."""
     corridor: float = 3.0
-    """So it does farther than this from the altitude [m] ..."""
+    """Altitude error above which the episode ends [m]."""
     width: float = 5.0
-    """... or from the line [m]."""
+    """Distance from the line beyond which the episode ends [m]."""
     below: Beam = Beam()
-    """Beam of the altimeter, straight down ..."""
+    """Beam of the altimeter, vertical unless the vehicle has another one; the environment sets it."""
     before: Beam = Beam(direction=(0.5, 0.0, -math.sqrt(0.75)))
-    """... and of that ahead, 30° from it, unless the vehicle carries them otherwise; the environment sets both."""
+    """Beam of the altimeter ahead, 30° from the vertical unless the vehicle has another one; the environment sets
+    it."""
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "TerrainFollowing":
         """Return the task for the speed and the altimeters of the vehicle."""
@@ -301,12 +302,12 @@ class TerrainFollowing(PathFollowing):
         return replace(super().fitted(vehicles), below=below, before=before)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for every world's line and seabed."""
+        """Allocate the line and the seabed of every world."""
         arrays.path = allocated(PathTable, worlds, device, points=self.legs + 1)
         arrays.seabed = wp.zeros((worlds, RIPPLES), dtype=wp.vec4, device=device)
 
     def straight(self, here: NDArray[np.float64], goal: Reference) -> NDArray[np.float64]:
-        """Return the level line from a place to the place of a goal [m], (2, 3)."""
+        """Return the level line from a position to the horizontal position of a goal [m], (2, 3)."""
         end = np.asarray(goal.position, float)
         return np.stack([here, [end[0], end[1], here[2]]])
 
@@ -314,7 +315,7 @@ class TerrainFollowing(PathFollowing):
         """Return the seabed of the first world as a described world; see `Task`.
 
         Raises:
-            SurroundingsError: The extension for perception, which measures in it, is not installed.
+            SurroundingsError: The perception extension, whose sensors measure in it, is not installed.
         """
         depth, half = -self.fit.size * self.floor, self.fit.size * (self.line + 30.0)
         x = np.linspace(-half, half, math.ceil(2.0 * half / SPACING) + 1)
@@ -336,14 +337,15 @@ class TerrainFollowing(PathFollowing):
             return described_world(file).drawn_for(self, arrays, seed)
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         lengths = (self.fit.size * length for length in (self.tolerance, self.corridor))
         return "the end of the line, {:.3g} m from the altitude (RMS), never more than {:.3g} m".format(
             *lengths
         )
 
     def terms(self) -> Terms:
-        """See `PathReward`; the error is that of the altitude, and `beside` is the distance to the line."""
+        """Return the terms; see `PathReward`. The error is that of the altitude, and `beside` is the distance to
+        the line."""
         r = self.reward
         return Terms(
             start=start_over,

@@ -1,7 +1,7 @@
-"""Rotations as torch tensors over a leading `...` batch: unit quaternions xyzw, as everywhere here.
+"""Rotations as torch tensors over a leading `...` batch: unit quaternions xyzw, as everywhere in FinsSim.
 
-On a CPU `torch.atan2`, `hypot` and general powers round the last rows of a batch otherwise than the rest: a world would
-depend on how many there are. Nothing here uses them; `arctangent` stands for the first.
+On a CPU, `torch.atan2`, `hypot` and general powers round the last rows of a batch differently from the others, so that
+a world would depend on the number of worlds. This module avoids them; `arctangent` replaces the first.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ def multiply(p: Tensor, q: Tensor) -> Tensor:
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """Return the quaternion of the rotation back, (..., 4)."""
+    """Return the quaternion of the inverse rotation, (..., 4)."""
     return torch.cat((-q[..., :3], q[..., 3:]), dim=-1)
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """A vector of the body written in the world frame, (..., 3); q is body to world. The unit is kept."""
+    """Transform a vector from body to world frame, (..., 3); q is body to world. The unit is kept."""
     axis, w = q[..., :3], q[..., 3:]
     twice = 2.0 * torch.linalg.cross(axis, v)
     return v + w * twice + torch.linalg.cross(axis, twice)
 
 
 def rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """A vector of the world written in the body frame, (..., 3); q is body to world. The unit is kept."""
+    """Transform a vector from world to body frame, (..., 3); q is body to world. The unit is kept."""
     return rotate(conjugate(q), v)
 
 
 def matrix(q: Tensor) -> Tensor:
-    """Rotation matrix, (..., 3, 3)."""
+    """Return the rotation matrix, (..., 3, 3)."""
     x, y, z, w = q.unbind(-1)
     rows = (
         *(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
@@ -56,30 +56,30 @@ def matrix(q: Tensor) -> Tensor:
 
 
 def about_axis(axis: int, angle: Tensor) -> Tensor:
-    """Rotation about x (0), y (1) or z (2) by an angle [rad], (..., 4)."""
+    """Return the rotation about x (0), y (1) or z (2) by an angle [rad], (..., 4)."""
     parts = [torch.zeros_like(angle)] * 3
     parts[axis] = torch.sin(0.5 * angle)
     return torch.stack((*parts, torch.cos(0.5 * angle)), dim=-1)
 
 
 def angle(q: Tensor) -> Tensor:
-    """Return the angle of a rotation, around any axis [rad], in [0, π], (...)."""
+    """Return the angle of a rotation about any axis [rad], in [0, π], (...)."""
     return 2.0 * torch.atan(torch.linalg.vector_norm(q[..., :3], dim=-1) / q[..., 3].abs())
 
 
 def heading(q: Tensor) -> Tensor:
-    """Yaw of the body x axis about world z [rad], (...)."""
+    """Return the yaw of the body x axis about world z [rad], (...)."""
     x, y, z, w = q.unbind(-1)
     return arctangent(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
 
 
 def arctangent(y: Tensor, x: Tensor) -> Tensor:
-    """Angle of the point (x, y) [rad], in [-π, π]; 0 at the origin."""
+    """Return the angle of the point (x, y) [rad], in [-π, π]; 0 at the origin."""
     r = torch.sqrt(x * x + y * y)
     half = torch.atan(y / (r + x.abs()).clamp(min=torch.finfo(y.dtype).tiny))
     return torch.where(x >= 0.0, 2.0 * half, torch.copysign(torch.full_like(y, math.pi), y) - 2.0 * half)
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """An angle [rad], brought to [-π, π], (...,)."""
+    """Wrap an angle [rad] to [-π, π], (...,)."""
     return angle - 2.0 * math.pi * torch.round(angle / (2.0 * math.pi))

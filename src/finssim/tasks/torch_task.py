@@ -17,12 +17,12 @@ from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, Total
 
-# The terms of every task in plain torch, which use the answers of its functions; and its draws.
+# Terms of every task in plain torch, which read the results of its functions, and the random draws.
 
 
 @wp.func
 def answered_start(state: State, arrays: TaskArrays, w: int):
-    """Take the start that `reset` gave."""
+    """Copy the start that `reset` returned."""
     for v in range(state.position.shape[1]):
         state.position[w, v] = arrays.answers.position[w, v]
         state.quaternion[w, v] = wp.normalize(arrays.answers.quaternion[w, v])
@@ -35,25 +35,25 @@ def answered_start(state: State, arrays: TaskArrays, w: int):
 
 @wp.func
 def answered_reward(arrays: TaskArrays, w: int, a: int) -> float:
-    """Return what `reward` returned."""
+    """Return the result of `reward`."""
     return arrays.answers.reward[w, a]
 
 
 @wp.func
 def answered_end(arrays: TaskArrays, w: int) -> bool:
-    """Return whether `terminated` was true."""
+    """Return the result of `terminated`."""
     return arrays.answers.terminated[w] != 0
 
 
 @wp.func
 def answered_inside(arrays: TaskArrays, w: int) -> bool:
-    """Return whether `inside` was true."""
+    """Return the result of `inside`."""
     return arrays.answers.inside[w] != 0
 
 
 @wp.func
 def answered_count(arrays: TaskArrays, w: int, k: int, was: float) -> float:
-    """Return the sum of what `counted` returned by this name, both in its unit."""
+    """Return the sum of the results of `counted` under this name, both in its unit."""
     return was + arrays.answers.counted[w, k]
 
 
@@ -66,7 +66,8 @@ def draw(
     place: int,
     normal: int,
 ):
-    """Fill rows with draws from [0, 1), or of a standard normal: by seed, world, episode, step and place alone."""
+    """Fill rows with draws from [0, 1), or from a standard normal, that depend only on seed, world, episode, step
+    and place."""
     w = wp.tid()
     world_seed = wp.rand_init(seed + 15485863 * episode[w], w)
     rng = wp.rand_init(wp.randi(world_seed) + 104729 * steps[w], place)
@@ -74,39 +75,39 @@ def draw(
         out[w, i] = wp.where(normal != 0, wp.randn(rng), wp.randf(rng))
 
 
-# All worlds of an environment as torch tensors in the same memory, as a task in plain torch sees them.
+# All worlds of an environment as torch tensors in the same memory, for a task in plain torch.
 
 
 class Worlds:
-    """State of everything by world, in views that the next step overwrites: read them, and write `memory` alone.
+    """State of all worlds, in views that the next step overwrites; everything except `memory` is read-only.
 
-    A world of one vehicle has rows (worlds, ...); of several (worlds, vehicles, ...), agents first.
+    With one vehicle per world, rows are (worlds, ...); with several (worlds, vehicles, ...), agents first.
 
     Attributes:
-        count: Worlds.
-        device: Of all tensors.
+        count: Number of worlds.
+        device: Device of all tensors.
         position: Body origin, world frame, z up and 0 on the water [m], (..., 3).
         quaternion: Body to world, xyzw, (..., 4).
         velocity: Body frame, linear and then angular [m/s, rad/s], (..., 6).
-        goal_position: What `reset` gave, world frame [m], (worlds, 3).
-        goal_quaternion: What `reset` gave, (worlds, 4).
-        held: Time within the tolerance of success up to the step before, without a break [s], (worlds,).
+        goal_position: Goal that `reset` returned, world frame [m], (worlds, 3).
+        goal_quaternion: Goal that `reset` returned, (worlds, 4).
+        held: Uninterrupted time within the tolerance of success up to the previous step [s], (worlds,).
         memory: The task's own numbers by name, (worlds, size).
 
-    On a robot nothing is drawn or scored: `held` and `memory` are not known there, and who looks at them is refused.
+    On a robot, random draws and rewards are not available: reading `held` or `memory` is then refused.
     """
 
     def __init__(
         self, batch: Batch, memory: Mapping[str, int], control_step: float, *, stage: int, measured: bool
     ) -> None:
-        """Look at an environment.
+        """Create views of an environment.
 
         Args:
-            batch: Its arrays.
-            memory: Names and sizes of what the task keeps.
+            batch: State and arrays of the environment.
+            memory: Names and sizes of the task's own numbers.
             control_step: [s]
-            stage: Number of what is being done: no two of them draw the same.
-            measured: Show what is measured in place of the truth.
+            stage: Number of the stage; each stage has its own draws.
+            measured: True for measurements instead of the true state.
         """
         state, arrays = batch.state, batch.arrays
         source = arrays if measured else state
@@ -136,13 +137,13 @@ class Worlds:
     velocity: Tensor
 
     def begin(self) -> "Worlds":
-        """Start a call of the task's functions: draws are counted from here."""
+        """Restart the count of draws, at the start of a call of the task's functions."""
         self._place = self._first
         return self
 
     @property
     def held(self) -> Tensor:
-        """Time within the tolerance of success up to the step before, without a break [s], (worlds,)."""
+        """Uninterrupted time within the tolerance of success up to the previous step [s], (worlds,)."""
         if isinstance(self.memory, _Unknown):
             raise _unknown("w.held")
         return self._held
@@ -150,13 +151,13 @@ class Worlds:
     @property
     def action(self) -> Tensor:
         """Actions of the agents in this step, in [-1, 1]: (worlds, size), or (worlds, agents, size) of several; zero
-        before the first."""
+        before the first step."""
         done = self._action.clamp(-1.0, 1.0)
         return self._by_agent(torch.where(self._steps[:, None] > 0, done, torch.zeros_like(done)))
 
     @property
     def previous_action(self) -> Tensor:
-        """Actions of the step before; zero in the first."""
+        """Actions of the previous step; zero in the first."""
         return self._by_agent(self._previous)
 
     @property
@@ -165,7 +166,7 @@ class Worlds:
         return self._steps * self._control_step
 
     def zeros(self, *size: int) -> Tensor:
-        """Zeros, (worlds, *size). They have the unit of what is put there."""
+        """Return zeros, (worlds, *size), of any unit."""
         return torch.zeros((self.count, *size), device=self.device)
 
     def full(self, row: float | Sequence[float]) -> Tensor:
@@ -174,17 +175,17 @@ class Worlds:
         return values.expand(self.count, *values.shape)
 
     def uniform(self, low: float | Sequence[float], high: float | Sequence[float]) -> Tensor:
-        """Draws between two numbers, (worlds,), or from a box, (worlds, size).
+        """Return draws between two numbers, (worlds,), or from a box, (worlds, size).
 
-        They follow from seed, world, episode, step, and from how many draws there were before in this call: equal seeds
-        give equal runs, however many worlds there are. `torch.rand` knows nothing of these.
+        They depend on seed, world, episode, step, and the number of earlier draws in this call: equal seeds give equal
+        runs, for any number of worlds. `torch.rand` does not have this property.
         """
         ends = [torch.as_tensor(end, dtype=torch.float32, device=self.device) for end in (low, high)]
         parts = self._drawn(max(ends[0].numel(), ends[1].numel()), normal=False)
         return ends[0] + (parts if ends[0].dim() or ends[1].dim() else parts[:, 0]) * (ends[1] - ends[0])
 
     def normal(self, size: int) -> Tensor:
-        """Draws of a standard normal, (worlds, size); see `uniform`."""
+        """Return draws from a standard normal, (worlds, size); see `uniform`."""
         return self._drawn(size, normal=True)
 
     def _drawn(self, size: int, normal: bool) -> Tensor:
@@ -199,7 +200,7 @@ class Worlds:
 
 
 class _Unknown(dict[str, Tensor]):
-    """A task's memory if it keeps none."""
+    """Memory of a task outside an episode; reading it is refused."""
 
     def __missing__(self, name: str) -> Tensor:
         raise _unknown(f"w.memory['{name}']")
@@ -207,7 +208,7 @@ class _Unknown(dict[str, Tensor]):
 
 def _unknown(name: str) -> EnvironmentSetupError:
     return EnvironmentSetupError(
-        f"it looks at {name}, which reset, reward and inside make, which do not run on a robot: use "
+        f"it reads {name}, which depends on reset, reward and inside, and these do not run on a robot: use "
         "only the measured state, the goal, the actions and the time"
     )
 
@@ -218,9 +219,9 @@ RESET, OBSERVE, SCORE, SCRIPT = range(4)
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Start of an episode in every world; it is used where one starts.
+    """Start of an episode in every world; only worlds that start one use it.
 
-    Rows are (worlds, ...), of several vehicles (worlds, vehicles, ...); what is None is zero, or no rotation.
+    Rows are (worlds, ...), or (worlds, vehicles, ...) for several vehicles; None means zero, or no rotation.
     """
 
     position: Tensor
@@ -234,25 +235,25 @@ class Start:
     goal_quaternion: Tensor | None = None
     """(worlds, 4)"""
     memory: Mapping[str, Tensor] = field(default_factory=dict)
-    """The task's own numbers that do not begin at zero, in its units, (worlds, size)."""
+    """Initial values of the task's own numbers, in its units, (worlds, size); zero for omitted ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorchTask(Task):
-    """Base of tasks in plain torch. Give `name`, `observation`, and the functions; `w` is always all worlds.
+    """Base class of tasks in plain torch. Define `name`, `observation`, and the functions; `w` is always all worlds.
 
-    Called in each step: `reward`, `terminated`, `inside`, `counted`, which see the truth, then `observe`, which sees
-    what is measured; where episodes begin `reset`, and `observe` again. Gradients are off.
+    In each step `reward`, `terminated`, `inside` and `counted` are called with the true state, then `observe` with
+    measurements; at the start of episodes `reset`, and `observe` again. Gradients are disabled.
     """
 
     succeeds: ClassVar[str] = "held"
     totals: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
-    """Names of what `counted` counts."""
+    """Names of the quantities that `counted` returns."""
     memory: ClassVar[Mapping[str, int]] = {}
-    """Numbers that the task keeps within an episode: name and size. `reward` may write `w.memory[name][:] = ...`."""
+    """Numbers that persist within an episode: name and size. `reward` may write `w.memory[name][:] = ...`."""
 
     hold: float = 0.0
-    """Success: inside for so long, without a break, when the episode ends [s]; at least one step."""
+    """Uninterrupted time within the tolerance at the end of an episode, for success [s]; at least one step."""
 
     def reset(self, w: Worlds) -> Start:
         """Return the start of an episode; random numbers come from `w.uniform` and `w.normal`."""
@@ -261,8 +262,8 @@ class TorchTask(Task):
     def observe(self, w: Worlds) -> Sequence[Tensor]:
         """Return the observation of an agent: a tensor for each part of `observation`, in the part's unit.
 
-        They are divided by the part's scale and limited to its clip here. Shapes: (worlds, size), or (worlds, agents,
-        size) of several agents; a size of 1 may be left out.
+        The caller divides them by the part's scale and limits them to its clip. Shapes: (worlds, size), or (worlds,
+        agents, size) of several agents; a size of 1 may be omitted.
         """
         raise NotImplementedError(f"task '{self.name}': define observe(self, w) -> tensors")
 
@@ -271,26 +272,27 @@ class TorchTask(Task):
         raise NotImplementedError(f"task '{self.name}': define reward(self, w) -> tensor")
 
     def terminated(self, w: Worlds) -> Tensor:
-        """Return where the episode failed, bool, (worlds,): no further reward is possible. Time ends it in any case."""
+        """Return where the episode failed, bool, (worlds,): no further reward is possible. The time limit applies
+        in any case."""
         return w.zeros()
 
     def inside(self, w: Worlds) -> Tensor:
-        """Return where the tolerance of success is met [bool], (worlds,); nowhere unless defined."""
+        """Return where the tolerance of success is met [bool], (worlds,); False by default."""
         return w.zeros()
 
     def counted(self, w: Worlds) -> Mapping[str, Tensor]:
-        """Return what this step adds to the `totals` of the episode, (worlds,) by name.
+        """Return the increments of the `totals` of the episode in this step, (worlds,) by name.
 
         Each has the unit of its total.
         """
         return {}
 
     def script(self, w: Worlds) -> Tensor:
-        """Actions of the `others` in the step to come, (worlds, others, size), each in [-1, 1]."""
+        """Return the actions of the `others` in the next step, (worlds, others, size), each in [-1, 1]."""
         raise NotImplementedError(f"task '{self.name}' has others: define script(self, w) -> tensor")
 
     def terms(self) -> Terms:
-        """Return the terms that every task of this kind uses once its functions have answered."""
+        """Return the terms common to all torch tasks, which read the results of their functions."""
         return Terms(
             start=answered_start,
             shown=False,
@@ -301,11 +303,12 @@ class TorchTask(Task):
         )
 
     def settings_class(self) -> type:
-        """This class: its kernels only carry what the functions answer, and need not be compiled for every task."""
+        """Return this class: its kernels only copy the results of the functions, so they are compiled once for all
+        tasks."""
         return TorchTask if type(self).terms is TorchTask.terms else type(self)
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for what the functions answer."""
+        """Allocate the results of the functions."""
         vehicles, memory = len(self.vehicles), sum(self.memory.values())
         arrays.answers = allocated(
             Answers, worlds, device, reward=len(self.agents), counted=len(self.totals), position=vehicles,
@@ -313,7 +316,7 @@ class TorchTask(Task):
         )  # fmt: skip
 
     def add_command(self, pipeline: KernelSequence, batch: Batch) -> None:
-        """Append what commands the `others`."""
+        """Append the call that commands the `others`."""
         w, out = self._worlds(batch, SCRIPT), batch.arrays.scripted
         pipeline.call(
             partial(_run, batch, lambda: self._answer("script", self.script(w.begin()).flatten(1), out))
@@ -409,7 +412,7 @@ class TorchTask(Task):
             self._answer("reset: memory", full, answers.begun)
 
     def _answer(self, name: str, value: Any, out: wp.array) -> None:
-        """Copy what a function gave to where the kernels look for it."""
+        """Copy the result of a function to the array that the kernels read."""
         target = wp.to_torch(out, requires_grad=False)
         if (
             not isinstance(value, Tensor)
@@ -429,7 +432,7 @@ def _shape(worlds: int, agents: int, size: int) -> tuple[int, ...]:
 
 
 def _run(batch: Batch, function: Callable[[], None], mask: wp.array | None = None) -> None:
-    """Call what works in torch, in the order of Warp's kernels; on a CPU only if mask, where given, is set anywhere."""
+    """Call a torch function in the order of Warp's kernels; on a CPU only if mask is None or set in any world."""
     with _in_line(batch.state.steps.device), torch.no_grad():
         if mask is None or mask.device.is_cuda or bool(wp.to_torch(mask).any()):
             function()

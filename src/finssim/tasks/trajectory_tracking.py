@@ -28,15 +28,15 @@ from finssim.tasks.terms import (
     world_up,
 )
 
-# References to follow: a table of knots per world, filled with the shapes of T2 by a kernel, or from trajectories.
+# References: a table of knots per world, filled by a kernel with the shapes of T2, or from trajectories.
 
 
 ENDLESS = 1.0e9
-"""A guide that takes longer takes this long [s]."""
+"""Upper limit of a guide's duration in the table [s]."""
 
 
 def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) -> ReferenceTable:
-    """Return an empty table of `knots` knots, `spacing` apart [s]."""
+    """Return an empty table of `knots` knots at intervals of `spacing` [s]."""
     table: ReferenceTable = allocated(ReferenceTable, worlds, device, position=knots, velocity=knots)
     table.spacing = spacing
     table.duration.fill_(1.0)
@@ -45,13 +45,13 @@ def reference_table(worlds: int, knots: int, spacing: float, device: wp.Device) 
 
 @wp.func
 def reference_knot(r: ReferenceTable, w: int, t: float) -> int:
-    """The knot at or before a time. `t` is the time [s]."""
+    """Return the knot at or before the time `t` [s]."""
     return wp.clamp(int(wp.floor(t / r.spacing)), 0, r.position.shape[1] - 2)
 
 
 @wp.func
 def held_time(r: ReferenceTable, w: int, t: float) -> float:
-    """The time, held at the end of the reference and of its table [s]."""
+    """Return the time, limited to the end of the reference and of its table [s]."""
     return wp.min(wp.min(t, r.duration[w]), float(r.position.shape[1] - 1) * r.spacing)
 
 
@@ -69,7 +69,7 @@ def reference_position(r: ReferenceTable, w: int, t: float) -> wp.vec3:
 
 @wp.func
 def reference_velocity(r: ReferenceTable, w: int, t: float) -> wp.vec3:
-    """Velocity of `reference_position`, zero where it is held [m/s]."""
+    """Return the velocity of `reference_position`, zero after its end [m/s]."""
     now = held_time(r, w, t)
     if now < t:
         return wp.vec3()
@@ -83,22 +83,22 @@ def reference_velocity(r: ReferenceTable, w: int, t: float) -> wp.vec3:
 
 @wp.func
 def reference_progress(r: ReferenceTable, w: int, t: float) -> float:
-    """Part of the way, from `offset` to `offset + 1`."""
+    """Return the progress along the reference, a fraction from `offset` to `offset + 1`."""
     return r.offset[w] + wp.min(t / r.duration[w], 1.0)
 
 
 def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
-    """Start an episode in every world at rest on its guide's first pose; world i follows guides[i] from then on.
+    """Start an episode in every world at rest at its guide's first pose; world i follows guides[i] from then on.
 
     Args:
-        environment: Of a task that follows references, such as `TrajectoryTracking`.
+        environment: Environment of a task that follows references, such as `TrajectoryTracking`.
         guides: One per world.
 
     Returns:
         Observations, (worlds, size).
 
     Raises:
-        EnvironmentSetupError: Another number of guides, or one that is longer than the task's `time_limit`.
+        EnvironmentSetupError: The number of guides does not fit, or one exceeds the task's `time_limit`.
     """
     table = environment.arrays.reference
     if len(guides) != environment.worlds or table.position is None:
@@ -121,16 +121,16 @@ def follow(environment: Environment, guides: Sequence[Guide]) -> np.ndarray:
 
 
 def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference]:
-    """Give world i the motion of guides[i]; a station has no end, and no progress.
+    """Fill the table of world i with the motion of guides[i]; a station has neither an end nor progress.
 
     Returns:
-        Each guide at the times of the knots, held at its end.
+        Each guide at the times of the knots, constant after its end.
     """
     t = table.spacing * np.arange(table.position.shape[1])
     ends = [np.minimum(t, guide.duration) for guide in guides]
     places = [guide.at(time) for guide, time in zip(guides, ends, strict=True)]
     velocity = np.stack([reference.velocity for reference in places])
-    # Beyond its end a motion continues in the table, so that the piece with the end is followed; none reads further.
+    # Beyond its end a motion continues in the table, so that the interval with the end is exact; later ones are unused.
     beyond = (t - np.stack(ends))[..., None] * velocity
     table.position.assign(
         (np.stack([reference.position for reference in places]) + beyond).astype(np.float32)
@@ -142,19 +142,19 @@ def fill_table(table: ReferenceTable, guides: Sequence[Guide]) -> list[Reference
     return places
 
 
-# The shapes that T2 trains on, drawn for every episode inside the kernels: line, circle, lemniscate, helix.
+# The training shapes of T2, drawn for every episode inside the kernels: line, circle, lemniscate, helix.
 
 
 SHAPE_NAMES = ("line", "circle", "lemniscate", "helix")
 """Names of the shapes by the number that the kernels use."""
 
 SPEED_SAMPLES = 96
-"""Phases at which the greatest slope of a shape is looked for, as published."""
+"""Number of phases at which the greatest slope of a shape is searched, as published."""
 
 
 @wp.func
 def shape_point(kind: int, phase: float, lift: float) -> wp.vec3:
-    """Point of a shape of unit scale at a phase; `lift` is the height of its tilt [1]."""
+    """Return the point of a shape of unit scale at a phase; `lift` is the height of its tilt [1]."""
     s = wp.sin(phase)
     c = wp.cos(phase)
     d = 1.0 + s * s
@@ -162,14 +162,14 @@ def shape_point(kind: int, phase: float, lift: float) -> wp.vec3:
         return wp.vec3(s, 0.0, lift * s)
     if kind == 1:
         return wp.vec3(c, s, lift * s)
-    if kind == 2:  # Bernoulli's
+    if kind == 2:  # lemniscate of Bernoulli
         return wp.vec3(c / d, s * c / d, lift * s)
     return wp.vec3(c, s, phase / 6.2831853)
 
 
 @wp.func
 def shape_slope(kind: int, phase: float, lift: float) -> wp.vec3:
-    """Derivative of `shape_point` by the phase. It is in shares of the half axes; `phase` is in [rad]."""
+    """Return the derivative of `shape_point` by the phase, as a fraction of the half axes; `phase` is in [rad]."""
     s = wp.sin(phase)
     c = wp.cos(phase)
     d = 1.0 + s * s
@@ -184,7 +184,7 @@ def shape_slope(kind: int, phase: float, lift: float) -> wp.vec3:
 
 @wp.func
 def greatest_rate(kind: int, lift: float, scale: wp.vec3, limit: wp.vec3) -> float:
-    """Phase rate at which the first axis reaches its speed limit [rad/s]."""
+    """Return the phase rate at which the first axis reaches its speed limit [rad/s]."""
     steepest = wp.vec3()
     for i in range(SPEED_SAMPLES):
         slope = shape_slope(kind, 6.2831853 * float(i) / float(SPEED_SAMPLES), lift)
@@ -209,10 +209,10 @@ def fill_reference(
     phase: float,
     rate: float,
 ):
-    """Write the knots of a shape that is run through at a constant phase rate [rad/s] from `phase` [rad] on."""
+    """Write the knots of a shape that is traversed at a constant phase rate [rad/s] from `phase` [rad] on."""
     for k in range(r.position.shape[1]):
         angle = rate * r.spacing * float(k)
-        if kind == 3:  # its height counts from the start
+        if kind == 3:  # its height is relative to the start
             lifted = shape_point(kind, phase + angle, lift)
             lifted[2] = angle / 6.2831853
             r.position[w, k] = origin + wp.cw_mul(scale, lifted)
@@ -233,27 +233,27 @@ LEVELS = (
     ("circle", "lemniscate", "helix"),
     ("line", "circle", "lemniscate", "helix"),
 )
-"""Shapes of the three published levels of difficulty, and of ours, which has all of them."""
+"""Shapes of the three published levels of difficulty, and of an additional level with all of them."""
 
 DISTANCE_SCALE = 3.0
-"""Distances are divided by this in the observation [m]."""
+"""Scale of distances in the observation [m]."""
 LOOK_AHEAD = 0.1
-"""The reference is seen now and one, two and three times this later [s]."""
+"""Preview interval: the reference is observed now and after one, two and three intervals [s]."""
 
 REST = 1.0e-6
-"""A reference slower than this has no tangent: it is taken to lie ahead [m/s]."""
+"""Speed of a reference below which its tangent is undefined and taken as straight ahead [m/s]."""
 
 
 @wp.func
 def reference_offset(arrays: TaskArrays, w: int, k: int) -> wp.vec3:
-    """Return the way from the vehicle to the reference in k `LOOK_AHEAD` from now, body frame [m]."""
+    """Return the vector from the vehicle to the reference k `LOOK_AHEAD` from now, body frame [m]."""
     ahead = reference_position(arrays.reference, w, arrays.time[w] + LOOK_AHEAD * float(k))
     return wp.quat_rotate_inv(arrays.quaternion[w, 0], ahead - arrays.position[w, 0])
 
 
 @wp.func
 def reference_drift(arrays: TaskArrays, w: int) -> wp.vec3:
-    """Velocity of the reference, body frame [m/s]."""
+    """Return the velocity of the reference, body frame [m/s]."""
     return wp.quat_rotate_inv(
         arrays.quaternion[w, 0], reference_velocity(arrays.reference, w, arrays.time[w])
     )
@@ -261,14 +261,14 @@ def reference_drift(arrays: TaskArrays, w: int) -> wp.vec3:
 
 @wp.func
 def tangent(drift: wp.vec3) -> wp.vec2:
-    """Sine and cosine of the heading of the reference's velocity, seen from the body."""
+    """Return sine and cosine of the heading of the reference's velocity, relative to the body."""
     pace = wp.sqrt(drift[0] * drift[0] + drift[1] * drift[1])
     return wp.vec2(wp.where(pace > REST, drift[1] / pace, 0.0), wp.where(pace > REST, drift[0] / pace, 1.0))
 
 
 @wp.func
 def progress(arrays: TaskArrays, w: int) -> wp.vec4:
-    """Sine and cosine of the progress, once and twice."""
+    """Return sine and cosine of one and two turns of the progress."""
     turn = 6.2831853 * reference_progress(arrays.reference, w, arrays.time[w])
     return wp.vec4(wp.sin(turn), wp.cos(turn), wp.sin(2.0 * turn), wp.cos(2.0 * turn))
 
@@ -305,15 +305,15 @@ class TrackingReward:
 
     pose = exp(-e / track_scale)
 
-    r = track · pose                             nearness to the reference; published with a scale of 0.6 m, on which
-                                                 centimetres are nothing
-      - distance · e                             a slope everywhere: a far reference is caught up with
+    r = track · pose                             nearness to the reference; published with a scale of 0.6 m, at which
+                                                 centimetres have no effect
+      - distance · e                             a slope everywhere: a distant reference is caught up with
       + posture · pose · (0.5 / (1 + (tilt / tilt_scale)²) + 0.5 / (1 + (r / spin_scale)⁴))
                                                  level, and not spinning: published with scales of one; only near the
-                                                 reference, so that it is never worth staying away for
-      - spin · |r|                               the heading is free, but turning all the time is not: without a slope
-                                                 at every yaw rate r, a steady turn was learnt
-      - action · mean(a²)                        the cheapest thrusts that do it
+                                                 reference, so that staying away from it never pays
+      - spin · |r|                               the heading is free, but not continuous turning: without a slope
+                                                 at every yaw rate r, policies learned a steady turn
+      - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
       - loss                                     once, on getting lost: more than a bad episode costs
     """
@@ -332,25 +332,25 @@ class TrackingReward:
 
 @wp.func
 def lead_reference(arrays: TaskArrays, w: int):
-    """Take the goal to where the reference is now."""
+    """Set the goal to the current reference."""
     arrays.goal_position[w] = reference_position(arrays.reference, w, arrays.time[w])
 
 
 @wp.func
 def on_reference(p: Any, e: float) -> float:
-    """Return 1 on the reference, 1/e at an error `e` of `track_scale` [m] in proportion to the vehicle."""
+    """Return 1 on the reference, 1/e at an error `e` of `track_scale` [m], scaled to the vehicle."""
     return wp.exp(-e / (p.fit.size * p.reward.track_scale))
 
 
 @wp.func
 def yaw_speed(state: State, w: int) -> float:
-    """Return the size of the yaw rate [rad/s]."""
+    """Return the magnitude of the yaw rate [rad/s]."""
     return wp.abs(state.velocity[w, 0][5])
 
 
 @wp.func
 def within_tolerance(p: Any, e: float) -> bool:
-    """Return whether the error `e` [m] is within `tolerance`."""
+    """Return True if the error `e` [m] is within `tolerance`."""
     return e <= p.tolerance
 
 
@@ -365,7 +365,7 @@ def posture(state: State, p: Any, w: int, pose: float) -> float:
 
 @wp.func
 def is_lost(state: State, p: Any, w: int, e: float) -> bool:
-    """Farther than `lost` from the reference, above `ceiling`, or beyond `range`. The error `e` is in [m]."""
+    """Return True if the error `e` [m] exceeds `lost`, or the vehicle is above `ceiling` or beyond `range`."""
     x = state.position[w, 0]
     size = p.fit.size
     return e > size * p.lost or x[2] > size * p.ceiling or wp.length(x) > size * p.range
@@ -373,7 +373,7 @@ def is_lost(state: State, p: Any, w: int, e: float) -> bool:
 
 @wp.func
 def draw_reference(arrays: TaskArrays, p: Any, key: int, w: int):
-    """A shape, its size, height, phase, direction and speed, drawn for this episode alone."""
+    """Draw a shape, its size, height, phase, direction and speed for this episode."""
     pi = 3.14159265
     size = p.fit.size
     jitter = size * p.jitter
@@ -392,7 +392,7 @@ def draw_reference(arrays: TaskArrays, p: Any, key: int, w: int):
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """A reference, unless one is given, and a start beside its first point."""
+    """Start an episode beside the first point of a random reference, unless a reference is given."""
     if arrays.reference.given[w] == 0:
         draw_reference(arrays, p, key, w)
     rng = wp.rand_init(key, 4 * w + 3)
@@ -408,9 +408,9 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 class TrajectoryTracking(FittedTask):
     """T2. Lengths in metres, angles in radians, world frame with z up and 0 on the water.
 
-    The published generator, except that shapes are as large as the pool (published: half axes up to 2.5 and 1.25 m,
-    beyond its walls) and that their speed is drawn, since what is to be followed is slow. A longer vehicle has shapes,
-    their speeds and the pool `fit.size` times as large; the tolerance stays.
+    The published generator, except that shapes fit in the pool (published: half axes up to 2.5 and 1.25 m, beyond its
+    walls) and that their speed is drawn, so that slow references occur as well. For a longer vehicle, shapes, their
+    speeds and the pool are scaled by `fit.size`; the tolerance is not.
     """
 
     succeeds: ClassVar[str] = "held"
@@ -421,17 +421,17 @@ class TrajectoryTracking(FittedTask):
     observation: tuple[ObservationPart, ...] = OBSERVATION
     time_limit: float = 30.0
     level: int = 3
-    """Index of the `LEVELS` that the shapes are drawn from: 0 to 2 as published, 3 all of them."""
+    """Index into `LEVELS`, the shapes to draw from: 0 to 2 as published, 3 all of them."""
     scale_low: tuple[float, float, float] = (0.3, 0.2, 0.04)
-    """Half axes of a shape are drawn from here [m], along, across and up ..."""
+    """Least half axes of a shape [m], along, across and up."""
     scale_high: tuple[float, float, float] = (1.2, 0.6, 0.12)
-    """... to here [m]."""
+    """Greatest half axes of a shape [m]."""
     speed_limit: tuple[float, float, float] = (0.30, 0.20, 0.10)
-    """Greatest speed of a reference along, across and up [m/s]; never more than one turn in `time_limit` either."""
+    """Greatest speed of a reference along, across and up [m/s]; it is also limited to one turn in `time_limit`."""
     slowest: float = 0.2
-    """Smallest part of the greatest possible speed that is drawn; 1: always the greatest, as published."""
+    """Least drawn fraction of the greatest possible speed; 1: always the greatest, as published."""
     lift: float = 0.6
-    """Greatest part of the upward half axis by which a shape is tilted."""
+    """Greatest tilt of a shape, as a fraction of its upward half axis."""
     depth: float = -0.5
     """Height of the middle of a shape [m]."""
     jitter: tuple[float, float, float] = (0.15, 0.15, 0.15)
@@ -439,13 +439,13 @@ class TrajectoryTracking(FittedTask):
     speed: float = 0.1
     """Largest starting speed per axis [m/s]."""
     lost: float = 4.0
-    """A greater distance to the reference ends the episode [m]."""
+    """Distance to the reference above which the episode ends [m]."""
     range: float = 12.0
-    """So does going this far from the world's origin [m]."""
+    """Distance from the world's origin beyond which the episode ends [m]."""
     tolerance: float = 0.05
-    """The time within this distance [m] is counted, without a break."""
+    """Distance within which the uninterrupted time is counted [m]."""
     hold: float = 10.0
-    """An episode counts as held when it ends with this long within the tolerance [s]."""
+    """Time within the tolerance at the end of an episode, for success [s]."""
     knot_spacing: float = 0.25
     """Time between two knots of the reference's table [s]."""
     reward: TrackingReward = field(default_factory=TrackingReward)
@@ -455,12 +455,12 @@ class TrajectoryTracking(FittedTask):
             raise ValueError(f"level is {self.level}, expected 0 to {len(LEVELS) - 1}")
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for every world's reference, from the start to what is seen at the end."""
+        """Allocate the reference of every world, up to the last preview time."""
         knots = math.ceil((self.time_limit + 3.0 * LOOK_AHEAD) / self.knot_spacing) + 2
         arrays.reference = reference_table(worlds, knots, self.knot_spacing, device)
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         return f"{self.tolerance:g} m from the reference for {self.hold:g} s, at the end"
 
     @property
@@ -475,7 +475,7 @@ class TrajectoryTracking(FittedTask):
         return len(LEVELS[self.level])
 
     def terms(self) -> Terms:
-        """See `TrackingReward`."""
+        """Return the terms; see `TrackingReward`."""
         r = self.reward
         return Terms(
             start=start,

@@ -34,12 +34,12 @@ from finssim.vehicles import AXES, Vehicle
 from finssim.vehicles.capability import coefficients_of
 
 VELOCITY_SCALE = 0.2
-"""The error of the velocity is divided by this in the observation [m/s]."""
+"""Scale of the velocity error in the observation [m/s]."""
 
 
 @wp.func
 def velocity_to_gain(arrays: TaskArrays, w: int) -> wp.vec3:
-    """Commanded minus measured velocity, body frame [m/s]."""
+    """Return the commanded minus the measured velocity, body frame [m/s]."""
     nu = arrays.velocity[w, 0]
     wanted = wp.quat_rotate_inv(arrays.quaternion[w, 0], arrays.target.velocity[w])
     return wanted - wp.vec3(nu[0], nu[1], nu[2])
@@ -64,7 +64,7 @@ class VelocityReward:
     r = match · exp(-u / match_scale)            a slope that does not vanish at the command: cm/s count
       - slip · u                                 a slope everywhere
       + heading · exp(-θ / heading_scale) - turn · θ     the same for the attitude, roll and pitch included
-      - action · mean(a²)                        the cheapest thrusts that do it
+      - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
     """
 
@@ -80,7 +80,7 @@ class VelocityReward:
 
 @wp.func
 def new_command(arrays: TaskArrays, p: Any, w: int, t: float):
-    """Draw a velocity in the axes of an attitude that is drawn too, and until when; `t` is the time [s]."""
+    """Draw an attitude, a velocity in its axes, and the time at which they end; `t` is the time [s]."""
     rng = arrays.target.rng[w]
     z = wp.randf(rng, -1.0, 1.0)
     angle = wp.randf(rng, -3.14159265, 3.14159265)
@@ -99,7 +99,7 @@ def new_command(arrays: TaskArrays, p: Any, w: int, t: float):
 
 @wp.func
 def change_command(arrays: TaskArrays, p: Any, w: int):
-    """Give another command when the last has lasted `period`, unless the episode ends now."""
+    """Draw a new command once the last one has lasted `period`, unless the episode ends now."""
     t = arrays.time[w] + 0.5 * p.control_step
     if t >= arrays.target.until[w] and t < p.time_limit:
         new_command(arrays, p, w, arrays.time[w])
@@ -107,37 +107,37 @@ def change_command(arrays: TaskArrays, p: Any, w: int):
 
 @wp.func
 def matching(p: Any, u: float) -> float:
-    """Return 1 at the commanded velocity, 1/e at an error `u` of `match_scale` [m/s] in proportion to the vehicle."""
+    """Return 1 at the commanded velocity, 1/e at an error `u` of `match_scale` [m/s], scaled to the vehicle."""
     return wp.exp(-u / (p.fit.pace * p.reward.match_scale))
 
 
 @wp.func
 def within_tolerance(p: Any, u: float, theta: float) -> bool:
-    """Return whether velocity [m/s] and attitude [rad] are within their tolerances."""
+    """Return True if velocity [m/s] and attitude [rad] are within their tolerances."""
     return u <= p.fit.pace * p.tolerance and theta <= p.attitude_tolerance
 
 
 @wp.func
 def mean_square(arrays: TaskArrays, p: Any, w: int, x: float, was: float) -> float:
-    """Mean of x² over the episode so far, in the square of the unit of `x`, from that before this step."""
+    """Return the mean of x² over the episode so far, in the squared unit of `x`, from the mean before this step."""
     return was + (x * x - was) / wp.max(1.0, wp.floor(arrays.time[w] / p.control_step + 0.5))
 
 
 @wp.func
 def squared_slip(arrays: TaskArrays, p: Any, w: int, u: float, was: float) -> float:
-    """Mean of u² over the episode [m²/s²]."""
+    """Return the mean of u² over the episode [m²/s²]."""
     return mean_square(arrays, p, w, u, was)
 
 
 @wp.func
 def squared_turn(arrays: TaskArrays, p: Any, w: int, theta: float, was: float) -> float:
-    """Mean of θ² over the episode [rad²]."""
+    """Return the mean of θ² over the episode [rad²]."""
     return mean_square(arrays, p, w, theta, was)
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Start deep in open water, with a command that is drawn about any heading."""
+    """Start an episode deep in open water, at any heading, with a random command."""
     here = wp.vec3(0.0, 0.0, -p.fit.size * p.depth)
     state.position[w, 0] = here
     start_upright(state, w, wp.rand_init(key, 4 * w), p.tilt, p.fit.pace * p.speed)
@@ -152,8 +152,8 @@ class VelocityControl(FittedTask):
     """Hold a velocity over ground and an attitude, as in *Learning to Swim* (arXiv:2410.00120) and *Sim2Swim*
     (arXiv:2512.08656).
 
-    A command is a velocity in the axes of the commanded attitude, and stays for `period`. Speeds are `fit.pace` times
-    as large for another vehicle. On a robot the reference's velocity and heading are the command.
+    A command is a velocity in the axes of the commanded attitude, and lasts for `period`. Speeds are scaled by
+    `fit.pace` for other vehicles. On a robot the reference's velocity and heading are the command.
     """
 
     succeeds: ClassVar[str] = "held"
@@ -164,11 +164,11 @@ class VelocityControl(FittedTask):
     name: str = "velocity6"
     observation: tuple[ObservationPart, ...] = OBSERVATION
     fastest: float = 0.15
-    """The commanded speed is drawn up to this [m/s]."""
+    """Greatest commanded speed [m/s]."""
     turn: float = math.radians(60.0)
-    """Largest turn of the heading from one command to the next [rad]."""
+    """Largest heading change between two commands [rad]."""
     lean: float = math.radians(45.0)
-    """Largest commanded roll and pitch [rad]; less where half of the thrusters' moment rights the vehicle from less."""
+    """Largest commanded roll and pitch [rad]; limited to the tilt that half of the thrusters' moment can hold."""
     period: float = 5.0
     """Time from one command to the next [s]."""
     speed: float = 0.1
@@ -176,17 +176,17 @@ class VelocityControl(FittedTask):
     depth: float = 30.0
     """Depth of the start [m]."""
     tolerance: float = 0.03
-    """Success: the velocity within this [m/s] ..."""
+    """Greatest velocity error for success [m/s]."""
     attitude_tolerance: float = math.radians(10.0)
-    """... and the attitude within this [rad] ..."""
+    """Greatest attitude error for success [rad]."""
     hold: float = 1.0
-    """... for this long [s]."""
+    """Time within these tolerances for success [s]."""
     reward: VelocityReward = field(default_factory=VelocityReward)
     training_noise: MeasurementNoise = replace(StationKeeping().training_noise, position_std=0.0)
-    """As for T1: without a delay, gains are learnt that ring on slower motors."""
+    """As for T1: without a delay, policies learn gains that oscillate on slower motors."""
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "VelocityControl":
-        """Return the task in the speed and the tilt that suit the vehicle."""
+        """Return the task with speeds and tilt scaled to the vehicle."""
         (vehicle, *_) = vehicles
         stiffness = axis_model(vehicle, coefficients_of(vehicle)).stiffness[3:5]
         moment = 0.5 * np.asarray(vehicle.wrench_limits)[3:5]
@@ -194,20 +194,20 @@ class VelocityControl(FittedTask):
         return replace(self, fit=fit(vehicle), lean=min(self.lean, math.asin(min(share, 1.0))))
 
     def arena(self) -> None:
-        """Return no walls: it is open water."""
+        """Return no walls: the task is in open water."""
         return
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for every world's command."""
+        """Allocate the command of every world."""
         arrays.target = allocated(TargetMotion, worlds, device)
 
     def success_rule(self) -> str:
-        """See `Task`."""
+        """Return the rule of success; see `Task`."""
         speed, angle = self.fit.pace * self.tolerance, math.degrees(self.attitude_tolerance)
         return f"{speed:.3g} m/s and {angle:g}° for {self.hold:g} s, at the end"
 
     def metrics(self, arrays: TaskArrays) -> dict[str, NDArray[np.float64]]:
-        """Return every task's measures, and the RMS of the errors over the episode: velocity [m/s], attitude [rad]."""
+        """Return the metrics of every task, and the RMS errors over the episode: velocity [m/s], attitude [rad]."""
         measured = super().metrics(arrays)
         return {
             **{name: x for name, x in measured.items() if not name.startswith("squared")},
@@ -216,7 +216,7 @@ class VelocityControl(FittedTask):
         }
 
     def terms(self) -> Terms:
-        """See `VelocityReward`."""
+        """Return the terms; see `VelocityReward`."""
         r = self.reward
         return Terms(
             start=start,
