@@ -358,7 +358,7 @@ def test_a_fins_slope_is_twice_its_damping_ahead():
         ({**FIN, "kind": "wing"}, "kind is 'wing'"),
         ({k: x for k, x in FIN.items() if k != "area"}, "area is missing"),
         ({**FIN, "colour": 3}, "unknown key 'colour'"),
-        ({**FIN, "minimum": 0.1}, "a travel that holds 0"),
+        ({**FIN, "minimum": 0.1}, "a range that contains 0"),
         ({**FIN, "chord": [0.0, 0.0, 1.0]}, "not perpendicular"),
         ({**FIN, "stall": 1.6}, "less than a right angle"),
         ({**FIN, "wake": {"screw": 0.5}}, "no thruster 'screw'"),

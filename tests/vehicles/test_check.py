@@ -59,7 +59,8 @@ def test_a_limit_beyond_the_thrust_curve_is_found():
 
 def test_trim_out_of_reach_is_found():
     assert (
-        "more than the thrusters give" in failed(load_vehicle("finsrov").replace({"body.mass": 16.0}))["trim"]
+        "exceeds the limits of the thrusters"
+        in failed(load_vehicle("finsrov").replace({"body.mass": 16.0}))["trim"]
     )
 
 

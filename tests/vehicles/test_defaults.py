@@ -121,7 +121,7 @@ def test_sensors_of_a_site_are_listed_once_a_file_gives_them(tmp_path):
         ("down: {device: ping, position: [0, 0], rate: 5.0}", "perception.down: position has shape"),
         ("down: {device: ping, rate: 5.0}", "perception.down: position is missing"),
         ("Down: {device: ping, position: [0, 0, 0], rate: 5.0}", "'Down' is no name of a sensor"),
-        ("dvl: {device: ping, position: [0, 0, 0], rate: 5.0}", "'dvl' is the name of something else"),
+        ("dvl: {device: ping, position: [0, 0, 0], rate: 5.0}", "'dvl' is already used by another part"),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(tmp_path, entry, message):

@@ -397,7 +397,7 @@ def test_what_is_not_read_is_named(tmp_path):
         ("m = 13.5;", "m = 13.5; mass = 0.07;", "m is 13.5 and mass is 0.07, which should be the same"),
         ("Xu_l = 13.7", "Xu_l = -13.7", "linear damping has both signs"),
         ("diag([6.36", "diag([-6.36", "added mass has both signs"),
-        ("MA = ", "G = eye(6); MA = ", "a vessel that floats"),
+        ("MA = ", "G = eye(6); MA = ", "as a surface vessel does"),
         ("      0   0   0   0  -1", "      0   0   0   0   0", "column 5 of the matrix of thrusters has no force"),
     ],
 )  # fmt: skip

@@ -151,7 +151,7 @@ def test_what_a_scenario_lacks_or_has_besides_is_named(tmp_path):
     [
         (scenario(agent_type="BlueROV2", fossen_model=None, dynamics=None), "a BlueROV2, are in HoloOcean's engine"),
         (scenario(fossen_model="otter"), "expected an agent with fossen_model torpedo"),
-        (scenario(COUGUV | {"diamm": 0.2}), "unknown word 'diamm', did you mean 'diam'"),
+        (scenario(COUGUV | {"diamm": 0.2}), "unknown key 'diamm', did you mean 'diam'"),
         (scenario(COUGUV | {"mass": "16"}), "mass is '16', expected a number > 0"),
         (scenario(COUGUV | {"T_sway": 0}), "T_sway is 0, expected a number > 0"),
         (scenario(COUGUV | {"r_bg": [0, 0]}), "r_bg is [0, 0], expected 3 numbers"),
@@ -233,8 +233,8 @@ def test_what_stands_in_a_usd_file_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("path", "value", "sentence"),
     [
-        ("volum", 0.01, "unknown word 'volum', did you mean 'volume'"),
-        ("hydro_coef.added_masses", [1.0] * 6, "unknown word 'added_masses', did you mean 'added_mass'"),
+        ("volum", 0.01, "unknown key 'volum', did you mean 'volume'"),
+        ("hydro_coef.added_masses", [1.0] * 6, "unknown key 'added_masses', did you mean 'added_mass'"),
         ("hydro_coef.added_mass", [1.0] * 5, "added_mass is [1.0, 1.0, 1.0, 1.0, 1.0], expected 6 numbers"),
         ("hydro_coef.linear_damping", [-4.03] + [1.0] * 5, "expected 6 numbers of 0 or more"),
         ("rotor_configuration.num_rotors", 8, "time_constants is [0.01"),

@@ -494,7 +494,7 @@ def test_other_files_are_refused(tmp_path):
         with pytest.raises(VehicleError, match=sentence):
             read_foreign(file)
     (tmp_path / "a.txt").write_text("nothing")
-    with pytest.raises(VehicleError, match="is of no format that is read, expected one of SDF of gz-sim"):
+    with pytest.raises(VehicleError, match="has an unknown format, expected one of SDF of gz-sim"):
         read_foreign(tmp_path / "a.txt")
     with pytest.raises(VehicleError, match="no such file"):
         read_foreign(tmp_path / "b.sdf")

@@ -261,7 +261,7 @@ def test_a_simple_thruster_is_a_force(tmp_path):
 def test_the_robot_alone_needs_its_materials(tmp_path):
     """A file that the scenario includes lacks the densities."""
     write(tmp_path)
-    with pytest.raises(VehicleError, match="material 'Foam' is in no file that is read: give the scenario"):
+    with pytest.raises(VehicleError, match="material 'Foam' is in no file that was read: give the scenario"):
         read_foreign(tmp_path / "data/robot.scn")
 
 

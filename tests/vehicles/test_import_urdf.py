@@ -308,7 +308,7 @@ def test_expressions_have_numbers_and_no_code():
     assert evaluate("2*pi if wide else -x[1]", {"pi": math.pi, "wide": False, "x": [1.0, 3.0]}) == -3.0
     assert evaluate("'a' + str(1 <= 2 and 3)", {}) == "a3" and evaluate("math.cos(0) + max(1, 2)", {}) == 3.0
     for text_of, reason in (
-        ("().__class__", "no namespace"),
+        ("().__class__", "known namespace"),
         ("(lambda: ().__class__)()", "Call"),
         ("[x for x in (1,)]", "ListComp"),
         ("open('/etc/passwd')", "the function 'open'"),
@@ -365,11 +365,11 @@ def test_an_expansion_that_grows_without_end_is_refused(tmp_path):
     tens = "".join(
         f'<xacro:macro name="m{i}" params="">{f"<xacro:m{i + 1}/>" * 10}</xacro:macro>' for i in range(9)
     )
-    assert "more than is read" in refusal(
+    assert "expand to too much text" in refusal(
         tmp_path, BODY.format(f'{tens}<xacro:macro name="m9" params=""><a/></xacro:macro><xacro:m0/>')
     )
     doubles = "".join(f'<xacro:property name="p{i + 1}" value="${{p{i}}}${{p{i}}}"/>' for i in range(40))
-    assert "more than is read" in refusal(
+    assert "expand to too much text" in refusal(
         tmp_path, BODY.format(f'<xacro:property name="p0" value="abcd"/>{doubles}<a>${{p40}}</a>')
     )
 
@@ -445,7 +445,7 @@ def test_a_collision_mesh_of_the_displaced_volume_is_the_hull(tmp_path):
     ("old", "new", "sentence"),
     [
         ("libuuv_underwater_object_ros", "libother", "0 plugins of underwater objects"),
-        ("<volume>", "<metacentric_width>1</metacentric_width><volume>", "floats as a ship does"),
+        ("<volume>", "<metacentric_width>1</metacentric_width><volume>", "is a surface vessel"),
         ("<volume>", "<volme>1</volme><volume>", "unknown element 'volme'"),
         ("<type>fossen</type>", "", "type is ''"),
         ("<thrusterID>${id}</thrusterID>", "<thrusterID>1</thrusterID>", "expected different integers"),

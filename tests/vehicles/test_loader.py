@@ -115,7 +115,7 @@ REFUSALS = {
     "infinite coordinate": (
         "center_of_gravity: [0.0, 0.0, -0.02]",
         "center_of_gravity: [0.0, .inf, 0.0]",
-        "body: center_of_gravity holds inf, expected finite numbers: give 3 numbers [x, y, z]",
+        "body: center_of_gravity contains inf, expected finite numbers: give 3 numbers [x, y, z]",
     ),
     "missing key": ("  mass: 11.2\n", "", "body: mass is missing: add it, with its origin"),
     "misspelt key": ("  mass: 11.2\n", "  mas: 11.2\n", "body: unknown key 'mas', did you mean 'mass'?"),

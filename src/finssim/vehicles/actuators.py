@@ -1,6 +1,6 @@
-"""Actuators other than thrusters: kinds by name, each from one file, and their sections in a vehicle file.
+"""Actuators other than thrusters: kinds by name, one file per kind, and their sections in a vehicle file.
 
-This layer reads the sections; `finssim.physics.actuators` has the kinds of FinsSim, and the engine evaluates them.
+This package reads the sections; `finssim.physics.actuators` defines FinsSim's kinds, and the engine evaluates them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ["Actuator", "ActuatorKind", "InstalledActuator", "installed", "read_a
 
 
 class Actuator(Part):
-    """Keys that the section of every actuator has: its travel and how it follows a command.
+    """Common keys of the section of every actuator: its range and its response to a command.
 
     Its value is an angle, a volume or a position, in the unit of its kind.
     """
@@ -48,16 +48,17 @@ class Actuator(Part):
     rate_limit: Positive = math.inf
     """Fastest change, in the unit of the kind per second."""
     play: NonNegative = 0.0
-    """Dead band and backlash: it does not move while its target is no farther than this, in the unit of the kind."""
+    """Dead band and backlash: the actuator does not move while its target is within this distance, in the
+    unit of the kind."""
     off: Number | None = None
-    """Value to which it goes while the vehicle is disarmed or in a fault, in the unit of the kind; it stays where it
-    is if None."""
+    """Value that the actuator moves to while the vehicle is disarmed or in a fault, in the unit of the kind;
+    if None it keeps its value."""
 
     @model_validator(mode="after")
     def _neutral_within(self) -> Actuator:
         if not self.minimum <= 0.0 <= self.maximum or self.minimum == self.maximum:
             raise refuse_section(
-                f"minimum {self.minimum:g} and maximum {self.maximum:g}: expected a travel that holds 0, the rest value"
+                f"minimum {self.minimum:g}, maximum {self.maximum:g}: expected a range that contains 0, the rest value"
             )
         if self.off is not None and not self.minimum <= self.off <= self.maximum:
             raise refuse_section(f"off is {self.off:g}, expected {self.minimum:g} to {self.maximum:g}")
@@ -66,10 +67,10 @@ class Actuator(Part):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ActuatorKind:
-    """A kind of actuator, with everything that the package has to know of it.
+    """Kind of actuator, with everything that the package needs to know about it.
 
-    Where all parameters are zero, its functions have to give zero: so it is of vehicles that do not have the actuator,
-    beside others that do.
+    Where all parameters are zero, its functions must return zero: vehicles without the actuator are simulated
+    in the same batch with zero parameters.
     """
 
     name: str
@@ -77,30 +78,30 @@ class ActuatorKind:
     schema: type[Actuator]
     """Keys of its section."""
     unit: str
-    """Unit of its value and of the command."""
+    """Unit of its value and of its command."""
     units: Mapping[str, str]
     """Unit of each parameter of its functions by name."""
     wrench: Any = None
-    """`wp.func` -> vec6: wrench about the body origin, body frame [N, N m], in proportion to the wet part of the
-    vehicle; see `finssim.physics.terms` for its arguments, of which nu_r is here that of the body origin."""
+    """`wp.func` -> vec6: wrench about the body origin, body frame [N, N m], scaled by the submerged fraction
+    of the vehicle; see `finssim.physics.terms` for its arguments; here nu_r is that of the body origin."""
     slope: Any = None
-    """`wp.func` of such arguments -> vec6: how fast the wrench falls with the velocity on each axis of the body origin,
-    0 or more [N s/m, N m s]. A stiff damping needs it, for the integrator takes that much implicitly."""
+    """`wp.func` of the same arguments -> vec6: decrease of the wrench with the velocity of the body origin on each
+    axis, at least 0 [N s/m, N m s]. Required for stiff damping, which the integrator then treats implicitly."""
     shift: Any = None
     """`wp.func` -> vec9: change of the body's first moment of mass [kg m] and of its inertia about the body origin
     [kg m²] (xx, yy, zz, xy, xz, yz), body frame."""
     carry: Any = None
-    """`wp.func` -> vec6: momentum about the body origin per rate of the value, times the value, of what moves within
-    the body [kg m, kg m²], body frame; the body recoils from its changes."""
+    """`wp.func` -> vec6: momentum about the body origin per rate of the value, times the value, of masses
+    moving within the body [kg m, kg m²], body frame; the body recoils when it changes."""
     numbers: Callable[[Any, Vehicle], Mapping[str, Any]] | None = None
-    """Function from section and vehicle to the parameters that no key of the section gives."""
+    """Function of section and vehicle that returns the parameters that the section does not contain."""
 
     further: tuple[str, ...] = ()
-    """Parameters besides those of the schema that can be drawn and fitted."""
+    """Additional parameters, not in the schema, that can be drawn and fitted."""
 
     @cached_property
     def scalars(self) -> tuple[str, ...]:
-        """Names of the parameters that can be drawn and fitted: one number each."""
+        """Names of the scalar parameters, which can be drawn and fitted."""
         fields = self.schema.model_fields
         own = (name for name in self.units if name in fields and fields[name].annotation is float)
         return (*own, *self.further)
@@ -108,14 +109,14 @@ class ActuatorKind:
 
 @dataclass(frozen=True)
 class InstalledActuator:
-    """A kind of actuator in one channel of a vehicle, as an item of the row of parameters."""
+    """Kind of actuator in one channel of a vehicle."""
 
     kind: ActuatorKind
     channel: int
 
     @property
     def name(self) -> str:
-        """Name that no other item has."""
+        """Unique name of the item."""
         return f"{self.kind.name}_{self.channel}"
 
     @property
@@ -129,7 +130,7 @@ class InstalledActuator:
         unknown = [name for name in further if name not in self.kind.units]
         if unknown:
             raise RegistryError(
-                f"actuator '{self.kind.name}': numbers gives '{unknown[0]}', expected of: {', '.join(self.kind.units)}"
+                f"actuator '{self.kind.name}': numbers returns '{unknown[0]}', expected {', '.join(self.kind.units)}"
             )
         return {
             path: further[name] if name in further else getattr(section, name)
@@ -144,7 +145,7 @@ def read_actuators(value: Any) -> dict[str, Actuator]:
         value: Content of `actuators` in a vehicle file.
 
     Raises:
-        PydanticCustomError: A section is refused; one sentence.
+        PydanticCustomError: A section is invalid; the message is one sentence.
     """
     if not isinstance(value, Mapping):
         raise refuse_value(f"is {value!r}, expected a section of actuators by name")
@@ -169,9 +170,9 @@ def read_actuators(value: Any) -> dict[str, Actuator]:
 
 
 def installed(vehicle: Vehicle) -> dict[InstalledActuator, Any]:
-    """Return the actuators of a vehicle with their sections, by kind and channel; thrusters come before the others.
+    """Return the actuators of a vehicle with their sections, by kind and channel; thrusters come first.
 
-    A thruster is among them where its thrust depends on the inflow.
+    A thruster is included only if its thrust depends on the inflow.
     """
     out: dict[InstalledActuator, Any] = {}
     for channel, thruster in enumerate(vehicle.thrusters.values()):

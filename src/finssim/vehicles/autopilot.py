@@ -1,4 +1,4 @@
-"""The autopilot of a vehicle that is steered by axes: ArduSub, its frame, and the demands of full sticks."""
+"""Autopilot of a vehicle that is commanded by axes: ArduSub, its frame, and full-stick demands."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ __all__ = ["DEMANDS", "FRAMES", "Autopilot"]
 Array = NDArray[np.float64]
 
 DEMANDS = ("roll", "pitch", "yaw", "throttle", "forward", "lateral")
-"""Demands of ArduSub's mixer, in the order of a motor's factors: right side down, nose up, clockwise from above, up,
-ahead, right."""
+"""Demands of ArduSub's mixer, in the order of a motor's factors: right side down, nose up, clockwise from
+above, up, forward, right."""
 
 _HORIZONTAL: list[list[float]] = [
     [0, 0, 1, 0, -1, 1],
@@ -64,7 +64,7 @@ FRAMES: dict[int, tuple[str, list[list[float]]]] = {
         ],
     ),
 }
-"""FRAME_CONFIG -> name, and of each motor its factors of the `DEMANDS` (ArduPilot, AP_Motors6DOF::setup_motors)."""
+"""FRAME_CONFIG -> name, and the factors of the `DEMANDS` for each motor (ArduPilot, AP_Motors6DOF::setup_motors)."""
 
 
 class Autopilot(Part):
@@ -72,14 +72,15 @@ class Autopilot(Part):
 
     firmware: Literal["ardusub"] = "ardusub"
     frame: str | tuple[tuple[float, ...], ...]
-    """Name of `FRAMES`, or a table: of each motor, in the order of motor_index, its factors of the `DEMANDS`."""
+    """Name of `FRAMES`, or a table with the factors of the `DEMANDS` for each motor, in the order of motor_index."""
     directions: tuple[Literal[-1, 1], ...] = ()
-    """MOT_n_DIRECTION of each motor; 1 where the file gives none."""
+    """MOT_n_DIRECTION of each motor; 1 where the file omits it."""
     gain: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    """Share of an axis's full output that action 1 of `pilot6` means [-]; the vehicle's own pilot gain
-    (JS_GAIN_DEFAULT) must be at least as large."""
+    """Fraction of an axis's full output that action 1 of `pilot6` represents [-]; the vehicle's own pilot
+    gain (JS_GAIN_DEFAULT) must be at least as large."""
     voltage: Positive | None = None
-    """Voltage of the battery under load, at which pulses become thrusts [V]; the thrusters' `esc.voltage` if None."""
+    """Battery voltage under load, at which pulses are converted to thrusts [V]; the thrusters' `esc.voltage`
+    if None."""
 
     @field_validator("frame")
     @classmethod
@@ -99,12 +100,12 @@ class Autopilot(Part):
 
     @property
     def name(self) -> str:
-        """Name of the frame; `table` if the file gives factors."""
+        """Name of the frame; `table` if the file contains factors."""
         return self.frame if isinstance(self.frame, str) else "table"
 
     @property
     def factors(self) -> Array:
-        """Factors of the `DEMANDS`, by motor, before directions [-], (motors, 6)."""
+        """Factors of the `DEMANDS` by motor, before directions are applied [-], (motors, 6)."""
         named = dict(FRAMES.values())
         return np.array(named[self.frame] if isinstance(self.frame, str) else self.frame, float)
 
@@ -114,10 +115,10 @@ class Autopilot(Part):
 
 
 def refuse_misfit(autopilot: Autopilot, thrusters: dict[str, Any], control_matrix: Array) -> None:
-    """Refuse an autopilot whose motors do not push in the direction of its frame.
+    """Refuse an autopilot whose motors do not push in the directions of its frame.
 
     Args:
-        autopilot: Its frame and directions.
+        autopilot: Autopilot with its frame and directions.
         thrusters: `Thruster` by name, canonical order, n of them.
         control_matrix: Wrench = B f, body frame [-, m], (6, n).
     """
@@ -138,6 +139,6 @@ def refuse_misfit(autopilot: Autopilot, thrusters: dict[str, Any], control_matri
         push = np.array([forward, -lateral, throttle]) @ control_matrix[:3, k]
         if not push > 0.0:
             raise refuse_section(
-                f"autopilot: a positive output of motor {motor + 1} pushes thruster '{name}' against what frame "
-                f"{autopilot.name} means: turn its axis, motor_sign or directions[{motor}]"
+                f"autopilot: a positive output of motor {motor + 1} pushes thruster '{name}' opposite to what frame "
+                f"{autopilot.name} expects: reverse its axis, motor_sign or directions[{motor}]"
             )

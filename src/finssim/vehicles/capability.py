@@ -41,16 +41,16 @@ class WrenchCapability:
 
     @property
     def symmetric(self) -> Array:
-        """Return what is reachable in both directions [N, N m], (6,)."""
+        """Return the largest values that are reachable in both directions [N, N m], (6,)."""
         return np.minimum(self.positive, self.negative)
 
 
 def wrench_capability(vehicle: Vehicle) -> WrenchCapability:
-    """Largest wrench on each controlled axis while the other controlled components are zero.
+    """Return the largest wrench on each controlled axis while the other controlled components are zero.
 
     max t  subject to  (B f)_axis = t,  (B f)_j = 0 for the other controlled j,  f_min <= f <= f_max
 
-    A component the vehicle does not control is left free; its own limit is zero.
+    A component that the vehicle does not control is unconstrained; its own limit is zero.
 
     Returns:
         Limits about `wrench_reference`, body frame.
@@ -69,18 +69,18 @@ def wrench_capability(vehicle: Vehicle) -> WrenchCapability:
 def largest(gain: Array, zero: Array, lower: Array, upper: Array) -> Array:
     """Return f that maximises gain · f subject to zero f = 0 and lower <= f <= upper, by an active set from f = 0.
 
-    A step follows the gain, projected onto what the constraints and the bounds that hold leave free, to the next bound.
-    Where nothing is left to gain, a bound whose multiplier has the wrong sign is released; without one, f is optimal
-    (Karush, Kuhn and Tucker). The lowest index goes first, so that it cannot cycle (Bland).
+    A step follows the gain, projected onto the null space of the constraints and the active bounds, to the next
+    bound. Where no further gain is possible, a bound whose multiplier has the wrong sign is released; without such a
+    bound, f is optimal (Karush, Kuhn and Tucker). The lowest index is chosen first, which prevents cycling (Bland).
 
     Args:
         gain: Wrench component per thrust [- or m], (n,).
-        zero: Rows that have to stay zero [- or m], (m, n).
+        zero: Rows of the components that must be zero [- or m], (m, n).
         lower: Least thrusts [N], at most 0, (n,).
         upper: Greatest thrusts [N], at least 0, (n,).
 
     Raises:
-        VehicleError: Numbers so unlike each other that rounding hides the optimum.
+        VehicleError: The numbers differ so much in magnitude that rounding hides the optimum.
     """
     n, f = len(gain), np.zeros(len(gain))
     side = np.zeros(n, int)  # -1 at the lower bound, 1 at the upper one, 0 free
@@ -110,7 +110,7 @@ def largest(gain: Array, zero: Array, lower: Array, upper: Array) -> Array:
 
 
 def terminal_speed(d1: float, d2: float, tau: float) -> float:
-    """Steady speed under a constant load: the positive root of d1 v + d2 v² = tau; inf without damping.
+    """Return the steady speed under a constant load: the positive root of d1 v + d2 v² = tau; inf without damping.
 
     Args:
         d1: Linear damping [N s/m or N m s].
@@ -127,15 +127,17 @@ def terminal_speed(d1: float, d2: float, tau: float) -> float:
 
 
 def coefficients_of(vehicle: Vehicle) -> str:
-    """Return the name of the hydrodynamic set that describes the vehicle: the calibrated one, if its file has it."""
+    """Return the name of the hydrodynamic set that describes the vehicle: the calibrated one, if its file
+    contains it."""
     sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
     return sets[0] if sets and "calibrated" not in sets else "calibrated"
 
 
 def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
-    """Steady speed on each axis alone at its symmetric wrench limit, from d1 and d2 of that axis and its terms.
+    """Return the steady speed on each axis alone at its symmetric wrench limit, from d1, d2 and the terms of
+    that axis.
 
-    A propeller that loses thrust in a flow does so at its speed of rotation for that limit.
+    The loss of thrust in a flow is computed at the propeller speed of that limit.
 
     Returns:
         [m/s, rad/s], (6,)
@@ -148,13 +150,13 @@ def terminal_speeds(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Arra
 
 
 def panel_drag(vehicle: Vehicle, hydrodynamics: str = "mesh") -> Array:
-    """Return d2 of steady motion along surge, sway and heave by the panels of the hull, where drag is d2 v².
+    """Return d2 of steady motion along surge, sway and heave from the panels of the hull, where drag is d2 v².
 
     d2 = ρ/2 Σ A [C_form max(μ, 0) + C_skin (1 - μ²)^(3/2)],  μ = n · axis                      (paper, eq. 3-4)
 
     Args:
-        vehicle: Any vehicle with a hull.
-        hydrodynamics: Its set with `form_drag` and `skin_drag`.
+        vehicle: Vehicle with a hull.
+        hydrodynamics: Name of its set with `form_drag` and `skin_drag`.
 
     Returns:
         d2 [N s²/m²], (3,)
@@ -189,7 +191,7 @@ def _inflow_damping(vehicle: Vehicle) -> Array:
 
 
 def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array:
-    """m_eff / d1 on each axis, taken about the centre of gravity; inf where there is no linear damping.
+    """Return m_eff / d1 on each axis, about the centre of gravity; inf where there is no linear damping.
 
     Returns:
         [s], (6,)
@@ -203,16 +205,16 @@ def time_constants(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Array
 
 
 def level_speed(vehicle: Vehicle, hydrodynamics: str = "calibrated", axis: int = 0) -> float:
-    """Return the speed along surge (or sway) at which a small pitch (or roll) angle θ begins to grow [m/s]; inf if
-    none.
+    """Return the speed along surge (or sway) at which a small pitch (or roll) angle θ starts to grow [m/s];
+    inf if there is none.
 
-    Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses with added mass: u² = k / (m_z - m_x). Damping in
-    heave and pitch lets a vehicle go somewhat faster; it is left out.
+    Stiffness k θ against the Munk moment (m_z - m_x) u² θ, masses including added mass: u² = k / (m_z - m_x).
+    Damping in heave and pitch raises the speed somewhat; it is neglected.
 
     Args:
         vehicle: The vehicle.
-        hydrodynamics: Its set.
-        axis: 0 surge, 1 sway.
+        hydrodynamics: Name of its set.
+        axis: 0 for surge, 1 for sway.
     """
     mass = np.diag(vehicle.mass_matrix(hydrodynamics))
     excess = float(mass[2] - mass[axis])
@@ -222,20 +224,21 @@ def level_speed(vehicle: Vehicle, hydrodynamics: str = "calibrated", axis: int =
 
 @dataclass(frozen=True)
 class Restoring:
-    """Small rotations about the centre of gravity of a submerged vehicle; arrays are (roll, pitch)."""
+    """Static and dynamic response to small rotations of a submerged vehicle about its centre of gravity;
+    arrays are (roll, pitch)."""
 
     stiffness: Array
     """Hydrostatic stiffness B (z_b - z_g) [N m/rad], (2,)."""
     natural_frequency: Array
-    """Undamped [Hz], (2,); zero where the stiffness is not positive."""
+    """Undamped natural frequency [Hz], (2,); zero where the stiffness is not positive."""
     damping_ratio: Array
-    """d1 / (2 sqrt(k I_eff)) [-], (2,)."""
+    """Damping ratio d1 / (2 sqrt(k I_eff)) [-], (2,)."""
     static_tilt: Array
-    """Angle that the symmetric roll or pitch moment holds, asin(tau / k) [rad], (2,); nan where tau > k."""
+    """Steady angle under the symmetric roll or pitch moment, asin(tau / k) [rad], (2,); nan where tau > k."""
 
 
 def restoring(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Restoring:
-    """Hydrostatic stiffness in roll and pitch and what follows from it.
+    """Return the hydrostatic stiffness in roll and pitch and the quantities derived from it.
 
     I_eff φ'' + d1 φ' + B (z_b - z_g) sin φ = tau            (uncoupled, fully submerged, weight nearly buoyancy)
     """
@@ -258,20 +261,20 @@ def restoring(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> Restoring:
 
 @dataclass(frozen=True)
 class Trim:
-    """The wrench that holds a submerged vehicle level at rest."""
+    """Wrench that holds a submerged vehicle level at rest."""
 
     wrench: Array
-    """About `wrench_reference`, body frame [N, N m], (6,)."""
+    """Wrench about `wrench_reference`, body frame [N, N m], (6,)."""
     forces: Array | None
-    """Thrusts that give its controlled components, canonical order [N]; None where they exceed the limits."""
+    """Thrusts that produce its controlled components, canonical order [N]; None where they exceed the limits."""
 
 
 def trim(vehicle: Vehicle) -> Trim:
-    """Thrust that balances weight and buoyancy with the vehicle level.
+    """Return the thrust that balances weight and buoyancy with the vehicle level.
 
     tau = -[(0, 0, B - W), (r_b - p) × (0, 0, B) + (r_g - p) × (0, 0, -W)],  p = wrench_reference
 
-    Uncontrolled components are left to the vehicle's own stability.
+    Uncontrolled components are left to the passive stability of the vehicle.
     """
     from scipy.optimize import lsq_linear
 

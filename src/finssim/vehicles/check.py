@@ -1,4 +1,4 @@
-"""Checks of a vehicle's numbers for physical consistency: one sentence per finding."""
+"""Consistency checks of a vehicle's physical parameters: one sentence per result."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ __all__ = ["CheckResult", "check_vehicle"]
 PUBLISHED = Path(__file__).with_name("published.yaml")
 """Top speeds and bollard pulls of real vehicles, with sources."""
 CURVE_TOLERANCE = 0.01
-"""Relative gap accepted between a force limit and the curve at the speed limit."""
+"""Accepted relative difference between a force limit and the curve at the speed limit."""
 PUBLISHED_TOLERANCE = 0.2
-"""Relative difference of top speed or bollard pull from the published one that needs no reason."""
+"""Relative difference of top speed or bollard pull from the published value that needs no explanation."""
 SETS_RATIO = 1.5
-"""Ratio of the steady speeds of two hydrodynamic sets under the same force from which a remark is made."""
+"""Ratio of the steady speeds of two hydrodynamic sets under the same force above which a remark is made."""
 VOLUME_TOLERANCE = 0.02
 CENTROID_TOLERANCE = 0.02
-"""Distance accepted between the hull's centroid and the centre of buoyancy, relative to the longest side."""
+"""Accepted distance between the hull's centroid and the centre of buoyancy, relative to the longest side."""
 
 
 class CheckResult(NamedTuple):
-    """One thing that was checked."""
+    """Result of one check."""
 
     name: str
     passed: bool
     sentence: str
     remark: bool = False
-    """Whether a finding that passed needs attention."""
+    """True if a check that passed still needs attention."""
 
 
 def check_vehicle(vehicle: Vehicle) -> list[CheckResult]:
-    """Check what no single number shows; the loader has already refused what cannot be simulated at all.
+    """Check relations between several numbers; the loader has already refused vehicles that cannot be simulated.
 
     Returns:
-        Every finding, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull,
-        agreement of the hydrodynamic sets, and top speed and bollard pull beside those of the real vehicle, where
-        `published.yaml` has them.
+        All results, passed or not: mass matrices, damping, allocation, thrust curves, trim, stability, hull,
+        agreement of the hydrodynamic sets, and top speed and bollard pull compared with those of the real
+        vehicle, if `published.yaml` contains them.
     """
     return [
         *_mass_matrices(vehicle),
@@ -94,7 +94,7 @@ def _damping(vehicle: Vehicle) -> Iterator[CheckResult]:
             share = _least_power(chosen.quadratic_damping)
             passed = passed and share >= 0.0
             sentence += (
-                f"; D2 couples axes: over sampled velocities it takes out at least {share:.3g} of the power "
+                f"; D2 couples axes: over sampled velocities it dissipates at least {share:.3g} of the power "
                 "of its diagonal, expected >= 0"
             )
         yield CheckResult(f"damping ({name})", passed, sentence)
@@ -105,9 +105,9 @@ def _damping(vehicle: Vehicle) -> Iterator[CheckResult]:
 
 
 def _least_power(D2: NDArray[np.float64], samples: int = 4000) -> float:
-    """Smallest nu · D2 diag(|nu|) nu over the same with the diagonal alone, over sampled velocities.
+    """Return the smallest ratio of nu · D2 diag(|nu|) nu to its diagonal part, over sampled velocities.
 
-    With couplings the sign depends on nu and no eigenvalue of D2 tells it.
+    With couplings the sign depends on nu, and the eigenvalues of D2 do not determine it.
     """
     generator = np.random.default_rng(0)
     nu = generator.standard_normal((samples, 6)) * 10.0 ** generator.uniform(-1.5, 1.5, (samples, 6))
@@ -131,7 +131,7 @@ def _allocation(vehicle: Vehicle) -> CheckResult:
         f"condition number {singular[0] / singular[-1] if singular[-1] > 0.0 else math.inf:.3g}"
     )
     if idle:
-        sentence += f"; no pure {', '.join(idle)} in both directions: take it out of controlled_axes"
+        sentence += f"; no pure {', '.join(idle)} in both directions: remove it from controlled_axes"
     return CheckResult("allocation", rank == len(rows) and not idle, sentence)
 
 
@@ -158,20 +158,20 @@ def _trim(vehicle: Vehicle) -> CheckResult:
     drift = "rises" if net > 0.0 else "sinks"
     sentence = f"it {drift} with {abs(net):.3g} N; level at rest needs {_wrench(level.wrench)}"
     if level.forces is None:
-        return CheckResult("trim", False, f"{sentence}, more than the thrusters give")
+        return CheckResult("trim", False, f"{sentence}, which exceeds the limits of the thrusters")
     uncontrolled = [
         a
         for a, x in zip(AXES, level.wrench, strict=True)
         if a not in vehicle.controlled_axes and abs(x) > 1e-6
     ]
     if uncontrolled:
-        sentence += f"; {', '.join(uncontrolled)} is not controlled and left to the water"
+        sentence += f"; {', '.join(uncontrolled)} is not controlled, so it depends on passive stability"
     lower, upper = vehicle.force_limits
     share = float(
         np.max(np.where(level.forces > 0.0, level.forces / upper, level.forces / lower), initial=0.0)
     )
     return CheckResult(
-        "trim", share < 1.0, f"{sentence}; the hardest thruster gives {100.0 * share:.2g} % of its limit"
+        "trim", share < 1.0, f"{sentence}; the most loaded thruster is at {100.0 * share:.2g} % of its limit"
     )
 
 
@@ -191,7 +191,7 @@ def _stability(vehicle: Vehicle) -> CheckResult:
         "upright",
         arm > 0.0,
         f"the centre of buoyancy lies {arm:.3g} m above the centre of gravity, expected > 0: "
-        "otherwise it turns over at rest",
+        "otherwise the vehicle turns over at rest",
     )
 
 
@@ -208,7 +208,7 @@ def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
     yield CheckResult("hull", True, f"the hull of {len(faces)} faces is closed and its normals point outward")
     volume, stated = mesh_volume(vertices, faces), vehicle.body.displaced_volume
     centre, loads, without = vehicle.body.center_of_buoyancy, list(vehicle.payloads.values()), ""
-    if vehicle.hull.file is not None and loads:  # a mesh has no payloads
+    if vehicle.hull.file is not None and loads:  # payloads are not part of a mesh
         moment = stated * centre - sum(load.volume * load.position for load in loads)
         stated -= math.fsum(load.volume for load in loads)
         centre, without = moment / stated, " without payloads"
@@ -227,9 +227,9 @@ def _hull(vehicle: Vehicle) -> Iterator[CheckResult]:
 
 
 def _agreement(vehicle: Vehicle) -> Iterator[CheckResult]:
-    """Remark on hydrodynamic sets of one vehicle that reach very different speeds under the same force."""
+    """Remark on hydrodynamic sets of one vehicle whose steady speeds under the same force differ strongly."""
     speeds = {}
-    with suppress(VehicleError):  # of a hull that another check finds
+    with suppress(VehicleError):  # an invalid hull is reported by another check
         for name, chosen in vehicle.hydrodynamics.items():
             if isinstance(chosen, HydrodynamicSet):
                 speeds[name] = terminal_speeds(vehicle, name)[:3]
@@ -249,10 +249,10 @@ def _agreement(vehicle: Vehicle) -> Iterator[CheckResult]:
 
 
 def _published(vehicle: Vehicle) -> Iterator[CheckResult]:
-    """Compare a vehicle of the catalogue with the real one."""
+    """Compare a vehicle of the catalogue with published data of the real one."""
     if vehicle.path is None or vehicle.path.parent != CATALOGUE or "calibrated" not in vehicle.hydrodynamics:
         return
-    if vehicle.sha256 != load_vehicle(vehicle.name).sha256:  # numbers of it were replaced
+    if vehicle.sha256 != load_vehicle(vehicle.name).sha256:  # the vehicle's parameters have been changed
         return
     rows = read_mapping(PUBLISHED, VehicleError, such_as="remus100: {top_speed: 2.5}")
     row = rows.get(vehicle.name, {})

@@ -1,7 +1,7 @@
 """Defaults of the sections `sensors`, `perception`, `tags`, `mcu` and `safety` that a vehicle file omits.
 
-They make every vehicle fit for the virtual world. None of them is known of the real one: `finssim vehicles show` lists
-them as defaults, and what reads records of real water refuses tags that the file does not give.
+They allow every vehicle to be used in the simulated world. They are not measured on the real vehicle: `finssim
+vehicles show` marks them as defaults, and readers of records of real water refuse tags that the file does not define.
 """
 
 from __future__ import annotations
@@ -45,19 +45,21 @@ __all__ = [
 ]
 
 LENGTH = 0.6
-"""Vehicles up to this long have the published pool, which FinsROV (0.56 m) fits [m]; for others everything grows."""
+"""Vehicles up to this length use the published pool, which is sized for FinsROV (0.56 m) [m]; it is scaled
+for longer vehicles."""
 POOL = (4.0, 2.0, 1.0)
-"""The published pool: length, width and depth [m]."""
+"""Published pool: length, width and depth [m]."""
 SITES: Mapping[str, tuple[float, float, float] | None] = {
     "pool": None,
     "tank": (10.0, 6.0, 5.0),
     "open-water": (2000.0, 2000.0, 20.0),
 }
-"""Size of the water of each site: length, width and depth [m]; None: the workspace of the vehicle's file."""
+"""Size of the water of each site: length, width and depth [m]; None: the workspace in the vehicle file."""
 EDGE = (0.2, 0.4)
-"""Largest edge of a tag, part of the vehicle's length and of its width: two with their margins fit on the top."""
+"""Largest edge of a tag, as a fraction of the vehicle's length and of its width: two tags with margins fit on
+the top."""
 APART = 0.15
-"""Offset of a tag from the middle of the top, as a share of the vehicle's length."""
+"""Offset of a tag from the centre of the top, as a fraction of the vehicle's length."""
 QUARTER_TURN = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 
 DEFAULTS: Mapping[str, str] = {
@@ -74,12 +76,13 @@ DEFAULTS: Mapping[str, str] = {
 
 
 def room(size: Any) -> float:
-    """Factor on the published pool, goals and trajectories for a vehicle of this envelope [m], (3,)."""
+    """Return the scale factor of the published pool, goals and trajectories for a vehicle of this envelope
+    [m], (3,)."""
     return max(1.0, float(max(size)) / LENGTH)
 
 
 def default_sensors() -> Sensors:
-    """The catalogue's guess of a MEMS unit, as in `finsrov.yaml`."""
+    """Return the catalogue's estimate of a MEMS unit, as in `finsrov.yaml`."""
     origin = np.zeros(3)
     return Sensors(
         imu=Imu(
@@ -97,10 +100,10 @@ def default_sensors() -> Sensors:
 
 
 def default_perception(values: Mapping[str, Any]) -> dict[str, RaySensor]:
-    """Camera, sonar and altimeter on the envelope, as a small ROV carries them; a vehicle that does not hover has in
-    place of the camera an altimeter that looks 30° ahead of straight down.
+    """Return camera, sonar and altimeter on the envelope, as on a small ROV; a vehicle that does not hover
+    has a second altimeter, pointing 30° ahead of straight down, instead of the camera.
 
-    Devices are those of the catalogue; pictures are as coarse as policies take them, delays and losses are guesses.
+    The devices are those of the catalogue; the resolution suits policies, delays and losses are estimates.
     """
     middle = np.asarray(values["body"].center_of_buoyancy)
     length, _, height = values["body"].size
@@ -124,7 +127,8 @@ def default_perception(values: Mapping[str, Any]) -> dict[str, RaySensor]:
 
 
 def default_tags(values: Mapping[str, Any]) -> Tags:
-    """Two tags on top of the envelope, about the centre of buoyancy, which is the middle of the hull."""
+    """Return two tags on top of the envelope, placed about the centre of buoyancy, which is the centre of the
+    hull."""
     length, width, height = values["body"].size
     x, y, z = values["body"].center_of_buoyancy
     top = float(z + 0.5 * height)
@@ -138,10 +142,10 @@ def default_tags(values: Mapping[str, Any]) -> Tags:
 
 
 def with_navigation(vehicle: Vehicle) -> Vehicle:
-    """The vehicle with a Doppler log and a compass of the small class where its file gives none: for open water.
+    """Return the vehicle for open water, with a small Doppler log and a compass if its file defines none.
 
-    The log is as the makers of hand-sized ones claim for their better models (0.1 % of speed, 8 Hz, reach 50 m), the
-    compass a magnetic one that was swung on site (0.3°).
+    The log has the specification of the better hand-sized models (0.1 % of speed, 8 Hz, range 50 m), the
+    compass is a magnetic one that was calibrated on site (0.3°).
     """
     dvl = Dvl(
         rate=8.0, position=np.zeros(3), latency=0.06, dropout=0.01, noise_std=0.008, bias_initial=0.0005,
@@ -161,12 +165,13 @@ def with_navigation(vehicle: Vehicle) -> Vehicle:
 
 
 def vehicle_at(site: str, vehicle: Vehicle, *, navigation: bool = False) -> Vehicle:
-    """The vehicle as it is equipped for a site: a workspace as large, and in open water Doppler log and compass.
+    """Return the vehicle as equipped for a site: with a workspace of the same size, and in open water with
+    Doppler log and compass.
 
     Args:
         site: A name of `SITES`.
-        vehicle: As its file has it.
-        navigation: It has Doppler log and compass at every site, as one that an autopilot steers.
+        vehicle: Vehicle as defined by its file.
+        navigation: True to add Doppler log and compass at every site, as for a vehicle with an autopilot.
 
     Raises:
         VehicleError: There is no such site.
@@ -187,7 +192,8 @@ def vehicle_at(site: str, vehicle: Vehicle, *, navigation: bool = False) -> Vehi
 
 
 def numbered(vehicle: Vehicle, number: int) -> Vehicle:
-    """Return the vehicle as one of several under one camera, from 0: its tags' ids follow those of the one before."""
+    """Return the vehicle as number `number`, from 0, of several under one camera: its tag ids follow those of
+    the previous one."""
     tags = vehicle.tags
     if number == 0 or tags is None:
         return vehicle
@@ -197,7 +203,7 @@ def numbered(vehicle: Vehicle, number: int) -> Vehicle:
 
 
 def default_mcu(values: Mapping[str, Any]) -> Mcu:
-    """Outputs enough for the motors that the thrusters name, or for one each."""
+    """Return a controller with enough outputs for the motors that the thrusters name, or one per thruster."""
     thrusters = values["thrusters"].values()
     named = [t.motor_index + 1 for t in thrusters if t.motor_index is not None]
     fastest = max((max(t.rpm_max, -t.rpm_min) for t in thrusters), default=1.0)
@@ -205,7 +211,8 @@ def default_mcu(values: Mapping[str, Any]) -> Mcu:
 
 
 def default_safety(values: Mapping[str, Any]) -> Safety:
-    """Limits by class: a vehicle that hovers, or one that needs way on to dive and may pitch further for it."""
+    """Return limits by class: for a vehicle that hovers, or one that must move ahead to dive and may
+    therefore pitch more."""
     hovers = "heave" in values["controlled_axes"]
     length, width, depth = (room(values["body"].size) * side for side in POOL)
     return Safety(

@@ -1,4 +1,4 @@
-"""Devices of a vehicle's `perception` as data: cameras, sonars and rangefinders, from YAML files that are checked."""
+"""Devices of a vehicle's `perception`: cameras, sonars and rangefinders, from validated YAML files."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ Array = NDArray[np.float64]
 
 DEVICES = Path(__file__).parent / "catalogue" / "devices"
 PIXELS = 1 << 23
-"""Greatest number of computed values of a device: pixels, rays, or cells of range and beam."""
+"""Largest number of computed values of a device: pixels, rays, or cells of range and beam."""
 
 
 class DeviceError(ValueError):
-    """A device that is not possible, or that a vehicle does not have: one sentence with what to do."""
+    """Invalid device, or a device that a vehicle does not have; the message is one sentence with the remedy."""
 
 
 def numbers(count: int | None, expected: str) -> BeforeValidator:
-    """So many finite numbers, or any, in a list."""
+    """Return a validator of a list of finite numbers of the given length, or of any length if None."""
 
     def check(values: Any) -> Any:
         if not isinstance(values, (list, tuple)) or count not in (None, len(values)):
             raise refuse_value(f"is {values!r}, expected {expected}")
         for value in values:
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
-                raise refuse_value(f"holds {value!r}, expected {expected}")
+                raise refuse_value(f"contains {value!r}, expected {expected}")
         return tuple(map(float, values))
 
     return BeforeValidator(check)
@@ -71,11 +71,11 @@ class DeviceMount(Part):
     position: Vector3 = Field(default_factory=lambda: zeros(3))
     """Position from the body origin, body axes [m]."""
     pitch: Number = 0.0
-    """Its x axis, along which it looks, turned down from the body's [rad]."""
+    """Downward pitch of the sensor's x axis, its viewing direction, relative to the body's [rad]."""
     yaw: Number = 0.0
-    """And to the left [rad]."""
+    """Yaw of the sensor's x axis to the left [rad]."""
     orientation: Quaternion | None = None
-    """q_body<sensor> in place of both, xyzw, (4,)."""
+    """Quaternion q_body<sensor>, xyzw, (4,), which replaces pitch and yaw."""
 
     @property
     def quaternion(self) -> Array:
@@ -86,49 +86,50 @@ class DeviceMount(Part):
 
 
 class SiteDevice(Part):
-    """A device on a vehicle that senses the site around it."""
+    """Device on a vehicle that senses the surroundings."""
 
     about: str
     source: str
-    """Source of the figures."""
+    """Source of the specification."""
     rate: Positive
-    """[Hz]"""
+    """Rate [Hz]."""
     mount: DeviceMount = Field(default_factory=lambda: DeviceMount())
 
 
 class Port(Part):
-    """A flat window between a lens in air and the water, square to the view."""
+    """Flat window between a lens in air and the water, perpendicular to the optical axis."""
 
     distance: Positive
     """Distance from the centre of the lens to the window's inner face [m]."""
     thickness: Positive
-    """[m]"""
+    """Thickness [m]."""
     index: Annotated[float, Field(strict=True, ge=1.0, le=3.0)] = 1.49
-    """Refractive index; acrylic has 1.49."""
+    """Refractive index; 1.49 for acrylic."""
 
 
 class CameraDevice(SiteDevice):
-    """A camera on a vehicle. Pixels and coefficients as OpenCV's; a dome port centred on the lens needs nothing."""
+    """Camera on a vehicle. Pixels and coefficients follow OpenCV; a dome port centred on the lens needs no
+    parameters."""
 
     width: Pixels
     height: Pixels
     focal_length: Positive
-    """[px] of the full picture; behind a flat port that of the lens in air."""
+    """Focal length of the full picture [px]; behind a flat port, that of the lens in air."""
     model: Literal["plumb_bob", "rational", "fisheye"] = "plumb_bob"
     distortion: Annotated[tuple[float, ...], numbers(None, "a list of numbers")] = ()
     port: Port | None = None
     exposure: Annotated[Any, AfterValidator(_exposure)] = "auto"
-    """Fraction of the full scale that radiance 1 reaches, or fitted to the last picture."""
+    """Fraction of full scale for radiance 1, or `auto`: adapted to the last picture."""
     white_balance: Probability = 0.0
-    """Share of the colour cast that automatic exposure takes out (gray world)."""
+    """Fraction of the colour cast that automatic white balance removes (gray world)."""
     full_well: Positive = 10_000.0
-    """[electrons]"""
+    """Full-well capacity [electrons]."""
     read_noise: NonNegative = 5.0
-    """[electrons]"""
+    """Read noise [electrons]."""
     gamma: Positive = 2.2
-    """Numbers are (charge)^(1/gamma) [-]."""
+    """Gamma: pixel values are (charge)^(1/gamma) [-]."""
     exposure_time: NonNegative = 0.0
-    """During which a picture that knows the vehicle's motion blurs [s]."""
+    """Exposure time, which causes motion blur if the vehicle's motion is known [s]."""
 
     @model_validator(mode="after")
     def _optics(self) -> CameraDevice:
@@ -143,7 +144,7 @@ class CameraDevice(SiteDevice):
         return self
 
     def lens(self, width: int | None = None) -> Lens:
-        """The lens, for pictures of another width [px] and the same proportions too."""
+        """Return the lens, optionally for pictures of another width [px] with the same aspect ratio."""
         scale = (width or self.width) / self.width
         columns, rows, focal = (
             width or self.width,
@@ -155,43 +156,44 @@ class CameraDevice(SiteDevice):
 
     @property
     def gain(self) -> float:
-        """Share of the full scale that radiance 1 reaches; before automatic exposure has seen a picture, 1."""
+        """Fraction of full scale for radiance 1; with automatic exposure 1 before the first picture."""
         return 1.0 if self.exposure == "auto" else float(self.exposure)
 
 
 class SonarDevice(SiteDevice):
-    """A sonar whose picture is echo strength by beam and range: imaging, profiling or side-scan."""
+    """Sonar whose picture is echo strength by beam and range: imaging, profiling or side-scan."""
 
     mode: Literal["imaging", "profiling", "side_scan"] = "imaging"
-    """Profiling: ranges of the first strong returns too. Side-scan: two beams square to the sensor's x axis."""
+    """Profiling: also returns ranges of the first strong echoes. Side-scan: two beams perpendicular to the
+    sensor's x axis."""
     frequency: Positive
-    """[Hz]"""
+    """Frequency [Hz]."""
     beams: Count
-    """Evenly over the sector."""
+    """Number of beams, evenly distributed over the sector."""
     sector: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
     """Horizontal field of view [rad]."""
     beam_width: Positive
-    """Width of one beam across, between its half-power points on reception [rad]."""
+    """Horizontal width of one beam between its half-power points on reception [rad]."""
     vertical_beam_width: Annotated[float, Field(strict=True, gt=0.0, le=math.pi)]
-    """Between half-power points, one way [rad]."""
+    """Vertical width between half-power points, one way [rad]."""
     depression: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
-    """Angle of the beams' middles below the sensor's x-y plane [rad]."""
+    """Angle of the beam axes below the sensor's x-y plane [rad]."""
     range: Positive
-    """[m]"""
+    """Largest range [m]."""
     minimum_range: NonNegative = 0.0
-    """[m]"""
+    """Least range [m]."""
     bins: Count
-    """Range cells from 0 to `range`."""
+    """Number of range cells from 0 to `range`."""
     elevations: Count = 16
-    """Rays of a beam, over 1.5 vertical beam widths: what is computed, not a figure of the device."""
+    """Number of rays per beam, over 1.5 vertical beam widths: a setting of the computation, not of the device."""
     noise_level_db: Number = -110.0
-    """Noise in a range cell before gain, as echo strength at 1 m [dB]."""
+    """Noise level in a range cell before gain, as echo strength at 1 m [dB]."""
     gain_spreading: NonNegative = 30.0
-    """Time-varying gain [dB per decade of range]; 40 undoes the loss of a small target, 20 that of a wall."""
+    """Time-varying gain [dB per decade of range]; 40 compensates the loss of a small target, 20 that of a wall."""
     display: Pair = (-80.0, -20.0)
-    """Echo strengths after gain that are 0 and 255 in the picture [dB]."""
+    """Echo strengths after gain that map to 0 and 255 in the picture [dB]."""
     detection_db: Number = -60.0
-    """Level after gain that a profiling sonar takes for a return [dB]."""
+    """Level after gain above which a profiling sonar detects a return [dB]."""
 
     @model_validator(mode="after")
     def _computable(self) -> SonarDevice:
@@ -214,24 +216,24 @@ class SonarDevice(SiteDevice):
 
 
 class RangeDevice(SiteDevice):
-    """An altimeter, a rangefinder, or the beams of a DVL: the distance along each beam."""
+    """Altimeter, rangefinder, or the beams of a DVL: the distance along each beam."""
 
     beams: Annotated[int, Field(strict=True, ge=1, le=16)] = 1
-    """One along the sensor's x axis, or several evenly around it."""
+    """Number of beams: one along the sensor's x axis, or several evenly distributed around it."""
     beam_angle: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
     """Angle of each beam from the x axis [rad]."""
     beam_width: Annotated[float, Field(strict=True, ge=0.0, lt=1.571)] = 0.0
-    """Between half-power points, one way [rad]; 0 for a single ray."""
+    """Width between half-power points, one way [rad]; 0 for a single ray."""
     rays: Count = 37
-    """Number of rays in a beam: a setting of the computation, not a figure of the device."""
+    """Number of rays per beam: a setting of the computation, not of the device."""
     quantile: Probability = 0.1
-    """Share of a beam's echo that has come when the range is taken; 0 for the first."""
+    """Fraction of a beam's echo that has arrived at the measured range; 0 for the first echo."""
     minimum_range: NonNegative
-    """[m]"""
+    """Least range [m]."""
     range: Positive
-    """[m]"""
+    """Largest range [m]."""
     noise: NonNegative = 0.0
-    """Standard deviation, as a share of the range."""
+    """Standard deviation, as a fraction of the range."""
     velocity_noise: NonNegative = 0.0
     """Standard deviation of a DVL's velocity along a beam [m/s]."""
 
@@ -242,12 +244,12 @@ KINDS: dict[str, type[CameraDevice] | type[SonarDevice] | type[RangeDevice]] = {
     "sonar": SonarDevice,
     "range": RangeDevice,
 }
-"""`kind` of a sensor file -> what it holds."""
+"""`kind` of a sensor file -> its schema."""
 assert set(CameraDevice.model_fields["model"].annotation.__args__) == set(LENS_MODELS)  # type: ignore[union-attr]
 
 
 def devices() -> list[str]:
-    """Names of the devices that come with FinsSim."""
+    """Return the names of the devices that are shipped with FinsSim."""
     return names_in(DEVICES)
 
 
@@ -258,7 +260,7 @@ def load_device(name_or_path: str | os.PathLike[str]) -> Device:
         name_or_path: A sensor of the catalogue such as `ping`, or the path of a YAML file.
 
     Raises:
-        DeviceError: Unknown name, or a file that is refused; the message says where, what and what to do.
+        DeviceError: Unknown name, or an invalid file; the message states location, error and remedy.
     """
     path, label = locate(name_or_path, DEVICES, "sensor", DeviceError)
     tree = read_tree(path, label, "kind: camera", DeviceError)
@@ -269,14 +271,14 @@ def load_device(name_or_path: str | os.PathLike[str]) -> Device:
 
 
 def device_of(vehicle: Vehicle, name: str) -> Device:
-    """A sensor of a vehicle: its device, with the mount, rate, width and range cells of the vehicle's entry.
+    """Return a sensor of a vehicle: its device, with the mount, rate, width and range cells of the vehicle's entry.
 
     Args:
-        vehicle: Its `perception` has the entry.
-        name: Of the entry, such as `front_camera`.
+        vehicle: Vehicle whose `perception` contains the entry.
+        name: Name of the entry, such as `front_camera`.
 
     Raises:
-        DeviceError: The vehicle has no such entry, or its device is refused.
+        DeviceError: The vehicle has no such entry, or its device is invalid.
     """
     label = f"{vehicle.name}: perception.{name}"
     if name not in vehicle.perception:

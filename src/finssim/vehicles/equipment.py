@@ -27,7 +27,7 @@ from finssim.vehicles.part import (
 
 
 class Mount(Part):
-    """Pose of something fixed to the vehicle."""
+    """Pose of a device that is fixed to the vehicle."""
 
     position: Vector3
     """Position from the body origin, body frame [m], (3,)."""
@@ -39,99 +39,99 @@ class Sensor(Mount):
     """Common fields of every sensor."""
 
     rate: Positive
-    """[Hz]"""
+    """Rate [Hz]."""
     latency: NonNegative = 0.0
-    """Age of a sample when it is delivered [s]."""
+    """Delay between measurement and delivery [s]."""
     dropout: Probability = 0.0
-    """Chance that a sample is lost."""
+    """Probability that a sample is lost."""
 
 
 class Imu(Sensor):
     """Gyroscope and accelerometer, per axis."""
 
     gyro_noise_density: NonNegative
-    """[rad/s/√Hz]"""
+    """Noise density [rad/s/√Hz]."""
     gyro_bias_walk: NonNegative
-    """[rad/s²/√Hz]"""
+    """Random walk of the bias [rad/s²/√Hz]."""
     gyro_bias_initial: NonNegative
     """Standard deviation of the bias at power-on [rad/s]."""
     gyro_quantisation: NonNegative = 0.0
     """Step of the output [rad/s]; 0 for none."""
     accel_noise_density: NonNegative
-    """[m/s²/√Hz]"""
+    """Noise density [m/s²/√Hz]."""
     accel_bias_walk: NonNegative
-    """[m/s³/√Hz]"""
+    """Random walk of the bias [m/s³/√Hz]."""
     accel_bias_initial: NonNegative
     """Standard deviation of the bias at power-on [m/s²]."""
     accel_quantisation: NonNegative = 0.0
     """Step of the output [m/s²]; 0 for none."""
     gyro_range: Positive = math.inf
-    """Largest rate that is reported [rad/s]."""
+    """Largest reported rate [rad/s]."""
     accel_range: Positive = math.inf
-    """Largest specific force that is reported [m/s²]."""
+    """Largest reported specific force [m/s²]."""
 
 
 class DepthSensor(Sensor):
-    """Pressure sensor reporting the depth of its port."""
+    """Pressure sensor that reports the depth of its port."""
 
     noise_std: NonNegative
-    """[m]"""
+    """Standard deviation of the noise [m]."""
     bias_initial: NonNegative = 0.0
     """Standard deviation of the bias at power-on [m]."""
     bias_walk: NonNegative = 0.0
-    """[m/s/√Hz]"""
+    """Random walk of the bias [m/s/√Hz]."""
     quantisation: NonNegative = 0.0
-    """[m]; 0 for none."""
+    """Step of the output [m]; 0 for none."""
 
 
 class Dvl(Sensor):
     """Velocity over ground, in the sensor frame."""
 
     noise_std: NonNegative
-    """Per axis [m/s]."""
+    """Standard deviation of the noise per axis [m/s]."""
     bias_initial: NonNegative = 0.0
     """Standard deviation of the bias at power-on [m/s]."""
     bias_walk: NonNegative = 0.0
-    """[m/s²/√Hz]"""
+    """Random walk of the bias [m/s²/√Hz]."""
     quantisation: NonNegative = 0.0
-    """[m/s]; 0 for none."""
+    """Step of the output [m/s]; 0 for none."""
     scale_error: NonNegative = 0.0
     """Standard deviation of the relative scale error at power-on [-]."""
     velocity_range: Positive = math.inf
-    """Largest speed per axis that is reported [m/s]."""
+    """Largest reported speed per axis [m/s]."""
     max_tilt: Positive = math.inf
-    """Tilt beyond which the beams lose the floor [rad]."""
+    """Tilt beyond which the beams lose bottom lock [rad]."""
     altitude_min: NonNegative = 0.0
-    """Least height above the floor with an echo [m]."""
+    """Least height above the floor with a valid echo [m]."""
     altitude_max: Positive = math.inf
-    """Greatest height above the floor with an echo [m]."""
+    """Largest height above the floor with a valid echo [m]."""
 
 
 class Compass(Sensor):
-    """Heading of the body's x axis from world x, left positive, of a compass that knows its tilt."""
+    """Tilt-compensated compass: heading of the body's x axis from world x, left positive."""
 
     noise_std: NonNegative
-    """[rad]"""
+    """Standard deviation of the noise [rad]."""
     bias_initial: NonNegative = 0.0
-    """Standard deviation of what calibration leaves of hard iron and declination [rad]."""
+    """Standard deviation of the residual hard-iron and declination error after calibration [rad]."""
     quantisation: NonNegative = 0.0
-    """[rad]; 0 for none."""
+    """Step of the output [rad]; 0 for none."""
 
 
 SENSOR_NAME = "[a-z][a-z0-9_]{0,31}"
 """Regular expression of the name of a sensor."""
 
 OTHER_NAMES = ("pressure", "base", "camera")
-"""Names that frames and topics of a robot have besides those of its sensors."""
+"""Other names that a robot's frames and topics use."""
 
 OWN_KINDS: dict[str, type[Sensor]] = {"imu": Imu, "depth": DepthSensor, "dvl": Dvl, "compass": Compass}
-"""Kind -> schema of the sensors of FinsSim; those of other packages are in `finssim.core.registry.SENSORS`."""
+"""Kind -> schema of FinsSim's sensors; those of other packages are in `finssim.core.registry.SENSORS`."""
 
 
 class Sensors(Part):
-    """Sensors aboard by name; None for those of FinsSim that are absent.
+    """Sensors aboard by name; FinsSim's own are None if absent.
 
-    A section has the name of its kind, or names its kind: `stern_depth: {kind: depth, ...}`.
+    A section is named after its kind, or states its kind: `stern_depth: {kind: depth, ...}`.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
@@ -163,7 +163,7 @@ class Sensors(Part):
 
 
 def _additional(name: str, value: Any) -> Sensor:
-    """Return the section of a sensor that has a name of its own, or a kind of another package."""
+    """Return the section of a sensor with an individual name, or of a kind of another package."""
     if isinstance(value, Sensor):
         return value
     named = isinstance(value, dict) and "kind" in value
@@ -177,8 +177,8 @@ def _additional(name: str, value: Any) -> Sensor:
             )
         raise refuse_section(
             f"unknown key '{name}'{did_you_mean(name, known)} known keys: {', '.join(known)}; a sensor of another "
-            f"name gives its kind, such as '{name}: {{kind: depth, ...}}', and a kind of your own is known once its "
-            "package is installed: pip install -e FOLDER"
+            f"name needs a kind, such as '{name}: {{kind: depth, ...}}', and a kind of your own needs its package: "
+            "pip install -e FOLDER"
         )
     if not re.fullmatch(SENSOR_NAME, name) or name in OTHER_NAMES:
         raise refuse_section(
@@ -192,7 +192,7 @@ def _additional(name: str, value: Any) -> Sensor:
 
 
 def _schema_of(kind: str) -> type[Sensor] | None:
-    """Return the schema of a kind; None where there is none."""
+    """Return the schema of a kind; None if the kind is unknown."""
     if kind in OWN_KINDS:
         return OWN_KINDS[kind]
     try:
@@ -204,28 +204,29 @@ def _schema_of(kind: str) -> type[Sensor] | None:
 
 @cache
 def _named_kind(schema: type[Sensor], kind: str) -> type[Sensor]:
-    """Return a schema with the key `kind`, for sections that have another name."""
+    """Return a schema with the additional key `kind`, for sections with an individual name."""
     return create_model(schema.__name__, __base__=schema, kind=(Literal[kind], ...))
 
 
 class RaySensor(Sensor):
-    """A camera, imaging sonar, altimeter, rangefinder or a DVL's beams, which sense the objects of a site."""
+    """Camera, imaging sonar, altimeter, rangefinder or DVL beams, which sense the objects of a site."""
 
     device: str
-    """A sensor of `finssim worlds`, or a file (`.yaml`) beside the vehicle file."""
+    """Name of a sensor listed by `finssim worlds`, or a file (`.yaml`) beside the vehicle file."""
     orientation: Quaternion | None = None  # type: ignore[assignment]
-    """Sensor frame (x along its view, y left, z up) to body frame, xyzw, (4,); its device's own where not given."""
+    """Sensor frame (x along its view, y left, z up) to body frame, xyzw, (4,); the device's orientation if None."""
     width: Annotated[int, Field(strict=True, ge=2, le=8192)] | None = None
-    """Columns of a camera's pictures [px], their height follows; beams of a sonar. The device's own where not given."""
+    """Columns of a camera's pictures [px], whose height is scaled accordingly, or beams of a sonar; the
+    device's value if None."""
     bins: Annotated[int, Field(strict=True, ge=2, le=4096)] | None = None
-    """Range cells of a sonar's pictures; the device's own where not given."""
+    """Range cells of a sonar's pictures; the device's value if None."""
 
 
 class TagMount(Mount):
     """Pose of a tag."""
 
     edge: Positive | None = None
-    """Edge of this tag's black border, where it is not that of the others [m]."""
+    """Edge of this tag's black border, if it differs from the others [m]."""
 
 
 class Tags(Part):
@@ -247,12 +248,12 @@ class Tags(Part):
 
 
 class Mcu(Part):
-    """The motor controller at the other end of the wire."""
+    """Motor controller at the other end of the serial link."""
 
     rpm_full_scale: Positive
-    """Shaft speed of a command of 1 [rpm]."""
+    """Shaft speed at a command of 1 [rpm]."""
     command_timeout: Positive
-    """The controller stops the motors this long after the last command [s]."""
+    """Time after the last command at which the controller stops the motors [s]."""
     outputs: Annotated[int, Field(strict=True, ge=1)]
     """Number of motor outputs in a command frame."""
 
@@ -261,23 +262,23 @@ class Safety(Part):
     """Limits that stop the vehicle."""
 
     command_timeout: Positive
-    """Longest silence of the commander before thrust is zeroed [s]."""
+    """Longest interval without a command before thrust is set to zero [s]."""
     telemetry_timeout: Positive
-    """Longest silence of the vehicle [s]."""
+    """Longest interval without telemetry of the vehicle [s]."""
     state_timeout: Positive
-    """Oldest state a controller may act on [s]."""
+    """Largest age of a state that a controller may use [s]."""
     command_rate: Positive
-    """Rate at which commands are repeated and watched [Hz]."""
+    """Rate at which commands are repeated and monitored [Hz]."""
     max_tilt: Positive
-    """[rad]"""
+    """Largest tilt [rad]."""
     max_tilt_duration: NonNegative
-    """Time above `max_tilt` that is tolerated [s]."""
+    """Tolerated time above `max_tilt` [s]."""
     workspace_lower: Vector3
     """Lower corner of the allowed box, world frame (z = 0 at the surface) [m], (3,)."""
     workspace_upper: Vector3
     """Upper corner [m], (3,)."""
     wrench_scale: Vector6 = Field(default_factory=lambda: np.ones(6))
-    """Share of `wrench_limits` used on the hardware, surge sway heave roll pitch yaw, each 0 to 1."""
+    """Fraction of `wrench_limits` used on the hardware, surge sway heave roll pitch yaw, each 0 to 1."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Safety:

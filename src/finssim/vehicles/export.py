@@ -1,8 +1,8 @@
 """Export of vehicles: SDF and URDF with the plugins Hydrodynamics, Thruster, Buoyancy and, in SDF, LiftDrag of gz-sim.
 
-The link of the body has its frame at the reference point of the hydrodynamic coefficients, x forward, y left, z up. Its
-only collision shape is a box of the displaced volume at the centre of buoyancy. SDF has the added mass in
-`fluid_added_mass`, with which gz-sim's Coriolis wrench has the right sign, and is a world that runs by itself.
+The frame of the body link is at the reference point of the hydrodynamic coefficients, x forward, y left, z up. Its
+only collision shape is a box of the displaced volume at the centre of buoyancy. SDF contains the added mass in
+`fluid_added_mass`, for which gz-sim's Coriolis wrench has the correct sign, and is a complete world.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from finssim.vehicles.vehicle import Vehicle
 __all__ = ["export_vehicle"]
 
 DIAMETER = 0.1
-"""Diameter of every propeller [m]; only its product with the thrust coefficient acts."""
+"""Diameter of every propeller [m]; only its product with the thrust coefficient matters."""
 PROPELLER = 1e-4
-"""Mass of a propeller or fin as a share of the vehicle's, from whose body it is taken."""
+"""Mass of a propeller or fin as a fraction of the vehicle's, subtracted from the body."""
 EFFORT, FASTEST = 100.0, 10.0
-"""Torque [N m] of a fin's joint, and its rate [rad/s] where the file limits none."""
+"""Torque of a fin's joint [N m], and its rate [rad/s] if the file sets no limit."""
 SECTIONS = ("sensors", "perception", "tags", "mcu", "autopilot", "safety", "calibrations")
-"""Sections of a vehicle file that these formats do not hold."""
+"""Sections of a vehicle file that these formats cannot represent."""
 
 
 def export_vehicle(
     vehicle: Vehicle, out: Path, kind: Literal["sdf", "urdf"], hydrodynamics: str = "calibrated"
 ) -> list[str]:
-    """Write a vehicle for gz-sim and return what the format does not hold, one sentence for each.
+    """Write a vehicle for gz-sim and return what the format cannot represent, one sentence per item.
 
     Args:
         vehicle: The vehicle.
         out: File to write.
         kind: Format.
-        hydrodynamics: Set with coefficients.
+        hydrodynamics: Name of a set with coefficients.
 
     Raises:
         VehicleError: There is no such set with coefficients.
@@ -50,7 +50,7 @@ def export_vehicle(
     chosen = vehicle.hydrodynamic_set(hydrodynamics)
     if not isinstance(chosen, HydrodynamicSet):
         raise VehicleError(
-            f"{vehicle.name}: the set '{hydrodynamics}' is of a mesh: name one with coefficients"
+            f"{vehicle.name}: the set '{hydrodynamics}' is based on a mesh: name one with coefficients"
         )
     lost = [f"section {name}" for name in SECTIONS if name in vehicle.model_fields_set]
     lost += [f"hydrodynamic set {name}" for name in vehicle.hydrodynamics if name != hydrodynamics]
@@ -93,12 +93,12 @@ def fins_of(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def fin_joint(name: str, fin: Any, origin: NDArray[np.float64]) -> Element:
-    """Return the joint of a fin in URDF, of which the angle is its deflection; its link is NAME_fin.
+    """Return the joint of a fin in URDF, whose angle is the deflection; its link is NAME_fin.
 
     Args:
-        name: Of the fin.
-        fin: Its section.
-        origin: Of the link of the body, body frame [m], (3,).
+        name: Name of the fin.
+        fin: Section of the fin.
+        origin: Origin of the body link, body frame [m], (3,).
     """
     fastest = fin.rate_limit if np.isfinite(fin.rate_limit) else FASTEST
     limit = _x("limit", lower=fin.minimum, upper=fin.maximum, effort=EFFORT, velocity=fastest)
@@ -108,7 +108,7 @@ def fin_joint(name: str, fin: Any, origin: NDArray[np.float64]) -> Element:
 
 
 def fin_plate(fin: Any) -> tuple[NDArray[np.float64], Element]:
-    """Return roll, pitch and yaw of a fin's plate in its link [rad], (3,), and the box that is drawn, in URDF."""
+    """Return roll, pitch and yaw of a fin's plate in its link [rad], (3,), and its visual box, in URDF."""
     axes = np.column_stack([fin.chord, fin.span, np.cross(fin.chord, fin.span)])
     box = _x("geometry", _x("box", size=[*fin.sides, 0.1 * fin.sides[0]]))
     return np.asarray(quat_to_euler(matrix_to_quat(axes))), box
@@ -119,7 +119,7 @@ def _numbers(values: Any) -> str:
 
 
 def _x(tag: str, *content: Any, **attributes: Any) -> Element:
-    """Return an element of children, a text, or numbers; attributes are texts or numbers."""
+    """Return an element with children, a text, or numbers; attributes are texts or numbers."""
     made = Element(tag, {k: x if isinstance(x, str) else _numbers(x) for k, x in attributes.items()})
     for part in content:
         if isinstance(part, Element):
@@ -132,9 +132,9 @@ def _x(tag: str, *content: Any, **attributes: Any) -> Element:
 def _links(
     vehicle: Vehicle, origin: NDArray[np.float64]
 ) -> dict[str, tuple[float, Any, Any, dict[str, float]]]:
-    """Return link -> mass [kg], place in the body [m], centre of gravity in the link [m], inertia by word [kg m²].
+    """Return link -> mass [kg], position in the body [m], centre of gravity in the link [m], inertia by name [kg m²].
 
-    The body's mass is less by those of propellers and fins, so that all together have that of the vehicle.
+    The masses of propellers and fins are subtracted from the body's, so that the total mass is that of the vehicle.
     """
     body, mass = vehicle.body, vehicle.body.mass * PROPELLER
     places = {f"{name}_propeller": thruster.position - origin for name, thruster in vehicle.thrusters.items()}
@@ -157,7 +157,7 @@ def _plugin(kind: str, **words: Any) -> Element:
 
 
 def _plugins(vehicle: Vehicle, chosen: HydrodynamicSet, *, added: bool) -> list[Element]:
-    """Return Hydrodynamics, with added mass or without it, and a Thruster for each propeller."""
+    """Return the plugin Hydrodynamics, with or without added mass, and a plugin Thruster for each propeller."""
     density, words = vehicle.water.density, {}
     matrices = {"Dot": chosen.added_mass} if added else {}
     for infix, matrix in (matrices | {"": chosen.linear_damping, "abs": chosen.quadratic_damping}).items():
@@ -178,11 +178,12 @@ def _plugins(vehicle: Vehicle, chosen: HydrodynamicSet, *, added: bool) -> list[
 
 
 def _lift(vehicle: Vehicle, origin: NDArray[np.float64]) -> list[Element]:
-    """Return LiftDrag for each fin: of its link, or of the body's if its incidence does not count in full.
+    """Return a plugin LiftDrag for each fin, on its link, and on the body's link if its incidence counts only
+    partially.
 
     Args:
         vehicle: The vehicle.
-        origin: Of the link of the body, body frame [m], (3,).
+        origin: Origin of the body link, body frame [m], (3,).
     """
     plugins = []
     for name, fin in fins_of(vehicle).items():
@@ -197,7 +198,7 @@ def _lift(vehicle: Vehicle, origin: NDArray[np.float64]) -> list[Element]:
 
 
 def _geometry(vehicle: Vehicle) -> Any:
-    """Return the sides of a box of the displaced volume, in the proportions of the size [m], (3,)."""
+    """Return the sides of a box of the displaced volume, with the aspect ratios of the size [m], (3,)."""
     return vehicle.body.size * (vehicle.body.displaced_volume / np.prod(vehicle.body.size)) ** (1.0 / 3.0)
 
 

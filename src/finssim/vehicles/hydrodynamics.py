@@ -1,4 +1,4 @@
-"""The hydrodynamic sets of a vehicle file: coefficients, or drag of the hull's panels."""
+"""Hydrodynamic sets of a vehicle file: coefficients, or drag of the hull's panels."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from finssim.vehicles.part import (
 
 
 class HydrodynamicSet(Part):
-    """Coefficients of tau_D = -[D1 + D2 diag(|nu_r|)] nu_r and of the added mass (paper, eq. 1-2), and further terms.
+    """Coefficients of tau_D = -[D1 + D2 diag(|nu_r|)] nu_r and of the added mass (paper, eq. 1-2), and
+    additional terms.
 
-    Body axes, order surge sway heave roll pitch yaw. Positive diagonal entries take energy out.
-    The file gives 6 diagonal entries or 6 rows of 6. Terms stand beside them, each under its key (see `Term`); a term
-    that the file does not have reads as what it says for that.
+    Body axes, order surge sway heave roll pitch yaw. Positive diagonal entries dissipate energy.
+    The file contains 6 diagonal entries or 6 rows of 6. Each additional term is a further key (see `Term`);
+    as an attribute, a term that the file omits has the term's `absent` value.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow", arbitrary_types_allowed=True)
@@ -38,7 +39,7 @@ class HydrodynamicSet(Part):
     quadratic_damping: Matrix6
     """D2 [N s²/m², ..., N m s²], (6, 6)."""
     reference_point: Vector3 = zeros(3)
-    """Body point at which velocity and wrench of these coefficients are taken [m], (3,)."""
+    """Body point to which velocity and wrench of these coefficients refer [m], (3,)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -74,7 +75,7 @@ class HydrodynamicSet(Part):
 
     @property
     def terms(self) -> dict[str, Any]:
-        """Key -> value of the terms that the file has."""
+        """Key -> value of the terms in the file."""
         return dict(sorted((self.model_extra or {}).items()))
 
     @property
@@ -85,9 +86,9 @@ class HydrodynamicSet(Part):
 
     @property
     def term_scalars(self) -> dict[str, tuple[float, float]]:
-        """Path -> least and greatest value of the parameters of its terms that are one number: fits may move these.
+        """Path -> least and greatest value of the scalar parameters of its terms, which fits may change.
 
-        Each has the unit of its parameter.
+        Values have the unit of the parameter.
         """
         return {path: ends for name in self.terms for path, ends in TERMS[name].scalars().items()}
 
@@ -102,13 +103,13 @@ class MeshSet(Part):
     """Drag coefficients of the hull mesh's panels (paper, eq. 3-4), plus an optional added mass."""
 
     form_drag: NonNegative
-    """C_form [-]"""
+    """Form-drag coefficient C_form [-]."""
     skin_drag: NonNegative
-    """C_skin [-]"""
+    """Skin-friction coefficient C_skin [-]."""
     added_mass: Symmetric6 = zeros(6, 6)
     """M_A at `reference_point` [kg, kg m, kg m²], (6, 6)."""
     reference_point: Vector3 = zeros(3)
-    """Body point at which `added_mass` holds [m], (3,)."""
+    """Body point to which `added_mass` refers [m], (3,)."""
 
 
 def _kind(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Reader of vehicle files: a name or a path becomes a checked `Vehicle`."""
+"""Reader of vehicle files: a name or a path is loaded as a validated `Vehicle`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from finssim.vehicles.tag_layout import with_layout
 from finssim.vehicles.vehicle import ORIGINS, Origin, Provenance, Vehicle
 
 GREATEST = 1e12
-"""Magnitude of a number in a vehicle file; squares and products of greater ones leave double precision."""
+"""Largest magnitude of a number in a vehicle file; squares and products of larger ones exceed double precision."""
 OWN = re.compile(rb"(?m)^(title|extends|origin|body|thrusters)\s*:")
-"""Beginning of a line of which a vehicle file of FinsSim has one or more."""
+"""Start of a line that identifies a vehicle file of FinsSim."""
 
 Tree = dict[str, Any]
 Origins = dict[str, Provenance]
@@ -44,10 +44,10 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
 
     Args:
         name_or_path: A catalogue name such as `finsrov`, or the path of a vehicle file or of another program's model,
-            whose guessed numbers a `VehicleWarning` lists; a `Vehicle` is returned as it is.
+            whose guessed numbers are listed in a `VehicleWarning`; a `Vehicle` is returned unchanged.
 
     Raises:
-        VehicleError: Unknown name, or a file that is refused; the message says where, what and what to do.
+        VehicleError: Unknown name, or an invalid file; the message states location, error and remedy.
     """
     if isinstance(name_or_path, Vehicle):
         return name_or_path
@@ -65,14 +65,14 @@ def load_vehicle(name_or_path: Vehicle | str | os.PathLike[str]) -> Vehicle:
 
 
 def catalogue_vehicle(name: str, source: str) -> Vehicle:
-    """The vehicle of the catalogue that data names: such a name is never a path.
+    """Return the catalogue's vehicle of a name from data, which is never interpreted as a path.
 
     Args:
-        name: From a record or another file.
-        source: Who names it, for messages.
+        name: Name from a record or another file.
+        source: Source of the name, for messages.
 
     Raises:
-        VehicleError: No plain name, or none of the catalogue.
+        VehicleError: The name is not a plain name, or is not in the catalogue.
     """
     if plain_name(name, f"{source}: vehicle", VehicleError) not in catalogue():
         raise VehicleError(f"{source}: {_unknown(name)}")
@@ -80,11 +80,11 @@ def catalogue_vehicle(name: str, source: str) -> Vehicle:
 
 
 def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Provenance) -> Vehicle:
-    """See `Vehicle.replace`."""
+    """Implement `Vehicle.replace`."""
     values, origins = vehicle.values(), dict(vehicle.provenance)
     for path, value in changes.items():
         section, inner, _ = path.partition(".")
-        if inner and section in vehicle.defaults:  # a section that is changed in part is kept completely
+        if inner and section in vehicle.defaults:  # a partly changed section is stored completely
             part = getattr(vehicle, section)
             plain = (
                 {name: entry.values() for name, entry in part.items()}
@@ -101,7 +101,7 @@ def with_changes(vehicle: Vehicle, changes: Mapping[str, Any], provenance: Prove
 
 
 def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) -> tuple[Path, str]:
-    """The file of a vehicle and what to call it in messages; `beside` is searched before the catalogue."""
+    """Return the file of a vehicle and its name in messages; the folder `beside` is searched before the catalogue."""
     text = os.fspath(name_or_path)
     path = Path(text)
     foreign = path.suffix != "" and text not in VEHICLES and (beside or Path()).joinpath(path).is_file()
@@ -121,7 +121,7 @@ def _locate(name_or_path: str | os.PathLike[str], beside: Path | None = None) ->
 
 
 def importer_of(path: Path) -> Importer | None:
-    """Return the importer that recognises a file; None for a vehicle file of FinsSim and for other formats."""
+    """Return the importer that recognises a file; None for a vehicle file of FinsSim or an unknown format."""
     if path.suffix in (".yaml", ".yml") and OWN.search(first_bytes(path)):
         return None
     name = recognised("vehicle", path)
@@ -130,14 +130,14 @@ def importer_of(path: Path) -> Importer | None:
 
 @cache
 def _meshes() -> TemporaryDirectory[str]:
-    """Return the folder for the hulls of vehicles that are read from other programs' files in this process."""
+    """Return the folder for the hulls of vehicles that are imported in this process."""
     return TemporaryDirectory(prefix="finssim-")
 
 
 def _read_foreign(path: Path, extended: bool) -> tuple[Tree, Origins]:
-    """Values and origins of another program's model, with a warning that lists its guesses.
+    """Return values and origins of another program's model, with a warning that lists its guesses.
 
-    One that another file extends may lack what that file gives.
+    If another file extends the model, it may lack the values that the file adds.
     """
     importer = importer_of(path)
     assert importer is not None
@@ -159,14 +159,14 @@ def _read_foreign(path: Path, extended: bool) -> tuple[Tree, Origins]:
 
 
 def check_registered(name: str, path: Any) -> None:
-    """Refuse what is no path of a vehicle file.
+    """Refuse an object that is not the path of a vehicle file.
 
     Args:
         name: Name of the vehicle.
-        path: The object that is registered under it.
+        path: Object that is registered under the name.
 
     Raises:
-        VehicleError: It is no `pathlib.Path` of a file `NAME.yaml`.
+        VehicleError: It is not a `pathlib.Path` of a file `NAME.yaml`.
     """
     if not isinstance(path, Path) or not path.is_file() or path.name != f"{name}.yaml":
         raise VehicleError(f"{name} is {str(path)!r}, expected the pathlib.Path of a file {name}.yaml")
@@ -185,7 +185,7 @@ def _available() -> str:
 
 
 def _with_parents(path: Path, label: str, children: tuple[Path, ...]) -> tuple[Tree, Origins]:
-    """Values and origins of a file merged onto the file it extends."""
+    """Return values and origins of a file merged onto those of the file it extends."""
     if path.resolve() in children:
         raise VehicleError(f"{label}: extends itself through {' -> '.join(child.stem for child in children)}")
     values, origins = (
@@ -224,7 +224,7 @@ class _Replacing(dict[str, Any]):
 
 
 def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> Any:
-    """`change` laid over `base`: sections merge, everything else replaces, null removes."""
+    """Return `base` overridden by `change`: sections merge, other values are replaced, null removes."""
     if isinstance(base, dict) and isinstance(change, dict) and not isinstance(change, _Replacing):
         result = dict(base)
         for key in _replaced_hull(change) if path == ("hull",) else ():
@@ -237,7 +237,7 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
                 _forget(inner, origins)
                 if inner == (
                     "tags",
-                ):  # a vehicle may have none; every other section left out has its default
+                ):  # a vehicle may have no tags; every other omitted section has its default
                     result[key] = None
             else:
                 result[key] = _merged(base.get(key), value, inner, origins)
@@ -247,7 +247,7 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
 
 
 def _replaced_hull(change: Tree) -> tuple[str, ...]:
-    """Inherited keys of a hull that a new one does not keep: it is parametric or from a file, never both."""
+    """Return the inherited keys of a hull that a new one replaces: it is parametric or from a file, never both."""
     if change.get("file") is not None:
         return ("parametric",)
     return ("file", "scale") if change.get("parametric") is True else ()
@@ -260,9 +260,9 @@ def _forget(path: tuple[str, ...], origins: Origins) -> None:
 
 
 def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tuple[Tree, Origins]:
-    """Give every thruster or actuator, which `noun` says, the numbers of its group; its own come first.
+    """Add the values of its group to every thruster or actuator (`noun`); its own values take precedence.
 
-    A thruster keeps the name of its group, by which fits change it.
+    A thruster keeps the name of its group, which fits use to change the group's parameters.
     """
     groups = values.pop(f"{noun}_groups", {})
     members = values.get(f"{noun}s")
@@ -279,7 +279,7 @@ def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tup
         if group not in groups:
             raise VehicleError(
                 f"{label}: {noun}s.{name}: group is '{group}'{did_you_mean(group, list(groups))} "
-                f"expected one of {', '.join(groups) or f'{noun}_groups, which the file does not give'}"
+                f"expected one of {', '.join(groups) or f'{noun}_groups, which the file does not contain'}"
             )
         for key in groups[group]:
             if key not in member:
@@ -295,7 +295,7 @@ def _expand_groups(values: Tree, origins: Origins, label: str, noun: str) -> tup
 
 
 def checked(values: Tree, origins: Origins, name: str, path: Path | None, label: str) -> Vehicle:
-    """Return the vehicle of values and their origins by dotted path, with every refusal as one sentence.
+    """Return the vehicle from values and their origins by dotted path; every error is reported in one sentence.
 
     Args:
         values: Content of a vehicle file, without origins, in its units.
@@ -305,7 +305,7 @@ def checked(values: Tree, origins: Origins, name: str, path: Path | None, label:
         label: Name of the file in messages.
 
     Raises:
-        VehicleError: A value is refused.
+        VehicleError: A value is invalid.
     """
     for key in ("name", "path", "provenance"):
         if key in values:
@@ -322,7 +322,7 @@ def checked(values: Tree, origins: Origins, name: str, path: Path | None, label:
 
 
 def _with_payloads(vehicle: Vehicle, label: str) -> Vehicle:
-    """Return the vehicle of a file with its payloads in its body; added mass and drag remain those of the file."""
+    """Return the vehicle of a file with its payloads added to the body; added mass and drag are unchanged."""
     if not vehicle.payloads:
         return vehicle
     body, loads = vehicle.body, list(vehicle.payloads.values())
@@ -357,7 +357,7 @@ def _with_payloads(vehicle: Vehicle, label: str) -> Vehicle:
 
 
 def _set(tree: Any, path: list[str], value: Any, label: str, done: tuple[str, ...] = ()) -> list[str]:
-    """Assign at a dotted path in plain values; `*` is every key. Returns the full paths assigned."""
+    """Assign a value at a dotted path in plain values; `*` matches every key. Return the full paths assigned."""
     key, rest = path[0], path[1:]
     if isinstance(tree, list):
         if not key.isdigit() or int(key) >= len(tree):
@@ -366,7 +366,7 @@ def _set(tree: Any, path: list[str], value: Any, label: str, done: tuple[str, ..
     elif isinstance(tree, dict):
         if key == "*":
             return [full for name in tree for full in _set(tree, [str(name), *rest], value, label, done)]
-        names = {str(name): name for name in tree}  # ids of tags are numbers
+        names = {str(name): name for name in tree}  # tag ids are numbers
         index = names.get(key, key)
         if rest and key not in names:
             raise VehicleError(
@@ -385,14 +385,14 @@ _MARKS = ("origin", "source", "note")
 
 
 def read_file(path: Path, label: str) -> tuple[dict[str, Any], dict[str, Provenance]]:
-    """Plain values of a vehicle file, and the origin of its numbers by dotted path.
+    """Return plain values of a vehicle file, and the origin of its numbers by dotted path.
 
     Args:
         path: The file.
-        label: How messages call it.
+        label: Name of the file in messages.
 
     Raises:
-        VehicleError: Unreadable, malformed, or a number without an origin.
+        VehicleError: The file is unreadable or malformed, or a number has no origin.
     """
     tree = read_mapping(path, VehicleError, such_as="body: {mass: 11.2}", label=label)
     if not isinstance(tree.get("extends"), str | None):
@@ -401,7 +401,7 @@ def read_file(path: Path, label: str) -> tuple[dict[str, Any], dict[str, Provena
         )
     records = tree.pop(
         "calibrations", None
-    )  # what a fit did, not numbers of the vehicle: they need no origin
+    )  # records of fits, not parameters of the vehicle: they need no origin
     provenance: dict[str, Provenance] = {}
     values = _plain(tree, (), None, provenance, label)
     if records is not None:
@@ -412,7 +412,7 @@ def read_file(path: Path, label: str) -> tuple[dict[str, Any], dict[str, Provena
 def _plain(
     node: Any, path: tuple[str, ...], inherited: Provenance | None, origins: dict[str, Provenance], label: str
 ) -> Any:
-    """Strip the origin marks from a tree, recording what they say about the numbers below them."""
+    """Strip the origin keys from a tree, recording the origins of the numbers below them."""
     if isinstance(node, dict):
         here = _marked(node, path, inherited, label)
         if "value" in node:
@@ -450,10 +450,10 @@ def _plain(
 def _marked(
     node: dict[Any, Any], path: tuple[str, ...], inherited: Provenance | None, label: str
 ) -> Provenance | None:
-    """Origin in force inside a mapping: a new `origin` starts afresh, a new `source` or `note` refines."""
+    """Return the origin inside a mapping: a new `origin` replaces it, a new `source` or `note` refines it."""
     for mark in _MARKS:
         if mark in node and not isinstance(node[mark], str):
-            raise VehicleError(f"{label}: {_where(path)}: {mark} is {node[mark]!r}, expected words")
+            raise VehicleError(f"{label}: {_where(path)}: {mark} is {node[mark]!r}, expected text")
     source, note = node.get("source", ""), node.get("note", "")
     if "origin" in node:
         origin = node["origin"]
@@ -471,7 +471,7 @@ def _marked(
 
 
 def _fold(path: tuple[str, ...], length: int, origins: dict[str, Provenance]) -> None:
-    """One entry for a list whose elements share their origin."""
+    """Merge the origins of a list's elements into one entry if they are equal."""
     keys = [".".join((*path, str(i))) for i in range(length)]
     if keys and all(key in origins for key in keys) and len({origins[key] for key in keys}) == 1:
         origins[".".join(path)] = origins[keys[0]]

@@ -1,6 +1,6 @@
-"""Base class and field types of everything a vehicle file may hold.
+"""Base class and field types of all sections of a vehicle file.
 
-Arrays are NumPy float64, read-only, and every message names the value it refuses and what was expected.
+Arrays are read-only NumPy float64; every error message states the invalid value and the expected one.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from finssim.core.page import notebook_html
 
 UNIT_TOLERANCE = 1e-3
 SYMMETRY_TOLERANCE = 1e-3
-"""Asymmetry accepted as rounding of printed digits, relative to the largest entry."""
+"""Relative asymmetry that is accepted as rounding of printed digits."""
 
 
 def refuse_value(message: str) -> PydanticCustomError:
-    """Error about one key; `message` continues the key's name ("is -3, expected > 0: ...")."""
+    """Return an error about one key; `message` continues after the key's name ("is -3, expected > 0: ...")."""
     return PydanticCustomError("value", "{message}", {"message": message})
 
 
@@ -32,13 +32,13 @@ def refuse_section(message: str) -> PydanticCustomError:
 
 
 def did_you_mean(word: str, available: list[str]) -> str:
-    """`, did you mean 'x'?` for the nearest known word, or `;` where none is near."""
+    """Return `, did you mean 'x'?` for the nearest known word, or `;` if none is similar."""
     close = difflib.get_close_matches(word, available, n=1)
     return f", did you mean '{close[0]}'?" if close else ";"
 
 
 class Part(BaseModel):
-    """A frozen section of a vehicle file: unknown keys are refused, equality is equality of the numbers."""
+    """Frozen section of a vehicle file: unknown keys are refused, and equality compares the numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
@@ -59,7 +59,8 @@ class Part(BaseModel):
         return notebook_html(type(self).__name__, ("", ""), rows)
 
     def values(self) -> dict[str, Any]:
-        """Plain nested dict of what was given (lists for arrays), ready to be read again."""
+        """Return the explicitly set values as a plain nested dict (lists for arrays), which can be validated
+        again."""
         return self.model_dump(exclude_unset=True)
 
     def __eq__(self, other: object) -> bool:
@@ -78,7 +79,7 @@ def _array(value: Any, shape: tuple[int, ...], expected: str) -> NDArray[np.floa
             for item in x:
                 refuse_non_numbers(item)
         elif not is_number(x):
-            raise refuse_value(f"holds {x!r}, expected {expected}")
+            raise refuse_value(f"contains {x!r}, expected {expected}")
 
     if not isinstance(value, (list, tuple, np.ndarray)):
         raise refuse_value(f"is {value!r}, expected {expected}")
@@ -91,7 +92,9 @@ def _array(value: Any, shape: tuple[int, ...], expected: str) -> NDArray[np.floa
     if array.shape != shape:
         raise refuse_value(f"has shape {array.shape}, expected {expected}")
     if not np.all(np.isfinite(array)):
-        raise refuse_value(f"holds {array[~np.isfinite(array)][0]}, expected finite numbers: give {expected}")
+        raise refuse_value(
+            f"contains {array[~np.isfinite(array)][0]}, expected finite numbers: give {expected}"
+        )
     return array
 
 
@@ -120,7 +123,7 @@ def _unit(array: NDArray[np.float64], remedy: str) -> NDArray[np.float64]:
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > UNIT_TOLERANCE:
         raise refuse_value(f"has length {length:.7g}, expected 1: give a {remedy}")
-    # A vector that was normalised before stays bit by bit what it is, so that its file keeps its hash.
+    # A vector that is already normalised remains bitwise unchanged, so that its file keeps its hash.
     return _frozen(array if abs(length - 1.0) < 4.0 * np.finfo(np.float64).eps else array / length)
 
 
@@ -184,28 +187,28 @@ Symmetric6 = Annotated[NDArray[np.float64], BeforeValidator(lambda v: _frozen(_s
 
 
 def zeros(*shape: int) -> NDArray[np.float64]:
-    """Read-only zeros, for defaults that mean "none". They have the unit of the field."""
+    """Return read-only zeros, for defaults that mean "none". They have the unit of the field."""
     return _frozen(np.zeros(shape))
 
 
 def identity_quaternion() -> NDArray[np.float64]:
-    """Read-only [0, 0, 0, 1]: mounted along the body axes."""
+    """Return the read-only quaternion [0, 0, 0, 1]: mounted along the body axes."""
     return _frozen(np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin") -> str:
-    """One pydantic complaint in the form `file: section: key value, expectation: what to do`.
+    """Return one pydantic error as a sentence `file: section: key value, expectation: remedy`.
 
     Args:
-        detail: One of `ValidationError.errors()`.
-        label: What to call the file.
-        missing: What to do about a key that is not there.
+        detail: One item of `ValidationError.errors()`.
+        label: Name of the file in messages.
+        missing: Remedy for a missing key.
     """
     location = [str(item) for item in detail["loc"] if not str(item).startswith("<")]
     kind, value, context = detail["type"], detail.get("input"), detail.get("ctx", {})
     if kind == "section":
         return ": ".join(filter(None, [label, ".".join(location), context["message"]]))
-    if not location:  # raised by a library about several sections
+    if not location:  # raised by a library for several sections
         return f"{label}: {str(detail['msg']).removeprefix('Value error, ')}"
     bounds = {
         "greater_than": ("gt", ">"),
@@ -234,8 +237,8 @@ def sentence_of(detail: Any, label: str, missing: str = "add it, with its origin
 
 
 class VehicleError(ValueError):
-    """A vehicle file or a value given for a vehicle is refused; the message states where, what and what to do."""
+    """Invalid vehicle file, or invalid value for a vehicle; the message states location, error and remedy."""
 
 
 class VehicleWarning(UserWarning):
-    """Numbers of a vehicle are guesses because another program's file lacks them."""
+    """Some numbers of a vehicle are guesses because another program's file lacks them."""

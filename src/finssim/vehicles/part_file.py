@@ -1,4 +1,4 @@
-"""Reader of files that hold one part, such as a world or a device: found by name or path, and checked."""
+"""Reader of files that contain one part, such as a world or a device: located by name or path, and validated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from finssim.core.yaml_file import read_mapping
 from finssim.vehicles.part import Part, did_you_mean, sentence_of
 
 SMALLEST, GREATEST = 1e-9, 1e9
-"""Magnitude of a number in a world or a device that is not 0."""
+"""Limits of the magnitude of a nonzero number in a world or a device."""
 P = TypeVar("P", bound=Part)
 
 
@@ -28,10 +28,10 @@ def locate(
     """Find a file by its name in a catalogue, or by its path.
 
     Args:
-        name_or_path: Which.
+        name_or_path: Name or path.
         catalogue: Directory of the named files.
         kind: Kind of the content, in messages.
-        refuse: Error that is raised.
+        refuse: Class of the error.
 
     Returns:
         The path, and its name in messages.
@@ -50,13 +50,13 @@ def locate(
 
 
 def read_tree(path: Path, label: str, such_as: str, refuse: type[ValueError]) -> dict[Any, Any]:
-    """Read the mapping of a file, whose numbers are within reach of single precision.
+    """Read the mapping of a file, whose numbers are within the range of single precision.
 
     Args:
         path: File.
-        label: Its name in messages.
+        label: Name of the file in messages.
         such_as: Example of its content, in messages.
-        refuse: Error that is raised.
+        refuse: Class of the error.
     """
     tree = read_mapping(path, refuse, such_as=such_as, label=label)
     _refuse_unphysical(tree, label, refuse)
@@ -67,14 +67,16 @@ def read_tree(path: Path, label: str, such_as: str, refuse: type[ValueError]) ->
 
 
 def _refuse_unphysical(value: Any, label: str, refuse: type[ValueError]) -> None:
-    """Refuse numbers that single precision, in which worlds are computed, cannot hold."""
+    """Refuse numbers outside the range of single precision, in which worlds are simulated."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             if key != "seed":
                 _refuse_unphysical(item, f"{label}: {key}" if isinstance(value, dict) else label, refuse)
     elif type(value) in (int, float) and value and not SMALLEST <= abs(value) <= GREATEST:
-        if math.isfinite(value):  # other references are refused where they occur
-            raise refuse(f"{label} holds {value:g}, expected 0 or a number from {SMALLEST:g} to {GREATEST:g}")
+        if math.isfinite(value):  # other values are refused elsewhere
+            raise refuse(
+                f"{label} contains {value:g}, expected 0 or a number from {SMALLEST:g} to {GREATEST:g}"
+            )
 
 
 def checked_part(kind: type[P], tree: dict[Any, Any], label: str, refuse: type[ValueError]) -> P:

@@ -35,7 +35,7 @@ _LEGEND = "no mark: measured or published    · derived    ? guessed"
 
 
 WIDE = 110
-"""Columns of a terminal from which the hydrodynamic sets have a column of their own in the catalogue."""
+"""Terminal width from which the hydrodynamic sets have a separate column in the catalogue [columns]."""
 
 
 def print_catalogue(console: Console) -> None:
@@ -55,11 +55,11 @@ def print_catalogue(console: Console) -> None:
 
 
 def print_vehicle(vehicle: Vehicle, console: Console) -> None:
-    """Everything about one vehicle: numbers with their origin, what it can do, what its checks found.
+    """Print everything about one vehicle: numbers with their origin, its capability, and the results of its checks.
 
     Args:
-        vehicle: Any vehicle, of the catalogue or of a user's file.
-        console: Where to print.
+        vehicle: Vehicle of the catalogue or of a user's file.
+        console: Console to print on.
     """
     console.print(f"[bold]{escape(vehicle.title)}[/bold]")
     console.print(escape(vehicle.description.strip()))
@@ -77,12 +77,12 @@ def print_vehicle(vehicle: Vehicle, console: Console) -> None:
 
 
 def print_motions(top: float, motions: Mapping[str, tuple[str, str, float | None]], console: Console) -> None:
-    """Print what a vehicle does without control.
+    """Print the uncontrolled motion of a vehicle.
 
     Args:
-        top: Its top speed [m/s].
-        motions: Motion -> what it does at rest and at top speed, and the speed from which it grows [m/s].
-        console: Where to print.
+        top: Top speed [m/s].
+        motions: Motion -> behaviour at rest and at top speed, and the speed above which it is unstable [m/s].
+        console: Console to print on.
     """
     heads = ("", "at rest", f"at {top:.2f} m/s", "unstable above [m/s]")
     items = motions.items()
@@ -91,9 +91,9 @@ def print_motions(top: float, motions: Mapping[str, tuple[str, str, float | None
 
 
 def vehicle_data(vehicle: Vehicle) -> dict[str, Any]:
-    """Return a vehicle as plain data: its values and what each axis can do alone, in the order of `AXES`.
+    """Return a vehicle as plain data: its values and the capability of each axis, in the order of `AXES`.
 
-    Wrenches are in N and N m, terminal speeds in m/s and rad/s, time constants in s; None where there is none.
+    Wrenches are in N and N m, terminal speeds in m/s and rad/s, time constants in s; None if undefined.
     """
     capability = wrench_capability(vehicle)
     sets = [name for name, chosen in vehicle.hydrodynamics.items() if isinstance(chosen, HydrodynamicSet)]
@@ -143,7 +143,7 @@ def _tables(vehicle: Vehicle) -> Iterator[Table]:
     yield _table("Thrusters", heads, _thrusters(vehicle))
     if vehicle.actuators:
         heads = ("", "kind", "position [m]", "travel", "rate [1/s]", "lag [s]", "play")
-        yield _table("Other actuators (angles in rad, volumes in m³, ways in m)", heads, _others(vehicle))
+        yield _table("Other actuators (angles in rad, volumes in m³, lengths in m)", heads, _others(vehicle))
     if "sensors" not in vehicle.defaults:
         heads = ("", "kind", "position [m]", "rate [Hz]", "latency [s]", "lost")
         aboard = (
@@ -158,14 +158,14 @@ def _tables(vehicle: Vehicle) -> Iterator[Table]:
             for n, s in vehicle.perception.items()
         )  # fmt: skip
         yield _table("Cameras, sonars, altimeters", heads, sensors)
-    title = "What it can do (each axis alone, about the wrench reference)"
+    title = "Capability (each axis alone, about the wrench reference)"
     yield _table(title, ("", *AXES), _performance(vehicle))
     heads = ("numbers", "origin", "source and note")
-    yield _table("Where the numbers come from", heads, _sources(vehicle), words=True)
+    yield _table("Sources of the numbers", heads, _sources(vehicle), words=True)
     if vehicle.defaults:
-        title = "Defaults (the file does not give these: for the virtual world; measure your own)"
+        title = "Defaults (missing in the file: for simulation only; measure your own)"
         rows = ((name, escape(DEFAULTS[name])) for name in vehicle.defaults)
-        yield _table(title, ("", "what stands for it"), rows, words=True)
+        yield _table(title, ("", "default"), rows, words=True)
     marks = {(True, False): "[green]pass[/green]", (True, True): "[yellow]note[/yellow]"}
     found = (
         (marks.get((f.passed, f.remark), "[red]fail[/red]"), f.name, escape(f.sentence))
@@ -178,7 +178,7 @@ DRAG = ("form_drag", "skin_drag")
 
 
 def _table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], *, words: bool = False) -> Table:
-    """A table of numbers to the right of their names, or of words."""
+    """Return a table of right-aligned numbers with their names, or of text."""
     table = Table(title=Text(title, "bold"), title_justify="left", box=None, pad_edge=False)
     for k, head in enumerate(heads):
         table.add_column(Text(head), justify="left" if words or k == 0 else "right", overflow="fold")
@@ -188,7 +188,7 @@ def _table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], *, w
 
 
 def _mark(vehicle: Vehicle, path: str) -> str:
-    """Mark of a number, or of the least known entry of a list whose entries differ in origin."""
+    """Return the mark of a number, or of the least reliable entry of a list whose entries differ in origin."""
     entries = [p.origin for key, p in vehicle.provenance.items() if key.startswith(f"{path}.")]
     if not entries:
         return _MARK[vehicle.origin_of(path).origin]
@@ -297,24 +297,24 @@ def _sources(vehicle: Vehicle) -> Iterator[Sequence[str]]:
         yield escape(text), origin, escape("; ".join(filter(None, [source, note])))
 
 
-# A picture of a vehicle's thruster layout.
+# Picture of a vehicle's thruster layout.
 
 ARROW = 0.16
-"""Length of a thrust arrow, relative to the vehicle's."""
+"""Length of a thrust arrow, relative to the vehicle's length."""
 
 
 def draw_vehicle(vehicle: Vehicle, picture: Path) -> None:
-    """Save a picture of the thruster layout, from above and from the left, arrows along positive thrust.
+    """Save a picture of the thruster layout, from above and from the left, with arrows along positive thrust.
 
     Args:
-        vehicle: Any vehicle.
-        picture: File to write; its suffix chooses the format.
+        vehicle: Vehicle to draw.
+        picture: File to write; its suffix determines the format.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 5.2), layout="constrained")
     above, side = figure.subplots(1, 2)
-    # Forward points up the page from above and to the left from the left side: both axes across run backwards.
+    # Forward points up in the top view and left in the side view: both horizontal axes are reversed.
     _draw_view(above, vehicle, across=1, up=0)
     above.set(title="from above", xlabel="y, left [m]", ylabel="x, forward [m]")
     _draw_view(side, vehicle, across=0, up=2)
@@ -326,7 +326,8 @@ def draw_vehicle(vehicle: Vehicle, picture: Path) -> None:
 
 
 def _envelope(vehicle: Vehicle) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner: of the hull's mesh, or of the size placed about the centre of buoyancy."""
+    """Return the lower and upper corner of the hull's mesh, or of the envelope placed about the centre of
+    buoyancy."""
     if vehicle.hull is not None:
         vertices, _ = vehicle.hull_mesh()
         return vertices.min(axis=0), vertices.max(axis=0)
@@ -335,7 +336,7 @@ def _envelope(vehicle: Vehicle) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _draw_view(axes: Axes, vehicle: Vehicle, across: int, up: int) -> None:
-    """One projection, seen along the axis that is neither `across` nor `up`; `across` grows to the left."""
+    """Draw one projection, seen along the axis that is neither `across` nor `up`; `across` increases to the left."""
     from matplotlib.patches import Rectangle
     from matplotlib.ticker import MaxNLocator
 

@@ -1,7 +1,7 @@
 """Reader of the tag files of apriltag_ros: bundles with poses and sizes (ROS 1), and settings with sizes (ROS 2).
 
-Tag frame of apriltag_ros: x to the right and y up in the printed image, z out of the printed side, as ours; `size` is
-the edge of the black border. The poses of a bundle are in a frame of its own.
+Tag frame of apriltag_ros: x to the right and y up in the printed image, z out of the printed side, as ours;
+`size` is the edge of the black border. The poses of a bundle are in the frame of the bundle.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from finssim.vehicles.part import VehicleError, did_you_mean
 __all__ = ["LaidTag", "TagLayout", "read_tag_layout", "with_layout"]
 
 OF_BUNDLE = {"id", "size", "x", "y", "z", "qw", "qx", "qy", "qz"}
-"""Words of a tag in a bundle."""
+"""Keys of a tag in a bundle."""
 OF_ROS_1 = {
     "standalone_tags", "tag_bundles", "tag_family", "tag_threads", "tag_decimate", "tag_blur", "tag_refine_edges",
     "tag_debug", "max_hamming_dist", "publish_tf", "transport_hint", "remove_duplicates",
 }  # fmt: skip
-"""Words of tags.yaml and settings.yaml of ROS 1."""
+"""Keys of tags.yaml and settings.yaml of ROS 1."""
 OF_ROS_2 = {
     "family", "size", "tag", "image_transport", "max_hamming", "profile", "pose_estimation_method", "z_up", "detector",
     "qos_overrides", "use_sim_time", "publish_tf",
 }  # fmt: skip
-"""Words of the parameters of ROS 2."""
+"""Keys of the parameters of ROS 2."""
 PARAMETERS = "ros__parameters"
 """Key of parameters in a file of ROS 2."""
 
@@ -41,7 +41,7 @@ class LaidTag(NamedTuple):
     """Pose of a tag in a bundle."""
 
     position: NDArray[np.float64]
-    """Centre, frame of the bundle [m], (3,)."""
+    """Centre in the frame of the bundle [m], (3,)."""
     orientation: NDArray[np.float64]
     """Tag frame to frame of the bundle, xyzw, (4,)."""
 
@@ -53,24 +53,24 @@ class TagLayout:
     sizes: Mapping[int, float]
     """Edge of each tag's black border by id [m]."""
     poses: Mapping[int, LaidTag] = field(default_factory=dict)
-    """Pose of each tag by id; empty where the file gives sizes alone."""
+    """Pose of each tag by id; empty if the file contains only sizes."""
     family: str = ""
-    """Family of the tags; empty where the file names none."""
+    """Family of the tags; empty if the file contains none."""
     remarks: tuple[str, ...] = ()
-    """Sentences about what was not read."""
+    """Sentences about contents that were not read."""
 
 
 def read_tag_layout(path: Path) -> TagLayout:
     """Read a tag file of apriltag_ros.
 
     Raises:
-        VehicleError: It cannot be read, holds an unknown word, several bundles, or a number that is none.
+        VehicleError: The file cannot be read, or contains an unknown key, several bundles, or an invalid number.
     """
     tree = read_mapping(
         path, VehicleError, such_as="tag_bundles: [{name: top, layout: [{id: 1, size: 0.08}]}]"
     )
     inner: Any = tree
-    for _ in range(3):  # a namespace and the name of a node may be around the parameters
+    for _ in range(3):  # parameters may be nested under a namespace and a node name
         if isinstance(inner, Mapping) and PARAMETERS in inner:
             return _ros_2(_mapping(inner[PARAMETERS], f"{path}: {PARAMETERS}"), path)
         values = list(inner.values()) if isinstance(inner, Mapping) else []
@@ -79,18 +79,18 @@ def read_tag_layout(path: Path) -> TagLayout:
 
 
 def with_layout(tags: Mapping[str, Any], folder: Path, label: str) -> dict[str, Any]:
-    """Return the section `tags` of a vehicle file with the tags of its `layout` in place of that word.
+    """Return the section `tags` of a vehicle file with its key `layout` replaced by the tags of that file.
 
-    A bundle becomes `mounts`: `position` and `orientation` are the pose of its frame in the body frame. Sizes alone
-    are those of the section's own `mounts`.
+    A bundle becomes `mounts`: `position` and `orientation` are the pose of its frame in the body frame. Sizes
+    without poses are assigned to the section's own `mounts`.
 
     Args:
         tags: The section.
         folder: Folder of the vehicle file.
-        label: What a message calls the vehicle file.
+        label: Name of the vehicle file in messages.
 
     Raises:
-        VehicleError: The file cannot be read, or does not fit.
+        VehicleError: The file cannot be read, or does not match the section.
     """
     section = dict(tags)
     layout = read_tag_layout(folder / str(section.pop("layout")))

@@ -1,6 +1,6 @@
-"""Hydrodynamic terms: parts of the water's wrench beyond added mass and damping, each from one file.
+"""Hydrodynamic terms: contributions to the water's wrench beyond added mass and damping, one file per term.
 
-This layer reads their keys in a vehicle file; `finssim.physics.terms` adds terms and evaluates them.
+This package reads their keys in a vehicle file; `finssim.physics.terms` registers terms and evaluates them.
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Term:
-    """A part of the wrench that water exerts on a vehicle, with everything that the package has to know of it.
+    """Term of the wrench that water exerts on a vehicle, with everything that the package needs to know about it.
 
-    Its parameters are numbers, vectors of 3 or 6, or 6x6 matrices. Where all of them are zero the wrench has to be
-    zero: so it is of vehicles that do not have the term, beside others that do.
+    Its parameters are numbers, vectors of 3 or 6, or 6x6 matrices. If all of them are zero the wrench must be
+    zero: vehicles without the term are simulated in the same batch with zero parameters.
     """
 
     name: str
-    """Its key in a hydrodynamic set of a vehicle file."""
+    """Key in a hydrodynamic set of a vehicle file."""
     schema: Any
-    """Content of that key: a `Part` whose fields are the parameters, or the type of its only parameter."""
+    """Schema of the key: a `Part` whose fields are the parameters, or the type of its only parameter."""
     units: Mapping[str, str]
     """Unit of each parameter by its name; an only parameter has the name of the term."""
     wrench: Any
     """`wp.func` -> vec6 [N, N m], body frame, about the reference point of the set; see `finssim.physics.terms`."""
     slope: Any = None
-    """`wp.func` of the same arguments -> vec6: how fast the wrench falls with the velocity on each axis, 0 or more
-    [N s/m, N m s]. A stiff damping needs it, for the integrator takes that much implicitly; nu_r is here that of the
-    point where inertia is nearly diagonal."""
+    """`wp.func` of the same arguments -> vec6: decrease of the wrench with the velocity on each axis, at
+    least 0 [N s/m, N m s]. Required for stiff damping, which the integrator then treats implicitly; here nu_r
+    is that of the point about which the inertia is nearly diagonal."""
     absent: Any = None
-    """Value of the key where the file does not have it."""
+    """Value of the key if the file omits it."""
     quadratic: Callable[[Any], Array] = field(default=lambda value: np.zeros(6))
-    """Function from the content of the key to its share in the drag d2 v|v| of motion along each axis alone, (6,)."""
+    """Function of the value of the key that returns its contribution to the drag d2 v|v| along each axis
+    alone, (6,)."""
     check: Callable[[Any], tuple[bool, str]] | None = None
-    """Function from the content of the key to whether it is plausible, and a sentence about it."""
+    """Function of the value of the key that returns whether it is plausible, and a sentence about it."""
 
     @cached_property
     def section(self) -> type[BaseModel]:
-        """A section of a vehicle file with this key alone: what pydantic checks and writes."""
+        """Model of a section of a vehicle file with only this key, which pydantic validates and writes."""
         fields: dict[str, Any] = {self.name: (self.schema, ...)}
         return create_model(self.name, __base__=Part, **fields)
 
@@ -63,26 +64,26 @@ class Term:
         return {self.name: self.name}
 
     def read(self, value: Any) -> Any:
-        """Checked value of the key; pydantic's error names the key."""
+        """Return the validated value of the key; pydantic's error names the key."""
         return getattr(self.section.model_validate({self.name: value}), self.name)
 
     def plain(self, value: Any) -> Any:
-        """The value as plain numbers, lists and dicts."""
+        """Return the value as plain numbers, lists and dicts."""
         return self.section.model_construct({self.name}, **{self.name: value}).model_dump(exclude_unset=True)[
             self.name
         ]
 
     def numbers(self, value: Any) -> dict[str, Any]:
-        """Path of each parameter -> its number or array."""
+        """Return path of each parameter -> its number or array."""
         return {
             path: value if path == self.name else getattr(value, name)
             for name, path in self.parameters.items()
         }
 
     def scalars(self) -> dict[str, tuple[float, float]]:
-        """Path -> lowest and highest value that the schema allows, of the parameters that are one number.
+        """Return path -> lowest and highest value allowed by the schema, for each scalar parameter.
 
-        Each has the unit of its parameter.
+        Values have the unit of the parameter.
         """
         if self.name in self.parameters:
             fields = self.section.model_fields
@@ -103,6 +104,6 @@ class Term:
 
 
 def unit_of(path: str) -> str:
-    """Unit of a term's parameter, by its path within a hydrodynamic set."""
+    """Return the unit of a term's parameter, by its path within a hydrodynamic set."""
     term, _, name = path.rpartition(".")
     return TERMS[term or name].units[name]

@@ -1,4 +1,4 @@
-"""The vehicle: the content of its file, and the matrices that follow directly."""
+"""Vehicle: the content of its file, and the matrices derived from it."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ Array = NDArray[np.float64]
 
 
 class ReferenceWater(Part):
-    """The water the numbers of the file were given for."""
+    """Water to which the numbers of the file refer."""
 
     density: Positive
-    """[kg/m³]"""
+    """Density [kg/m³]."""
     gravity: Positive
-    """[m/s²]"""
+    """Gravity [m/s²]."""
 
 
 class Body(Part):
@@ -69,21 +69,22 @@ class Body(Part):
     mass: Positive
     """Dry mass including flooded-in solids, without entrained water [kg]."""
     inertia: Inertia
-    """About the centre of gravity, body axes, (3, 3) [kg m²]; the file gives 3 diagonal entries or 3 rows of 3."""
+    """Inertia about the centre of gravity, body axes, (3, 3) [kg m²]; 3 diagonal entries or 3 rows of 3 in
+    the file."""
     center_of_gravity: Vector3
-    """[m], (3,)"""
+    """Centre of gravity [m], (3,)."""
     displaced_volume: Positive
     """Volume of water displaced when fully submerged [m³]."""
     center_of_buoyancy: Vector3
-    """[m], (3,)"""
+    """Centre of buoyancy [m], (3,)."""
     size: Positive3
     """Envelope box along x, y, z [m], (3,)."""
     surface_half_height: Positive
-    """Half height of the layer in which buoyancy fades out at the surface [m]."""
+    """Half height of the layer at the surface in which buoyancy decreases to zero [m]."""
 
 
 class Payload(Part):
-    """Something fixed to the vehicle, such as a lamp or ballast: a homogeneous box, or a point without a size."""
+    """Object fixed to the vehicle, such as a lamp or ballast: a homogeneous box, or a point if it has no size."""
 
     mass: NonNegative
     """Dry mass [kg]."""
@@ -92,7 +93,7 @@ class Payload(Part):
     position: Vector3
     """Centre of gravity and of buoyancy, from the body origin, body frame [m], (3,)."""
     size: Positive3 | None = None
-    """Sides of the box along x, y, z [m], (3,); without it the payload has no inertia about its own centre."""
+    """Sides of the box along x, y, z [m], (3,); if None the payload has no inertia about its own centre."""
 
     @model_validator(mode="after")
     def _something(self) -> Payload:
@@ -110,12 +111,12 @@ class Payload(Part):
 
 
 class Hull(Part):
-    """The closed surface of the vehicle: a mesh file, or one built from `body` (envelope, volume, centre)."""
+    """Closed surface of the vehicle: a mesh file, or a mesh generated from `body` (envelope, volume, centre)."""
 
     parametric: bool = False
-    """True: build the mesh from `body.size`, `body.displaced_volume` and `body.center_of_buoyancy`."""
+    """True to generate the mesh from `body.size`, `body.displaced_volume` and `body.center_of_buoyancy`."""
     file: Path | None = None
-    """STL in body axes [m]; a relative path starts at the vehicle file."""
+    """STL file in body axes [m]; a relative path starts at the vehicle file."""
     scale: Positive = 1.0
     """Factor on the coordinates of the file."""
 
@@ -127,12 +128,12 @@ class Hull(Part):
 
 
 def skew(r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """S(r) with S(r) x = r × x. The unit is kept."""
+    """Return S(r) with S(r) x = r × x. The unit is unchanged."""
     return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
 
 
 def moved_to_origin(matrix: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A 6x6 mass or damping matrix that holds at `point` [m, body], for the twist at the body origin.
+    """Return a 6x6 mass or damping matrix, given about `point` [m, body], for the twist at the body origin.
 
     H(r)ᵀ M H(r) with H(r) = [[I, -S(r)], [0, I]]                       (Fossen 2021, eq. 3.31)
     """
@@ -142,7 +143,7 @@ def moved_to_origin(matrix: NDArray[np.float64], point: NDArray[np.float64]) -> 
 
 
 class CalibrationRecord(Part):
-    """One entry of `calibrations` in a vehicle file; no clock time is in it, so that equal fits write equal files."""
+    """Entry of `calibrations` in a vehicle file; it contains no timestamp, so that equal fits write equal files."""
 
     kind: Literal["thruster", "motor", "hydrodynamics", "mounts"]
     """Kind of the calibration."""
@@ -153,16 +154,16 @@ class CalibrationRecord(Part):
     settings: dict[str, Any] = Field(default_factory=dict)
     """Options of the method and its seed, as plain values."""
     start: str = ""
-    """`sha256` of the vehicle that it started from."""
+    """`sha256` of the initial vehicle."""
     finssim: str = ""
     """Version of FinsSim."""
     revision: str | None = None
-    """Git commit of FinsSim, where it ran from a checkout."""
+    """Git commit of FinsSim, if it ran from a checkout."""
     interrupted: bool = False
     """True if it was stopped before it converged."""
 
     def sentence(self) -> str:
-        """`hydrodynamics by simulation on 24 trials`, for lists and notes."""
+        """Return a summary such as `hydrodynamics by simulation on 24 trials`, for lists and notes."""
         count = len(self.trials)
         noun = {"thruster": "table", "mounts": "recording"}.get(self.kind, "trial")
         text = f"{self.kind} by {self.method} on {count} {noun}{'' if count == 1 else 's'}"
@@ -185,43 +186,43 @@ class Provenance(NamedTuple):
 
 
 class Vehicle(Part):
-    """One vehicle. Frames: body x forward, y left, z up; wrenches and twists are linear then angular."""
+    """Vehicle. Frames: body x forward, y left, z up; wrenches and twists are linear then angular."""
 
     title: str
-    """One line naming the vehicle and the set of numbers."""
+    """Title that names the vehicle and the set of numbers, in one line."""
     description: str
-    """Description of the vehicle, and what to know before using the numbers."""
+    """Description of the vehicle, with remarks on the use of its numbers."""
     water: ReferenceWater
     body: Body
-    """Rigid body with its payloads: `load_vehicle` has added them to the numbers of the file."""
+    """Rigid body including its payloads: `load_vehicle` adds them to the numbers of the file."""
     payloads: dict[str, Payload] = Field(default_factory=dict)
-    """Payloads that `body` contains, by name; neither part of `values` nor of `sha256`, which have their sum."""
+    """Payloads that `body` includes, by name; not part of `values` and `sha256`, whose `body` includes them."""
     hull: Hull | None = None
     hydrodynamics: dict[str, AnyHydrodynamicSet]
-    """Sets by name: `calibrated`, `simplified`, `mesh`; only what the sources give."""
+    """Hydrodynamic sets by name: `calibrated`, `simplified`, `mesh`; only those that the sources provide."""
     thrusters: dict[str, Thruster]
-    """Thrusters by name, in the canonical order of every thruster vector."""
+    """Thrusters by name; their order is the canonical order of every thruster vector."""
     actuators: dict[str, SerializeAsAny[Actuator]] = Field(default_factory=dict)
-    """Fins, buoyancy engines and other actuators by name; their channels come after those of the thrusters."""
+    """Fins, buoyancy engines and other actuators by name; their channels follow those of the thrusters."""
     controlled_axes: tuple[Axis, ...] = AXES
-    """Axes the thrusters are there to control; the others are left to the water (an underactuated vehicle)."""
+    """Axes controlled by the thrusters; the others are uncontrolled (an underactuated vehicle)."""
     wrench_reference: Vector3 = Field(default_factory=lambda given: given["body"].center_of_gravity)
-    """Body point about which wrenches are commanded [m], (3,); the centre of gravity where the file gives none."""
+    """Body point about which wrenches are commanded [m], (3,); the centre of gravity by default."""
     sensors: Sensors = Field(default_factory=default_sensors)
     perception: dict[str, RaySensor] = Field(default_factory=default_perception)
     """Sensors of the site by name, such as cameras and sonars; see `finssim.extensions.perception.device_of`."""
     tags: Tags | None = Field(default_factory=default_tags)
-    """None only where a file takes them off: `tags: null`."""
+    """Tags; None only if a file removes them: `tags: null`."""
     mcu: Mcu = Field(default_factory=default_mcu)
     autopilot: Autopilot | None = None
-    """Autopilot of a vehicle that is steered by axes instead of shaft speeds."""
+    """Autopilot of a vehicle that is commanded by axes instead of shaft speeds."""
     safety: Safety = Field(default_factory=default_safety)
     calibrations: tuple[CalibrationRecord, ...] = ()
     """Calibrations of its numbers, oldest first; not part of `sha256`."""
     name: str = Field(exclude=True)
     """Name of the file without its suffix."""
     path: Path | None = Field(default=None, exclude=True)
-    """The file it was read from."""
+    """File that the vehicle was read from."""
     provenance: dict[str, Provenance] = Field(default_factory=dict, exclude=True)
     """Origin of the numbers by dotted path; see `origin_of`."""
 
@@ -248,7 +249,9 @@ class Vehicle(Part):
                 )
             aboard = (*OWN_KINDS, *info.data["sensors"].by_name) if "sensors" in info.data else OWN_KINDS
             if name in (*OTHER_NAMES, *aboard, *info.data.get("thrusters", ())):
-                raise refuse_section(f"'{name}' is the name of something else of a robot: take another")
+                raise refuse_section(
+                    f"'{name}' is already used by another part of a robot: choose another name"
+                )
         return value
 
     @field_validator("hydrodynamics")
@@ -265,7 +268,7 @@ class Vehicle(Part):
             if smallest <= 0.0:
                 raise refuse_section(
                     f"hydrodynamics.{name}: added_mass makes M_RB + M_A not positive definite "
-                    f"(smallest eigenvalue {smallest:.4g}): no acceleration would follow from a force"
+                    f"(smallest eigenvalue {smallest:.4g}): the acceleration would be undefined"
                 )
             if isinstance(hydrodynamic_set, MeshSet) and self.hull is None:
                 raise refuse_section(
@@ -283,7 +286,7 @@ class Vehicle(Part):
             )
         for name, actuator in self.actuators.items():
             if name in self.thrusters:
-                raise refuse_section(f"actuators: '{name}' is the name of a thruster: take another")
+                raise refuse_section(f"actuators: '{name}' is the name of a thruster: choose another")
             named = [*getattr(actuator, "wake", {}), *filter(None, [getattr(actuator, "thruster", None)])]
             for thruster in named:
                 if thruster not in self.thrusters:
@@ -306,19 +309,20 @@ class Vehicle(Part):
 
     @property
     def defaults(self) -> tuple[str, ...]:
-        """Sections that the file leaves out and that `finssim.vehicles.defaults` gives; not part of `sha256`."""
+        """Sections that the file omits and `finssim.vehicles.defaults` provides; not part of `sha256`."""
         return tuple(name for name in DEFAULTS if name not in self.model_fields_set)
 
     @property
     def file_tags(self) -> Tags | None:
-        """The tags that the file gives: what a real camera may look for; None where they are none or defaults."""
+        """Tags in the file, which a real camera may search for; None if there are none or they are defaults."""
         return None if "tags" in self.defaults else self.tags
 
     def values(self) -> dict[str, Any]:
-        """Return what was given as a plain nested dict, ready to be read again; the payloads are in the body."""
+        """Return the explicitly set values as a plain nested dict, which can be validated again; payloads are
+        in the body."""
         return self.model_dump(exclude_unset=True, exclude={"payloads"})
 
-    # -- numbers that follow directly -------------------------------------------------------------------------
+    # -- derived numbers ------------------------------------------------------------------------------------
 
     @property
     def thruster_names(self) -> tuple[str, ...]:
@@ -348,17 +352,17 @@ class Vehicle(Part):
         return lower, upper
 
     def thruster_matrix(self, point: Any = (0.0, 0.0, 0.0)) -> Array:
-        """B of tau = B f, for unit thrust in canonical order.
+        """Return B of tau = B f, for unit thrust in canonical order.
 
         B = [a_1 ... a_n; (r_1 - point) × a_1 + q_1 a_1 ... ]                             (paper, eq. 17)
 
-        The reaction q of a propeller's torque is 0 where the vehicle file gives no torque constant.
+        The reaction q of a propeller's torque is 0 if the vehicle file defines no torque constant.
 
         Args:
-            point: Body point about which moments are taken [m], (3,).
+            point: Body point that is the reference of moments [m], (3,).
 
         Returns:
-            Body frame, [-] and [m], (6, n).
+            Matrix B in the body frame, [-] and [m], (6, n).
         """
         axes = np.reshape([thruster.axis for thruster in self.thrusters.values()], (-1, 3))
         arms = np.reshape([thruster.position for thruster in self.thrusters.values()], (-1, 3)) - np.asarray(
@@ -374,7 +378,7 @@ class Vehicle(Part):
 
     @cached_property
     def wrench_limits(self) -> Array:
-        """Largest wrench on each axis alone that the thrusters give in both directions [N, N m], (6,).
+        """Largest wrench on each axis alone that the thrusters reach in both directions [N, N m], (6,).
 
         See `finssim.vehicles.capability.wrench_capability`; zero on axes that are not controlled.
         """
@@ -383,21 +387,22 @@ class Vehicle(Part):
         return np.asarray(wrench_capability(self).symmetric)
 
     def rigid_body_mass_matrix(self) -> Array:
-        """M_RB about the body origin, (6, 6) [kg, kg m, kg m²]                       (Fossen 2021, eq. 3.49)."""
+        """Return M_RB about the body origin, (6, 6) [kg, kg m, kg m²]                       (Fossen 2021, eq.
+        3.49)."""
         m, S = self.body.mass, skew(self.body.center_of_gravity)
         return np.block([[m * np.eye(3), -m * S], [m * S, self.body.inertia - m * S @ S]])
 
     def added_mass_matrix(self, name: str = "calibrated") -> Array:
-        """M_A of a set about the body origin, (6, 6) [kg, kg m, kg m²]."""
+        """Return M_A of a set about the body origin, (6, 6) [kg, kg m, kg m²]."""
         chosen = self.hydrodynamic_set(name)
         return moved_to_origin(chosen.added_mass, chosen.reference_point)
 
     def mass_matrix(self, name: str = "calibrated") -> Array:
-        """M_RB + M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
+        """Return M_RB + M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
         return self.rigid_body_mass_matrix() + self.added_mass_matrix(name)
 
     def hydrodynamic_set(self, name: str) -> HydrodynamicSet | MeshSet:
-        """The set of that name.
+        """Return the hydrodynamic set of a name.
 
         Raises:
             VehicleError: The file has no such set.
@@ -410,19 +415,19 @@ class Vehicle(Part):
 
     @property
     def weight(self) -> float:
-        """[N]"""
+        """Weight [N]."""
         return self.body.mass * self.water.gravity
 
     @property
     def buoyancy(self) -> float:
-        """Fully submerged [N]."""
+        """Buoyancy when fully submerged [N]."""
         return self.water.density * self.water.gravity * self.body.displaced_volume
 
     def hull_mesh(self) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices (n, 3) [m, body frame] and faces (m, 3) of the closed hull, normals outward.
+        """Return vertices (n, 3) [m, body frame] and faces (m, 3) of the closed hull, with outward normals.
 
         Raises:
-            VehicleError: The file gives no hull, or its mesh cannot be used.
+            VehicleError: The file defines no hull, or its mesh cannot be used.
         """
         from finssim.core import mesh  # SciPy, which it uses, is slow to import
 
@@ -472,7 +477,8 @@ class Vehicle(Part):
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of every number of the vehicle and of its hull mesh; no titles, comments or calibration records."""
+        """Digest of every number of the vehicle and of its hull mesh, without titles, comments or calibration
+        records."""
         values = self.values()
         for prose in ("title", "description", "calibrations"):
             values.pop(prose, None)
@@ -482,18 +488,19 @@ class Vehicle(Part):
             if "perception" in values and Path(sensor.device).is_absolute():
                 digest = hashlib.sha256(Path(sensor.device).read_bytes()).hexdigest()
                 values["perception"][name]["device"] = digest
-        values["thruster_names"] = self.thruster_names  # their order is part of the meaning
+        values["thruster_names"] = self.thruster_names  # their order is significant
         return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
     def fitted_on(self, sha256: str) -> bool:
-        """Return whether one of its calibrations used the trial or table of a digest."""
+        """Return whether one of its calibrations used the trial or table with this digest."""
         return any(sha256 in record.trials.values() for record in self.calibrations)
 
     def origin_of(self, path: str) -> Provenance:
-        """Provenance of the number at a dotted path, `body.mass` or `hydrodynamics.calibrated.linear_damping.3`.
+        """Return the provenance of the number at a dotted path, `body.mass` or
+        `hydrodynamics.calibrated.linear_damping.3`.
 
         Raises:
-            VehicleError: Nothing there has an origin.
+            VehicleError: No number at this path has an origin.
         """
         parts = path.split(".")
         for length in range(len(parts), 0, -1):
@@ -503,15 +510,16 @@ class Vehicle(Part):
         raise VehicleError(f"{self.name}: no number at '{path}'{did_you_mean(path, list(self.provenance))}")
 
     def replace(self, changes: Mapping[str, Any], provenance: Provenance | None = None) -> Vehicle:
-        """A new vehicle with some values changed, checked like a file.
+        """Return a new vehicle with some values changed, validated like a file.
 
         Args:
-            changes: Values by dotted path: `{"body.mass": 11.6, "thrusters.*.force_max": 5.0}`. `*` stands for every
-                entry, a number for a row or element of an array.
-            provenance: Origin of the new values; `guessed` where none is given.
+            changes: Values by dotted path: `{"body.mass": 11.6, "thrusters.*.force_max": 5.0}`. `*` matches
+                every entry, a
+                number is the index of a row or element of an array.
+            provenance: Origin of the new values; `guessed` if None.
 
         Raises:
-            VehicleError: A path does not exist or a value is refused.
+            VehicleError: A path does not exist or a value is invalid.
         """
         from finssim.vehicles.loader import with_changes
 

@@ -93,7 +93,7 @@ def test_a_camera_may_not_have_its_name(tmp_path):
     """Names of sensors are those of frames and topics, so each is given once."""
     camera = "perception:\n  pinger: {origin: guessed, device: altimeter, rate: 1.0, position: [0, 0, 0]}\n"
     (tmp_path / "bad.yaml").write_text(FILE + camera, encoding="utf-8")
-    with pytest.raises(VehicleError, match="'pinger' is the name of something else"):
+    with pytest.raises(VehicleError, match="'pinger' is already used by another part"):
         load_vehicle(tmp_path / "bad.yaml")
 
 

@@ -1,8 +1,4 @@
-"""Reader of the numbers that Python and MATLAB files assign to names: nothing of a file is executed.
-
-Constants, arithmetic, matrices and a few known functions are evaluated; an assignment with anything else is not read,
-and its name has no value from there on. MATLAB is brought into Python's grammar first, statement by statement.
-"""
+"""Reader of the numbers that Python and MATLAB files assign to names; the files are not executed."""
 
 from __future__ import annotations
 
@@ -25,11 +21,11 @@ from finssim.vehicles.part import VehicleError
 __all__ = ["Assignments", "read_assignments"]
 
 LARGEST = 1 << 20
-"""Greatest size of a file [bytes]."""
+"""Largest size of a file [bytes]."""
 GREATEST_SIZE = 1000
-"""Greatest number of entries of a matrix."""
+"""Largest number of entries of a matrix."""
 UNREAD = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, np.linalg.LinAlgError)
-"""Errors of an expression that is not read."""
+"""Errors for an expression that cannot be evaluated."""
 Names = dict[str, Any]
 
 
@@ -44,7 +40,7 @@ def _filled(make: Callable[[Any], Any]) -> Callable[..., Any]:
 
 
 def _hmtrx(r: Any) -> Any:
-    """H(r) of Fossen's toolboxes."""
+    """Return the matrix H(r) of Fossen's toolboxes."""
     return np.block([[np.eye(3), -skew(np.ravel(r))], [np.zeros((3, 3)), np.eye(3)]])
 
 
@@ -80,33 +76,33 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "gravity": lambda mu: 9.78032534 * (1 + 1.93185e-3 * np.sin(mu) ** 2) / (1 - 6.69438e-3 * np.sin(mu) ** 2) ** 0.5,
     "struct": lambda *words: dict(zip(words[::2], words[1::2], strict=True)),
 }  # fmt: skip
-"""Last part of a function's name -> the function; some of MSS are among them."""
+"""Last component of a function's name -> the function; some are from MSS."""
 
 
 @dataclass
 class Assignments:
-    """Names of a file with their numbers."""
+    """Names in a file with their numbers."""
 
     matlab: bool = False
     values: Names = field(default_factory=dict)
-    """Name, such as `self.L` or `m` -> number or array, in the unit of the file; the first value of a name that
-    several functions have."""
+    """Name, such as `self.L` or `m` -> number or array, in the unit of the file; the first value if several
+    functions assign the name."""
     cleared: dict[str, set[tuple[int, ...]]] = field(default_factory=dict)
     """Name of a matrix that is not read -> its entries, counted from 0, that the file sets to 0."""
     altered: dict[str, set[tuple[int, ...]]] = field(default_factory=dict)
-    """Name of a matrix that is read -> its entries that are changed later by what is not read."""
+    """Name of a matrix that is read -> its entries that statements that are not read change later."""
     calls: dict[str, list[Any]] = field(default_factory=dict)
-    """Function that is called and not read -> its arguments, None where they are not read."""
+    """Name of a function that is called but not evaluated -> its arguments, None where they cannot be evaluated."""
     mappings: Names = field(default_factory=dict)
     """Name -> mapping that is assigned to it."""
     unread: dict[str, None] = field(default_factory=dict)
-    """Names whose assignments are not read, in their order."""
+    """Names whose assignments cannot be evaluated, in order."""
 
     def of(self, *names: str) -> Names:
-        """Return the values of which the last part of the name is one of some names."""
+        """Return the values whose last name component is one of some names."""
         return {name: x for name, x in self.values.items() if name.rpartition(".")[2] in names}
 
-    # The statements, in their order.
+    # Statements, in order.
 
     def read(self, nodes: list[Any], names: Names) -> None:
         """Read statements; names are those of the module, or of one function."""
@@ -127,7 +123,7 @@ class Assignments:
                     self._assign(target, node.value, names)
             elif isinstance(node, ast.AugAssign):
                 self._assign(node.target, ast.BinOp(node.target, node.op, node.value), names)
-            else:  # under a condition: what it assigns has no value that is sure
+            else:  # under a condition: its assignments have no certain value
                 for inside in ast.walk(node):
                     if isinstance(inside, ast.Name | ast.Attribute) and isinstance(inside.ctx, ast.Store):
                         self._lose(inside, names)
@@ -159,7 +155,7 @@ class Assignments:
             return None
 
     def _store(self, name: str, value: Any, names: Names) -> bool:
-        """Give a name its value, and `name.key` those of a mapping; return whether they are numbers."""
+        """Assign a value to a name, and the values of a mapping to `name.key`; return whether they are numbers."""
         if isinstance(value, dict):
             self.mappings[name] = value
             return sum(self._store(f"{name}.{key}", item, names) for key, item in value.items()) > 0
@@ -199,7 +195,8 @@ class Assignments:
     # Expressions.
 
     def value(self, node: Any, names: Names) -> Any:
-        """Return the value of an expression, in the unit of the file; an error of `UNREAD` if it is not read."""
+        """Return the value of an expression, in the unit of the file; raise an error of `UNREAD` if it cannot
+        be evaluated."""
         if isinstance(node, ast.Constant) and isinstance(node.value, int | float | str):
             return node.value if isinstance(node.value, str) else float(node.value)
         if isinstance(node, ast.Attribute) and node.attr == "T" and _dotted(node) not in names:
@@ -233,7 +230,7 @@ class Assignments:
             return np.asarray(self.value(node.value, names))[self._index(node.slice, names)]
         if isinstance(node, ast.Call):
             types = ("float", "int")  # of np.array(..., float)
-            # The functions of a spheroid take velocities, too, which are not read.
+            # The spheroid functions also take velocities, which are not read.
             one = self._or_none if _last(node.func) in ("spheroid", "imlay61") else self.value
             arguments = [one(x, names) for x in node.args if _dotted(x) not in types]
             if self.matlab and _dotted(node.func) in names:
@@ -252,7 +249,7 @@ class Assignments:
 
 
 def _dotted(node: Any) -> str:
-    """Return the name that an expression is, with its dots; empty if it is none."""
+    """Return the dotted name of an expression; empty if it is not a name."""
     if isinstance(node, ast.Attribute):
         return f"{_dotted(node.value)}.{node.attr}"
     return node.id if isinstance(node, ast.Name) else ""
@@ -270,7 +267,7 @@ def read_assignments(path: Path) -> Assignments:
     """Read the assignments of a .py or .m file.
 
     Raises:
-        VehicleError: It cannot be read, is too large, or is no Python.
+        VehicleError: The file cannot be read, is too large, or is not valid Python.
     """
     text = read_bytes(path, VehicleError, limit=LARGEST).decode("utf-8", "replace")
     found = Assignments(path.suffix.lower() == ".m")
@@ -290,7 +287,7 @@ def read_assignments(path: Path) -> Assignments:
     return found
 
 
-# MATLAB in Python's grammar.
+# Translation of MATLAB to Python's grammar.
 
 TOKEN = re.compile(
     r"(?P<skip>\.\.\.[^\n]*\n|%\{[ \t\r]*\n.*?\n[ \t]*%\}|[%#][^\n]*)|(?P<word>[A-Za-z_][\w.]*|(?:\d+\.?\d*|\.\d+)"
@@ -298,16 +295,17 @@ TOKEN = re.compile(
     r"|(?P<operator>\.?[*/^']|[=~<>]=|.|\n)",
     re.DOTALL,
 )
-"""Token of MATLAB; a quote behind a word or a bracket is an operator."""
+"""Token of MATLAB; a quote after a word or a bracket is an operator."""
 PART = re.compile(r"[-+](?!\s)|[\w(\[\"'@.~](?![*/^'])")
-"""Beginning of an operand that begins an element of a matrix."""
+"""Start of an operand that starts an element of a matrix."""
 CONTROL = {"if", "for", "while", "switch", "try", "parfor"}
 
 
 def _statements(text: str) -> Iterator[str]:
-    """Yield the assignments of a MATLAB text with Python's expressions; under a condition none has a value.
+    """Yield the assignments of a MATLAB text with Python expressions; conditional ones have the value None.
 
-    A matrix becomes a call of `block`: in brackets, spaces between operands part them, and new lines part rows.
+    A matrix becomes a call of `block`: in brackets, spaces between operands separate elements, and new lines
+    separate rows.
     """
     line, brackets, depth, k = "", "", 0, 0
     while k < len(text) + 1:
@@ -342,7 +340,7 @@ def _statements(text: str) -> Iterator[str]:
 
 
 def _parsed(line: str) -> list[Any]:
-    """Return the statement of a line in Python's grammar; none if it is no assignment that can be read."""
+    """Return the statement of a line in Python's grammar; empty if it is not an assignment that can be read."""
     line = re.sub(r"^block\(\[\[(.*?)\]\]\)\s*=(?!=)", r"\1, _ =", line)
     line = re.sub(
         r"^([\w.]+)\s*\(([^()=]*)\)\s*=(?!=)",

@@ -1,11 +1,11 @@
-"""Importer of coefficients of Fossen's equations that stand in a Python or MATLAB file, such as the vehicles of MSS.
+"""Importer of coefficients of Fossen's equations from a Python or MATLAB file, such as the vehicles of MSS.
 
 Equations of these programs (Fossen 2021), body axes x forward, y right, z down:
 
     (M_RB + M_A) nu_dot + C_RB nu + C_A nu + D nu + D_n |nu| nu + g(eta) = tau
 
-Read are the names of the field: `m`, `W`, `B`, `Ix`, `r_bg`, `MRB`, `MA`, `Xudot`, `Xu`, `Xuu` and their other
-spellings. Of a torpedo of PythonVehicleSimulator also the drag of its hull, which functions of its library compute.
+The importer reads conventional names: `m`, `W`, `B`, `Ix`, `r_bg`, `MRB`, `MA`, `Xudot`, `Xu`, `Xuu` and their
+variants. For a torpedo of PythonVehicleSimulator it also reads the hull drag, which functions of its library compute.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ NAMES = {
     "quadratic": "Dn D_n Dq D_q D_nl D_NL D_quad quadratic_damping quadratic_drag",
     "thrust": "T TAM T_alloc T_matrix B B_matrix Thrust_alloc Thurst_alloc thrust_matrix thruster_matrix",
 }  # fmt: skip
-"""Quantity -> its names. Matrices may be 6 numbers of a diagonal, an inertia 3; centres may be xg, x_g or xG."""
+"""Quantity -> its names. Matrices may be 6 diagonal entries, an inertia 3; centres may also be xg, x_g or xG."""
 
 
 def one_sign(matrix: Array, what: str, where: str) -> Array:
-    """Return added mass or damping with a diagonal of 0 or more, (6, 6), in the unit of the coefficients.
+    """Return added mass or damping with a non-negative diagonal, (6, 6), in the unit of the coefficients.
 
     Args:
-        matrix: Coefficients such as X_udot [kg], X_u [N s/m] or X_u|u| [N s²/m²] at their places, which are negative,
-            or minus these, (6, 6).
+        matrix: Matrix of coefficients such as X_udot [kg], X_u [N s/m] or X_u|u| [N s²/m²], which are
+            negative, or of their negated values, (6, 6).
         what: Name of the matrix in messages.
         where: Name of the file in messages.
 
     Raises:
-        VehicleError: Its diagonal has both signs.
+        VehicleError: Its diagonal contains both signs.
     """
     diagonal = np.diag(matrix)
     if diagonal.min() < 0.0 < diagonal.max():
@@ -68,7 +68,7 @@ def one_sign(matrix: Array, what: str, where: str) -> Array:
 
 
 def symbol_of(name: str) -> tuple[str, int, int] | None:
-    """Return kind (`added`, `linear`, `quadratic`, `product`), row and column of a coefficient; None of other names.
+    """Return kind (`added`, `linear`, `quadratic`, `product`), row and column of a coefficient; None for other names.
 
     Args:
         name: Such as Xudot, X_u_dot, Xdu; Xu, X_u, Xu_l; Xuu, Xu_abs_u, Xabs_u, Xu_q; Yuv.
@@ -91,17 +91,17 @@ def _last(name: str) -> str:
 
 
 class _Names:
-    """Numbers of a file under the names of the field; each that is used is remembered."""
+    """Numbers of a file by quantity; used names are recorded."""
 
     def __init__(self, found: Assignments, label: str) -> None:
         self.found, self.label = found, label
         self.used: set[str] = set()
 
     def first(self, quantity: str, sizes: tuple[int, ...] = (1,)) -> Any:
-        """Return the value of a quantity that has one of the sizes, a number if that is 1; None if there is none.
+        """Return the value of a quantity that has one of the sizes, a number if the size is 1; None if there is none.
 
         Raises:
-            VehicleError: Several names of it have one, and differ.
+            VehicleError: Several of its names have different values.
         """
         names = NAMES.get(quantity, quantity).split()
         fits = {n: np.asarray(x, float) for n, x in self.found.of(*names).items() if np.size(x) in sizes}
@@ -118,7 +118,7 @@ class _Names:
         return value if value is None or sizes != (1,) else float(value.ravel()[0])
 
     def square(self, quantity: str, side: int) -> Array | None:
-        """Return a matrix, (side, side), of its rows or of its diagonal."""
+        """Return a matrix, (side, side), from its rows or its diagonal."""
         value = self.first(quantity, (side, side * side))
         if value is None:
             return None
@@ -147,7 +147,7 @@ class _Names:
         return tensor
 
     def coefficients(self) -> dict[str, Array]:
-        """Return kind -> coefficients at their places, (6, 6)."""
+        """Return kind -> matrix of coefficients, (6, 6)."""
         out: dict[str, Array] = {}
         symbols = {name: symbol_of(name) for name in map(_last, self.found.values)}
         dotted = any(symbol and "dot" in name for name, symbol in symbols.items())
@@ -155,19 +155,19 @@ class _Names:
             value = self.first(name) if symbol else None
             if (
                 symbol and value is not None and not (dotted and re.match(r"._?d", name))
-            ):  # Ndr is of the rudder then
+            ):  # in that case Ndr is a rudder coefficient
                 out.setdefault(symbol[0], np.zeros((6, 6)))[symbol[1:]] = value
         return out
 
 
 def read_coefficients(path: Path) -> Draft:
-    """Read the vehicle of a .py or .m file with coefficients.
+    """Read the vehicle from a .py or .m file with coefficients.
 
     Args:
         path: The file; it is read as text and never executed.
 
     Raises:
-        VehicleError: It cannot be read, or lacks what no guess can replace.
+        VehicleError: The file cannot be read, or lacks required numbers.
     """
     found = read_assignments(path)
     draft = draft_of(found, path, f"{path.stem} ({'MATLAB' if found.matlab else 'Python'})")
@@ -178,22 +178,22 @@ def read_coefficients(path: Path) -> Draft:
 
 
 def draft_of(found: Assignments, path: Path, title: str) -> Draft:
-    """Return the draft of a vehicle whose numbers have the names of the field.
+    """Return the draft of a vehicle from numbers with conventional names.
 
     Args:
-        found: The numbers, and the functions of PythonVehicleSimulator that are called with some.
-        path: File that they are from.
+        found: The numbers, and the calls of functions of PythonVehicleSimulator.
+        path: File that contains them.
         title: Title of the vehicle.
 
     Raises:
-        VehicleError: They lack what no guess can replace.
+        VehicleError: Required numbers are missing.
     """
     names = _Names(found, str(path))
     draft = Draft(str(path), f"{path.name} (coefficients of Fossen's equations)")
     draft.values |= {"title": title, "description": f"Read by FinsSim from {path.name}."}
     if names.first("G", (36,)) is not None:
         raise VehicleError(
-            f"{path}: has a restoring matrix G: a vessel that floats, expected a submerged vehicle"
+            f"{path}: has a restoring matrix G, as a surface vessel does, expected a submerged vehicle"
         )
     draft.different.append("axes are taken as Fossen's: x forward, y right, z down, turned here to z up")
     try:
@@ -258,7 +258,7 @@ def _put_body(names: _Names, draft: Draft) -> None:
 
 
 def _put_hydrodynamics(names: _Names, draft: Draft) -> None:
-    """Set added mass and damping: of matrices or of coefficients, and of what a torpedo computes for its hull."""
+    """Set added mass and damping from matrices or coefficients, and from the hull functions of a torpedo."""
     parts, path, found = names.coefficients(), "hydrodynamics.calibrated", names.found
     wholes = {kind: names.square(kind, 6) for kind in ("added", "linear", "quadratic")}
     matrices = {k: parts.get(k, np.zeros((6, 6))) if x is None else np.array(x) for k, x in wholes.items()}
@@ -311,7 +311,7 @@ def _put_hydrodynamics(names: _Names, draft: Draft) -> None:
 
 
 def _put_thrusters(names: _Names, draft: Draft) -> None:
-    """Set the thrusters of a matrix of their wrenches, or ask for them."""
+    """Set the thrusters from the thrust allocation matrix, or request them."""
     limit = SHARE * draft.values["body"]["mass"] * draft.values["water"]["gravity"]
     wide = {
         n: x for n, x in names.found.of(*NAMES["thrust"].split()).items() if np.ndim(x) == 2 and len(x) == 6

@@ -1,4 +1,4 @@
-"""Draft of a vehicle, which an importer fills; the class of importers, and the choice of one by content.
+"""Draft of a vehicle, which an importer fills, and the selection of an importer by content.
 
 An importer is one file with an `Importer`, registered as `vehicle.FORMAT` in the family `IMPORTERS`.
 """
@@ -28,38 +28,39 @@ __all__ = [
 ]  # fmt: skip
 
 GRAVITY = 9.8
-"""Gravity of Gazebo where a file gives none [m/s²]."""
+"""Gravity of Gazebo if a file defines none [m/s²]."""
 SHARE = 0.3
-"""Guessed limit of a thruster, as a share of the weight of the vehicle."""
+"""Guessed limit of a thruster, as a fraction of the weight of the vehicle."""
 LAG = 0.05
-"""Guessed time constant of a thruster whose thrust follows at once [s]."""
+"""Guessed time constant of a thruster without lag in the file [s]."""
 
 
 @dataclass
 class Draft:
-    """A vehicle that an importer reads: its numbers with their origins, and what was guessed or not read."""
+    """Vehicle that an importer has read: its numbers with their origins, the guesses, and contents that were
+    not read."""
 
     label: str
     """Name of the file in messages."""
     source: str
-    """Source of the numbers, for their origins."""
+    """Source of the numbers, used in their origins."""
     values: dict[str, Any] = field(default_factory=dict)
     """Content of the vehicle file, without origins."""
     origins: dict[str, Provenance] = field(default_factory=dict)
     """Origin of each number or list by dotted path."""
     guessed: dict[str, str] = field(default_factory=dict)
-    """Dotted path of each number that the file does not give -> how it was guessed."""
+    """Dotted path of each number that is missing in the file -> how it was guessed."""
     not_read: Counter[str] = field(default_factory=Counter)
-    """Contents of the file that the vehicle lacks -> their number."""
+    """Contents of the file that the vehicle does not represent -> their number."""
     different: list[str] = field(default_factory=list)
-    """Sentences about what the other program computes and FinsSim does not, or differently."""
+    """Sentences about differences between the other program's model and FinsSim's."""
     hull: tuple[Vertices, Faces] | None = None
-    """Closed mesh in body axes, vertices (n, 3) [m] and faces (m, 3), that becomes the hull's file."""
+    """Closed mesh in body axes, vertices (n, 3) [m] and faces (m, 3), that is written to the hull's file."""
     missing: dict[str, Any] = field(default_factory=dict)
-    """Lines of a vehicle file, with words in place of numbers, without which the vehicle is not complete."""
+    """Lines of a vehicle file, with placeholders for numbers, that are required to complete the vehicle."""
 
     def put(self, path: str, value: Any, origin: Origin = "published", note: str = "") -> None:
-        """Set a value that the file gives or that follows from it; the unit is that of the vehicle file."""
+        """Set a value from the file or derived from it, in the unit of the vehicle file."""
         node = self.values
         *sections, key = path.split(".")
         for section in sections:
@@ -68,13 +69,13 @@ class Draft:
         self.origins[path] = Provenance(origin, self.source, note)
 
     def guess(self, path: str, value: Any, how: str) -> None:
-        """Set a value that the file does not give; the unit is that of the vehicle file."""
+        """Set a value that is missing in the file, in the unit of the vehicle file."""
         self.put(path, value)
         self.origins[path] = Provenance("guessed", "", how)
         self.guessed[path] = how
 
     def guesses(self) -> list[str]:
-        """Return a sentence for each guess; the same guess of several thrusters is one sentence."""
+        """Return a sentence for each guess; equal guesses for several thrusters share one sentence."""
         grouped: dict[tuple[str, str, str], list[str]] = {}
         for path, how in self.guessed.items():
             section, _, rest = path.partition(".")
@@ -90,13 +91,13 @@ class Draft:
         ]
 
     def vehicle(self, folder: Path) -> Vehicle:
-        """Return the vehicle, checked as its file will be.
+        """Return the vehicle, with the checks of a vehicle file.
 
         Args:
             folder: Existing folder for the mesh of the hull; `write_vehicle` copies it.
 
         Raises:
-            VehicleError: The numbers are refused; the message names the file.
+            VehicleError: The numbers are invalid; the message names the file.
         """
         if self.missing:
             lines = {"extends": Path(self.label).name, "origin": "measured"} | self.missing
@@ -114,20 +115,20 @@ class Draft:
             parametric = values | {"hull": {"parametric": True}}
             vehicle = checked(parametric, self.origins, Path(self.label).stem, None, self.label)
             vehicle.hull_mesh()
-        except (VehicleError, MeshError):  # a volume that fits no hull of this size
+        except (VehicleError, MeshError):  # the volume fits no hull of this size
             return checked(values, self.origins, Path(self.label).stem, None, self.label)
         return vehicle
 
 
 def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
-    """Read the vehicle of another program, by the importer that recognises its file.
+    """Read the vehicle of another program with the importer that recognises its file.
 
     Args:
         path: The file.
-        folders: Where the files that it names are sought besides its own folder.
+        folders: Folders that are searched for referenced files besides its own folder.
 
     Raises:
-        VehicleError: It cannot be read, or is of no known format.
+        VehicleError: The file cannot be read, or has an unknown format.
     """
     if not path.is_file():
         raise VehicleError(f"{path}: no such file: give the file of a vehicle")
@@ -139,21 +140,21 @@ def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
     if importer is not None:
         return importer.read(path, folders) if importer.folders else importer.read(path)
     known = ", ".join(sorted(member.title for member in importers("vehicle").values()))
-    raise VehicleError(f"{path}: is of no format that is read, expected one of {known}")
+    raise VehicleError(f"{path}: has an unknown format, expected one of {known}")
 
 
 NO_FORCE = {"visual", "sensor", "light", "surface", "laser_retro", "max_contacts", "self_collide"}
-"""Elements that say nothing about the motion in free water."""
+"""Elements without effect on the motion in open water."""
 
 
 def unread(element: Element, known: Collection[str], where: str, draft: Draft) -> None:
     """Note the children that are not read.
 
     Args:
-        element: Their parent.
-        known: Those that are read.
-        where: What the note calls the parent.
-        draft: Draft to note them in.
+        element: Parent element.
+        known: Names of the children that are read.
+        where: Name of the parent in the note.
+        draft: Draft to which the notes are added.
     """
     for child in element:
         if child.tag not in known:
@@ -162,11 +163,11 @@ def unread(element: Element, known: Collection[str], where: str, draft: Draft) -
             draft.not_read[f"{where}: {child.tag}{kind}{idle}"] += 1
 
 
-# Numbers that no format gives.
+# Numbers that no format contains.
 
 
 def put_envelope(draft: Draft, corners: Sequence[NDArray[np.float64]]) -> None:
-    """Guess the size: the box around shapes and thrusters, large enough for the displaced volume.
+    """Guess the size: the bounding box of shapes and thrusters, enlarged to the displaced volume if necessary.
 
     Args:
         draft: Draft with volume and thrusters.
@@ -185,7 +186,7 @@ def put_envelope(draft: Draft, corners: Sequence[NDArray[np.float64]]) -> None:
 
 
 def put_controlled_axes(draft: Draft) -> None:
-    """Set the controlled axes: those along which the thrusters can push without much of another."""
+    """Set the controlled axes: those along which the thrusters can push with little coupling to the others."""
     thrusters, centre = draft.values["thrusters"].values(), draft.values["body"]["center_of_gravity"]
     axes_of = np.array([thruster["axis"] for thruster in thrusters])
     arms = np.array([thruster["position"] for thruster in thrusters]) - centre
@@ -198,6 +199,4 @@ def put_controlled_axes(draft: Draft) -> None:
     if 0 < len(axes) < 6:
         draft.values["controlled_axes"] = axes
         missing = ", ".join(axis for axis in AXES if axis not in axes)
-        draft.different.append(
-            f"the thrusters do not control {missing}: controlled_axes leaves it to the water"
-        )
+        draft.different.append(f"the thrusters do not control {missing}: it is not part of controlled_axes")

@@ -1,4 +1,4 @@
-"""Numbers, words and files in the elements of a model."""
+"""Numbers, text and file references in the elements of a model."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
     """Return the finite numbers of a text, in its unit, (count,).
 
     Args:
-        text: Words with spaces between them.
-        count: How many are expected.
-        where: What the message calls the text.
+        text: Numbers separated by spaces.
+        count: Expected number of values.
+        where: Name of the text in messages.
 
     Raises:
-        VehicleError: It holds something else.
+        VehicleError: The text contains anything else.
     """
     words = (text or "").split()
     plain = all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word, re.ASCII) for word in words)
@@ -40,13 +40,13 @@ def numbers(text: str | None, count: int, where: str) -> NDArray[np.float64]:
 
 
 def number(parent: Element, tag: str, where: str, default: float = math.nan) -> float:
-    """Return the number of a child element, in its unit.
+    """Return the number in a child element, in its unit.
 
     Args:
-        parent: The element around it.
-        tag: Its name.
-        where: What the message calls the parent.
-        default: Number where there is no such child, in its unit; NaN: it must be there.
+        parent: Parent element.
+        tag: Name of the child.
+        where: Name of the parent in messages.
+        default: Value if there is no such child, in its unit; NaN if the child is required.
     """
     child = parent.find(tag)
     if child is None:
@@ -57,7 +57,7 @@ def number(parent: Element, tag: str, where: str, default: float = math.nan) -> 
 
 
 def flag(parent: Element, tag: str, where: str, default: bool = False) -> bool:
-    """Return whether a child element says true or 1; the default where there is none."""
+    """Return whether a child element contains true or 1; the default if there is no such child."""
     child = parent.find(tag)
     text = str(default) if child is None else (child.text or "")
     word = text.strip().lower()
@@ -67,12 +67,12 @@ def flag(parent: Element, tag: str, where: str, default: bool = False) -> bool:
 
 
 def refuse_unknown(element: Element, known: Collection[str], where: str) -> None:
-    """Refuse children that are not known.
+    """Refuse children with unknown names.
 
     Args:
-        element: Their parent.
-        known: Their names.
-        where: What the message calls the parent.
+        element: Parent element.
+        known: Known names.
+        where: Name of the parent in messages.
     """
     for child in element:
         if child.tag not in known:
@@ -83,17 +83,18 @@ def refuse_unknown(element: Element, known: Collection[str], where: str) -> None
 
 
 def file_of_model(folder: Path, uri: str, where: str, packages: Mapping[str, Path] | None = None) -> Path:
-    """Return a file that a model names: in the folder of the model, in that of a package, or below.
+    """Return a file that a model refers to, inside the folder of the model or of a package.
 
     Args:
         folder: Folder of the model.
-        uri: `model://NAME/PATH`, `package://NAME/PATH`, or a path below the folder; NAME is that of the model or of a
-            package. Within a package, `file://PATH` too.
-        where: What the message calls the element.
-        packages: Name -> folder of packages of ROS.
+        uri: `model://NAME/PATH`, `package://NAME/PATH`, or a path relative to the folder; NAME is that of the
+            model or of a
+            package. Within a package, also `file://PATH`.
+        where: Name of the element in messages.
+        packages: Name -> folder of ROS packages.
 
     Raises:
-        VehicleError: It lies elsewhere, or there is none.
+        VehicleError: The file is outside these folders, or does not exist.
     """
     kind, scheme, below = uri.partition("://")
     package, _, rest = below.partition("/")

@@ -1,6 +1,7 @@
-"""Importer of scenarios of HoloOcean whose agent has Fossen's torpedo (`fossen_dynamics/torpedo.py` of HoloOcean 2).
+"""Importer of HoloOcean scenarios whose agent is Fossen's torpedo (`fossen_dynamics/torpedo.py` of HoloOcean 2).
 
-It is a spheroid with Lamb's added mass, and hull drag and propeller as in `torpedo`; x forward, y right, z down.
+The hull is a spheroid with Lamb's added mass, and hull drag and propeller as in `torpedo`; x forward, y
+right, z down.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ TORPEDO: dict[str, Any] = {
     "r44": 0.3, "Cd": 0.42, "e": 0.7, "nMax": 1525.0, "T_n": 1.0, "D_prop": 0.14, "t_prop": 0.1, "KT_0": 0.4566,
     "KT_max": 0.1798, "Ja_max": 0.6632, "w": 0.056,
 }  # fmt: skip
-"""Word of `dynamics` or `actuator` -> HoloOcean's value where the scenario has none."""
+"""Key of `dynamics` or `actuator` -> HoloOcean's default."""
 FINS: dict[str, Any] = {
     "fin_count": 4, "fin_offset_deg": 0.0, "fin_center": 0.1, "fin_area": 0.00697, "CL_delta": 0.5,
     "deltaMax_fin_deg": 15.0, "fin_speed_max": 0.5, "T_delta": 0.1,
 }  # fmt: skip
-"""The same of the fins, which are alike, at the stern, in equal angles around the axis."""
+"""Defaults of the fins, which are identical and evenly spaced around the axis at the stern."""
 CONTROL = "K_nomoto sampleTime KQ_0 KQ_max x_fin CL_delta_r CL_delta_s".split()
-"""Words of torque and control, and of fins that HoloOcean's torpedo does not use; they are not read."""
+"""Keys of torque and control, and of fins that HoloOcean's torpedo does not use; they are not read."""
 
 USUAL = TORPEDO | FINS
 
@@ -54,10 +55,10 @@ def read_holoocean(path: Path) -> Draft:
     """Read the main agent of a scenario.
 
     Args:
-        path: JSON, YAML, or a Python program with the scenario as a mapping, which is not executed.
+        path: JSON, YAML, or a Python program that contains the scenario as a mapping and is not executed.
 
     Raises:
-        VehicleError: It has no scenario, or its agent's numbers are elsewhere.
+        VehicleError: There is no scenario, or the numbers of its agent are not in the file.
     """
     python = path.suffix.lower() == ".py"
     tree = (
@@ -81,9 +82,7 @@ def read_holoocean(path: Path) -> Draft:
     sections = [section for section in ("dynamics", "actuator") if isinstance(agent.get(section), Mapping)]
     for key, value in ((key, value) for section in sections for key, value in agent[section].items()):
         if key not in USUAL and key not in CONTROL:
-            raise VehicleError(
-                f"{path}: unknown word '{key}'{did_you_mean(str(key), list(USUAL))} correct it"
-            )
+            raise VehicleError(f"{path}: unknown key '{key}'{did_you_mean(str(key), list(USUAL))} correct it")
         count = 3 if key in ("r_bg", "r_bb") else 1
         least = (
             -np.inf
@@ -119,7 +118,7 @@ def read_holoocean(path: Path) -> Draft:
 
 
 def _put_fins(n: Mapping[str, Any], draft: Draft) -> None:
-    """Set the fins: each turns about its radius, and its lift goes with the deflection alone."""
+    """Set the fins: each rotates about its radius, and its lift depends on the deflection alone."""
     if n["fin_count"] != int(n["fin_count"]):
         raise VehicleError(f"fin_count is {n['fin_count']!r}, expected an integer")
     travel = math.radians(n["deltaMax_fin_deg"])
@@ -138,7 +137,7 @@ def _put_fins(n: Mapping[str, Any], draft: Draft) -> None:
 
 
 def _torpedo(n: Mapping[str, Any]) -> Assignments:
-    """Return the numbers that `torpedo.py` computes from its words, under the names of the field."""
+    """Return the numbers that `torpedo.py` computes from its parameters, under conventional names."""
     m, a, b, W = n["mass"], n["length"] / 2.0, n["diam"] / 2.0, n["mass"] * 9.81
     rg, rb = np.array(n["r_bg"], float), np.array(n["r_bb"], float)
     moments, added = torpedo.spheroid_moments(a, b, m), torpedo.spheroid_added_mass(a, b, m, n["r44"])

@@ -1,4 +1,4 @@
-"""Importer of the parameters of MarineGym's vehicles (YAML); mass, inertia and thrusters' places are in a USD file.
+"""Importer of the parameters of MarineGym's vehicles (YAML); mass, inertia and thruster positions are in a USD file.
 
 Equations of MarineGym (`underwaterVehicle.py` and `t200.py`), z down, n the speed of a rotor in rpm:
 
@@ -35,17 +35,17 @@ def thrust(constant: float, rpm: float) -> float:
 
     Args:
         constant: K of `force_constants`, 4.4e-7 for a T200 [-].
-        rpm: Speed with its sign [rpm].
+        rpm: Signed speed [rpm].
     """
     curve = (4.7368e-7, -1.9275e-4, 8.4452e-2) if rpm > 0.0 else (-3.8442e-7, -1.6186e-4, -3.9139e-2)
     return constant / 4.4e-7 * 9.81 * float(np.polyval(curve, rpm))
 
 
 def read_marinegym(path: Path) -> Draft:
-    """Read a vehicle of MarineGym; the draft lacks what its USD file holds.
+    """Read a vehicle of MarineGym; the draft lacks the contents of its USD file.
 
     Raises:
-        VehicleError: A word is unknown, or a number is missing or wrong.
+        VehicleError: A key is unknown, or a number is missing or wrong.
     """
     tree = read_mapping(path, VehicleError, such_as="volume: 0.0113")
     if "fin_configuration" in tree:
@@ -58,7 +58,7 @@ def read_marinegym(path: Path) -> Draft:
         for word in part:
             if word not in known:
                 raise VehicleError(
-                    f"{path}: unknown word '{word}'{did_you_mean(str(word), list(known))} correct it"
+                    f"{path}: unknown key '{word}'{did_you_mean(str(word), list(known))} correct it"
                 )
 
     def numbers(part: Any, key: str, count: int) -> list[float]:

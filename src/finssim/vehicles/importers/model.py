@@ -1,4 +1,4 @@
-"""Models of links, joints and collision shapes, as SDF has them: frames, rigid body, and displaced water."""
+"""Models with links, joints and collision shapes, as in SDF: frames, rigid body, and displaced volume."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ __all__ = [
 Array = NDArray[np.float64]
 
 INERTIA = {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"}
-"""Words of an inertia."""
+"""Child elements of an inertia."""
 SHAPES = {
     "box": ("size",), "ellipsoid": ("radii",), "sphere": ("radius",), "cylinder": ("radius", "length"),
     "capsule": ("radius", "length"), "cone": ("radius", "length"), "mesh": ("uri", "scale"),
     "plane": ("normal", "size"), "empty": (),
 }  # fmt: skip
-"""CollisionShape -> its words."""
+"""Shape -> its child elements."""
 
 
 def pose_of(element: Element | None, where: str) -> LinkPose:
     """Return the pose of an element `pose`: x y z, then roll pitch yaw, or a quaternion.
 
     Args:
-        element: None: the identity.
-        where: What a message calls the element.
+        element: The element; None for the identity.
+        where: Name of the element in messages.
     """
     if element is None or not (element.text or "").strip():
         return IDENTITY
@@ -81,7 +81,7 @@ def shape_volume(shape: Element, where: str) -> float:
 
 
 def _half_size(shape: Element) -> Array:
-    """Return half the box around a shape other than a mesh, in its frame [m], (3,)."""
+    """Return half the sides of the bounding box of a shape other than a mesh, in its frame [m], (3,)."""
     if shape.tag == "box":
         return numbers(shape.findtext("size"), 3, "size") / 2.0
     if shape.tag == "ellipsoid":
@@ -92,7 +92,8 @@ def _half_size(shape: Element) -> Array:
 
 
 class Model:
-    """A model whose links and frames have poses in the body frame, which is that of the link with hydrodynamics."""
+    """Model whose links and frames have poses in the body frame, which is the frame of the link with
+    hydrodynamics."""
 
     def __init__(
         self, element: Element, label: str, draft: Draft, packages: Mapping[str, Path] | None = None
@@ -100,9 +101,9 @@ class Model:
         """
         Args:
             element: The element `model`.
-            label: What messages call it.
-            draft: Draft that notes what is not read.
-            packages: Name -> folder of the packages in which its meshes may be.
+            label: Name of the model in messages.
+            draft: Draft to which unread contents are added.
+            packages: Name -> folder of packages that may contain its meshes.
         """
         self.element, self.label, self.draft = element, label, draft
         self.packages = packages or {}
@@ -158,7 +159,7 @@ class Model:
         return self._poses[name]
 
     def text(self, element: Element, tag: str) -> str:
-        """Return the text of a child element that must be there."""
+        """Return the text of a required child element."""
         text = (element.findtext(tag) or "").strip()
         if not text:
             raise VehicleError(
@@ -167,7 +168,7 @@ class Model:
         return text
 
     def link_of(self, name: str) -> str:
-        """Return the link that a joint names: itself, or that a frame is attached to."""
+        """Return the link that a joint refers to, directly or through a frame that is attached to it."""
         for _ in range(50):
             if name in self.links or name not in self.frames:
                 break
@@ -177,11 +178,11 @@ class Model:
         return name
 
     def set_body(self, base: str, where: str) -> None:
-        """Take the frame of a link as that of the body, and refuse links that no joints hold to it.
+        """Use the frame of a link as the body frame, and refuse links that are not joined to it.
 
         Args:
-            base: The link.
-            where: What a message calls the element that names it.
+            base: Name of the link.
+            where: Name of the referring element in messages.
         """
         if base not in self.links:
             raise VehicleError(
@@ -200,14 +201,14 @@ class Model:
             raise VehicleError(f"{self.label}: link '{name}' is not joined to '{base}': join it or remove it")
 
     def pose_in(self, link: str, element: Element, where: str) -> LinkPose:
-        """Return the pose in the body frame of what a link holds, such as a collision."""
+        """Return the pose in the body frame of a child of a link, such as a collision."""
         pose = element.find("pose")
         reference = (None if pose is None else pose.get("relative_to")) or link
         return self.pose(reference).after(pose_of(pose, where))
 
 
 def put_body(model: Model, draft: Draft) -> None:
-    """Set mass, centre of gravity and inertia: of all links together, fixed to one another."""
+    """Set mass, centre of gravity and inertia of all links combined, as one rigid body."""
     masses, centres, tensors = [], [], []
     massless, momentless = [], []
     for name, link in model.links.items():
@@ -259,25 +260,25 @@ def put_body(model: Model, draft: Draft) -> None:
 
 
 class CollisionShape(NamedTuple):
-    """A collision shape."""
+    """Collision shape."""
 
     link: str
     """Name of its link."""
     pose: LinkPose
-    """Its pose in the body frame."""
+    """Pose of the shape in the body frame."""
     volume: float
-    """[m³]"""
+    """Volume [m³]."""
     corners: Array
-    """Points that it reaches, in the body frame [m], (n, 3)."""
+    """Points that bound the shape, in the body frame [m], (n, 3)."""
     faces: NDArray[np.int64] | None
-    """Faces of a mesh, whose vertices the corners are, (m, 3); None: it is no mesh."""
+    """Faces of a mesh with the corners as vertices, (m, 3); None for other shapes."""
 
 
 def shapes_of(model: Model) -> list[CollisionShape]:
     """Return the collision shapes of a model.
 
     Raises:
-        VehicleError: A shape or a mesh is not read.
+        VehicleError: A shape or a mesh is not supported.
     """
     shapes = []
     for name in model.links:
@@ -305,7 +306,7 @@ def shapes_of(model: Model) -> list[CollisionShape]:
 
 
 def put_hull(shapes: Sequence[CollisionShape], draft: Draft) -> None:
-    """Set the hull, if there is one shape only, and this is a closed mesh of the displaced volume."""
+    """Set the hull, if there is exactly one shape and it is a closed mesh of the displaced volume."""
     if len(shapes) != 1 or shapes[0].faces is None:
         return
     shape, volume = shapes[0], draft.values["body"]["displaced_volume"]
@@ -323,7 +324,8 @@ def put_hull(shapes: Sequence[CollisionShape], draft: Draft) -> None:
 
 
 def put_physical_inertia(draft: Draft) -> None:
-    """Move what an inertia has too much for a body of positive mass into the added mass, where it acts the same."""
+    """Move the part of an inertia that is impossible for a body of positive mass to the added mass, which
+    acts equally."""
     inertia = np.asarray(draft.values["body"]["inertia"])
     moments, axes = np.linalg.eigh(inertia)
     excess = (1.0 + 1e-6) * (moments[2] - moments[0] - moments[1])
@@ -344,9 +346,9 @@ def put_displacement(lifts: Sequence[tuple[float, Array]], density: float, note:
 
     Args:
         lifts: Volume [m³] and centre in the body frame [m] of each part that displaces water.
-        density: Of the water [kg/m³].
-        note: How the volume comes about.
-        draft: Draft to set them in.
+        density: Density of the water [kg/m³].
+        note: Derivation of the volume.
+        draft: Draft to which the values are written.
     """
     volume = sum(lift[0] for lift in lifts)
     if volume <= 0.0:
@@ -360,7 +362,7 @@ def put_displacement(lifts: Sequence[tuple[float, Array]], density: float, note:
 
 
 def _mesh(model: Model, shape: Element, where: str) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (n, 3) [m] and faces (m, 3) of a collision mesh in its own frame."""
+    """Return vertices (n, 3) [m] and faces (m, 3) of a collision mesh in its own frame."""
     uri = (shape.findtext("uri") or "").strip()
     file = file_of_model(Path(model.label).parent, uri, where, model.packages)
     if file.suffix.lower() != ".stl":
@@ -389,9 +391,9 @@ def note_rest(
 
     Args:
         model: The model.
-        plugins: Its plugins by kind.
+        plugins: Plugins of the model by kind.
         read: Kinds that are read.
-        remarks: Kind -> what is said of it.
+        remarks: Kind -> remark that is appended to its note.
         turned: Joints of thrusters.
     """
     draft = model.draft

@@ -1,4 +1,4 @@
-"""Rigid bodies that importers assemble: poses of their links, and mass and inertia of all together."""
+"""Rigid bodies that importers assemble: poses of their links, and combined mass and inertia."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class LinkPose(NamedTuple):
     """Origin of the frame in the other [m], (3,)."""
 
     def after(self, inner: LinkPose) -> LinkPose:
-        """Return the pose of a frame that is given in this one."""
+        """Return the composition with a pose that is given in this frame."""
         return LinkPose(self.turn @ inner.turn, self.turn @ inner.place + self.place)
 
     def inverse(self) -> LinkPose:
-        """Return the pose of the other frame in this one."""
+        """Return the inverse pose."""
         return LinkPose(self.turn.T, -self.turn.T @ self.place)
 
 
@@ -37,12 +37,12 @@ IDENTITY = LinkPose(np.eye(3), np.zeros(3))
 def combined(
     masses: Sequence[float], centres: Sequence[Array], tensors: Sequence[Array]
 ) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of gravity (3,) [m] and inertia about it (3, 3) [kg m²] of parts fixed to one another.
+    """Return mass [kg], centre of gravity (3,) [m] and inertia about it (3, 3) [kg m²] of rigidly connected parts.
 
     Args:
-        masses: Of the parts [kg].
-        centres: Their centres of gravity in the body frame [m], (3,) each.
-        tensors: Their inertias about these, in body axes [kg m²], (3, 3) each.
+        masses: Masses of the parts [kg].
+        centres: Centres of gravity in the body frame [m], (3,) each.
+        tensors: Inertias about these centres, in body axes [kg m²], (3, 3) each.
     """
     centre = np.average(centres, axis=0, weights=masses)
     total = np.zeros((3, 3))
@@ -53,14 +53,15 @@ def combined(
 
 
 def plain(value: Any) -> Any:
-    """Return a number or array, in its unit, without what rounding leaves beside its greatest entry."""
+    """Return a number or array, in its unit, with entries set to 0 that are rounding errors relative to the
+    largest."""
     array = np.asarray(value, dtype=np.float64)
     cleaned = np.where(np.abs(array) < 1e-12 * np.abs(array).max(initial=0.0), 0.0, array)
     return float(cleaned) if cleaned.ndim == 0 else cleaned
 
 
 def flu_of_frd(value: Any) -> Array:
-    """Return a vector (3,) or (6,), or a matrix (3, 3) or (6, 6), x forward, y left, z up, in its unit.
+    """Return a vector (3,) or (6,), or a matrix (3, 3) or (6, 6), in axes x forward, y left, z up, in its unit.
 
     Args:
         value: The same in axes x forward, y right, z down, in any unit.

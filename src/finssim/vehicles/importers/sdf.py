@@ -1,4 +1,4 @@
-"""Importer of SDF as gz-sim reads it: a model with the plugins Hydrodynamics, Thruster and Buoyancy.
+"""Importer of SDF for gz-sim: a model with the plugins Hydrodynamics, Thruster and Buoyancy.
 
 Equations of gz-sim as of July 2026, in its own symbols; body axes x forward, y left, z up, as here:
 
@@ -6,8 +6,8 @@ Equations of gz-sim as of July 2026, in its own symbols; body axes x forward, y 
     thrust = thrust_coefficient fluid_density propeller_diameter⁴ n |n|             n in rad/s, along the joint's axis
     buoyancy = density g volume of the collision shapes, at the mean of their poses, weighted by their volumes
 
-Ma holds xDotU and the like, which are negative, and C is Fossen's Coriolis matrix of -Ma: gz-sim adds it where Fossen
-subtracts it, which FinsSim does not follow. Propellers and other jointed links are fixed where the file puts them.
+Ma contains xDotU and so on, which are negative, and C is Fossen's Coriolis matrix of -Ma: gz-sim adds it where Fossen
+subtracts it, which FinsSim does not reproduce. Propellers and other jointed links are fixed in the pose of the file.
 """
 
 from __future__ import annotations
@@ -64,50 +64,50 @@ Array = NDArray[np.float64]
 
 FORCES, VELOCITIES = "xyzkmn", "UVWPQR"
 COEFFICIENT = re.compile(r"([xyzkmn])(Dot)?([UVWPQR])(?:(abs)?([UVWPQR]))?")
-"""A coefficient: force, whether it is of added mass, velocity, and the second velocity of a quadratic one."""
+"""Coefficient: force, optional marker of added mass, velocity, and the second velocity of a quadratic coefficient."""
 
 HYDRODYNAMICS = {
     "link_name", "water_density", "disable_coriolis", "disable_added_mass", "default_current", "namespace",
     "lookup_current_x", "lookup_current_y", "lookup_current_z",
 }  # fmt: skip
-"""Words of the plugin Hydrodynamics besides coefficients."""
+"""Child elements of the plugin Hydrodynamics besides coefficients."""
 THRUSTER = {
     "namespace", "topic", "joint_name", "thrust_coefficient", "propeller_diameter", "fluid_density", "use_angvel_cmd",
     "velocity_control", "max_thrust_cmd", "min_thrust_cmd", "deadband", "p_gain", "i_gain", "d_gain", "battery_name",
     "power_load", "wake_fraction", "alpha_1", "alpha_2",
 }  # fmt: skip
-"""Words of the plugin Thruster."""
+"""Child elements of the plugin Thruster."""
 CONTROL = {
     "jointName", "cmd_topic", "multiplier", "offset", "type", "servo_min", "servo_max", "useForce", "p_gain", "i_gain",
     "d_gain", "i_max", "i_min", "cmd_max", "cmd_min", "controlVelocitySlowdownSim", "frequencyCutoff",
 }  # fmt: skip
-"""Words of a control of the plugin ArduPilotPlugin."""
+"""Child elements of a control of the plugin ArduPilotPlugin."""
 BUOYANCY = {"uniform_fluid_density", "graded_buoyancy", "enable"}
-"""Words of the plugin Buoyancy."""
+"""Child elements of the plugin Buoyancy."""
 PROPELLER = {"thrust_coefficient": 1.0, "fluid_density": 1000.0, "propeller_diameter": 0.02}
-"""Words that give the thrust -> gz-sim's number without them [-, kg/m³, m]."""
+"""Child elements that determine the thrust -> gz-sim's default [-, kg/m³, m]."""
 CURVES = {"alpha_1", "alpha_2", "wake_fraction"}
-"""Words of a thrust coefficient that falls with the speed."""
+"""Child elements of a thrust coefficient that decreases with the speed."""
 LEFT_OUT = "plugin LiftDrag (its forces are left out)"
 WRENCHES = ("BuoyancyEngine", "JointPositionController", "AddedMass", "Wind")
-"""Plugins that act on a vehicle and are not read; others are named as well, without a warning."""
+"""Plugins that act on a vehicle and are not read; other plugins are listed without a warning."""
 
 DENSITY = 1000.0
-"""Density of water where the plugins give none [kg/m³]."""
+"""Density of water if the plugins define none [kg/m³]."""
 
 
-# The conversions: each from the words of gz-sim to those of a vehicle file.
+# Conversions from gz-sim's parameters to those of a vehicle file.
 
 
 def added_mass(coefficients: Mapping[str, float], where: str) -> Array:
-    """Return M_A [kg, kg m, kg m²], (6, 6), which is minus Ma.
+    """Return M_A [kg, kg m, kg m²], (6, 6), the negative of Ma.
 
     Args:
-        coefficients: Word, such as `xDotU`, -> number; others are left alone.
-        where: What a message calls them.
+        coefficients: Name, such as `xDotU`, -> number; other coefficients are ignored.
+        where: Name of the coefficients in messages.
 
     Raises:
-        VehicleError: A diagonal one is positive, or the matrix is not symmetric.
+        VehicleError: A diagonal coefficient is positive, or the matrix is not symmetric.
     """
     Ma = np.zeros((6, 6))
     for name, value in coefficients.items():
@@ -121,14 +121,14 @@ def added_mass(coefficients: Mapping[str, float], where: str) -> Array:
 
 
 def damping(coefficients: Mapping[str, float], where: str) -> tuple[Array, Array]:
-    """Return D1 [N s/m, N s, N m s] and D2 [N s²/m², N s², N m s²], (6, 6) each, which are minus the coefficients.
+    """Return D1 [N s/m, N s, N m s] and D2 [N s²/m², N s², N m s²], (6, 6) each, the negatives of the coefficients.
 
     Args:
-        coefficients: Word, such as `xU` or `yRabsR`, -> number; those of added mass are left alone.
-        where: What a message calls them.
+        coefficients: Name, such as `xU` or `yRabsR`, -> number; those of added mass are ignored.
+        where: Name of the coefficients in messages.
 
     Raises:
-        VehicleError: A diagonal one is positive, or a product of two velocities is not of the form v|v|.
+        VehicleError: A diagonal coefficient is positive, or a product of two velocities is not of the form v|v|.
     """
     linear, quadratic = np.zeros((6, 6)), np.zeros((6, 6))
     for name, value in coefficients.items():
@@ -142,7 +142,7 @@ def damping(coefficients: Mapping[str, float], where: str) -> tuple[Array, Array
             quadratic[force, velocity] = -value
         elif value and match[4]:
             raise VehicleError(
-                f"{where}: {name} couples two velocities, which a vehicle file cannot hold: set it to 0 or leave it out"
+                f"{where}: {name} couples two velocities, which a vehicle file cannot represent: set it to 0 or omit it"
             )
         elif value:
             abs_name = f"{match[1]}{match[3]}abs{match[5]}"
@@ -181,12 +181,12 @@ def fluid_added_mass(element: Element, where: str) -> Array:
 
 
 def thrust_factor(coefficient: float, density: float, diameter: float) -> float:
-    """Return c of thrust = c n|n| [N s²/rad²], without its sign, which only says how the propeller turns.
+    """Return the magnitude of c in thrust = c n|n| [N s²/rad²]; its sign only states the direction of rotation.
 
     Args:
-        coefficient: Of n in rad/s, not in revolutions per second [-].
-        density: Of the water [kg/m³].
-        diameter: Of the propeller [m].
+        coefficient: Thrust coefficient for n in rad/s, not in revolutions per second [-].
+        density: Density of the water [kg/m³].
+        diameter: Diameter of the propeller [m].
     """
     return abs(coefficient) * density * diameter**4
 
@@ -203,7 +203,7 @@ def axis_of_joint(joint: LinkPose, axis: Array) -> Array:
 
 
 def _put_hydrodynamics(model: Model, plugin: Element, base: str, draft: Draft) -> None:
-    """Set added mass and damping of the plugin, or added mass of the link."""
+    """Set added mass and damping from the plugin, or added mass from the link."""
     where = f"{model.label}: plugin Hydrodynamics"
     coefficients = {}
     for child in plugin:
@@ -321,15 +321,15 @@ LIFT_DRAG = {
     "link_name", "area", "air_density", "a0", "cla", "cda", "cma", "alpha_stall", "cla_stall", "cda_stall", "cma_stall",
     "cp", "forward", "upward", "radial_symmetry", "control_joint_name", "control_joint_rad_to_cl",
 }  # fmt: skip
-"""Words of LiftDrag."""
+"""Child elements of LiftDrag."""
 STEEPEST_STALL = 1.5
-"""Stall of a surface that has none below 90° [rad]."""
+"""Stall angle of a surface without stall below 90° [rad]."""
 
 
 def _put_fins(model: Model, plugins: list[Element], draft: Draft) -> set[str]:
-    """Set the surfaces that a joint turns, or whose lift the angle of a joint adds to; return the joints.
+    """Set the surfaces that a joint rotates, or whose lift depends on the angle of a joint; return the joints.
 
-    Lift is area rho/2 V² cla alpha along `upward` where the flow comes along `forward`, in the frame of the link.
+    Lift is area rho/2 V² cla alpha along `upward` for flow along `forward`, in the frame of the link.
     """
     joints = set()
     for plugin in plugins:
@@ -421,13 +421,13 @@ def _put_limits(
     """Set the limits of force and shaft speed.
 
     Args:
-        plugin: The Thruster.
-        where: What a message calls it.
-        path: Of the thruster in the vehicle file.
-        commands: Least and greatest command of the autopilot, N or rad/s; None: no autopilot gives it.
-        factor: Of thrust = factor n|n|, with its sign [N s²/rad²].
-        weight: Of the vehicle [N].
-        draft: Draft to set them in.
+        plugin: Element of the Thruster.
+        where: Name of the plugin in messages.
+        path: Path of the thruster in the vehicle file.
+        commands: Least and greatest command of the autopilot, N or rad/s; None if no autopilot commands it.
+        factor: Factor of thrust = factor n|n|, with its sign [N s²/rad²].
+        weight: Weight of the vehicle [N].
+        draft: Draft to which the values are written.
     """
     low = number(plugin, "min_thrust_cmd", where, -math.inf)
     high = number(plugin, "max_thrust_cmd", where, math.inf)
@@ -453,11 +453,11 @@ def _put_limits(
             draft.guess(f"{path}.rpm_{key}", sign * _rpm(force, abs(factor)), f"{how}, as shaft speed")
 
 
-# The file: its world or its model, its plugins, and what is not read.
+# The file: its world or its model, its plugins, and contents that are not read.
 
 
 def kind_of(plugin: Element) -> str:
-    """Return the last word of a plugin's name: `Thruster` of gz::sim::systems::Thruster."""
+    """Return the last component of a plugin's name: `Thruster` of gz::sim::systems::Thruster."""
     return plugin.get("name", "").rpartition("::")[2]
 
 
@@ -534,13 +534,13 @@ def _density(plugin: Element, where: str) -> float:
     changes = graded.findall("density_change")
     if any(number(change, "above_depth", where, 0.0) != 0.0 for change in changes):
         raise VehicleError(
-            f"{where}: the density changes under water, which no vehicle file holds: give one density"
+            f"{where}: the density changes under water, which a vehicle file cannot represent: give one density"
         )
     return number(graded, "default_density", where, DENSITY)
 
 
 def _ranges(plugins: list[Element], label: str) -> dict[str, tuple[float, float]]:
-    """Return joint -> least and greatest command to its Thruster, of the controls of ArduPilotPlugin."""
+    """Return joint -> least and greatest command to its Thruster, from the controls of ArduPilotPlugin."""
     ranges = {}
     for control in (control for plugin in plugins for control in plugin.findall("control")):
         joint = (control.findtext("jointName") or "").strip()
@@ -558,10 +558,11 @@ def read_sdf(path: Path) -> Draft:
     """Read the model of an SDF file.
 
     Args:
-        path: File of a model, or of a world with one model that has hydrodynamics. Meshes are in its folder or below.
+        path: File of a model, or of a world with exactly one model with hydrodynamics. Meshes are in its
+            folder or below.
 
     Raises:
-        VehicleError: It cannot be read; the message says where, what was expected and what to do.
+        VehicleError: The file cannot be read; the message states location, expected content and remedy.
     """
     element, world = _model_of(read_xml(path, VehicleError), path)
     return read_model(element, world, path, "SDF of gz-sim")
@@ -574,13 +575,13 @@ def read_model(
 
     Args:
         element: The element `model`.
-        world: The world around it; None: there is none.
-        path: Its file.
+        world: The world that contains it; None if there is none.
+        path: File of the model.
         form: Name of the file's format.
-        packages: Name -> folder of the packages in which its meshes may be.
+        packages: Name -> folder of packages that may contain its meshes.
 
     Raises:
-        VehicleError: It cannot be read.
+        VehicleError: The model cannot be read.
     """
     name = element.get("name", "")
     draft = Draft(str(path), f"{path.name}, model {name} ({form})")

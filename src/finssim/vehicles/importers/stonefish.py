@@ -1,4 +1,4 @@
-"""Importer of scenarios of Stonefish (`.scn`): the robot with its parts, materials and thrusters.
+"""Importer of Stonefish scenarios (`.scn`): the robot with its parts, materials and thrusters.
 
 Equations as of version 1.6 (commit b21eb8e), in axes forward, right, down:
 
@@ -9,8 +9,8 @@ Equations as of version 1.6 (commit b21eb8e), in axes forward, right, down:
     drag = density Cd / 2 of the sum over faces that meet the flow of A cos v², along the flow; moments with the same Cd
     friction = density Cf of the sum over all faces of A v along the face
 
-The drag of version 1.6 has one speed more (v³), earlier ones the speed along the face's normal. The documents describe
-a quadratic drag; that of the import is equal to version 1.6 at 1 m/s.
+The drag of version 1.6 contains an additional factor of speed (v³), that of earlier versions the speed along the
+face's normal. The documentation describes a quadratic drag; the imported drag equals that of version 1.6 at 1 m/s.
 """
 
 from __future__ import annotations
@@ -58,21 +58,21 @@ __all__ = ["STONEFISH", "added_mass", "drag", "enclosing_ellipsoid", "read_stone
 Array = NDArray[np.float64]
 
 GRAVITY, DENSITY = 9.81, 1000.0
-"""Gravity [m/s²] and density of water [kg/m³] of Stonefish where a scenario gives none."""
+"""Gravity [m/s²] and density of water [kg/m³] of Stonefish if a scenario defines none."""
 SOLID = {
     "dimensions", "origin", "physical", "visual", "material", "look", "mass", "inertia", "cg", "hydrodynamics",
     "compound_transform", "contact", "external_part", "internal_part",
 }  # fmt: skip
-"""Words of a part."""
+"""Child elements of a part."""
 ACTUATOR = {"link", "origin", "specs", "propeller", "rotor_dynamics", "thrust_model", "watchdog"}
-"""Words of a thruster."""
+"""Child elements of a thruster."""
 
 
 # The scenario: its files, arguments and expressions.
 
 
 def word(element: Element | None, name: str, where: str, default: str | None = None) -> str:
-    """Return an attribute; the default where there is none, or a refusal."""
+    """Return an attribute; if it is missing, the default, or an error if there is none."""
     value = default if element is None else element.get(name, default)
     if value is None:
         raise VehicleError(f"{where}: {name} is missing: add it")
@@ -80,18 +80,18 @@ def word(element: Element | None, name: str, where: str, default: str | None = N
 
 
 def values(element: Element | None, name: str, count: int, where: str, default: str | None = None) -> Array:
-    """Return the numbers of an attribute in its unit, (count,)."""
+    """Return the numbers of an attribute, in its unit, (count,)."""
     return numbers(word(element, name, where, default), count, f"{where}: {name}")
 
 
 def refuse_strange(element: Element, known: set[str], where: str, draft: Draft) -> None:
-    """Refuse children that are not known, but for those of the ROS package of Stonefish, which are noted.
+    """Refuse children with unknown names, except those of Stonefish's ROS package, which are noted.
 
     Args:
-        element: Their parent.
-        known: Their names.
-        where: What the message calls the parent.
-        draft: Draft to note them in.
+        element: Parent element.
+        known: Known names.
+        where: Name of the parent in messages.
+        draft: Draft to which the notes are added.
     """
     ros = [child.tag for child in element if child.tag.startswith("ros_")]
     draft.not_read.update(f"{element.tag}: {tag}" for tag in ros)
@@ -99,7 +99,7 @@ def refuse_strange(element: Element, known: set[str], where: str, draft: Draft) 
 
 
 def scalar(element: Element | None, name: str, where: str, default: str | None = None) -> float:
-    """Return the number of an attribute, in its unit."""
+    """Return the number in an attribute, in its unit."""
     return float(values(element, name, 1, where, default)[0])
 
 
@@ -112,12 +112,12 @@ def pose_of(element: Element | None, where: str) -> LinkPose:
 
 
 class ScenarioFiles:
-    """Files of a scenario: in its folder, in a folder `data` near it, in given folders, or in packages of ROS."""
+    """Files of a scenario: in its folder, in a folder `data` near it, in given folders, or in ROS packages."""
 
     def __init__(self, path: Path, folders: Sequence[Path]) -> None:
         """
         Args:
-            path: The scenario.
+            path: Scenario file.
             folders: Folders that are searched first.
         """
         own = path.resolve().parent
@@ -127,10 +127,10 @@ class ScenarioFiles:
         self.places = [x for folder in folders for x in (folder.resolve(), folder.resolve() / "data")] + near
 
     def find(self, name: str, where: str) -> Path:
-        """Return a file that the scenario names.
+        """Return a file that the scenario refers to.
 
         Raises:
-            VehicleError: It is not there, or its name leads elsewhere.
+            VehicleError: The file does not exist, or its path leads outside these folders.
         """
         package = re.match(r"\$\(find ([\w.-]+)\)/+", name)
         rest = name[package.end() :] if package else name
@@ -193,35 +193,35 @@ def scenario(path: Path, files: ScenarioFiles, draft: Draft) -> list[Element]:
     return out
 
 
-# Parts: shapes, their mass, and what the water adds to it.
+# Parts: shapes, their mass, and their interaction with the water.
 
 
 @dataclass
 class Solid:
-    """A part, in the frame of the base link or that in which this is level."""
+    """Part of a robot, in the frame of the base link, or in a levelled frame if that is tilted."""
 
     mass: float
-    """[kg]"""
+    """Mass [kg]."""
     volume: float
-    """Volume that it displaces, or 0 [m³]."""
+    """Displaced volume, or 0 [m³]."""
     lift: Array
-    """Centre of this volume [m], (3,)."""
+    """Centre of the displaced volume [m], (3,)."""
     frame: LinkPose
-    """Its centre of gravity, and the axes of its moments of inertia."""
+    """Frame at its centre of gravity, along the principal axes of inertia."""
     moments: Array
     """Moments of inertia [kg m²], (3,)."""
     added: tuple[float, Array]
-    """Added mass [kg], and moments of it [kg m²], (3,)."""
+    """Added mass [kg], and added moments of inertia [kg m²], (3,)."""
     turn: Array
-    """Axes of the coefficients of drag [-], (3, 3)."""
+    """Axes of the drag coefficients [-], (3, 3)."""
     coefficients: Array
-    """Coefficients of drag, then of friction [-], (2, 3)."""
+    """Coefficients of drag and of friction [-], (2, 3)."""
     surface: tuple[Vertices, Faces] | None
-    """Surface that the water meets [m]; None: it meets none."""
+    """Surface exposed to the water [m]; None if there is none."""
 
 
 def split(vertices: Vertices, faces: Faces, chosen: NDArray[np.bool_]) -> tuple[Vertices, Faces]:
-    """Return a mesh whose chosen faces are divided into four, as Stonefish does."""
+    """Return a mesh whose selected faces are divided into four, as in Stonefish."""
     a, b, c = faces[chosen].T
     edges = np.stack([a, b, b, c, c, a], axis=1).reshape(-1, 2)
     unique, first, index = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_inverse=True)
@@ -234,7 +234,7 @@ def split(vertices: Vertices, faces: Faces, chosen: NDArray[np.bool_]) -> tuple[
 
 
 def refined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Return a mesh without faces of more than three times the mean area."""
+    """Return a mesh without faces larger than three times the mean area."""
     for _ in range(20):
         area = face_geometry(vertices, faces)[1]
         large = area > 3.0 * max(float(area.mean()), 1e-4)
@@ -245,7 +245,7 @@ def refined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
 
 
 def box_mesh(half: Array) -> tuple[Vertices, Faces]:
-    """Return the mesh of a box of these half sides [m], each side with corners of its own."""
+    """Return the mesh of a box with these half sides [m]; adjacent sides share no vertices."""
     sides = "--- -+- ++- +-- | +-- ++- +++ +-+ | --+ -++ -+- --- | +-+ +++ -++ --+ | +++ ++- -+- -++ | +-- +-+ --+ ---"
     corners = [corner for side in sides.split(" | ") for corner in side.split()]
     vertices = half * np.array([[1.0 if sign == "+" else -1.0 for sign in corner] for corner in corners])
@@ -256,7 +256,8 @@ def box_mesh(half: Array) -> tuple[Vertices, Faces]:
 
 
 def cylinder_mesh(radius: float, half: float) -> tuple[Vertices, Faces]:
-    """Return the mesh of a cylinder along z of this radius and half height [m], of the volume of the cylinder."""
+    """Return the mesh of a cylinder along z of this radius and half height [m], scaled to the volume of the
+    cylinder."""
     n = int(max(math.ceil(20.0 * math.pi * radius), 32))
     step = 2.0 * math.pi / n
     radius *= math.sqrt(step / math.sin(step))
@@ -276,14 +277,14 @@ def cylinder_mesh(radius: float, half: float) -> tuple[Vertices, Faces]:
 
 
 def sphere_mesh(radius: float) -> tuple[Vertices, Faces]:
-    """Return the mesh of a sphere of this radius [m], of the volume of the sphere."""
+    """Return the mesh of a sphere of this radius [m], scaled to the volume of the sphere."""
     vertices, faces = box_mesh(np.ones(3))
     vertices /= np.linalg.norm(vertices, axis=1)[:, None]
     return radius * (4.0 / 3.0 * math.pi / mesh_volume(vertices, faces)) ** (1.0 / 3.0) * vertices, faces
 
 
 def mesh_moments(points: Array, density: float) -> Array:
-    """Return the inertia (3, 3) [kg m²] about the origin of the solid that triangles (n, 3, 3) [m] enclose."""
+    """Return the inertia (3, 3) [kg m²] about the origin of the solid enclosed by triangles (n, 3, 3) [m]."""
     volumes, total = np.linalg.det(points), points.sum(axis=1)
     P = np.einsum("n,nij,nik->jk", volumes, points, points) + np.einsum("n,nj,nk->jk", volumes, total, total)
     P *= density / 120.0
@@ -291,9 +292,10 @@ def mesh_moments(points: Array, density: float) -> Array:
 
 
 def enclosing_ellipsoid(points: Array) -> Array:
-    """Return the half axes [m], (3,), of the ellipsoid that Stonefish puts around points (n, 3) [m].
+    """Return the half axes [m], (3,), of the ellipsoid that Stonefish fits around points (n, 3) [m].
 
-    It is that of Kumar and Yildirim (2008), ended when its volume is known within 20 % or after 10 steps.
+    The algorithm is that of Kumar and Yildirim (2008), terminated when its volume is accurate to 20 % or
+    after 10 steps.
     """
     weights = np.zeros(len(points))
     ends = []
@@ -304,7 +306,9 @@ def enclosing_ellipsoid(points: Array) -> Array:
     steps = 0
     while True:
         mean = weights @ points
-        spread = np.maximum(weights @ points**2 - mean**2, 1e-18)  # flat parts have no third axis
+        spread = np.maximum(
+            weights @ points**2 - mean**2, 1e-18
+        )  # flat parts have no extent along the third axis
         reach = ((points - mean) ** 2 / (3.0 * spread)).sum(axis=1)
         farthest = int(np.argmax(reach))
         excess = float(reach[farthest]) - 1.0
@@ -318,12 +322,12 @@ def enclosing_ellipsoid(points: Array) -> Array:
 
 
 def added_mass(kind: str, size: Array, density: float) -> tuple[Array, Array]:
-    """Return added masses [kg] and moments [kg m²] that Stonefish gives a shape, (3,) each.
+    """Return the added masses [kg] and moments [kg m²] that Stonefish assigns to a shape, (3,) each.
 
     Args:
         kind: `sphere`, `cylinder` (along z) or `ellipsoid`.
         size: Radius; radius and length; or three half axes [m].
-        density: Of the water [kg/m³].
+        density: Density of the water [kg/m³].
     """
     if kind == "sphere":
         return np.full(3, 2.0 / 3.0 * math.pi * density * size[0] ** 3), np.zeros(3)
@@ -346,8 +350,8 @@ def drag(surface: tuple[Vertices, Faces], centre: Array, twist: Array) -> tuple[
 
     Args:
         surface: Vertices (n, 3) [m] and faces (m, 3).
-        centre: Point about which moments are taken [m], (3,).
-        twist: Velocity of this point and rate of turn of the body [m/s, rad/s], (6,).
+        centre: Reference point of the moments [m], (3,).
+        twist: Velocity of this point and angular velocity of the body [m/s, rad/s], (6,).
     """
     normal, area, place = face_geometry(*surface)
     flow = -(twist[:3] + np.cross(twist[3:], place - centre))
@@ -402,7 +406,8 @@ def _primitive(
 def _model(
     part: Element, files: ScenarioFiles, where: str
 ) -> tuple[float, Array, Array, LinkPose, tuple[Vertices, Faces]]:
-    """Return volume, centre, moments per density, their axes, and mesh, of a part with a mesh, in the mesh's frame."""
+    """Return volume, centre, moments per density, principal axes, and mesh, of a part with a mesh, in the
+    mesh's frame."""
     mesh = part.find("physical/mesh")
     file = files.find(word(mesh, "filename", f"{where}: mesh"), where)
     try:
@@ -446,16 +451,16 @@ def solid_of(
     water: float,
     where: str,
 ) -> Solid:
-    """Return a part in the frame in which it has a pose.
+    """Return a part in the frame of its given pose.
 
     Args:
-        part: The element.
-        place: Its pose.
-        external: Whether the water meets it.
+        part: Element of the part.
+        place: Pose of the part.
+        external: True if it is exposed to the water.
         files: Files of the scenario.
         densities: Material -> density [kg/m³].
         water: Density of the water [kg/m³].
-        where: What a message calls it.
+        where: Name of the part in messages.
     """
     refuse_unknown(part, SOLID, where)
     kind, mode = word(part, "type", where), word(part, "physics", where, "submerged")
@@ -470,7 +475,7 @@ def solid_of(
     volume, centre, moments, axes, mesh = form
     frame, at = outer.after(axes), place.after(outer)
 
-    # Its shape in the water, in the axes of its moments.
+    # Its shape in the water, in its principal axes.
     points = (mesh[0] - axes.place) @ axes.turn
     fit = {"model": "ellipsoid", "box": "ellipsoid"}.get(kind, kind)
     if fit == "sphere":
@@ -488,13 +493,13 @@ def solid_of(
         own = values(part.find("hydrodynamics"), name, 3, where, "-1 -1 -1")
         coefficients[row] = own if own.min() >= 0.0 else coefficients[row]
 
-    # Its mass: of its material, or as given.
+    # Its mass, from its material or as given.
     mass, cg = scalar(part.find("mass"), "value", where, "-1"), part.find("cg")
     own = values(part.find("inertia"), "xyz", 3, where, "0 0 0")
     material = word(part.find("material"), "name", f"{where}: material")
     if material not in densities and (mass <= 0.0 or (cg is not None and not own.any())):
         raise VehicleError(
-            f"{where}: material '{material}' is in no file that is read: give the scenario that includes it, or a mass"
+            f"{where}: material '{material}' is in no file that was read: give the scenario that includes it or a mass"
         )
     density = densities.get(material, 1.0)
     own_mass, moments = density * volume, density * moments
@@ -519,7 +524,7 @@ def solid_of(
 
 
 def solids_of(link: Element, pose: LinkPose, *context: object, where: str) -> list[Solid]:
-    """Return the parts of a link in the frame in which it has a pose; `context` is that of `solid_of`."""
+    """Return the parts of a link in the frame of its given pose; `context` is that of `solid_of`."""
     if word(link, "physics", where, "submerged") not in ("submerged", "floating"):
         raise VehicleError(
             f"{where}: physics is '{link.get('physics')}', expected submerged or floating: change it"
@@ -539,7 +544,8 @@ def solids_of(link: Element, pose: LinkPose, *context: object, where: str) -> li
 
 
 def rigid(parts: Sequence[Solid], augmented: bool) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of gravity (3,) [m], and inertia (3, 3) [kg m²] about it, with the water's or not."""
+    """Return mass [kg], centre of gravity (3,) [m], and inertia (3, 3) [kg m²] about it, optionally with
+    added mass."""
     mass, centre, inertia = combined(
         [part.mass for part in parts],
         [part.frame.place for part in parts],
@@ -561,9 +567,9 @@ def water_wrench(
 
     Args:
         links: Parts of each link.
-        centre: The point [m], (3,).
-        twist: Its velocity and the rate of turn, in axes forward, right, down [m/s, rad/s], (6,).
-        density: Of the water [kg/m³].
+        centre: Reference point [m], (3,).
+        twist: Velocity of the point and angular velocity, in axes forward, right, down [m/s, rad/s], (6,).
+        density: Density of the water [kg/m³].
     """
     out = np.zeros((2, 6))
     for parts in links:
@@ -591,7 +597,7 @@ def water_wrench(
 def _links(
     robot: Element, context: tuple[object, ...], draft: Draft, where: str
 ) -> dict[str, tuple[LinkPose, list[Solid]]]:
-    """Return name -> pose in the base link, and parts in its frame, of every link."""
+    """Return, for every link, name -> pose in the base link, and its parts in that frame."""
     base = robot.find("base_link")
     if base is None:
         raise VehicleError(f"{where}: base_link is missing: add it")
@@ -650,7 +656,7 @@ def _put_propeller(actuator: Element, name: str, draft: Draft, where: str) -> No
     diameter, old = of("propeller@diameter"), actuator.find("specs[@max_rpm]") is not None
     factor = draft.values["water"]["density"] * diameter**4 / (4.0 * math.pi**2)
     model = "fluid_dynamics" if old else kind_of("thrust_model")
-    if model == "fluid_dynamics":  # its coefficients are those of the force ahead and astern, for both hands
+    if model == "fluid_dynamics":  # coefficients of the force ahead and astern, for both rotations
         if old:
             ahead, turning = of("specs@thrust_coeff"), of("specs@torque_coeff", "0")
             astern = of("specs@thrust_coeff_backward", repr(ahead))
@@ -726,15 +732,16 @@ def _placed(
 
 
 RUDDER = {"specs", "visual", "origin", "link", "watchdog"}
-"""Words of a rudder."""
+"""Child elements of a rudder."""
 ENDLESS = 1.5
-"""Stall of a rudder without a stall angle [rad]."""
+"""Stall angle of a rudder without one in the file [rad]."""
 
 
 def _put_rudder(
     actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
 ) -> None:
-    """Set a rudder, which turns about the z axis of its origin: lift is lift_coeff by the angle, drag by its square."""
+    """Set a rudder that rotates about the z axis of its origin: lift is lift_coeff times the angle, drag
+    quadratic in the angle."""
     refuse_strange(actuator, RUDDER, where, draft)
     (name, pose), specs = _placed(actuator, links, draft, where), actuator.find("specs")
     lift, drag, area, most = (
@@ -766,7 +773,7 @@ def _put_rudder(
 def _put_thruster(
     actuator: Element, links: Mapping[str, tuple[LinkPose, list[Solid]]], draft: Draft, where: str
 ) -> None:
-    """Set a thruster, or a force of limited size in its place."""
+    """Set a thruster, or a force actuator of limited magnitude as a thruster."""
     refuse_strange(actuator, ACTUATOR, where, draft)
     name, pose = _placed(actuator, links, draft, where)
     path = f"thrusters.{name}"
@@ -794,10 +801,10 @@ def read_stonefish(path: Path, folders: Sequence[Path] = ()) -> Draft:
 
     Args:
         path: The scenario, or a file of the robot that it includes.
-        folders: Where the files that it names are sought, besides its folder and `data` near it.
+        folders: Folders that are searched for referenced files, besides its folder and `data` near it.
 
     Raises:
-        VehicleError: It cannot be read; the message says where, what was expected and what to do.
+        VehicleError: The scenario cannot be read; the message states location, expected content and remedy.
     """
     files, draft = ScenarioFiles(path, folders), Draft(str(path), "")
     elements = scenario(path, files, draft)

@@ -1,4 +1,4 @@
-"""Thrust curves over the speed of the rotor, as uuv_simulator and Stonefish have them, and thrusters with them."""
+"""Thrust as a function of rotor speed, as in uuv_simulator and Stonefish, and thrusters with such curves."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ __all__ = [
 
 
 class ThrustCurve(NamedTuple):
-    """Thrust of a thruster over the speed of its rotor, and back."""
+    """Thrust of a thruster as a function of its rotor speed, and the inverse."""
 
     thrust: Callable[[float], float]
     """Function of the speed [rad/s] that returns the thrust [N]."""
     speed: Callable[[float], float]
-    """Function of the thrust [N] that returns the least speed for it [rad/s]."""
+    """Function of the thrust [N] that returns the least speed that produces it [rad/s]."""
     ends: tuple[float, float] = (-math.inf, math.inf)
     """Least and greatest thrust [N]."""
 
@@ -43,7 +43,7 @@ def dead_zone(left: float, right: float, low: float, high: float, where: str) ->
         right: Factor of forward thrust [N s²/rad²].
         low: Edge of the dead zone in reverse, 0 or less [rad²/s²].
         high: Edge of the dead zone forward, 0 or more [rad²/s²].
-        where: What a message calls it.
+        where: Name of the curve in messages.
     """
     if min(left, right) <= 0.0 or low > 0.0 or high < 0.0:
         raise VehicleError(
@@ -60,17 +60,17 @@ def dead_zone(left: float, right: float, low: float, high: float, where: str) ->
 
 
 def quadratic(forward: float, reverse: float, where: str) -> ThrustCurve:
-    """Return thrust = forward w² or -reverse w² [N s²/rad²]; `where` is what a message calls it."""
+    """Return the curve thrust = forward w² or -reverse w² [N s²/rad²]; `where` is its name in messages."""
     return dead_zone(reverse, forward, 0.0, 0.0, where)
 
 
 def interpolated(inputs: NDArray[np.float64], outputs: NDArray[np.float64], where: str) -> ThrustCurve:
-    """Return thrust between points.
+    """Return the curve that interpolates between points.
 
     Args:
         inputs: Speeds [rad/s], (n,).
         outputs: Thrusts [N], (n,).
-        where: What a message calls it.
+        where: Name of the curve in messages.
     """
     order = np.argsort(inputs)
     inputs, outputs = inputs[order], outputs[order]
@@ -86,7 +86,7 @@ def interpolated(inputs: NDArray[np.float64], outputs: NDArray[np.float64], wher
 
 
 def scaled(curve: ThrustCurve, push: float, turn: float) -> ThrustCurve:
-    """Return thrust = push f(turn w) of a curve f; both are shares [-]."""
+    """Return the curve thrust = push f(turn w) of a curve f; both factors are fractions [-]."""
     low, high = curve.ends
     return ThrustCurve(
         lambda w: push * curve.thrust(turn * w),
@@ -96,7 +96,7 @@ def scaled(curve: ThrustCurve, push: float, turn: float) -> ThrustCurve:
 
 
 def mirrored(curve: ThrustCurve) -> ThrustCurve:
-    """Return thrust = -f(-w) of a curve f: that of a propeller that turns the other way."""
+    """Return the curve thrust = -f(-w) of a curve f: that of a propeller with the opposite direction of rotation."""
     low, high = curve.ends
     return ThrustCurve(lambda w: -curve.thrust(-w), lambda f: -curve.speed(-f), (-high, -low))
 
@@ -105,10 +105,10 @@ def steady_speed(gain: float, linear: float, square: float, where: str) -> Calla
     """Return the speed [rad/s] at which gain u = linear w + square w|w|, as a function of u.
 
     Args:
-        gain: Of the input, in the unit of the others per unit of u.
-        linear: Loss that grows with the speed [unit of gain u per rad/s].
-        square: Loss that grows with its square [unit of gain u per rad²/s²].
-        where: What a message calls it.
+        gain: Gain of the input, in the unit of the other terms per unit of u.
+        linear: Loss proportional to the speed [unit of gain u per rad/s].
+        square: Loss proportional to its square [unit of gain u per rad²/s²].
+        where: Name of the rotor in messages.
     """
     if square <= 0.0 or linear < 0.0:
         raise VehicleError(f"{where}: its losses are {linear:g} and {square:g}, expected more than 0")
@@ -124,12 +124,12 @@ def put_curve(draft: Draft, name: str, curve: ThrustCurve, low: float, high: flo
     """Set limits, dead zone and thrust of a thruster: the parabola through the limit.
 
     Args:
-        draft: Draft with the mass, to set them in.
-        name: Of the thruster.
-        curve: Its curve.
-        low: Least thrust [N]; -inf: the file gives none.
-        high: Greatest thrust [N]; inf: the file gives none.
-        limits: Where the limits are from.
+        draft: Draft with the mass, to which the values are written.
+        name: Name of the thruster.
+        curve: Thrust curve.
+        low: Least thrust [N]; -inf if the file sets no limit.
+        high: Greatest thrust [N]; inf if the file sets no limit.
+        limits: Source of the limits.
     """
     path = f"thrusters.{name}"
     low, high = max(low, curve.ends[0]), min(high, curve.ends[1])

@@ -1,12 +1,12 @@
 """Hull drag, propeller and fins of the torpedoes of PythonVehicleSimulator and HoloOcean.
 
-Their equations, x forward, y right, z down, b span, S area of the hull, alpha angle of attack, x_k places of 21 strips:
+Equations, x forward, y right, z down, b span, S area of the hull, alpha angle of attack, x_k positions of 21 strips:
 
     drag = rho/2 U² S (CD_0 + CL² / (pi e b²/S)),  lift = rho/2 U² S CL,  CL = CL_alpha alpha
     Y = -rho/2 T Cd sum_k |v + x_k r| (v + x_k r) dx,  N = -rho/2 T Cd sum_k x_k |v + x_k r| (v + x_k r) dx
     X = (1 - t) rho D⁴ (KT_0 n|n| + (KT_max - KT_0) / Ja_max (1 - w) U / D |n|)                n in 1/s
 
-The terms `lift_drag`, `cross_flow_drag` and `munk_relief` of a vehicle file hold the hull.
+The hull is represented by the terms `lift_drag`, `cross_flow_drag` and `munk_relief` of a vehicle file.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ Array = NDArray[np.float64]
 SET = "hydrodynamics.calibrated"
 """Path of the hydrodynamic set that importers write."""
 PROPELLER = ("D_prop", "t_prop", "KT_0", "KT_max", "Ja_max")
-"""Words of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
+"""Keys of a propeller: diameter [m], thrust deduction, thrust coefficients at J = 0 and at Ja_max, Ja_max [-]."""
 FINS = ("CL_delta_r", "CL_delta_s", "S_fin")
-"""Words of fins: slopes of lift of rudder and stern plane [1/rad], area of one [m²]."""
+"""Keys of fins: lift slopes of rudder and stern plane [1/rad], area of one fin [m²]."""
 TRAVEL = math.radians(15.0)
-"""Travel of the fins of PythonVehicleSimulator [rad]."""
+"""Range of the fins of PythonVehicleSimulator [rad]."""
 RHO, WAKE, OSWALD = 1026.0, 0.056, 0.7
-"""Density [kg/m³] that the library's drag has, wake fraction and Oswald's efficiency of PythonVehicleSimulator [-]."""
+"""Density in the library's drag [kg/m³], wake fraction and Oswald efficiency of PythonVehicleSimulator [-]."""
 RPM = 3000.0
 """Guessed shaft speed at the limit of a thruster [rpm]."""
 HOERNER = (
@@ -50,16 +50,16 @@ HOERNER = (
     (1.9661, 1.9657, 1.8976, 1.7872, 1.5837, 1.2786, 1.2108, 1.0836, 0.9986, 0.8796, 0.8284, 0.7599, 0.6914, 0.6571,
      0.6307, 0.5962, 0.5868, 0.5859, 0.5599, 0.5593),
 )  # fmt: skip
-"""Beam by twice the draft [-], and cross-flow drag coefficient of Hoerner's curve [-]."""
+"""Ratio of beam to twice the draught [-], and cross-flow drag coefficient of Hoerner's curve [-]."""
 
 
 def spheroid_moments(a: float, b: float, mass: float) -> Array:
     """Return the moments of inertia of a homogeneous spheroid [kg m²], (3,).
 
     Args:
-        a: Its half length [m].
-        b: Its radius [m].
-        mass: Its mass [kg].
+        a: Half length [m].
+        b: Radius [m].
+        mass: Mass [kg].
     """
     return mass * np.array([0.4 * b**2, 0.2 * (a**2 + b**2), 0.2 * (a**2 + b**2)])
 
@@ -68,10 +68,10 @@ def spheroid_added_mass(a: float, b: float, mass: float, roll: float) -> Array:
     """Return the diagonal of the added mass of a spheroid by Lamb's k-factors [kg, kg m²], (6,).
 
     Args:
-        a: Its half length [m].
-        b: Its radius [m].
-        mass: Of the water that it displaces [kg].
-        roll: Added moment in roll, as a share of its moment of inertia [-].
+        a: Half length [m].
+        b: Radius [m].
+        mass: Mass of the displaced water [kg].
+        roll: Added moment in roll, as a fraction of the moment of inertia [-].
     """
     e = math.sqrt(1.0 - (b / a) ** 2)
     log = math.log((1.0 + e) / (1.0 - e))
@@ -82,11 +82,11 @@ def spheroid_added_mass(a: float, b: float, mass: float, roll: float) -> Array:
 
 
 def slow_damping(mass: Array, times: Array, ratios: Array, stiffness: float) -> Array:
-    """Return the diagonal of the linear damping of a torpedo [N s/m, N m s], (6,).
+    """Return the diagonal of the linear damping of a torpedo at low speed [N s/m, N m s], (6,).
 
     Args:
         mass: Diagonal of its mass matrix [kg, kg m²], (6,).
-        times: Time constants in surge, sway, which is that of heave, and yaw [s], (3,).
+        times: Time constants in surge, in sway and heave, and in yaw [s], (3,).
         ratios: Damping ratios in roll and pitch [-], (2,).
         stiffness: W (z_g - z_b) [N m].
     """
@@ -95,14 +95,14 @@ def slow_damping(mass: Array, times: Array, ratios: Array, stiffness: float) -> 
 
 
 def put_lift_drag(draft: Draft, span: float, area: float, drag: float, efficiency: float = OSWALD) -> None:
-    """Set lift and drag of a hull by its angle of attack.
+    """Set lift and drag of a hull as a function of its angle of attack.
 
     Args:
         draft: Draft with hydrodynamics.
-        span: Of the hull as a wing [m].
-        area: Of the hull as a wing [m²].
+        span: Span of the hull as a wing [m].
+        area: Area of the hull as a wing [m²].
         drag: CD_0 [-].
-        efficiency: Oswald's [-].
+        efficiency: Oswald efficiency [-].
     """
     ratio, q = span**2 / area, 0.5 * RHO * area
     slope = math.pi * ratio / (1.0 + math.sqrt(1.0 + (ratio / 2.0) ** 2))
@@ -116,12 +116,12 @@ def put_lift_drag(draft: Draft, span: float, area: float, drag: float, efficienc
 
 
 def put_cross_flow(draft: Draft, length: float, beam: float, draught: float) -> None:
-    """Set cross-flow drag in sway and yaw: 21 strips, a twentieth of the length each, reach beyond the hull's ends.
+    """Set cross-flow drag in sway and yaw: 21 strips, each a twentieth of the length, extend beyond the hull's ends.
 
     Args:
         draft: Draft with hydrodynamics.
-        length: Of the hull [m].
-        beam: Of the hull [m].
+        length: Length of the hull [m].
+        beam: Beam of the hull [m].
         draught: Height of the hull [m].
     """
     across = 0.5 * RHO * draught * float(np.interp(beam / (2.0 * draught), *HOERNER))
@@ -130,7 +130,7 @@ def put_cross_flow(draft: Draft, length: float, beam: float, draught: float) -> 
 
 
 def put_munk_relief(draft: Draft) -> None:
-    """Cancel the products of two velocities in C_A that these programs set to 0."""
+    """Cancel the velocity products in C_A that these programs set to 0."""
     A = np.diag(np.array(draft.values["hydrodynamics"]["calibrated"]["added_mass"]))
     draft.put(f"{SET}.munk_relief", A[:3].tolist(), "derived", "the file sets these terms of C_A to 0")
     draft.different.append(
@@ -139,11 +139,11 @@ def put_munk_relief(draft: Draft) -> None:
 
 
 def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
-    """Set the propeller at the stern: its thrust at rest, and what it loses in the flow.
+    """Set the propeller at the stern: its thrust at rest, and its loss of thrust in a flow.
 
     Args:
         draft: Draft with water.
-        words: Numbers of `PROPELLER`, `nMax` [rpm], `L` [m] and, where given, `T_n` [s] and `w` [-].
+        words: Values of `PROPELLER`, `nMax` [rpm], `L` [m] and, where given, `T_n` [s] and `w` [-].
     """
     omega, D, path = words["nMax"] * math.pi / 30.0, words["D_prop"], "thrusters.propeller"
     scale = (1.0 - words["t_prop"]) * draft.values["water"]["density"] * D**4
@@ -167,12 +167,13 @@ def put_propeller(draft: Draft, words: Mapping[str, float]) -> None:
 
 
 def put_fins(draft: Draft, words: Mapping[str, float | None]) -> None:
-    """Set a rudder and a stern plane, of two fins each, whose lift goes with the deflection alone.
+    """Set a rudder and a stern plane, of two fins each, whose lift depends on the deflection alone.
 
     Args:
         draft: Draft with a propeller.
-        words: `CL_delta_r` and `CL_delta_s` [1/rad], `S_fin` of one fin [m²], `L` [m] and, where given, `A_r`, `A_s` of
-            a pair [m²], which has drag then, `x_r`, `x_s` [m], `deltaMax_r`, `deltaMax_s` [rad] and `T_delta` [s].
+        words: `CL_delta_r` and `CL_delta_s` [1/rad], `S_fin` of one fin [m²], `L` [m] and, where given,
+            `A_r`, `A_s` of a pair [m²], in which case the pair has drag, `x_r`, `x_s` [m], `deltaMax_r`,
+            `deltaMax_s` [rad] and `T_delta` [s].
     """
     for name, side, span in (("rudder", "r", [0.0, 0.0, 1.0]), ("stern_plane", "s", [0.0, -1.0, 0.0])):
         path, slope, area = f"actuators.{name}", words[f"CL_delta_{side}"], words.get(f"A_{side}")
@@ -198,7 +199,7 @@ def put_fins(draft: Draft, words: Mapping[str, float | None]) -> None:
 
 
 def guess_thruster(draft: Draft, section: str, name: str, limit: float) -> None:
-    """Guess the thrust curve and lag of a thruster of a section, of which the limit is known or guessed [N]."""
+    """Guess the thrust curve and lag of a thruster from its known or guessed limit [N]."""
     factor = limit / (RPM * math.pi / 30.0) ** 2
     for key, value in (("force_min", -limit), ("force_max", limit), ("rpm_min", -RPM), ("rpm_max", RPM),
                        ("c_plus", factor), ("c_minus", factor), ("time_constant", LAG)):  # fmt: skip

@@ -1,7 +1,7 @@
 """Importer of URDF and xacro: links and joints with the plugins of gz-sim or of uuv_simulator.
 
-A URDF becomes the SDF that Gazebo makes of it: `<gazebo>` elements go where they refer to, and a link without mass
-stays massless. Links fixed to one another stay links: their rigid body is the same.
+A URDF is converted to SDF as Gazebo does it: `<gazebo>` elements are merged into the elements they refer to, and a
+link without mass stays massless. Fixed links stay separate links: their combined rigid body is the same.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ READ = {
 
 
 def sdf_of(robot: Element, label: str) -> tuple[Element, Counter[str]]:
-    """Return the `model` of SDF that Gazebo makes of a `robot` of URDF, and what was left out.
+    """Return the `model` of SDF that Gazebo generates from a `robot` of URDF, and the omitted contents.
 
     Args:
         robot: The element `robot`, expanded.
-        label: What messages call its file.
+        label: Name of its file in messages.
     """
     model, left = Element("model", {"name": robot.get("name", "")}), Counter[str]()
 
@@ -119,14 +119,14 @@ def sdf_of(robot: Element, label: str) -> tuple[Element, Counter[str]]:
 
 
 def read_urdf(path: Path, folders: Sequence[Path] = ()) -> Draft:
-    """Read the robot of a URDF, or of a file of xacro.
+    """Read the robot from a URDF or xacro file.
 
     Args:
-        path: The file; the packages around it are found by their package.xml.
-        folders: Where packages are sought besides.
+        path: The file; packages near it are identified by their package.xml.
+        folders: Additional folders that are searched for packages.
 
     Raises:
-        VehicleError: It cannot be read; the message says where, what was expected and what to do.
+        VehicleError: The file cannot be read; the message states location, expected content and remedy.
     """
     root, packages = read_xml(path, VehicleError), packages_near(path, folders)
     texts = [text for e in root.iter() for text in (e.tag, e.text or "", *e.attrib.values())]

@@ -1,14 +1,14 @@
 """Reader of uuv_simulator's plugins: UnderwaterObject with its hydrodynamic models, Thruster and Fin.
 
-Equations as of commit bfb40cb, about the centre of gravity c of the base link and all links fixed to it, in which
-Gazebo applies wrenches, while it takes the velocity at the link's origin; v is in axes forward, right, down:
+Equations as of commit bfb40cb, about the centre of gravity c of the base link and all links fixed to it, where Gazebo
+applies wrenches, although it evaluates the velocity at the link's origin; v is in axes forward, right, down:
 
     force = (DLin + u DLinForward + diag(DQuad |v|)) v - Ma v_dot - C_A(Ma v) v     D is negative
     buoyancy = density g volume at c + center_of_buoyancy;  mass g where neutrally_buoyant
     thrust = thrust_efficiency f(propeller_efficiency w), w from gain times the command, along the axis of the joint
     lift = lift_constant V² a, drag = drag_constant V² a² (or cla, cda of an area) by the angle of attack a of a fin
 
-The factors and offsets of these (`scaling_damping`, `offset_volume`, ...) are set while it runs, not in files.
+The factors and offsets of these (`scaling_damping`, `offset_volume`, ...) are set at run time, not in files.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ PLUGINS = tuple(
     for name in (OBJECT, THRUSTER)
     for ros in ("_ros", "")
 )
-"""File names of the plugins that are read."""
+"""File names of the supported plugins."""
 FACTORS = {
     f"{word}_{what}"
     for word in ("scaling", "offset")
@@ -71,7 +71,7 @@ FACTORS = {
         "nonlin_damping",
     )
 }
-"""Words that uuv_simulator takes from its services, and not from a file."""
+"""Parameters that uuv_simulator receives from its services, not from a file."""
 WORDS = {
     "plugin": {"fluid_density", "flow_velocity_topic", "debug", "link", "use_global_current", "robotNamespace"},
     "link": {"neutrally_buoyant", "volume", "box", "center_of_buoyancy", "hydrodynamic_model"},
@@ -89,11 +89,11 @@ WORDS = {
         "output_topic", "robotNamespace",
     },
 }  # fmt: skip
-"""Element -> its words."""
+"""Element -> its child elements."""
 SURFACE = ("metacentric_width", "metacentric_length", "submerged_height")
-"""Words of a vessel that floats."""
+"""Child elements of a surface vessel."""
 DENSITY = 1028.0
-"""Density of a plugin that gives none, and of the models of a sphere and a cylinder [kg/m³]."""
+"""Default density of a plugin, and density in the models of a sphere and a cylinder [kg/m³]."""
 
 
 def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str) -> dict[str, Array]:
@@ -101,8 +101,8 @@ def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str
 
     Args:
         hydrodynamics: The element `hydrodynamic_model`.
-        box: Width, length and height of the link [m]; None: they are not given.
-        where: What a message calls it.
+        box: Width, length and height of the link [m]; None if they are not given.
+        where: Name of the element in messages.
 
     Returns:
         `added_mass` [kg, kg m, kg m²], `linear_damping` [N s/m, ...], `surge_damping` and `quadratic_damping`
@@ -164,7 +164,7 @@ def coefficients(hydrodynamics: Element, box: Sequence[float] | None, where: str
 
 
 def conversion(element: Element, where: str) -> ThrustCurve:
-    """Return the thrust curve of an element `conversion`; `where` is what a message calls it."""
+    """Return the thrust curve of an element `conversion`; `where` is its name in messages."""
     kind = (element.findtext("type") or "").strip()
     words = {
         "Basic": ("rotorConstant",),
@@ -179,13 +179,13 @@ def conversion(element: Element, where: str) -> ThrustCurve:
         columns = [numbers(element.findtext(word), count, f"{where}: {word}") for word in words[kind]]
         return interpolated(columns[0], columns[1], where)
     values = [number(element, word, where) for word in words[kind]]
-    if kind == "Basic":  # the sign of rotorConstant only says which way the propeller turns
+    if kind == "Basic":  # the sign of rotorConstant only states the direction of rotation
         return quadratic(abs(values[0]), abs(values[0]), where)
     return dead_zone(*values, where)
 
 
 def _response(element: Element, where: str) -> tuple[float | None, Callable[[float], float], str]:
-    """Return time constant [s], steady rotor speed [rad/s] of an input, and how the time constant comes about."""
+    """Return time constant [s], steady rotor speed [rad/s] of an input, and the source of the time constant."""
     kind = (element.findtext("type") or "").strip()
 
     def of(word: str) -> float:
@@ -236,7 +236,7 @@ def _put_thruster(model: Model, plugin: Element, name: str, managed: float | Non
         pair = tuple(
             number(plugin, f"{kind}{end}", where, x) for end, x in zip(("Min", "Max"), none, strict=True)
         )
-        ends[kind] = pair if pair[0] < pair[1] else none  # uuv_simulator leaves out reversed limits
+        ends[kind] = pair if pair[0] < pair[1] else none  # uuv_simulator ignores reversed limits
     low, high = sorted(
         curve.thrust(steady(gain * u)) if math.isfinite(u) else gain * u for u in ends["clamp"]
     )
@@ -252,13 +252,13 @@ def _put_thruster(model: Model, plugin: Element, name: str, managed: float | Non
 
 
 SLOPE = 3.0
-"""Guessed slope of the lift of a fin whose area the file does not give [1/rad]; both enter by their product."""
+"""Guessed lift slope of a fin whose area is not in the file [1/rad]; only their product matters."""
 ENDLESS = 1.5
-"""Stall of a fin whose lift grows with the angle up to 90° [rad]."""
+"""Stall angle of a fin whose lift increases with the angle up to 90° [rad]."""
 
 
 def _put_fin(model: Model, plugin: Element, draft: Draft) -> str:
-    """Set a fin, whose span and chord are the axes z and x of its link, and return the name of its joint."""
+    """Set a fin, whose span and chord are the z and x axes of its link, and return the name of its joint."""
     name = f"fin_{(plugin.findtext('fin_id') or '').strip()}"
     where, path = f"{model.label}: {name.replace('_', ' ')}", f"actuators.{name}"
     if not re.fullmatch(r"fin_\d{1,9}", name) or name in draft.values.get("actuators", {}):
@@ -294,7 +294,7 @@ def _put_fin(model: Model, plugin: Element, draft: Draft) -> str:
 
 
 def _lift(law: Element, where: str, draft: Draft) -> list[tuple[str, Any, str]]:
-    """Return key of a fin, its value, and how it is guessed if it is, of an element `liftdrag`."""
+    """Return key of a fin, its value, and how it was guessed (empty if it was not), from an element `liftdrag`."""
     kind, density = (law.findtext("type") or "").strip(), draft.values["water"]["density"]
 
     def of(word: str) -> float:
@@ -326,7 +326,7 @@ def _lift(law: Element, where: str, draft: Draft) -> list[tuple[str, Any, str]]:
 
 
 def _managed(model: Model, base: str) -> float | None:
-    """Return the greatest thrust in the thruster manager's file of this robot, near it [N]; None: there is none."""
+    """Return the greatest thrust in the thruster manager's file of this robot, near it [N]; None if there is none."""
     robot = base.rpartition("/")[0] or model.element.get("name", "")
     for folder in model.packages.values():
         for pattern in ("config/thruster_manager.yaml", "config/*/thruster_manager.yaml"):
@@ -347,25 +347,23 @@ def _managed(model: Model, base: str) -> float | None:
 def _put_buoyancy(
     model: Model, links: Mapping[str, Element], base: str, draft: Draft
 ) -> dict[str, list[float]]:
-    """Put what the links displace, and return the size of each link's box: width, length and height [m].
+    """Set the displacement of the links, and return the size of each link's box: width, length and height [m].
 
     Args:
         model: Robot.
         links: Name -> element of each link of the underwater object.
         base: Name of the link that has the hydrodynamics.
-        draft: Vehicle, whose density of water is known.
+        draft: Vehicle with a known density of water.
 
     Raises:
-        VehicleError: A link floats as a ship does, is not in the robot, or cannot be read.
+        VehicleError: A link is a surface vessel, is not in the robot, or cannot be read.
     """
     density = draft.values["water"]["density"]
     lifts, boxes = [], {}
     for link, words in links.items():
         where = f"{draft.label}: underwater object, link '{link}'"
         if any(words.find(word) is not None for word in SURFACE):
-            raise VehicleError(
-                f"{where}: floats as a ship does ({SURFACE[0]}), expected a vehicle under water"
-            )
+            raise VehicleError(f"{where}: is a surface vessel ({SURFACE[0]}), expected a submerged vehicle")
         refuse_unknown(words, WORDS["link"], where)
         if link not in model.links:
             raise VehicleError(f"{where}: the robot has no such link: correct it")
@@ -387,13 +385,13 @@ def _put_buoyancy(
 
 
 def _put_hydrodynamics(model: Model, link: Element, base: str, box: list[float] | None, draft: Draft) -> None:
-    """Put added mass and damping.
+    """Set added mass and damping.
 
     Args:
         model: Robot.
         link: Element of the link in the underwater object.
         base: Name of the link.
-        box: Its width, length and height [m], if it has a box.
+        box: Width, length and height of its box [m], if it has one.
         draft: Vehicle.
 
     Raises:
@@ -420,11 +418,11 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
 
     Args:
         element: The element `model`.
-        path: Its file.
-        packages: Name -> folder of the packages in which its meshes may be.
+        path: File of the model.
+        packages: Name -> folder of packages that may contain its meshes.
 
     Raises:
-        VehicleError: It cannot be read.
+        VehicleError: The model cannot be read.
     """
     name = element.get("name", "")
     draft = Draft(str(path), f"{path.name}, robot {name} (uuv_simulator)")
@@ -481,7 +479,7 @@ def read_uuv(element: Element, path: Path, packages: Mapping[str, Path]) -> Draf
 
 
 def _fixed(model: Model, link: str) -> tuple[float, Array]:
-    """Return mass [kg] and centre of gravity in the body frame [m], (3,), of a link and all that are fixed to it."""
+    """Return mass [kg] and centre of gravity in the body frame [m], (3,), of a link and all links fixed to it."""
     joined = [
         {model.text(joint, "parent"), model.text(joint, "child")}
         for joint in model.joints.values()
@@ -504,7 +502,7 @@ def _fixed(model: Model, link: str) -> tuple[float, Array]:
 
 
 def _note_differences(hydrodynamics: Element, centre: Array, draft: Draft) -> None:
-    """Note what uuv_simulator computes otherwise."""
+    """Note differences between uuv_simulator's computation and FinsSim's."""
     for word in FACTORS & {child.tag for child in hydrodynamics}:
         draft.not_read[f"{word} (uuv_simulator does not read it from a file either)"] += 1
     if len((hydrodynamics.findtext("quadratic_damping") or "").split()) == 36:

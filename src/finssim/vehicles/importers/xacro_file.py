@@ -1,8 +1,9 @@
-"""Expansion of xacro by its own library, without running code of the file and within bounds; packages of ROS nearby.
+"""Expansion of xacro files by the xacro library, without executing code of the file and within limits; ROS
+packages nearby.
 
-The library evaluates expressions as Python and reads any file. Here it works on a copy of its module in which
-expressions are numbers, texts and lists with the functions of `CALLS`, files lie in the folder of the file or in a
-package that was found, and every step is counted.
+The library evaluates expressions as Python and reads any file. Here, a copy of its module is restricted:
+expressions are numbers, strings and lists with the functions of `CALLS`, files must be in the folder of the
+file or in a package that was found, and every step is counted.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from finssim.vehicles.part import VehicleError
 __all__ = ["evaluate", "expanded", "packages_near"]
 
 FILE = 1 << 20
-"""Greatest size of one file [bytes]."""
+"""Largest size of one file [bytes]."""
 TEXT = 20_000
-"""Greatest length of a text or attribute [characters]."""
+"""Largest length of a text or attribute [characters]."""
 STEPS = 1_000_000
-"""Greatest number of characters and elements that an expansion goes through."""
+"""Largest number of characters and elements that an expansion processes."""
 FOLDERS = 5_000
-"""Greatest number of folders in which packages are sought."""
+"""Largest number of folders that are searched for packages."""
 
 CALLS: dict[str, Callable[..., Any]] = {
     name: getattr(math, name)
@@ -41,9 +42,9 @@ CALLS: dict[str, Callable[..., Any]] = {
         "log", "log10", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh",
     )
 } | {f.__name__: f for f in (abs, bool, float, int, len, max, min, round, str, sum)}  # fmt: skip
-"""Functions of an expression."""
+"""Functions allowed in an expression."""
 CONSTANTS = {"pi": math.pi, "e": math.e, "tau": math.tau, "True": True, "False": False}
-"""Names of an expression that the file need not define; angles in rad."""
+"""Predefined names in expressions; angles in rad."""
 OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow, ast.USub: operator.neg,
@@ -54,15 +55,15 @@ OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
 
 
 def evaluate(text: str, names: Mapping[str, Any], calls: Mapping[str, Callable[..., Any]] = CALLS) -> Any:
-    """Return the value of an expression of xacro: a number, a text, a truth value or a list.
+    """Return the value of an xacro expression: a number, a string, a Boolean or a list.
 
     Args:
         text: The expression.
-        names: Value of each name.
-        calls: Function of each name.
+        names: Name -> value.
+        calls: Name -> function.
 
     Raises:
-        VehicleError: It is no such expression, or its value is too large.
+        VehicleError: The expression is invalid, or its value is too large.
     """
     try:
         if len(text) > 1000:
@@ -96,7 +97,7 @@ def _value(node: ast.AST, names: Mapping[str, Any], calls: Mapping[str, Callable
         case ast.Attribute():
             space = of(node.value)
             if not isinstance(space, dict):
-                raise ValueError(f"'{node.attr}' is of no namespace")
+                raise ValueError(f"'{node.attr}' is not in a known namespace")
             return space[node.attr]
         case ast.Call(
             func=ast.Name(id=name) | ast.Attribute(value=ast.Name(id="math" | "python"), attr=name)
@@ -128,9 +129,9 @@ def _value(node: ast.AST, names: Mapping[str, Any], calls: Mapping[str, Callable
             a, b = of(node.left), of(node.right)
             joined = isinstance(node.op, ast.Add) and isinstance(a, str) and isinstance(b, str)
             if not joined and not all(isinstance(x, int | float) for x in (a, b)):
-                raise ValueError("only numbers are combined")
+                raise ValueError("only numbers can be combined")
             if isinstance(node.op, ast.Pow) and abs(b) > 64:
-                raise ValueError("an exponent is over 64")
+                raise ValueError("an exponent is larger than 64")
             return _bounded(OPERATORS[type(node.op)](a, b))
         case _:
             raise ValueError(f"{type(node).__name__} is not read in an expression")
@@ -145,10 +146,10 @@ def _bounded(value: Any) -> Any:
 
 
 def packages_near(path: Path, folders: Iterable[Path] = ()) -> dict[str, Path]:
-    """Return name -> folder of packages of ROS: in the folders, and around the package that holds a file.
+    """Return name -> folder of ROS packages: in the folders, and around the package that contains a file.
 
     Args:
-        path: The file; around it are its package and the two folders above that.
+        path: The file; its package and the two parent folders of that are searched.
         folders: Folders that are searched first.
     """
     parents = path.resolve().parents
@@ -182,14 +183,14 @@ def packages_near(path: Path, folders: Iterable[Path] = ()) -> dict[str, Path]:
 
 
 def expanded(path: Path, packages: Mapping[str, Path]) -> Element:
-    """Return the root of a file after expansion.
+    """Return the root element of a file after expansion.
 
     Args:
-        path: File of xacro.
-        packages: Name -> folder of the packages that `$(find NAME)` may name.
+        path: The xacro file.
+        packages: Name -> folder of the packages that `$(find NAME)` may refer to.
 
     Raises:
-        VehicleError: It cannot be expanded.
+        VehicleError: The file cannot be expanded.
     """
     spec = importlib.util.find_spec("xacro")
     if spec is None or spec.loader is None:
@@ -206,7 +207,7 @@ def expanded(path: Path, packages: Mapping[str, Path]) -> Element:
         raise VehicleError(
             f"{path}: its macros call one another too often: expand the file to URDF"
         ) from None
-    except Exception as error:  # of the library, of its parser, and ours, which the library may wrap
+    except Exception as error:  # raised by the library, by its parser, or here and wrapped by the library
         while isinstance(getattr(error, "exc", None), VehicleError | library.XacroException):
             error = error.exc
         sentence = " ".join(str(error).split())
@@ -214,7 +215,7 @@ def expanded(path: Path, packages: Mapping[str, Path]) -> Element:
 
 
 def _restrict(library: Any, path: Path, packages: Mapping[str, Path]) -> None:
-    """Replace what evaluates, reads and prints in a copy of the library's module."""
+    """Replace the functions that evaluate, read and print in a copy of the library's module."""
     inside = [path.resolve().parent, *packages.values()]
     spent = 0
 
@@ -222,7 +223,7 @@ def _restrict(library: Any, path: Path, packages: Mapping[str, Path]) -> None:
         nonlocal spent
         spent += steps
         if spent > STEPS:
-            raise VehicleError("its macros expand to more than is read: expand the file to URDF")
+            raise VehicleError("its macros expand to too much text: expand the file to URDF")
 
     def symbol_names(symbols: Any) -> Any:
         return symbols if symbols is not None else CONSTANTS
@@ -238,7 +239,7 @@ def _restrict(library: Any, path: Path, packages: Mapping[str, Path]) -> None:
     def eval_all(node: Any, macros: Any, symbols: Any, original: Any = library.eval_all) -> None:
         spend(1 + len(node.getElementsByTagName("*")))
         original(node, macros, symbols)
-        spend(len(node.childNodes) ** 2 // 100)  # the library moves children one by one, from the first
+        spend(len(node.childNodes) ** 2 // 100)  # the library moves the children one by one
 
     def argument(name: str) -> str:
         arguments = library.substitution_args_context["arg"]
