@@ -87,7 +87,7 @@ def test_own_errors_dry_points_and_targets(tmp_path):
         ("", "is empty"),
         ("\n# surveyed on Monday\n", "nothing but comments"),
         ("id,x,y,z\na,1,two,3\n", "line 2: y is 'two'.*file is refused.*empty it"),
-        ("id,x,y,z\na,1,2,3\nb,0,0,0\na,1,2,4\n", "line 4: point 'a' was at another place in line 2"),
+        ("id,x,y,z\na,1,2,3\nb,0,0,0\na,1,2,4\n", "line 4: point 'a' has another position in line 2"),
         ("tag,x,y,z\n1,0,0,0\n", "without its edge"),
         ("tag,x,y,z,edge\none,0,0,0,0.1\n", "tag is 'one'"),
         ("id,x,x_mm,y,z\na,1,1,2,3\n", "two columns mean 'x'"),

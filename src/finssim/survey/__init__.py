@@ -1,4 +1,4 @@
-"""Calibration by pictures: lens, camera pose and water plane, tags on the vehicle, its sensors' mounting."""
+"""Calibration from pictures: lens, camera pose and water plane, tags on the vehicle, mounts of its sensors."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Boards of known corners, and where a picture shows those corners."""
+"""Calibration boards with known corners, and detection of these corners in pictures."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from finssim.trials.findings import CalibrationError
 Array = NDArray[np.float64]
 
 REFINE_SHARE = 0.35
-"""Half width of the window that refines a corner, in distances to its nearest neighbour: no other corner is in it."""
+"""Half width of the corner refinement window, relative to the distance to the nearest neighbour, so that it
+contains no other corner [-]."""
 
 WIDEST, NARROWEST = 11, 2
-"""Bounds of that half width [px]."""
+"""Bounds of the window's half width [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A flat chessboard or ChArUco board."""
+    """Flat chessboard or ChArUco board."""
 
     columns: int
-    """Inner corners along x of a chessboard; squares of a ChArUco board."""
+    """Number of inner corners along x of a chessboard; of squares of a ChArUco board."""
     rows: int
-    """Along y."""
+    """Number along y."""
     square: float
     """Edge of a square [m]."""
     marker: float | None = None
@@ -51,7 +52,7 @@ class Board:
 
     @property
     def words(self) -> str:
-        """`chessboard of 9x6 inner corners, squares of 25 mm`."""
+        """Description such as `chessboard of 9x6 inner corners, squares of 25 mm`."""
         kind = "chessboard" if self.marker is None else "ChArUco board"
         pattern = "inner corners" if self.marker is None else f"squares, markers of {1e3 * self.marker:g} mm"
         return f"{kind} of {self.columns}x{self.rows} {pattern}, squares of {1e3 * self.square:g} mm"
@@ -66,7 +67,7 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class BoardView:
-    """The corners that one picture shows."""
+    """Corners of a board visible in one picture."""
 
     name: str
     width: int
@@ -74,16 +75,16 @@ class BoardView:
     height: int
     """Height of the picture [px]."""
     pixels: Array
-    """(n, 2); integer coordinates are pixel centres."""
+    """Pixels of the corners, integers at pixel centres, (n, 2)."""
     points: Array
     """Corners on the board, board frame, z = 0 [m], (n, 3)."""
 
 
 def parse_size(text: str, option: str) -> tuple[int, int]:
-    """`9x6` as two numbers.
+    """Parse a size such as `9x6`.
 
     Raises:
-        CalibrationError: It reads otherwise.
+        CalibrationError: The text is not of that form.
     """
     parts = text.lower().replace("×", "x").split("x")
     if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
@@ -92,15 +93,15 @@ def parse_size(text: str, option: str) -> tuple[int, int]:
 
 
 def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | None:
-    """Find a board in a picture.
+    """Detect a board in a picture.
 
     Args:
         image: Gray, (h, w).
         board: The board.
 
     Returns:
-        Pixels (n, 2) and the corners on the board (n, 3) [m]; None if it is not seen. A chessboard is seen as a whole
-        or not at all, a ChArUco board in parts of at least 6 corners.
+        Pixels (n, 2) and the corners on the board (n, 3) [m]; None if it is not detected. A chessboard is
+        detected only completely, a ChArUco board also partially with at least 6 corners.
 
     Raises:
         CalibrationError: OpenCV has no such dictionary.
@@ -115,7 +116,8 @@ def see_board(image: NDArray[np.uint8], board: Board) -> tuple[Array, Array] | N
 
 
 def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Array, NDArray[np.int64]] | None:
-    """Pixels and indices of all inner corners; two finders, for each misses boards that the other sees."""
+    """Return pixels and indices of all inner corners; uses two detectors, since each misses boards that the
+    other detects."""
     import cv2
 
     size = (columns, rows)
@@ -133,9 +135,10 @@ def _chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> tuple[Arra
 
 
 def _refined(image: NDArray[np.uint8], pixels: Array) -> Array:
-    """Corners where the gradients around them say, each within a window that holds no other corner.
+    """Refine corners to subpixel accuracy by image gradients, each within a window that contains no other corner.
 
-    A window as wide as is usual pulls the corners of a small or oblique board towards their neighbours, by pixels.
+    A window of the usual size would pull the corners of a small or oblique board towards their neighbours, by
+    pixels.
     """
     import cv2
 
@@ -153,7 +156,8 @@ def _refined(image: NDArray[np.uint8], pixels: Array) -> Array:
 
 
 def _charuco(image: NDArray[np.uint8], board: Board) -> tuple[Array, NDArray[np.int64]] | None:
-    """Pixels and indices of the corners between squares whose markers are read; refined like a chessboard's."""
+    """Return pixels and indices of the corners between squares with decoded markers, refined as those of a
+    chessboard."""
     import cv2
 
     code = getattr(cv2.aruco, board.dictionary.upper(), None)
@@ -164,7 +168,7 @@ def _charuco(image: NDArray[np.uint8], board: Board) -> tuple[Array, NDArray[np.
     drawn = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square, board.marker, cv2.aruco.getPredefinedDictionary(code)
     )
-    # Boards drawn before OpenCV 4.6 start with the other colour if rows are even.
+    # Boards generated before OpenCV 4.6 start with the other colour if the number of rows is even.
     for legacy in (False, True):
         drawn.setLegacyPattern(legacy)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(image)

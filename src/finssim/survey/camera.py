@@ -1,4 +1,4 @@
-"""`finssim calibrate camera`: read pictures, find the board, fit the lens, write the camera file, report."""
+"""`finssim calibrate camera`: read pictures, detect the board, fit the lens, write the camera file and the report."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ READING = (
 )
 
 DIGITS = 7
-"""Digits of the numbers in a record."""
+"""Significant digits of the numbers in a record."""
 
 OF_A_VIDEO = 15
-"""Interval between used pictures of a video: neighbours show the same view."""
+"""Interval between used pictures of a video, since neighbours show the same view."""
 
 
 def camera_record(fit: CameraFit) -> dict[str, Any]:
-    """Return the record of a camera file: estimates, intervals, residuals and their origin, as plain values."""
+    """Return the record of a camera file: estimates, intervals, residuals and their provenance, as plain values."""
     record = {
         "estimates": {
             name: {"estimate": e.estimate, "ci95": e.ci95, "unit": e.unit}
@@ -77,7 +77,8 @@ def camera_record(fit: CameraFit) -> dict[str, Any]:
 
 
 def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
-    """Return what `--json` prints: the record, the lens, every view, the correlation of the errors and the coverage."""
+    """Return the content of `--json`: the record, the lens, every view, the correlation of the errors and the
+    coverage."""
     views = [
         {
             "name": view.name,
@@ -104,7 +105,7 @@ def camera_json(fit: CameraFit, out: Path | None = None) -> dict[str, Any]:
 
 
 def camera_report(fit: CameraFit) -> Report:
-    """The calibration in words."""
+    """Return the report of the calibration."""
     worst = max(fit.used, key=lambda view: view.rms)
     held_out = "too few views to hold any out"
     if math.isfinite(fit.held_out_rms):
@@ -114,8 +115,8 @@ def camera_report(fit: CameraFit) -> Report:
     ]
     if math.isfinite(fit.error95[1]):
         summary.append(
-            f"a pixel is known to {fit.error95[0]:.2f} px (95 %) where corners were seen, to "
-            f"{fit.error95[1]:.2f} px anywhere in the picture"
+            f"uncertainty of a pixel (95 %): {fit.error95[0]:.2f} px where corners were detected, "
+            f"up to {fit.error95[1]:.2f} px elsewhere in the picture"
         )
     return Report(
         title="Camera calibration",
@@ -147,14 +148,14 @@ def _views_table(fit: CameraFit) -> ExtraTable:
     return heads, rows, ["doubt" if v.left_out else "" for v in fit.views]
 
 
-# Pictures of a lens calibration: where corners were seen, how well the picture is known, what is left over.
+# Figures of a lens calibration: detected corners, uncertainty over the picture, residuals.
 
 
 def camera_pictures(fit: CameraFit) -> dict[str, tuple[str, bytes]]:
-    """File name -> what the picture shows, and the PNG."""
+    """Return the figures: file name -> caption and PNG."""
     drawn = {
         "coverage.png": ("Detected corners, and uncertainty of pixels", _coverage(fit)),
-        "residuals.png": ("Corners less what the lens predicts, enlarged", _residuals(fit)),
+        "residuals.png": ("Residuals of the corners, enlarged", _residuals(fit)),
     }
     return {name: (text, png(figure)) for name, (text, figure) in drawn.items()}
 
@@ -202,16 +203,16 @@ def _residuals(fit: CameraFit) -> Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class BoardChoice:
-    """Calibration board that the images show."""
+    """Calibration board in the images."""
 
     board: str | None = None
-    """(NxM) Inner corners of a chessboard, such as 9x6."""
+    """(NxM) Number of inner corners of a chessboard, such as 9x6."""
     square: float = 0.025
     """Edge of a square [m]."""
     charuco: str | None = None
-    """(NxM) Squares of a ChArUco board instead of a chessboard, such as 7x5."""
+    """(NxM) Number of squares of a ChArUco board instead of a chessboard, such as 7x5."""
     marker: float | None = None
-    """Edge of its markers [m]; three quarters of a square if not given."""
+    """Edge of the board's markers [m]; default three quarters of a square."""
     dictionary: str = "DICT_5X5_100"
     """(NAME) OpenCV's name of the marker dictionary."""
 
@@ -219,7 +220,7 @@ class BoardChoice:
         """Return the board.
 
         Raises:
-            CalibrationError: No board is given, or two, or a size cannot be read.
+            CalibrationError: There is no board or more than one, or a size cannot be parsed.
         """
         if (self.board is None) == (self.charuco is None):
             given = (
@@ -239,7 +240,7 @@ class BoardChoice:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options of a command line that name it."""
+        """Command-line options that specify the board."""
         if self.charuco is None:
             return {"square": self.square, "board": self.board}
         return {
@@ -264,7 +265,7 @@ def run(
     Args:
         images (IMAGE): Images of a board, folders of them, or videos.
         out (FILE): Camera file to write (.yaml).
-        board: Board that the images show.
+        board: Board in the images.
         model (MODEL): Lens: plumb_bob, rational or fisheye.
         report (DIR): Directory for the report and its figures.
         seed: Seed of every random number; equal seeds give equal results.
@@ -274,7 +275,9 @@ def run(
         The fit.
 
     Raises:
-        CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
+        CalibrationError: The images cannot be used; nothing is written.
+        LocalizationError: An image or video cannot be read; nothing is written.
+        OutputError: A file cannot be written.
     """
     check_model(model)
     refuse_places(out, report, "camera")
@@ -300,7 +303,7 @@ def run(
 
 
 def _board_views(images: Sequence[Path], board: Board, screen: Console) -> tuple[list[BoardView], list[str]]:
-    """Views of the board, and the names of the pictures that do not show it; Ctrl-C keeps those until then."""
+    """Return views of the board, and the names of the pictures without it; Ctrl-C keeps the views detected so far."""
     views: list[BoardView] = []
     without: list[str] = []
     try:

@@ -1,4 +1,4 @@
-"""A lens and the poses of all boards, from the pixels of their corners."""
+"""Estimation of a lens and the poses of all boards, from the pixels of their corners."""
 
 from __future__ import annotations
 
@@ -41,59 +41,61 @@ __all__ = [
 Array = NDArray[np.float64]
 
 FOCAL_SHARES = (1.0 / math.pi, 0.6, 1.2)
-"""Focal lengths from which a fisheye is fitted, in widths of the image."""
+"""Initial focal lengths of a fisheye fit, relative to the width of the image [-]."""
 
 FEWEST_VIEWS = 4
 
 NO_LIMIT = 1e9
-"""Distance from which corners of a held-out board would count linearly: they are not judged [px]."""
+"""Huber limit for corners of a held-out board, so large that none is treated as an outlier [px]."""
 
 STRAY = 6.0
-"""Times the median residual of its view for a corner to be left out: it was taken for another."""
+"""Ratio of a corner's residual to the median of its view above which it is excluded as a false detection [-]."""
 
 OUTLIER = 2.0
-"""Times the median residual of all views, at least, for a view to be left out; and beyond their usual spread."""
+"""Ratio of a view's residual to the median of all views above which it may be excluded, if it also exceeds
+`SPREAD` [-]."""
 
 SPREAD = 4.0
-"""Robust standard deviations of the logarithm of the views' residuals."""
+"""Limit of a view's residual in robust standard deviations of the logarithm of the views' residuals [-]."""
 
 NONSENSE = 0.003
-"""Residual of the usual picture, in widths of the image, with which nothing can be right."""
+"""Median residual, relative to the width of the image, above which the calibration is refused [-]."""
 
 MAX_EXCLUDED = 0.25
 FOLDS = 8
 
 UNSURE_FOCAL = 0.02
-"""Half width of its interval, relative, beyond which a focal length does not count as identified."""
+"""Relative half width of its 95 % interval above which a focal length is not identifiable [-]."""
 
 UNSURE_CENTRE = 0.02
-"""Half width of its interval, in widths of the image, beyond which a principal point does not count as identified."""
+"""Half width of its 95 % interval, relative to the image width, above which a principal point is not
+identifiable [-]."""
 
 COLUMNS, ROWS = 12, 9
-"""Points of the picture at which the uncertainty of a pixel is computed."""
+"""Number of points along u and v at which the uncertainty of a pixel is computed."""
 
 TWO_SIGMA_PLANE = 5.991
-"""95 % point of chi-squared with two degrees of freedom."""
+"""95 % quantile of the chi-squared distribution with two degrees of freedom."""
 
 BORDER = 0.10
-"""Empty share of the picture's width or height that is spoken of."""
+"""Fraction of the picture's width or height without corners above which the border is reported [-]."""
 
 FLAT, TILTED = math.radians(10.0), math.radians(20.0)
-"""Tilts below which a board gives almost no information on the focal length, and little."""
+"""Tilts of a board below which it contains almost no, or little, information on the focal length [rad]."""
 
 FEW_VIEWS = 10
 LARGE_ERROR = 1.0
-"""Uncertainty somewhere in the picture that is spoken of [px]."""
+"""Uncertainty anywhere in the picture above which it is reported [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
-    """A lens and one pose per view."""
+    """Lens and one pose per view."""
 
     lens: Lens
     poses: tuple[Pose, ...]
     residuals: tuple[Array, ...]
-    """Measured less predicted, per view (n, 2) [px]."""
+    """Residuals, measured minus predicted, per view (n, 2) [px]."""
 
     @property
     def sigma(self) -> float:
@@ -102,32 +104,32 @@ class Bundle:
 
     @property
     def rms(self) -> Array:
-        """Root of the mean squared distance of corners, per view [px]."""
+        """Root mean square distance of corners, per view [px]."""
         return np.array([rms(r) for r in self.residuals])
 
 
 def lens_names(model: str) -> tuple[str, ...]:
-    """Names of a lens's numbers, in the order of `Lens.parameter_jacobian`."""
+    """Return the names of a lens's parameters, in the order of `Lens.parameter_jacobian`."""
     return ("fx", "fy", "cx", "cy", *COEFFICIENTS[model])
 
 
 def lens_vector(lens: Lens) -> Array:
-    """The lens's numbers in that order. Focal lengths and centre are in pixels."""
+    """Return the lens's parameters in the order of `lens_names`. Focal lengths and centre are in pixels."""
     return np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion])
 
 
 def adjust(views: Sequence[BoardView], model: str) -> Bundle:
-    """The lens and the poses with least squared distances of all corners, by OpenCV.
+    """Estimate the lens and the poses by least squares over all corners, with OpenCV.
 
     Raises:
-        CalibrationError: OpenCV finds none.
+        CalibrationError: OpenCV's calibration fails.
     """
     import cv2
 
     size = (views[0].width, views[0].height)
     solve, threads = _fisheye if model == "fisheye" else _perspective, cv2.getNumThreads()
     try:
-        cv2.setNumThreads(1)  # with more, sums depend on which of them ends first
+        cv2.setNumThreads(1)  # with more threads, the order of summation varies
         K, distortion, turns, shifts = solve(views, size, model)
     except cv2.error as error:
         raise CalibrationError(
@@ -158,7 +160,9 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int], model: str) -> t
     import cv2
 
     points, pixels = ([np.asarray(getattr(v, n), float)[None] for v in views] for n in ("points", "pixels"))
-    names = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # where OpenCV 4 has them
+    names = (
+        cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye
+    )  # location of the flags in OpenCV 4
     flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW | names.CALIB_USE_INTRINSIC_GUESS
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-12)
     ends, refusal = [], None
@@ -177,12 +181,12 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int], model: str) -> t
 
 
 def _residual(lens: Lens, pose: Pose, view: BoardView) -> Array:
-    """Measured less predicted pixels, NaN where the lens cannot see, (n, 2)."""
+    """Return measured minus predicted pixels, NaN where the lens cannot project, (n, 2)."""
     return np.asarray(view.pixels - lens.project(pose.at(view.points))[0])
 
 
 def board_pose(lens: Lens, view: BoardView) -> Pose | None:
-    """The pose of a board with least squared residuals; None where none lies before the camera."""
+    """Return the pose of a board with least squared residuals; None if there is none in front of the camera."""
     rays, ok = lens.rays(view.pixels)
     start = plane_pose(rays[ok], view.points[ok, :2]) if ok.sum() >= 4 else None
     if start is None:
@@ -192,7 +196,8 @@ def board_pose(lens: Lens, view: BoardView) -> Pose | None:
 
 
 def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
-    """Return the evidence of each view on the lens without its own pose, for intervals that treat a view as one."""
+    """Return the information of each view about the lens, its pose eliminated, for intervals that treat a
+    view as one sample."""
     blocks = []
     for view, pose, residual in zip(views, bundle.poses, bundle.residuals, strict=True):
         points_c = pose.at(view.points)
@@ -205,20 +210,20 @@ def evidence(bundle: Bundle, views: Sequence[BoardView]) -> Evidence:
 
 @dataclass(frozen=True, kw_only=True)
 class FittedView:
-    """One picture after the fit."""
+    """One view after the fit."""
 
     name: str
     pixels: Array
-    """(n, 2)"""
+    """Pixels of the corners, (n, 2)."""
     residuals: Array
-    """Measured less predicted, (n, 2) [px]."""
+    """Residuals, measured minus predicted [px], (n, 2)."""
     pose: Pose
     left_out: str = ""
-    """Reason why it was not used; empty if it was."""
+    """Reason why the view was not used; empty if it was."""
 
     @property
     def rms(self) -> float:
-        """Root of the mean squared distance of its corners [px]."""
+        """Root mean square distance of its corners [px]."""
         return rms(self.residuals)
 
     @property
@@ -229,28 +234,29 @@ class FittedView:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFit:
-    """A calibrated lens."""
+    """Calibrated lens."""
 
     lens: Lens
     estimates: dict[str, Estimate]
-    """fx, fy, cx, cy and the distortion, by name."""
+    """Estimates of fx, fy, cx, cy and the distortion, by name."""
     correlation: Correlation
     views: tuple[FittedView, ...]
-    """Every picture in which the board was seen, in the order given."""
+    """Every view in which the board was detected, in the given order."""
     rms: float
-    """Root of the mean squared distance of corners over the views used [px]."""
+    """Root mean square distance of corners over the views used [px]."""
     held_out_rms: float
-    """Residual of views that the lens was not fitted to, only their pose; NaN if there are too few views [px]."""
+    """Residual of held-out views, of which only the pose is fitted; NaN if there are too few views [px]."""
     error95: tuple[float, float]
-    """Largest radius of the 95 % circle of a pixel of known direction, where corners were seen and anywhere [px]."""
+    """Largest radius of a pixel's 95 % uncertainty circle, where corners were detected and anywhere in the
+    picture [px]."""
     covariance: Covariance
-    """Covariance of the lens's numbers, in the order of `lens_names`."""
+    """Covariance of the lens's parameters, in the order of `lens_names`."""
     findings: tuple[Finding, ...]
     settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def used(self) -> tuple[FittedView, ...]:
-        """The views that the lens rests on."""
+        """Views that the lens was fitted to."""
         return tuple(view for view in self.views if not view.left_out)
 
 
@@ -258,13 +264,13 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
     """Fit a lens to views of a board.
 
     Args:
-        views: From `see_board`; all of one size.
-        model: plumb_bob, rational or fisheye.
-        seed: Of the split for the held-out error.
+        views: Views from `see_board`; all of one size.
+        model: Lens model: plumb_bob, rational or fisheye.
+        seed: Seed of the folds for the held-out error.
 
     Raises:
-        CalibrationError: Unknown model, fewer than four views, pictures of several sizes, which are named, or corners
-            that no lens explains.
+        CalibrationError: The model is unknown, there are fewer than four views, the pictures have several
+            sizes, or no lens fits the corners.
     """
     check_model(model)
     _check(views)
@@ -298,7 +304,7 @@ def calibrate_camera(views: Sequence[BoardView], *, model: str = "plumb_bob", se
 
 
 def check_model(model: str) -> None:
-    """Refuse a lens model that is not known with a CalibrationError."""
+    """Refuse an unknown lens model with a CalibrationError."""
     if model not in COEFFICIENTS:
         raise CalibrationError(f"unknown lens model '{model}'; available: {', '.join(COEFFICIENTS)}")
 
@@ -339,7 +345,7 @@ def _refuse_nonsense(bundle: Bundle, views: Sequence[BoardView]) -> None:
 
 
 def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[BoardView], Bundle]:
-    """Leave out the worst view as long as it is far from the others, and fit again; the others, and their fit."""
+    """Exclude the worst view and refit, as long as it is an outlier; return the other views and their fit."""
     used = list(views)
     for _ in range(min(int(MAX_EXCLUDED * len(views)), len(views) - FEWEST_VIEWS)):
         if not _outliers(bundle.rms).any():
@@ -350,14 +356,15 @@ def _without_outliers(views: Sequence[BoardView], bundle: Bundle) -> tuple[list[
 
 
 def _without_strays(view: BoardView, residual: Array) -> BoardView:
-    """Return the view without corners that are far off among those of its own."""
+    """Return the view without outlying corners."""
     size = np.linalg.norm(residual, axis=-1)
     keep = size <= STRAY * max(float(np.median(size)), 1e-6)
     return replace(view, pixels=view.pixels[keep], points=view.points[keep])
 
 
 def _held_out(views: Sequence[BoardView], model: str, seed: int) -> float:
-    """Residual of views that the lens has not seen: each fold left out in turn, only the poses of its views fitted."""
+    """Return the residual of held-out views: for each fold, the lens is fitted to the others and only the
+    poses to its views."""
     folds = min(FOLDS, len(views))
     if len(views) - math.ceil(len(views) / folds) < FEWEST_VIEWS - 1:
         return math.nan
@@ -393,7 +400,7 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
         unit, limit, note = {
             "f": ("px", UNSURE_FOCAL * value, "not distinguishable from the distance of the board"),
             "c": ("px", UNSURE_CENTRE * lens.width, "not distinguishable from a rotation of the board"),
-        }.get(name[0], ("-", math.inf, "not told"))
+        }.get(name[0], ("-", math.inf, "not determined"))
         estimate = Estimate.within(name, value, width, unit, width < limit, note)
         if unit == "-" and abs(value) < width < limit:
             estimate = replace(estimate, note="not distinguishable from 0")
@@ -401,26 +408,27 @@ def _estimates(lens: Lens, half: Array) -> dict[str, Estimate]:
     return estimates
 
 
-# How well a calibrated lens is known over the picture, and where the pictures taken say nothing about it.
+# Uncertainty of a calibrated lens over the picture, and gaps in the pictures' coverage.
 
 
 def picture_grid(lens: Lens) -> Array:
-    """Centres of `COLUMNS` by `ROWS` cells of the picture [px], (rows, columns, 2)."""
+    """Return the centres of `COLUMNS` by `ROWS` cells of the picture [px], (rows, columns, 2)."""
     u, v = (size * (np.arange(n) + 0.5) / n - 0.5 for size, n in ((lens.width, COLUMNS), (lens.height, ROWS)))
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -> Array:
-    """Radius of the 95 % circle of pixels whose direction is known [px], (...); NaN where the lens cannot see.
+    """Return the radius of the 95 % uncertainty circle of pixels of known direction [px], (...); NaN outside
+    the lens's range.
 
-    d pixel = A d lens + B turn, without the turn of the whole camera that takes most of it away at the corners: any
-    pose takes that up.
+    d pixel = A d lens + B turn, where the rotation `turn` of the camera minimizes the error at the corners,
+    since any pose estimate would absorb it.
 
     Args:
         lens: The lens.
         at: Pixels, (..., 2).
         corners: Pixels of the corners that were used, (n, 2).
-        covariance: Of the lens's numbers, in the order of `Lens.parameter_jacobian`.
+        covariance: Covariance of the lens's parameters, in the order of `Lens.parameter_jacobian`.
     """
 
     def derivatives(pixels: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -434,7 +442,7 @@ def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -
     J = A + B @ turn
     if not np.isfinite(covariance.local).all():
         return np.full(at.shape[:-1], np.nan)
-    # The information gives the shape, the disagreement of the views the size: alone, theirs would lack directions.
+    # The information matrix gives the shape, the scatter of the views the scale: the scatter alone is rank deficient.
     ratio = covariance.std**2 / np.maximum(np.diagonal(covariance.local), 1e-300)
     S = max(float(np.mean(ratio)), 1.0) * J @ covariance.local @ np.swapaxes(J, -1, -2)
     radius = np.sqrt(TWO_SIGMA_PLANE * np.maximum(np.linalg.eigvalsh(S)[..., -1], 0.0))
@@ -444,9 +452,9 @@ def pixel_error(lens: Lens, at: Array, corners: Array, covariance: Covariance) -
 def camera_findings(
     lens: Lens, views: Sequence[FittedView], estimates: Mapping[str, Estimate], error95: tuple[float, float]
 ) -> tuple[Finding, ...]:
-    """Return findings on coverage, tilt and undetermined numbers, and what to photograph; none if all is well.
+    """Return findings on coverage, tilt and undetermined parameters, with what to photograph; none if all is well.
 
-    `error95` is in pixels.
+    The radii `error95` are in pixels.
     """
     tilts, findings = np.array([view.tilt for view in views]), []
     tilted = int(np.sum(tilts > TILTED))
@@ -473,7 +481,8 @@ def camera_findings(
 
 
 def empty_edges(lens: Lens, views: Sequence[FittedView]) -> dict[str, float]:
-    """Border of the picture without a corner at left, right, top and bottom, as a share of its width or height [-]."""
+    """Return the border without corners at left, right, top and bottom, relative to the picture's width or
+    height [-]."""
     pixels, size = np.concatenate([view.pixels for view in views]), np.array([lens.width, lens.height])
     low, high = (pixels.min(axis=0) + 0.5) / size, (size - 0.5 - pixels.max(axis=0)) / size
     shares = zip(("left", "right", "top", "bottom"), (low[0], high[0], low[1], high[1]), strict=True)

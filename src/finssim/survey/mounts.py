@@ -1,4 +1,4 @@
-"""`finssim calibrate mounts`: read a log of pictures, IMU and depth, fit where tags sit on the vehicle, report."""
+"""`finssim calibrate mounts`: read a log of pictures, IMU and depth, fit the tags' poses on the vehicle, report."""
 
 from __future__ import annotations
 
@@ -45,34 +45,34 @@ Array = NDArray[np.float64]
 
 DETECTIONS, IMU, DEPTH = "detections.csv", "imu.csv", "depth.csv"
 LONGEST_AGE = 0.3
-"""Greatest distance between the samples around an exposure at which a sensor is read [s]."""
+"""Longest gap between samples over which a sensor is interpolated to an exposure [s]."""
 
 SETTLING = 5.0
-"""Until the tilt of gyro and accelerometer has forgotten its start [s]."""
+"""Time until the tilt from gyro and accelerometer is independent of its start [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountLog:
-    """Content of a folder."""
+    """Content of a log folder."""
 
     pictures: tuple[tuple[float, Mapping[int, Array]], ...]
     """Time of the exposure [s] and tag -> pixels of its corners (4, 2), in order of time."""
     up: Series | None
     """Direction of up in body axes."""
     turning: Series | None
-    """Angular rate about the vertical, by gyro and `up` [rad/s]."""
+    """Angular rate about the vertical, from gyro and `up` [rad/s]."""
     depth: Series | None
-    """[m]"""
+    """Depth of the pressure port [m]."""
     sha256: str
     """Digest of the read files."""
     findings: tuple[Finding, ...]
-    """Data that was left out or is missing."""
+    """Findings on excluded or missing data."""
 
     def moments(self, imu_offset: float = 0.0) -> tuple[Moment, ...]:
-        """The pictures with tilt and depth at their time.
+        """Return the pictures with tilt and depth at their times.
 
         Args:
-            imu_offset: To be added to the IMU's times [s].
+            imu_offset: Offset that is added to the IMU's times [s].
         """
         moments = []
         for time, corners in self.pictures:
@@ -89,20 +89,22 @@ class MountLog:
 
 
 def _at(sensor: Series | None, time: float) -> Array | None:
-    """Return a sensor's values at a time, (k,); None where they are not known."""
+    """Return a sensor's values at a time, (k,); None if they are unknown."""
     values = None if sensor is None else sensor.at(time)
     return values if isinstance(values, np.ndarray) else None
 
 
 def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog:
-    """Read `detections.csv`, and of `imu.csv` and `depth.csv` what is there.
+    """Read `detections.csv`, and `imu.csv` and `depth.csv` if present.
 
-    Times are of one clock; a picture's is its stamp, from which the pool's latency is taken. As for `finssim fuse`, the
-    IMU's `p q r`, `ax ay az` and attitude are the body's, with its mount in the vehicle file; `gyro_x ...` and
-    `accel_x ...` are in its own axes, and so is then the attitude. Without an attitude the tilt is made from both.
+    All times are of one clock; the time of a picture is its stamp minus the pool's latency. As for `finssim
+    fuse`, the IMU's `p q r`, `ax ay az` and attitude are in body axes; `gyro_x ...`, `accel_x ...` and an
+    attitude with them are in the IMU's own axes, whose mount is in the vehicle file. Without an attitude, the
+    tilt is computed from both.
 
     Raises:
-        CalibrationError, LocalizationError: A file is missing or cannot be used.
+        CalibrationError: `detections.csv` or a column is missing.
+        LocalizationError: A file cannot be read.
     """
     folder = Path(folder)
     if not (folder / DETECTIONS).is_file():
@@ -134,7 +136,7 @@ def read_mount_log(folder: str | Path, pool: Pool, vehicle: Vehicle) -> MountLog
 
 
 def _read_imu(path: Path, vehicle: Vehicle, findings: list[Finding]) -> tuple[Series | None, Series | None]:
-    """Up in body axes, and the angular rate about the vertical."""
+    """Return the up direction in body axes, and the angular rate about the vertical."""
     if not path.is_file():
         findings.append(finding("imu_missing", file=IMU))
         return None, None
@@ -161,9 +163,10 @@ def _read_imu(path: Path, vehicle: Vehicle, findings: list[Finding]) -> tuple[Se
 
 
 def _tilt(t: Array, omega: Array, force: Array, gravity: float) -> Array:
-    """Up from gyro and accelerometer, (m, 3); NaN until the filter has settled and after a gap.
+    """Return the up direction from gyro and accelerometer, (m, 3); NaN until the filter has settled and after
+    a gap.
 
-    It runs twice: the first time learns the gyro's bias, with which the second starts.
+    The filter runs twice: the first pass estimates the gyro's bias, with which the second starts.
     """
     gains, bias = TiltGains(gravity=gravity), np.zeros(3)
     up = np.full((len(t), 3), np.nan)
@@ -195,16 +198,17 @@ def _read_depth(path: Path, findings: list[Finding]) -> Series | None:
     return series("depth", table.t, table.columns("depth"), LONGEST_AGE, label=str(path))
 
 
-# The mounts, as estimates and as numbers of the vehicle file.
+# Mounts as estimates and as numbers of the vehicle file.
 
 EDGE_STD = 0.25e-3
-"""Standard deviation of a tag's edge measured with a ruler [m]: it makes every distance wrong by the same share."""
+"""Standard deviation of a tag's edge measured with a ruler [m]; it scales every distance."""
 
 RETAINED = "the motion does not determine it: kept from the file"
 
 
 def distance_std(fit: MountFit) -> float:
-    """Error of every depth from an edge that is measured a little wrong: its share of the apparent distance [m]."""
+    """Return the standard deviation of the depth due to the measured edge: its relative error times the
+    apparent distance [m]."""
     interface = fit.rig.pool.interface
     above = float(interface.normal @ fit.rig.pool.camera.position) + interface.offset
     below = -float(np.median([interface.normal @ pose.t for pose in fit.state.poses])) - interface.offset
@@ -214,7 +218,7 @@ def distance_std(fit: MountFit) -> float:
 def tag_estimates(
     fit: MountFit, mounts: Mapping[int, Pose], vehicle: Vehicle
 ) -> tuple[list[Estimate], dict[str, Any]]:
-    """Return estimates of every tag, and the mounts to write; an undetermined tag keeps the file's."""
+    """Return estimates of every tag, and the mounts to write; an undetermined tag keeps that of the file."""
     estimates, written, any_identified = [], {}, False
     for tag, mount in vehicle.tags.mounts.items():  # type: ignore[union-attr]
         written[tag] = {"position": list(mount.position), "orientation": list(mount.orientation)}
@@ -239,10 +243,10 @@ def tag_estimates(
 
 
 def _half_widths(fit: MountFit, tag: int) -> Array:
-    """Half widths of a tag's 95 % intervals, turn about the body axes [rad] and position [m], (6,).
+    """Return half widths of a tag's 95 % intervals, rotation about the body axes [rad] and position [m], (6,).
 
-    What is kept from the file counts as exact for the other tags, which are told relative to it; for the reference tag
-    itself it is infinite.
+    Values kept from the file count as exact for the other tags, which are estimated relative to them; for the
+    reference tag itself they are infinite.
     """
     half = np.array([fit.half_width(f"reference.{axis}") for axis in AXES])
     half[5] = np.hypot(half[5], 1.96 * distance_std(fit))
@@ -257,7 +261,7 @@ def _half_widths(fit: MountFit, tag: int) -> Array:
 
 
 def of_frozen(fit: MountFit) -> list[Finding]:
-    """Return findings on what the motion does not determine of the tags."""
+    """Return findings on unknowns of the tags that the motion does not determine."""
     findings, tag = [], fit.rig.reference
     frozen = [name.partition(".")[2] for name in fit.frozen if name.startswith("reference.")]
     turns = tuple(name[-1] for name in frozen if "turn" in name)
@@ -273,19 +277,19 @@ def of_frozen(fit: MountFit) -> list[Finding]:
 
 
 def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, seed: int = 0) -> Fit:
-    """Fit the tags' mounts in the body, with everything that the motion determines; IMU and pressure port are right in
-    the file.
+    """Fit the tags' mounts in the body, as far as the motion determines them; IMU and pressure port are
+    assumed to be mounted as in the file.
 
     Args:
         log: The recording.
         pool: Camera and water.
-        vehicle: Gives the tags' edge and the mounts so far.
-        name: Of the recording.
-        seed: Recorded; nothing here is random.
+        vehicle: Vehicle with the tags' edge and initial mounts.
+        name: Name of the recording.
+        seed: Seed, which is only recorded; nothing here is random.
 
     Raises:
-        CalibrationError: A vehicle without tags, a pool whose plane is no water surface, or a recording with too little
-            in it.
+        CalibrationError: The vehicle has no tags, the pool's plane is not a water surface, or the recording
+            contains too little.
     """
     tags = vehicle.file_tags
     if tags is None:
@@ -334,15 +338,15 @@ def calibrate_mounts(log: MountLog, pool: Pool, vehicle: Vehicle, *, name: str, 
 
 
 FEWEST = 20
-"""Turns without which no offset is fitted."""
+"""Least number of samples for a clock offset."""
 
 UNSURE_CLOCK = 0.05
-"""Half width of the 95 % interval of the offset beyond which it does not count as identified [s]."""
+"""Half width of the 95 % interval of the clock offset above which it is not identifiable [s]."""
 
 
 def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | None:
-    """Return the time to add to the IMU's times, by turns that the pixels alone show: tilts by the IMU agree with its
-    gyro whatever its clock does."""
+    """Return the offset to add to the IMU's times, from rotations of the pixels-only fit: tilts by the IMU
+    agree with its gyro whatever its clock."""
     if log.turning is None:
         return None
     alone = fit_mounts(rig, mounts, [replace(m, up=None, depth=None) for m in log.moments()], held_out=False)
@@ -354,20 +358,20 @@ def _clock(rig: Rig, mounts: Mapping[int, Pose], log: MountLog) -> Estimate | No
 def imu_clock(
     t_picture: Array, attitude: Array, up_p: Array, t_imu: Array, vertical_rate: Array
 ) -> Estimate | None:
-    """Return the time to add to the IMU's times, from turns about the vertical between neighbouring pictures.
+    """Return the offset to add to the IMU's times, from rotations about the vertical between consecutive pictures.
 
-    n · log(R_2 R_1ᵀ) is the turn from one picture to the next; its rate is compared with ω · up, ω and up in any one
-    frame of the vehicle, so that neither the IMU's mounting nor the tilt is needed.
+    n · log(R_2 R_1ᵀ) is the rotation from one picture to the next; its rate is compared with ω · up, ω and up
+    in any frame of the vehicle, so that neither the IMU's mount nor the tilt is needed.
 
     Args:
         t_picture: Times of the pictures, increasing [s], (n,).
-        attitude: From the pixels, body to pool, unit xyzw [-], (n, 4); its tilt may be poor.
+        attitude: Attitudes from the pixels, body to pool, unit xyzw [-], (n, 4); their tilt may be inaccurate.
         up_p: Unit vector n, upwards in the pool, (3,).
         t_imu: Times of the IMU, increasing [s], (m,).
         vertical_rate: ω · up [rad/s], (m,).
 
     Returns:
-        `imu.time_offset` [s], or None if there are too few pictures or both do not show one motion.
+        `imu.time_offset` [s], or None if there are too few pictures or the two motions do not match.
     """
     turn = quat_to_rotvec(quat_multiply(attitude[1:], quat_conjugate(attitude[:-1]))) @ up_p
     heading = np.concatenate([[0.0], np.cumsum(turn)])
@@ -384,7 +388,7 @@ def imu_clock(
 
 
 def _curves(fit: MountFit) -> tuple[Curve, ...]:
-    """For the report: first corners, tilt and depth as measured and as the fit has them, over time."""
+    """Return curves for the report: first corners, tilt and depth, measured and fitted, over time."""
     rig, state, moments = fit.rig, fit.state, fit.moments
     t = np.array([moment.time for moment in moments])
     pixels, owner, _ = residuals(rig, state, moments)
@@ -436,10 +440,13 @@ def run(
         as_json: Print one JSON object instead of tables.
 
     Returns:
-        The vehicle written.
+        The vehicle that was written.
 
     Raises:
-        CalibrationError, LocalizationError, VehicleError, OutputError: As they say; nothing is written then.
+        CalibrationError: The log cannot be used; nothing is written.
+        LocalizationError: A file of the log or the pool file cannot be read; nothing is written.
+        VehicleError: The vehicle file cannot be used; nothing is written.
+        OutputError: A file cannot be written.
     """
     options = dict(locals())
     refuse_places(out, report, "vehicle")

@@ -1,8 +1,9 @@
-"""Fit of tags on a vehicle, from what a camera above the water, an IMU and a pressure sensor measure while it moves.
+"""Fit of tag mounts on a vehicle, from measurements of a camera above the water, an IMU and a pressure sensor
+while it moves.
 
-A vehicle carries tags; one is the reference tag r, the others are placed relative to it. Unknown are the pose of every
-moment, and shared by all moments: the mount of the reference tag and the other tags relative to it. The pixels of a
-corner follow from refraction (`finssim.core.optics.project`).
+One of the vehicle's tags is the reference tag r; the others are placed relative to it. Unknown are the pose
+of every moment, and shared by all moments: the mount of the reference tag and the poses of the other tags
+relative to it. The pixels of a corner follow from refraction (`finssim.core.optics.project`).
 """
 
 from __future__ import annotations
@@ -33,31 +34,31 @@ from finssim.trials.findings import CalibrationError
 Array = NDArray[np.float64]
 
 AXES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
-"""Axes of a small motion of a tag: about the outer axes [rad], and along them [m]."""
+"""Components of a small motion of a tag: rotation about the outer axes [rad], and translation along them [m]."""
 
 HUBER = 3.0
-"""Corners further off than this many standard deviations count linearly."""
+"""Residual of a corner in standard deviations beyond which the loss grows linearly."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Measurements when one picture was taken."""
+    """Measurements at the time of one picture."""
 
     time: float
-    """[s]"""
+    """Time of the picture [s]."""
     corners: Mapping[int, Array]
-    """Tag -> pixels of its corners as printed, (4, 2)."""
+    """Tag -> pixels of its corners in printed order, (4, 2)."""
     up: Array | None = None
-    """Unit direction of up by the IMU, in body axes as its mount in the vehicle file has them, (3,)."""
+    """Unit direction of up from the IMU, in body axes according to its mount in the vehicle file, (3,)."""
     depth: float | None = None
     """Depth of the pressure port [m]."""
 
 
 PIXEL_STD = 0.3
-"""Standard deviation of a coordinate of a corner [px]."""
+"""Standard deviation of a corner, per axis [px]."""
 
 UP_STD = 0.009
-"""Standard deviation of roll and pitch by the IMU [rad]."""
+"""Standard deviation of roll and pitch from the IMU [rad]."""
 
 DEPTH_STD = 0.01
 """Standard deviation of a depth [m]."""
@@ -65,7 +66,7 @@ DEPTH_STD = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Known values."""
+    """Known parameters of camera, water and vehicle."""
 
     pool: Pool
     edge: float
@@ -73,9 +74,9 @@ class Rig:
     port: Array
     """Pressure port, body frame [m], (3,)."""
     reference: int
-    """The reference tag."""
+    """Id of the reference tag."""
     edges: Mapping[int, float] = field(default_factory=dict)
-    """Edges of tags of another size, by id [m]."""
+    """Edges of tags of a different size, by id [m]."""
 
     def corners_t(self, tag: int) -> Array:
         """Return the corners of a tag in its own frame [m], (4, 3)."""
@@ -84,14 +85,14 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True)
 class MountState:
-    """Everything that is estimated."""
+    """All unknowns."""
 
     reference: Pose
-    """Reference tag in the body."""
+    """Pose of the reference tag in the body."""
     others: Mapping[int, Pose]
-    """Other tags in the frame of the reference tag."""
+    """Poses of the other tags in the frame of the reference tag."""
     poses: Sequence[Pose]
-    """Body in the pool at every moment."""
+    """Pose of the body in the pool at every moment."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,12 +100,12 @@ class MountState:
         return tuple(f"{tag}.{axis}" for tag in ("reference", *self.others) for axis in AXES)
 
     def mount(self, tag: int, reference: int) -> Pose:
-        """A tag in the body."""
+        """Return the pose of a tag in the body."""
         return self.reference if tag == reference else self.reference.then(self.others[tag])
 
 
 def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> MountState:
-    """After a step of the shared unknowns, in the order of `names`, and of each moment's pose.
+    """Return the state after a step of the shared unknowns, in the order of `names`, and of each moment's pose.
 
     Steps are in [m] and [rad].
     """
@@ -120,7 +121,7 @@ def moved(state: MountState, shared: Array, pose_steps: Sequence[Array]) -> Moun
 
 
 def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Array:
-    """Corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3) [m]."""
+    """Return the corners of all tags of all moments in the pool, tags in each moment's order, (n, 4, 3) [m]."""
     mounts = {
         tag: state.mount(tag, rig.reference).at(rig.corners_t(tag)) for tag in (rig.reference, *state.others)
     }
@@ -132,7 +133,8 @@ def corner_points(rig: Rig, state: MountState, moments: Sequence[Moment]) -> Arr
 def residuals(
     rig: Rig, state: MountState, moments: Sequence[Moment]
 ) -> tuple[Array, NDArray[np.int64], list[Array]]:
-    """Measured less predicted corners [px] (n, 4, 2), NaN out of sight, their moments (n,), and the whitened rest."""
+    """Return measured minus predicted corners [px] (n, 4, 2), NaN if not visible, their moments (n,), and the
+    whitened residuals of IMU and depth."""
     observed = np.array([pixels for m in moments for pixels in m.corners.values()])
     owner = np.repeat(np.arange(len(moments)), [len(m.corners) for m in moments])
     predicted = project(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).pixels
@@ -144,7 +146,7 @@ def residuals(
 
 
 def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment]) -> list[Block]:
-    """Weighted normal equations of every moment, shared unknowns in the order of `MountState.names`."""
+    """Return the weighted normal equations of every moment, shared unknowns in the order of `MountState.names`."""
     pixels, _, _ = residuals(rig, state, moments)
     J = projection_jacobians(rig.pool.camera, rig.pool.interface, corner_points(rig, state, moments)).point
     size = np.linalg.norm(pixels, axis=-1)
@@ -162,8 +164,8 @@ def moment_blocks(rig: Rig, state: MountState, moments: Sequence[Moment]) -> lis
 
 
 def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) -> tuple[Array, Array]:
-    """Derivatives of a tag's pixels with respect to the shared unknowns (4, 2, P) and the pose (4, 2, 6), from those
-    with respect to its corners in the pool, J (4, 2, 3)."""
+    """Return the derivatives of a tag's pixels by the shared unknowns (4, 2, P) and the pose (4, 2, 6), from those
+    by its corners in the pool, J (4, 2, 3)."""
     corners_t = rig.corners_t(tag)
     in_reference = corners_t if tag == rig.reference else state.others[tag].at(corners_t)
     in_body = state.reference.at(in_reference)
@@ -180,7 +182,7 @@ def _corner_rows(rig: Rig, state: MountState, pose: Pose, tag: int, J: Array) ->
 
 
 def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tuple[Array, Array, Array]]:
-    """Whitened rows of IMU and depth: shared, own, residual."""
+    """Return whitened rows of IMU and depth: derivatives by the shared unknowns and by the pose, and residual."""
     n, rows = rig.pool.interface.normal, []
 
     def add(std: float, turn: Array, shift: Array, residual: Array) -> None:
@@ -196,15 +198,16 @@ def _others(rig: Rig, state: MountState, pose: Pose, moment: Moment) -> list[tup
     return rows
 
 
-# Where a vehicle is, roughly, from one tag, its tilt and the file's mounts: enough for least squares to begin.
+# Initial poses of the vehicle, from one tag, the tilt and the mounts in the file, for the least-squares fit.
 
 HALVINGS = 40
 DEEPEST = 20.0
-"""Distance below the surface up to which a tag is looked for [m]."""
+"""Greatest depth below the surface at which a tag is searched [m]."""
 
 
 def rotation_between(a: Array, b: Array) -> Array:
-    """Rotation q_ab with a = R_ab b in least squares; where the vectors leave it open, the smallest  (Kabsch 1976).
+    """Return the rotation q_ab with a = R_ab b in least squares; the smallest one if the vectors do not
+    determine it (Kabsch 1976).
 
     Args:
         a: Vectors of any unit, (n, 3).
@@ -220,9 +223,11 @@ def rotation_between(a: Array, b: Array) -> Array:
 def start_state(
     rig: Rig, mounts: Mapping[int, Pose], moments: Sequence[Moment]
 ) -> tuple[MountState, list[int]]:
-    """First guess, and which moments it holds: those with a tag whose mount is known and whose corners meet the water.
+    """Return the initial state, and the moments in it: those with a tag of known mount whose corners' rays
+    enter the water.
 
-    A tag without a mount gets that of the first moment that shows it beside one with a mount, as if all were level.
+    A tag without a mount gets that of the first moment that shows it together with one with a mount, as if
+    all were level.
     """
     mounts = dict(mounts)
     _locate_unknown(rig, mounts, moments)
@@ -238,12 +243,12 @@ def start_state(
 
 
 def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | None:
-    """Body in the pool: position and heading of a tag seen as if it were parallel to the surface, tilt by the IMU."""
+    """Return the initial pose of the body: position and heading of a tag as if it were level, tilt from the IMU."""
     for tag in sorted(moment.corners, key=lambda tag: tag != rig.reference):
         level = level_tag(rig, tag, moment.corners[tag]) if tag in mounts else None
         if level is None:
             continue
-        R = level.R @ mounts[tag].R.T  # of a body whose tag is level
+        R = level.R @ mounts[tag].R.T  # as if the tag were level
         up_p, up_b = rig.pool.interface.normal, moment.up
         R = quat_to_matrix(rotation_between(up_p[None], (R @ up_b if up_b is not None else up_p)[None])) @ R
         return Pose(R, level.t - R @ mounts[tag].t)
@@ -251,7 +256,8 @@ def start_pose(rig: Rig, mounts: Mapping[int, Pose], moment: Moment) -> Pose | N
 
 
 def level_tag(rig: Rig, tag: int, pixels: Array) -> Pose | None:
-    """Tag in the pool as if it lay parallel to the surface, at the depth at which its edges have their length."""
+    """Return the pose of a tag as if it were parallel to the surface, at the depth at which its edges have
+    their length."""
     rays = back_project(rig.pool.camera, rig.pool.interface, pixels)
     if not np.isfinite(rays.direction).all():
         return None
@@ -289,13 +295,13 @@ def _locate_unknown(rig: Rig, mounts: dict[int, Pose], moments: Sequence[Moment]
                 break
 
 
-# Least squares over mounts and moments, in those unknowns that are left free.
+# Least squares over mounts and moments, for the shared unknowns that are free.
 
 STEPS = 60
 
 
 def restricted(block: Block, state: MountState, free: Sequence[str]) -> Block:
-    """A block in the free unknowns alone."""
+    """Return a block reduced to the free unknowns."""
     index = [state.names.index(name) for name in free]
     return Block(block.aa[np.ix_(index, index)], block.ab[index], block.bb, block.a[index], block.b)
 
@@ -303,7 +309,7 @@ def restricted(block: Block, state: MountState, free: Sequence[str]) -> Block:
 def minimise(
     rig: Rig, state: MountState, moments: Sequence[Moment], free: Sequence[str], steps: int = STEPS
 ) -> MountState:
-    """The state that suits the moments best, nearby, over their poses and the shared unknowns `free`."""
+    """Return the state that fits the moments best, near a state, over their poses and the shared unknowns `free`."""
     index = [state.names.index(name) for name in free]
 
     def cost(state: MountState) -> float:
@@ -326,7 +332,7 @@ def minimise(
 
 
 def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:
-    """Return the state with unknowns of the start restored."""
+    """Return the state with the frozen unknowns reset to their initial values."""
     back = np.zeros(len(state.names))
     for name, total in zip(frozen, change(origin, state, frozen), strict=True):
         back[state.names.index(name)] = -total
@@ -347,46 +353,47 @@ def change(before: MountState, after: MountState, free: Sequence[str]) -> Array:
 
 
 MAX_MOMENTS = 150
-"""Greatest number of used moments, spread over the recording; more add nothing."""
+"""Greatest number of moments used, spread over the recording; more do not improve the fit."""
 
 FEWEST_MOMENTS = 8
 BLOCKS = 12
 UNSURE_ANGLE = math.radians(3.0)
-"""Half width of the 95 % interval of an angle beyond which it does not count as determined."""
+"""Half width of the 95 % interval of an angle above which it is not determined [rad]."""
 
 UNSURE_LENGTH = 0.02
-"""Half width of the 95 % interval of a length beyond which it does not count as determined [m]."""
+"""Half width of the 95 % interval of a length above which it is not determined [m]."""
 
 TURNED = math.radians(25.0)
-"""Disagreement about up beyond which a mount is taken as turned, and not as inexact."""
+"""Disagreement about up beyond which a mount is treated as rotated rather than inaccurate [rad]."""
 
 BETTER = 0.6
-"""Share of the disagreement that such a turn must leave, at most: noise alone always finds some turn."""
+"""Largest ratio of the squared disagreement after such a rotation to that before: noise alone always allows
+some reduction."""
 
 FAR = 6.0
-"""Times the usual residual for a moment to be left out."""
+"""Ratio of a moment's residual to the usual one above which the moment is excluded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountFit:
-    """Mounts, and how well the motion determines them."""
+    """Estimated mounts, and how well the motion determines them."""
 
     state: MountState
     rig: Rig
     moments: tuple[Moment, ...]
-    """Used moments."""
+    """Moments that were used."""
     free: tuple[str, ...]
-    """Shared unknowns that were estimated, of `state.names`."""
+    """Shared unknowns that were estimated, a subset of `state.names`."""
     frozen: tuple[str, ...]
-    """Unknowns that the motion does not determine, kept as they were."""
+    """Unknowns that the motion does not determine, kept at their initial values."""
     covariance: Covariance
     """Covariance of `free`."""
     rms: float
-    """Root of the mean squared distance of corners [px]."""
+    """Root mean square distance of corners [px]."""
     held_out_rms: float
-    """Residual of moments whose pose alone was fitted, to mounts from other moments [px]."""
+    """Residual of held-out moments, of which only the pose is fitted, with mounts from the other moments [px]."""
     excluded: int
-    """Moments left out as far off."""
+    """Number of moments excluded as outliers."""
 
     def half_width(self, name: str) -> float:
         """Return the half width of the 95 % interval of a shared unknown; infinite if it is not free.
@@ -399,16 +406,16 @@ class MountFit:
 
     @property
     def port_depths(self) -> Array:
-        """Depth of the pressure port at every moment by the poses [m], (n,)."""
+        """Depth of the pressure port at every moment, from the poses [m], (n,)."""
         n, b = self.rig.pool.interface.normal, self.rig.pool.interface.offset
         return np.array([-(n @ pose.at(self.rig.port) + b) for pose in self.state.poses])
 
 
 def reference_tag(moments: Sequence[Moment], mounts: Mapping[int, Pose]) -> int:
-    """The tag of the vehicle file that is seen most.
+    """Return the tag of the vehicle file that is visible most often.
 
     Raises:
-        CalibrationError: None of its tags is seen.
+        CalibrationError: None of its tags is visible.
     """
     counts = {tag: sum(tag in moment.corners for moment in moments) for tag in mounts}
     best = max(counts, key=lambda tag: (counts[tag], -tag), default=None)
@@ -427,18 +434,19 @@ def fit_mounts(
     *,
     held_out: bool = True,
 ) -> MountFit:
-    """Fit mounts of all tags, from moments of a moving vehicle whose IMU and pressure port are mounted as its file
-    states.
+    """Fit mounts of all tags, from moments of a moving vehicle whose IMU and pressure port are mounted as in
+    its file.
 
-    Tags relative to one another follow from pictures that show two. How the reference tag sits in the body follows from
-    the IMU's tilt (its whole orientation, once the vehicle tilts two ways) and from the depth (its height over the
-    pressure port, and sideways from it by how depth changes with tilt). What the motion does not tell keeps its start.
+    The poses of tags relative to one another follow from pictures that show two. The mount of the reference
+    tag in the body follows from the IMU's tilt (its complete orientation, once the vehicle tilts in two
+    directions) and from the depth (its height over the pressure port, and its horizontal position from the
+    change of depth with tilt). Unknowns that the motion does not determine keep their initial values.
 
     Args:
         rig: Camera, water, tags, port.
-        mounts: Tags in the body as the vehicle file has them; one of them may be all.
-        moments: In order of time.
-        held_out: Fit parts of the recording too, for the error at the others.
+        mounts: Tags in the body according to the vehicle file; one is enough.
+        moments: Moments in order of time.
+        held_out: True to compute the error at held-out parts of the recording too.
 
     Raises:
         CalibrationError: Too few moments show a tag in the water.
@@ -483,7 +491,8 @@ def fit_mounts(
 
 
 def _held_out(rig: Rig, state: MountState, moments: Sequence[Moment], free: tuple[str, ...]) -> float:
-    """Mounts from every other sixth of the recording, tried on the sixths between, and the other way round."""
+    """Return the residual of held-out moments: two halves of alternate sixths of the recording, each tested
+    with the other's mounts."""
     fold = np.arange(len(moments)) * 6 // len(moments) % 2
 
     def fitted(state: MountState, k: int, free: tuple[str, ...]) -> tuple[MountState, list[Moment]]:
@@ -514,14 +523,15 @@ def _candidates(state: MountState, moments: Sequence[Moment]) -> tuple[str, ...]
 
 
 def _of_others(state: MountState) -> tuple[str, ...]:
-    """Shared unknowns of the tags that are placed relative to the reference tag."""
+    """Return the shared unknowns of the tags that are placed relative to the reference tag."""
     return tuple(name for name in state.names if name[0].isdigit())
 
 
 def _without_far(
     rig: Rig, state: MountState, moments: Sequence[Moment]
 ) -> tuple[MountState, list[Moment], int]:
-    """Moments whose best corner is far off even alone, as a wrongly read tag's, go."""
+    """Exclude moments of which even the median corner is an outlier, such as with a misread tag; return the
+    number excluded."""
     corner, owner, _ = residuals(rig, state, moments)
     distance = np.linalg.norm(corner, axis=-1)
     far = np.array([np.median(distance[owner == i]) for i in range(len(moments))])
@@ -542,7 +552,8 @@ def _least_observable(free: Sequence[str], half: Array) -> str | None:
 def _hopeful(
     rig: Rig, state: MountState, moments: Sequence[Moment], free: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Without what the geometry alone rules out: least squares would wander along it."""
+    """Return the free unknowns without those that the geometry does not determine, along which least squares
+    would drift."""
     blocks = moment_blocks(rig, state, moments)
     while True:
         some = [restricted(block, state, free) for block in blocks]
@@ -554,10 +565,10 @@ def _hopeful(
 
 
 def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment]) -> MountState:
-    """Poses from the pixels, and a reference tag turned so that up by the IMU is up by the pixels.
+    """Fit poses to the pixels, and rotate the reference tag so that up from the IMU agrees with up from the pixels.
 
-    A tag that is mounted a quarter turn away from what the file says would otherwise start with tilts of the wrong
-    sign. Where the vehicle never tilts, the smallest turn is taken.
+    A tag that is mounted a quarter turn away from the file's mount would otherwise start with tilts of the wrong
+    sign. If the vehicle never tilts, the smallest rotation is used.
     """
     blind = [replace(moment, up=None) for moment in moments]
     state = minimise(rig, state, blind, _of_others(state), steps=15)
@@ -569,7 +580,7 @@ def _by_vision(rig: Rig, state: MountState, moments: Sequence[Moment]) -> MountS
     q = rotation_between(felt, observed)
     better = np.sum((felt - quat_rotate(q, observed)) ** 2) < BETTER * np.sum((felt - observed) ** 2)
     if 2.0 * math.acos(min(1.0, abs(float(q[3])))) >= TURNED and better:
-        # The body turns about the reference tag, so that every tag stays where it is seen.
+        # The body rotates about the reference tag, so that every tag stays at its observed position.
         mount = Pose(quat_to_matrix(q) @ state.reference.R, state.reference.t)
         back = state.reference.then(mount.inverse)
         state = replace(state, reference=mount, poses=[pose.then(back) for pose in state.poses])

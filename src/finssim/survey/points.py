@@ -1,4 +1,4 @@
-"""Surveyed points of a pool and their pixels, from tables in many spellings and from images."""
+"""Surveyed points of a pool and their pixels, from tables with varying column names and from images."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from finssim.vehicles.tag_layout import read_tag_layout
 Array = NDArray[np.float64]
 
 METRES = {**UNITS["length"], "inch": 0.0254}
-"""Metres in one of each."""
+"""Unit of length -> metres."""
 
 LENGTHS, ANGLES = ("x", "y", "z", "sigma", "edge"), ("yaw", "roll", "pitch")
 
 WIDEST = 300.0
-"""Spread of coordinates beyond which the file must state the unit [m]."""
+"""Spread of coordinates above which the file must state the unit [m]."""
 
 _BY_WORD = {
     word: name
@@ -40,7 +40,7 @@ _BY_WORD = {
     ).items()
     for word in words.split()
 }
-"""What people call a column (`columns.yaml`) -> its standard name."""
+"""Alternative column name (`columns.yaml`) -> standard name."""
 
 COMMENT = ("#", "%", "//")
 
@@ -57,16 +57,16 @@ class TableRow:
     line: int
     """Line number in the file, from 1."""
     words: dict[str, str]
-    """Cells that are not empty, by the standard name of their column."""
+    """Standard column name -> text of each cell that is not empty."""
     numbers: dict[str, float]
-    """Cells with numbers: lengths in metres, angles in radians, pixels."""
+    """Standard column name -> number: lengths in metres, angles in radians, pixels."""
 
     def missing(self, *names: str) -> list[str]:
-        """Return those of some columns that have no number."""
+        """Return the given columns that have no number in the row."""
         return [name for name in names if name not in self.numbers]
 
     def position(self, z: float | None) -> Array:
-        """x, y and z [m], (3,); `z` where the table has none."""
+        """Return x, y and z [m], (3,), with `z` if the table has no such column."""
         return np.array([self.numbers["x"], self.numbers["y"], self.numbers.get("z", z)], float)
 
     @property
@@ -75,7 +75,7 @@ class TableRow:
         return np.array([self.numbers["u"], self.numbers["v"]])
 
     def placed(self, name: str, points: Array) -> Placed:
-        """Return points with the other cells of the row. Points are in [m]."""
+        """Return surveyed points with the row's standard error and flags. Points are in [m]."""
         return Placed(
             name,
             points,
@@ -93,10 +93,11 @@ class SurveyTable:
     columns: tuple[str, ...]
     rows: tuple[TableRow, ...]
     united: bool
-    """True if the file or its reader states the unit of lengths."""
+    """True if the file or the caller states the unit of lengths."""
 
     def refuse_other_units(self, spread: float) -> None:
-        """Refuse coordinates that would be metres only in a lake. `spread` is in the unit of the table."""
+        """Refuse coordinates without a stated unit that are too large for a pool in metres. The spread is in
+        the unit of the table."""
         if spread > WIDEST and not self.united:
             raise CalibrationError(
                 f"{self.path}: the points spread over {spread:.0f} m: if they are not in metres, write the unit into "
@@ -104,30 +105,30 @@ class SurveyTable:
             )
 
     def refuse(self, row: TableRow, sentence: str) -> CalibrationError:
-        """Return the error for a sentence about a row."""
+        """Return the error with a sentence about a row."""
         return CalibrationError(f"{self.path}: line {row.line}: {sentence}")
 
 
 def read_table(path: str | Path, *, unit: str | None = None) -> SurveyTable:
     """Read a table of points, pixels or tags.
 
-    Columns may have any case and order; lengths may carry their unit (`x_mm`, `x [mm]`, `X (cm)`) or a comment line may
-    (`# unit: mm`); else they are metres, or of `unit`. Angles are `yaw_deg` or `yaw_rad`; a bare `yaw` is in radians
-    if all of its numbers are below 2 pi, else in degrees. Separators: comma, semicolon, tab or blanks.
+    Column names may be in any case and order; lengths may state their unit in the name (`x_mm`, `x [mm]`, `X
+    (cm)`) or in a comment line (`# unit: mm`); else they are in `unit`, by default metres. Angles are
+    `yaw_deg` or `yaw_rad`; plain `yaw` is in radians if all of its numbers are below 2 pi, else in degrees.
+    Separators: comma, semicolon, tab or blanks.
 
     Args:
         path: The file.
-        unit: Of lengths, where the file does not say.
+        unit: Unit of lengths if the file does not state it.
 
     Raises:
-        CalibrationError: Unreadable, no header, a cell that must be a number is none; names the line.
+        CalibrationError: The file is unreadable, has no header, or a cell is not a number; the message names
+            the line.
     """
     text, _ = read_text(path, CalibrationError)
     table = text_table(text, spaces=None, comment=COMMENT)
     heads = [text_table(line.lstrip("#%/ "), spaces=None).names for line in table.comments]
-    if (
-        heads and table.names and _recognised(table.names) < 2
-    ):  # the header itself may be behind a comment sign
+    if heads and table.names and _recognised(table.names) < 2:  # the header itself may be a comment line
         head = max(heads, key=_recognised)
         if _recognised(head) >= 2:
             table = text_table(text, names=head, spaces=None, comment=COMMENT)
@@ -170,7 +171,7 @@ def _table(path: str, text: TextTable, default: str | None) -> SurveyTable:
 
 
 def _check(path: str, row: TableRow) -> None:
-    """Refuse words where numbers belong; an empty cell or NaN is a missing number, which is the reader's affair."""
+    """Refuse texts in number columns; an empty cell or NaN is a missing number, which the caller handles."""
     for name in ("u", "v", *LENGTHS, *ANGLES):
         word = row.words.get(name, "0")
         if _number(word) is None:
@@ -181,7 +182,7 @@ def _check(path: str, row: TableRow) -> None:
 
 
 def _column(word: str) -> tuple[str, str]:
-    """Standard name (empty: of no use here) and unit of a column."""
+    """Return the standard name (empty: ignored) and the unit of a column."""
     word = word.strip().strip("\"'")
     match = _UNIT_AT_END.search(word)
     unit = (match[1] or match[2] or "").lower() if match else ""
@@ -209,33 +210,33 @@ def _factor(name: str, unit: str, default: str | None, cells: list[str]) -> floa
 
 
 def _recognised(names: Sequence[str]) -> int:
-    """Return the number of column names that are known."""
+    """Return the number of recognised column names."""
     return sum(bool(_column(word)[0]) for word in names)
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Points that were surveyed together, so that one error moves them all: a tag's corners, or a single point."""
+    """Points that share one survey error because they were surveyed together: a tag's corners, or a single point."""
 
     name: str
     points: Array
-    """Pool frame [m], (K, 3); a tag's corners in the order of `localization.tags.corners`."""
+    """Pool frame [m], (K, 3); a tag's corners in the order of `families.corners`."""
     sigma: float
-    """Standard error of each coordinate [m]; NaN where the survey does not say."""
+    """Standard error of each coordinate [m]; NaN if the survey does not state it."""
     dry: bool = False
     """True if the points are on the camera's side of the water."""
     group: str = ""
     """Name of the rigid target to which the points belong; empty: none."""
 
     def arm(self, corner: int) -> Array:
-        """Displacement of a corner by a turn of its tag about z [m/rad], (3,)."""
+        """Return the displacement of a corner by a rotation of its tag about z [m/rad], (3,)."""
         x, y, _ = self.points[corner] - self.points.mean(axis=0)
         return np.array([-y, x, 0.0])
 
 
 @dataclass(frozen=True)
 class Survey:
-    """All that was surveyed."""
+    """Surveyed points and tags."""
 
     path: str
     points: dict[str, Placed] = field(default_factory=dict)
@@ -243,7 +244,7 @@ class Survey:
     tags: dict[int, Placed] = field(default_factory=dict)
     """Fixed tags by id."""
     locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
-    """Image -> tags that lay there (id, or None for whichever was seen)."""
+    """Image -> tags surveyed for it (id, or None for the only one visible)."""
     findings: tuple[Finding, ...] = ()
 
 
@@ -259,19 +260,19 @@ def read_survey(
 
     Columns `id,x,y,z` for points; `tag,x,y,z,yaw_deg[,roll_deg,pitch_deg],edge` for fixed tags (centre and attitude
     of the tag frame); `image,x,y,z,yaw_deg[,tag],edge` for one tag that was moved from picture to picture. `sigma`
-    gives a row its own standard error, `dry` marks what is above the water, `group` ties points to one target.
+    is the standard error of a row, `dry` flags points above the water, `group` assigns points to one rigid target.
 
-    A tag file of apriltag_ros (.yaml) gives the tags of its bundle, in the bundle's frame.
+    A tag file of apriltag_ros (.yaml) provides the tags of its bundle, in the bundle's frame.
 
     Args:
         path: CSV file, or the YAML file of a bundle.
-        unit: Of lengths where the file says none.
-        edge: Of all tags [m] where the table has no such column.
-        edges: Of tags by id [m], before `edge`.
-        z: Height of all points [m] where the table has no such column.
+        unit: Unit of lengths if the file states none.
+        edge: Edge of all tags [m] if the table has no such column.
+        edges: Edges of tags by id [m], with priority over `edge`.
+        z: Height of all points [m] if the table has no such column.
 
     Raises:
-        CalibrationError: A column or number is missing, or an id has two positions; names the line.
+        CalibrationError: A column or number is missing, or an id has two positions; the message names the line.
     """
     if Path(path).suffix.lower() in (".yaml", ".yml"):
         return _bundle(Path(path))
@@ -302,7 +303,7 @@ def read_survey(
         if before is not None and np.abs(before.points - here.points).max() > 1e-6:
             label = f"point '{name}'" if tag is None else name
             raise table.refuse(
-                row, f"{label} was at another place in line {lines[name]}: keep one of the two"
+                row, f"{label} has another position in line {lines[name]}: keep one of the two"
             )
         lines[name] = row.line
         if tag is None:
@@ -318,7 +319,7 @@ def read_survey(
 def _surveyed(
     table: SurveyTable, row: TableRow, edges: tuple[float | None, Mapping[int, float]], z: float | None
 ) -> tuple[str, int | None, Placed]:
-    """Return the name of a row, the number of its tag (None: a point, or any tag), and its points."""
+    """Return the name of a row, the id of its tag (None: a point, or any tag), and its points."""
     of_any, of_tags = edges
     named = row.words.get("tag", "").removesuffix(".0")
     edge = row.numbers.get("edge", of_tags.get(int(named), of_any) if named.isdecimal() else of_any)
@@ -363,21 +364,21 @@ def _bundle(path: Path) -> Survey:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Pixels of N surveyed points; points of one location share the error of its survey."""
+    """Pixels of N surveyed points; points of one location share its survey error."""
 
     pixels: Array
-    """(N, 2), integers at pixel centres."""
+    """Pixels (u, v), integers at pixel centres, (N, 2)."""
     points: Array
-    """Pool frame [m], (N, 3)."""
+    """Surveyed points, pool frame [m], (N, 3)."""
     location: NDArray[np.intp]
     """Index into `locations`, (N,)."""
     names: tuple[str, ...]
-    """Name of each row: the point's id or tag/corner, with its image where there are several."""
+    """Name of each row: the point's id or tag/corner, with its image if there are several."""
     locations: tuple[str, ...]
     sigma: Array
-    """Standard error of the survey [m], (N,); NaN where it does not say."""
+    """Standard error of the survey [m], (N,); NaN if it is not stated."""
     arm: Array
-    """Displacement of the point by a turn of its location about z [m/rad], (N, 3); zero for single points."""
+    """Displacement of the point by a rotation of its location about z [m/rad], (N, 3); zero for single points."""
     dry: NDArray[np.bool_]
     """True for points on the camera's side of the plane, (N,)."""
     findings: tuple[Finding, ...] = ()
@@ -386,7 +387,7 @@ class Observations:
         return len(self.points)
 
     def subset(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
-        """Some of the rows; locations keep their indices."""
+        """Return some of the rows; locations keep their indices."""
         index = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
         columns = ("pixels", "points", "location", "sigma", "arm", "dry")
         return replace(
@@ -401,12 +402,13 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
 
     Args:
         inputs: Detections CSV (`image,tag,u0,v0,...`), pixel CSV (`[image,]id,u,v`), or pictures, in which tags of
-            `family` are looked for.
-        survey: Where everything lay.
-        family: Of the tags in pictures.
+            `family` are detected.
+        survey: Surveyed points and tags.
+        family: Family of the tags in pictures.
 
     Raises:
-        CalibrationError: Nothing of it is in the survey, or a file cannot be read; names ids and lines.
+        CalibrationError: No observation is in the survey, or a file cannot be read; the message names ids and
+            lines.
     """
     rows = _Rows()
     tables, pictures = [], []
@@ -431,7 +433,7 @@ def observe(inputs: Sequence[Path], survey: Survey, *, family: str | None = None
 def observe_combined(
     paths: Sequence[Path], *, unit: str | None = None, z: float | None = None
 ) -> Observations:
-    """Read tables that hold pixel and point in one row: `u,v,x,y,z`, with `id`, `group`, `sigma`, `dry` where given.
+    """Read tables with pixel and point in one row: `u,v,x,y,z`, and optionally `id`, `group`, `sigma`, `dry`.
 
     Raises:
         CalibrationError: A column or number is missing.
@@ -466,7 +468,7 @@ def observe_combined(
 
 
 class _Match(NamedTuple):
-    """A pixel of a surveyed point."""
+    """Pixel of a surveyed point."""
 
     image: str
     name: str
@@ -476,7 +478,7 @@ class _Match(NamedTuple):
 
 
 class _Rows:
-    """Matches as they are gathered."""
+    """Accumulator of matches."""
 
     def __init__(self) -> None:
         self.findings: list[Finding] = []
@@ -566,7 +568,7 @@ def _match_table(rows: _Rows, table: SurveyTable, survey: Survey) -> None:
 
 
 def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
-    """A point by its id, also where one file writes 7 and the other 7.0, or a corner `tag/0`."""
+    """Return a point by its id, even if one file writes 7 and the other 7.0, or a tag's corner by `tag/0`."""
     if name in survey.points:
         return survey.points[name], 0
     tag, _, corner = name.partition("/")

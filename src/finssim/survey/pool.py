@@ -1,4 +1,4 @@
-"""`finssim calibrate pool`: read and match surveyed points, fit camera and water plane, write the pool file, report."""
+"""`finssim calibrate pool`: read and match surveyed points, fit camera and water plane, write pool file and report."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIGITS = {"m": 4, "deg": 3, "px": 2}
-"""Digits after the point: tenths of a millimetre, thousandths of a degree, hundredths of a pixel; five without unit."""
+"""Decimals by unit: tenths of a millimetre, thousandths of a degree, hundredths of a pixel; five without a unit."""
 
 MAX_NAMES = 12
-"""Outliers that a sentence names."""
+"""Greatest number of outliers that a sentence names."""
 
 LEAST_SPREAD = 5.0
-"""Largest width of all pixels that are refused: numbers from 0 to 1 are no pixels [px]."""
+"""Least spread of pixels [px]: values with a smaller one, such as from 0 to 1, are not pixels."""
 
 READING = (
     "The interval holds the true value in 19 of 20 such calibrations, if the priors (index, tape, "
@@ -64,7 +64,7 @@ def pool_json(
     Args:
         fit: The calibration.
         out: Pool file that was written.
-        inputs: File -> SHA-256 of what the fit was made from.
+        inputs: Input file -> its SHA-256.
     """
     held_out, pinhole = (None if h is None else h.as_json() for h in (fit.held_out, fit.pinhole_held_out))
     figures = {
@@ -89,18 +89,18 @@ def pool_json(
 
 
 def pool_record(fit: PoolFit, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Return the record in the pool file: the same without its long parts."""
+    """Return the record in the pool file: the content of `pool_json` without its long parts."""
     record = pool_json(fit, inputs=inputs)
     return {key: value for key, value in record.items() if key not in ("kind", "correlation", "out")}
 
 
 def pool_report(fit: PoolFit) -> Report:
-    """The calibration in words."""
+    """Return the report of the calibration."""
     figures = fit.residual_json()
     held_out = "too few points to hold any out: the error at other points is not known"
     summary = [
-        f"residual {figures['rms_px']:.2f} px, {figures['rms_mm']:.1f} mm at the points; of it a pixel is worth "
-        f"{figures['pixel_sigma']:.2f} px, the survey {figures['survey_sigma_mm']:.1f} mm"
+        f"residual {figures['rms_px']:.2f} px, {figures['rms_mm']:.1f} mm at the points; standard errors: pixel "
+        f"{figures['pixel_sigma']:.2f} px, survey {figures['survey_sigma_mm']:.1f} mm"
     ]
     if fit.held_out is not None:
         share = _survey_share(fit)
@@ -140,9 +140,9 @@ def _figures(held_out: HeldOut) -> str:
 
 
 def _survey_share(fit: PoolFit) -> float:
-    """Root mean square of the survey's own error across the planes of the points held out [cm].
+    """Return the root mean square of the survey's own error within the planes of the held-out points [cm].
 
-    Two coordinates of each place, and the turn of tags; it is in the held-out error, and not one of the calibration.
+    It covers two coordinates of each location and the rotation of tags, and is part of the held-out error.
     """
     if fit.held_out is None or not len(fit.held_out.rows):
         return math.nan
@@ -152,13 +152,16 @@ def _survey_share(fit: PoolFit) -> float:
     return 100.0 * noise.scale * float(np.sqrt(np.mean(2.0 * sigma**2 + turn)))
 
 
-# Pictures of a calibrated pool: errors on the map and in the picture, and beside straight lines.
+# Figures of a calibrated pool: errors on the map and in the picture, next to those of straight lines.
 
 
 def pool_pictures(fit: PoolFit) -> dict[str, tuple[str, bytes]]:
-    """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
+    """Return the figures: file name -> caption and PNG; equal fits give equal figures."""
     drawn = {
-        "map.png": ("Where each pixel's ray meets the point's plane, less the surveyed point", _map(fit)),
+        "map.png": (
+            "Errors at the points: back-projected minus surveyed, in the plane of each point",
+            _map(fit),
+        ),
         "picture.png": ("Measured less predicted pixels, enlarged", _picture(fit)),
     }
     if len(fit.correlation.names) > 1:
@@ -167,7 +170,7 @@ def pool_pictures(fit: PoolFit) -> dict[str, tuple[str, bytes]]:
 
 
 def _map(fit: PoolFit) -> Figure:
-    """Seen along the plane's normal."""
+    """Draw the errors, viewed along the plane's normal."""
     figure = new_figure(7.4, 5.6)
     axes = figure.subplots()
     across, names = np.eye(3)[:2], ("x [m]", "y [m]")
@@ -205,7 +208,7 @@ def run(
 
     Args:
         inputs (INPUT): Detections (.csv), pixels (id,u,v), pixels with points (u,v,x,y,z), or images of tags.
-        survey (FILE): Survey file (.yaml): the points, what the camera looks through, and what is known of it.
+        survey (FILE): Survey file (.yaml): the points, the kind of interface (surface or window), and priors.
         camera (FILE): Camera file: ours, or that of another program (see the page Bring what you have).
         out (FILE): Pool file to write (.yaml).
         report (DIR): Directory for the report and its figures.
@@ -216,7 +219,9 @@ def run(
         The calibration.
 
     Raises:
-        CalibrationError, LocalizationError, OutputError: As they say; nothing is written then.
+        CalibrationError: The inputs cannot be used or do not determine the camera; nothing is written.
+        LocalizationError: The camera file or an image cannot be read; nothing is written.
+        OutputError: A file cannot be written.
     """
     refuse_places(out, report, "pool")
     camera_file, survey_file = load_camera(camera), load_survey_file(survey)
@@ -249,7 +254,7 @@ def run(
 
 
 def _refuse_pixels(observed: Observations, file: CameraFile) -> None:
-    """Refuse pixels that another size of picture must have had, and what are none."""
+    """Refuse pixels of a picture of another size, and numbers that are not pixels."""
     spread = float(np.ptp(observed.pixels, axis=0).max())
     if len(observed) > 1 and 0.0 < spread < LEAST_SPREAD:
         raise CalibrationError(
@@ -266,7 +271,8 @@ def _refuse_pixels(observed: Observations, file: CameraFile) -> None:
 
 
 def _lens_sigma(file: CameraFile) -> tuple[float, float]:
-    """Standard errors that the camera file remembers: of the focal length, relative, and of the centre [px]; or 0."""
+    """Return the standard errors in the camera file's record: of the focal length, relative, and of the
+    centre [px]; 0 if absent."""
     std = {}
     for name in ("fx", "cx", "cy"):
         try:

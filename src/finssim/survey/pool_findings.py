@@ -1,4 +1,4 @@
-"""Findings on what a survey of a pool does not determine, with the measurements that would."""
+"""Findings on parameters that a survey of a pool does not determine, with measurements that would help."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from finssim.survey.pool_refine import Refined, squared_distance
 from finssim.trials.findings import Finding, finding
 
 NARROW = np.radians(20.0)
-"""Angle of incidence below which refraction looks like a nearer floor."""
+"""Angle of incidence below which refraction cannot be distinguished from a shallower floor [rad]."""
 
 COMMON_DEPTH = 0.02
-"""Spread of depths, over the distance to the camera, below which they count as one."""
+"""Spread of depths, relative to the distance to the camera, below which they count as equal [-]."""
 
 TOUCHING = 0.0001
-"""Distance of the plane from a point or the camera, below which the one keeps the other from moving on [m]."""
+"""Distance of the plane from a point or the camera below which it counts as touching [m]."""
 
 PRESSED = 9.0
-"""Fall of chi² that a plane held by a point or the camera would gain beyond it, from which that is no chance."""
+"""Decrease of chi² possible beyond a touching point or camera, above which the contact is significant."""
 
 CERTAIN = 0.999
-"""Share of the marks above the water that are taken for such."""
+"""Quantile of the residuals up to which excluded points above the plane are identified as dry [-]."""
 
 CAMERA = "the camera"
 
@@ -37,11 +37,11 @@ FULL_LENS = "fit: [pose, height, tilt, index, focal, center, distortion]"
 
 
 def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
-    """Points used, and the camera, that the plane and its window have come to rest against although the pixels want it
-    further on; the nearest first.
+    """Return the points in use, and the camera, that stop the plane or its window although the pixels favour
+    a position beyond them; the nearest first.
 
     Args:
-        fit: Of these rows.
+        fit: Fit of these rows.
         observed: All rows.
     """
     wet = fit.used & ~observed.dry
@@ -62,7 +62,7 @@ def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
 def separability(
     fit: Refined, observed: Observations, settings: PoolFitSettings, table: Mapping[str, Estimate]
 ) -> Iterator[Finding]:
-    """Yield findings on camera height, water height and index, which few points cannot separate.
+    """Yield findings on camera height, water height and index, which unsuitable points cannot separate.
 
     Args:
         fit: The fit.
@@ -98,7 +98,7 @@ def separability(
 
 
 def conflicts(fit: Refined, settings: PoolFitSettings) -> Iterator[Finding]:
-    """Yield findings where the pixels pull an estimate far from its prior.
+    """Yield findings on estimates that the pixels pull far from their priors.
 
     Args:
         fit: The fit.
@@ -122,7 +122,7 @@ def conflicts(fit: Refined, settings: PoolFitSettings) -> Iterator[Finding]:
 
 
 def numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
-    """Yield findings on few places and large errors of pixels and survey.
+    """Yield findings on too few locations and large errors of pixels and survey.
 
     Args:
         fit: The fit.
@@ -139,7 +139,7 @@ def numbers(fit: Refined, observed: Observations) -> Iterator[Finding]:
 
 
 def excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterator[Finding]:
-    """Yield findings on rows that were left out: marks above the water that are not flagged as dry, and others.
+    """Yield findings on excluded rows: marks above the water that are not flagged as dry, and others.
 
     Args:
         fit: The fit.
@@ -155,10 +155,10 @@ def excluded_rows(fit: Refined, observed: Observations, surface: bool) -> Iterat
 
 
 def _above(fit: Refined, observed: Observations) -> NDArray[np.bool_]:
-    """Return which rows were left out although straight lines from the camera meet them on its side of the plane,
-    (N,)."""
+    """Return a mask of excluded rows whose straight rays from the camera meet the points on its side of the
+    plane, (N,)."""
     side = observed.points @ fit.model.interface.normal + fit.model.interface.offset > 0.0
     side &= ~fit.used & ~observed.dry
     dry = replace(observed, dry=np.ones(len(observed), bool))
     met = side & (squared_distance(fit.model, dry, fit.noise, fit.covariance) < float(chi2.ppf(CERTAIN, 2)))
-    return met & (2 * met.sum() > side.sum())  # some are met by chance
+    return met & (2 * met.sum() > side.sum())  # a few may agree by chance

@@ -1,4 +1,4 @@
-"""Calibration of a pool: camera pose and water plane from surveyed points that are seen through the plane."""
+"""Calibration of a pool: camera pose and water plane from surveyed points seen through the plane."""
 
 from __future__ import annotations
 
@@ -49,20 +49,20 @@ __all__ = ["PoolFit", "calibrate_pool", "doubted"]
 Array = NDArray[np.float64]
 
 IDENTIFIED = 0.7
-"""Ratio of a standard error to its prior above which the pictures contain almost no information."""
+"""Ratio of a standard error to its prior above which the pictures contain almost no information on a parameter."""
 
 FAR = 0.05
-"""Standard error of a distance, over the total distance, above which it counts as not determined."""
+"""Standard error of a distance, relative to the total distance, above which it is not determined [-]."""
 
 AT_BOUND = 0.01
-"""Distance from the plane, over the total distance, below which camera or points lie on it."""
+"""Distance from the plane, relative to the total distance, below which camera or points are at the bound [-]."""
 
 STEPS = np.array([1e-5] * 3 + [1e-6] * 5 + [1e-5, 1e-5, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6] + [1e-7] * 3)
-"""Steps of the derivatives by the parameters."""
+"""Steps of the numerical derivatives by the parameters, in their units."""
 
 
 def estimates(fit: Refined, settings: PoolFitSettings) -> tuple[dict[str, Estimate], Correlation]:
-    """Return the table of estimates and the correlation of their errors; the latter without what was not fitted.
+    """Return the table of estimates, and the correlation of the errors of the fitted ones.
 
     Args:
         fit: The fit.
@@ -87,7 +87,7 @@ def estimates(fit: Refined, settings: PoolFitSettings) -> tuple[dict[str, Estima
 
 
 def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]:
-    """Return name -> unit and value of all quantities in the table."""
+    """Return all quantities of the table: name -> unit and value."""
     camera, lens, n = model.camera, model.camera.lens, model.interface.normal
     rows = dict(zip(("camera_x", "camera_y", "camera_z"), (("m", x) for x in camera.position), strict=True))
     angles = np.degrees(quat_to_euler(np.asarray(camera.orientation)))
@@ -107,7 +107,7 @@ def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]
 
 
 def _doubt(name: str, std: float, fit: Refined, settings: PoolFitSettings) -> str:
-    """Return the basis of a number that the pictures do not determine; empty where they do."""
+    """Return the source of a number that the pictures do not determine; empty if they do."""
     model, prior = fit.model, fit.prior
     reach = model.clearance + max(model.depth, 0.0)
     before, sentence = np.inf, ""
@@ -128,49 +128,50 @@ def _doubt(name: str, std: float, fit: Refined, settings: PoolFitSettings) -> st
 
 
 DOUBT = 20.0
-"""Fall of chi² above which a prior counts as contradicted: by chance once in 20000 surveys, more in very poor ones."""
+"""Decrease of chi² without a prior above which the prior is contradicted: by chance once in 20000 surveys,
+more often in very poor ones."""
 
 MAX_LEAN = np.radians(5.0)
-"""A surface tilted further from the survey's z than this is none [rad]."""
+"""Largest angle between a water surface's normal and the survey's z axis [rad]."""
 
 LENS_STEPS = (("focal", "center"), ("focal", "center", "distortion"))
-"""Groups of lens parameters that are fitted where the error at held-out points decreases."""
+"""Groups of lens parameters that are fitted if they decrease the error at held-out points."""
 
 BETTER = 0.9
-"""Factor on the held-out error below which another group of parameters is fitted."""
+"""Factor on the held-out error below which a further group of parameters is fitted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolFit(Refined):
-    """The result, in the survey's frame."""
+    """Result of a pool calibration, in the survey's frame."""
 
     settings: PoolFitSettings
     estimates: dict[str, Estimate]
     correlation: Correlation
     observed: Observations
     residual: Array
-    """Measured minus predicted [px], (N, 2)."""
+    """Measured minus predicted pixels [px], (N, 2)."""
     error: Array
-    """Back-projected minus surveyed, in the plane of each point [m], (N, 3)."""
+    """Back-projected minus surveyed points, in the plane of each point [m], (N, 3)."""
     held_out: HeldOut | None
     pinhole: Refined
     pinhole_residual: Array
     """Residuals of the straight-line fit, (N, 2), in pixels."""
     pinhole_held_out: HeldOut | None
     lens_fitted: tuple[str, ...]
-    """Groups of `FITTED` that the lens gave up."""
+    """Groups in `FITTED` of lens parameters that were fitted."""
     findings: tuple[Finding, ...]
-    """Findings, the gravest first, notes last."""
+    """Findings, the most severe first, notes last."""
 
     @property
     def outliers(self) -> list[str]:
-        """Names of the rows left out, the worst first."""
+        """Names of the excluded rows, the worst first."""
         size = np.linalg.norm(self.residual, axis=1)
         rows = np.flatnonzero(~self.used)
         return [self.observed.names[i] for i in rows[np.argsort(-size[rows])]]
 
     def residual_json(self) -> dict[str, float | int]:
-        """Figures of the rows used. Units are in the names."""
+        """Return the residual figures of the rows used. Units are in the names."""
         error = self.error[self.used]
         error = error[np.isfinite(error).all(axis=1)]
         return {
@@ -185,15 +186,15 @@ class PoolFit(Refined):
 
 
 def calibrate_pool(observed: Observations, lens: Lens, settings: PoolFitSettings | None = None) -> PoolFit:
-    """Find the camera and the plane from no guess of either.
+    """Estimate the camera and the plane without an initial guess.
 
     Args:
         observed: Pixels and surveyed points.
-        lens: Of the camera.
-        settings: Options; those of `PoolFitSettings` if None.
+        lens: Lens of the camera.
+        settings: Options; None: those of `PoolFitSettings()`.
 
     Raises:
-        CalibrationError: The points cannot tell a pose, or contradict each other or what is given; says which.
+        CalibrationError: The points do not determine a pose, or contradict each other or the priors.
     """
     settings = settings or PoolFitSettings()
     if observed.dry.all():
@@ -233,7 +234,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: PoolFitSettings
 
 @dataclass(frozen=True)
 class _Steps:
-    """Steps of a calibration after the search, for the same rows and options."""
+    """Stages of a calibration after the search, for the same rows and options."""
 
     observed: Observations
     settings: PoolFitSettings
@@ -246,7 +247,7 @@ class _Steps:
         return refine(model, self.observed, active, prior, noise, fixed_pixel=fixed)
 
     def normal(self, fit: Refined) -> Array:
-        """Return the normal of the planes on which errors in the water are measured, pool frame, (3,)."""
+        """Return the normal of the planes in which errors in the water are measured, pool frame, (3,)."""
         return UP if self.settings.surface else fit.model.interface.normal
 
     def held_out(self, fit: Refined, refractive: Refined) -> HeldOut | None:
@@ -255,7 +256,8 @@ class _Steps:
         return held_out(fit, self.observed, settings.folds, settings.seed, self.normal(refractive))
 
     def best_lens(self, model: PoolModel, notes: list[Finding]) -> Refined:
-        """Return the fit as set; unless set, lens parameters are fitted if the error at held-out points decreases."""
+        """Return the fit; unless its parameters are set, lens parameters are fitted if they decrease the
+        held-out error."""
         settings = self.settings
         start = replace(model, interface=replace(model.interface, index_far=settings.index))
 
@@ -283,7 +285,8 @@ class _Steps:
         return best
 
     def generalisation(self, fit: Refined, first: Refined) -> float:
-        """Return the held-out error in the picture [px], rows that the fit left out counted as far as they lie."""
+        """Return the held-out error in the picture [px], including the bounded residuals of rows that the fit
+        excluded."""
         out = self.held_out(fit, first)
         if out is None:
             return float("nan")
@@ -291,7 +294,8 @@ class _Steps:
         return rms(np.concatenate([out.pixels, np.clip(excluded, -20.0, 20.0)]))
 
     def released(self, fit: Refined, notes: list[Finding]) -> Refined:
-        """Let the plane tilt freely where the pixels contradict its prior direction and no tilt sigma is set."""
+        """Return the fit with a free tilt if the pixels contradict the prior direction of the plane and no
+        tilt sigma is set."""
         normal = fit.prior.normal
         if normal is None or not np.isfinite(fit.prior.tilt_std):
             return fit
@@ -300,7 +304,7 @@ class _Steps:
         free = self.without(fit, replace(fit.prior, tilt_std=np.inf))
         if free is None:
             return fit
-        # Small enough to be a tilt, and determined by the pixels.
+        # Accept it if it is small enough for a tilt, and determined by the pixels.
         lean = free.model.lean(normal)
         error = float(np.sqrt(max(free.covariance[k, k] for k in (6, 7))))
         if not (lean < MAX_LEAN and error < lean / 3.0):
@@ -309,7 +313,7 @@ class _Steps:
         return free
 
     def contradicted(self, fit: Refined) -> list[Finding]:
-        """Return a finding where the pixels by themselves put the plane elsewhere than it was measured."""
+        """Return a finding if the pixels alone place the plane at a distance that contradicts its measurement."""
         if not self.settings.stated_depth or not fit.active[NAMES.index("depth")]:
             return []
         free = self.without(fit, replace(fit.prior, depth_std=np.inf))
@@ -320,7 +324,7 @@ class _Steps:
         return [finding("plane_contradicted", distance=abs(by), sense=sense)]
 
     def without(self, fit: Refined, loose: Prior) -> Refined | None:
-        """Return the fit with a prior loosened, where the pixels contradict that prior; else None."""
+        """Return the fit with a loosened prior if the pixels contradict the original prior; else None."""
         try:
             free = self.refined(fit.model, fit.active, loose)
         except (CalibrationError, np.linalg.LinAlgError):
@@ -329,7 +333,7 @@ class _Steps:
         return free if 2.0 * (held.cost - free.cost) > DOUBT else None
 
     def pinhole(self, model: PoolModel, fit: Refined) -> Refined:
-        """Return straight lines fitted to the same rows, as plain calibrations do."""
+        """Return a straight-line fit to the same rows, as in an ordinary calibration."""
         model = replace(model, camera=replace(model.camera, lens=fit.model.camera.lens))
         active = fit.active & mask_of((*NAMES[:6], *NAMES[10:]))
         prior = replace(fit.prior, normal=None, depth=np.nan, depth_std=np.inf, index_std=np.inf)
@@ -348,37 +352,40 @@ def _lens_groups(active: NDArray[np.bool_]) -> tuple[str, ...]:
     return tuple(group for group, name in named.items() if active[NAMES.index(name)])
 
 
-# Findings against a finished calibration: no water, a wrong unit, an ambiguous frame.
+# Critical findings about a finished calibration: no water, a wrong unit, an ambiguous frame.
 
 STRAIGHTER = 0.7
-"""Held-out error of straight lines over that of refraction below which refraction is not believed."""
+"""Ratio of the held-out error of straight lines to that of refraction below which refraction is doubted."""
 
 FEWEST_COMPARED = 8
-"""Held-out rows from which the two are compared."""
+"""Least number of held-out rows for this comparison."""
 
 ON_PLANE = 0.01
-"""Distance of the camera from the plane, over that of the points from the camera, below which it lies on it."""
+"""Distance of the camera from the plane, relative to that of the points from the camera, below which it lies
+on it [-]."""
 
 ODD, ABSURD = 3.0, 10.0
-"""Residuals of a camera on the plane [px] above which it is doubted, and refused."""
+"""Residuals of a camera on the plane above which it is reported, and refused [px]."""
 
 TOO_DEEP = 1.5
-"""Ratio of the stated depth of the points to the greatest at which the camera could see them so large, above which it
+"""Ratio of the stated depth of the points to the greatest depth consistent with their apparent size, above which it
 is refused."""
 
 LEAST_THICKNESS = 0.02
-"""Thickness of the points, over their lesser width, below which they equal their mirror image."""
+"""Thickness of the point set, relative to its lesser width, below which it cannot be distinguished from its
+mirror image."""
 
 
 def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
-    """Return the calibration with the findings against it put first.
+    """Return the calibration with critical findings put first.
 
     Args:
         fit: The calibration.
-        lens_stated: Somebody said how sure the lens is.
+        lens_stated: True if the uncertainty of the lens is stated.
 
     Raises:
-        CalibrationError: It cannot be a camera before water; says which number to check.
+        CalibrationError: The result is impossible for a camera in front of water; the message names the
+            number to check.
     """
     _refuse_depth(fit)
     findings = [*_touching(fit), *_handed(fit)]
@@ -387,7 +394,7 @@ def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
 
 
 def _refuse_depth(fit: PoolFit) -> None:
-    """Refuse a stated plane so far from the points that the camera would be between them."""
+    """Refuse a stated plane that is so far from the points that the camera would be between them."""
     settings, model = fit.settings, fit.pinhole.model
     depth = abs(stated_plane(model, settings)[1])
     apparent = abs(float(fit.model.interface.normal @ (model.camera.position - model.reference)))
@@ -404,7 +411,7 @@ def _refuse_depth(fit: PoolFit) -> None:
 
 
 def _touching(fit: PoolFit) -> list[Finding]:
-    """Return findings where the camera ends on the plane, which it cannot pass; refuse large residuals there."""
+    """Return findings if the camera ends on the plane, which it cannot pass; refuse large residuals there."""
     model, error = fit.model, rms(fit.residual[fit.used])
     if model.clearance >= ON_PLANE * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
         return []
@@ -418,7 +425,7 @@ def _touching(fit: PoolFit) -> list[Finding]:
 
 
 def _straight(fit: PoolFit) -> list[Finding]:
-    """Return findings where straight lines predict points better than refraction."""
+    """Return findings if straight lines predict points better than refraction."""
     bent, straight = fit.held_out, fit.pinhole_held_out
     if bent is None or straight is None or len(bent.rows) < FEWEST_COMPARED:
         return []
@@ -429,7 +436,7 @@ def _straight(fit: PoolFit) -> list[Finding]:
 
 
 def _handed(fit: PoolFit) -> list[Finding]:
-    """Return findings on a flat survey with z down or left-handed, which pixels do not distinguish."""
+    """Return findings on a flat survey with z down or left-handed axes, which pixels do not distinguish."""
     settings = fit.settings
     if not settings.surface or fit.model.interface.normal[2] > 0.0 or settings.water_height is not None:
         return []
@@ -439,4 +446,4 @@ def _handed(fit: PoolFit) -> list[Finding]:
     return [finding("handedness_open")]
 
 
-# What `finssim calibrate pool` runs: read, match, fit, write the pool file, report.
+# Steps of `finssim calibrate pool`: read, match, fit, write the pool file, report.

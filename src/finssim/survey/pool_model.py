@@ -1,4 +1,4 @@
-"""Model of one camera before one plane: predicted pixels, priors, and least squares for both."""
+"""Model of one camera in front of one plane: predicted pixels, priors, and least squares with both."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ UP = np.array([0.0, 0.0, 1.0])
 POSE_NAMES = ("camera_x", "camera_y", "camera_z", "rotation_x", "rotation_y", "rotation_z")
 LENS_NAMES = ("focal", "center_x", "center_y", *(f"distortion_{k}" for k in range(1, 6)))
 NAMES = (*POSE_NAMES, "tilt_x", "tilt_y", "depth", "index", *LENS_NAMES)
-"""Order of every vector of parameters: camera centre [m], rotation by pool axes [rad], tilt of the plane about the
+"""Order of every parameter vector: camera centre [m], rotation about pool axes [rad], tilt of the plane about the
 reference point [rad], distance of the plane from the reference point [m], index beyond it, logarithm of the focal
-length, optical centre [px], first five coefficients of distortion as the lens lists them."""
+length, optical centre [px], first five coefficients of distortion in the lens's order."""
 
 
 def mask_of(names: Iterable[str]) -> NDArray[np.bool_]:
@@ -45,39 +45,39 @@ def mask_of(names: Iterable[str]) -> NDArray[np.bool_]:
 
 
 def extended_lens(lens: Lens) -> Lens:
-    """Return the same lens with zeros for the coefficients of distortion that it lacks."""
+    """Return the same lens with zeros for the distortion coefficients that it lacks."""
     missing = len(COEFFICIENTS[lens.model]) - len(lens.distortion)
     return replace(lens, distortion=(*lens.distortion, *([0.0] * missing))) if missing > 0 else lens
 
 
 @dataclass(frozen=True)
 class PoolModel:
-    """Camera and plane. All in the pool frame."""
+    """Camera and plane, in the pool frame."""
 
     camera: Camera
     interface: Interface
     reference: Array
-    """Surveyed point under water, about which the plane turns and from which its distance counts, (3,) [m]."""
+    """Surveyed point under water, about which the plane tilts and from which its distance is measured, (3,) [m]."""
     refractive: bool = True
-    """False: straight lines, as if nothing were between the camera and the points."""
+    """False for straight lines, without any interface between camera and points."""
 
     @property
     def depth(self) -> float:
-        """Distance of the plane from the reference point, towards the camera [m]."""
+        """Distance of the plane from the reference point, positive towards the camera [m]."""
         return -float(self.interface.normal @ self.reference + self.interface.offset)
 
     @property
     def clearance(self) -> float:
-        """Distance of the camera from the plane, on its own side [m]."""
+        """Distance of the camera from the plane, positive on its own side [m]."""
         return float(self.interface.normal @ self.camera.position + self.interface.offset)
 
     def lean(self, normal: Array) -> float:
-        """Return the angle between the plane's normal and another one, unit, pool frame (3,) [rad]."""
+        """Return the angle between the plane's normal and another unit vector, pool frame (3,) [rad]."""
         return float(np.arccos(np.clip(self.interface.normal @ normal, -1.0, 1.0)))
 
     @cached_property
     def tangents(self) -> Array:
-        """Return the unit directions that the plane's normal tilts towards, (2, 3)."""
+        """Return the unit directions towards which the tilt parameters move the plane's normal, (2, 3)."""
         return np.stack([np.asarray(e, float) for e in self.interface.tangents()])
 
     @property
@@ -87,11 +87,11 @@ class PoolModel:
         return np.array([np.log(lens.fx), lens.cx, lens.cy, *lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0])[:8]
 
     def predict(self, points: Array, dry: NDArray[np.bool_]) -> Array:
-        """Return the pixels of points, (N, 3) -> (N, 2); NaN where the camera does not see them.
+        """Return the pixels of points, (N, 3) -> (N, 2); NaN if they are not visible.
 
         Args:
-            points: Pool frame [m].
-            dry: Points on the camera's side of the plane, seen in a straight line, (N,).
+            points: Points, pool frame [m].
+            dry: Mask of points on the camera's side of the plane, seen along a straight line, (N,).
         """
         pixels = np.full((len(points), 2), np.nan)
         wet = ~dry if self.refractive else np.zeros(len(points), bool)
@@ -105,7 +105,7 @@ class PoolModel:
         return pixels
 
     def jacobians(self, points: Array, dry: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return the derivatives of `predict`: by the parameters, as `NAMES` (N, 2, 18), by the point (N, 2, 3)."""
+        """Return the derivatives of `predict` by the parameters, as `NAMES` (N, 2, 18), and by the point (N, 2, 3)."""
         J, J_point = np.zeros((len(points), 2, len(NAMES))), np.zeros((len(points), 2, 3))
         wet = ~dry if self.refractive else np.zeros(len(points), bool)
         if wet.any():
@@ -118,7 +118,7 @@ class PoolModel:
         return J, J_point
 
     def moved(self, step: Array) -> PoolModel:
-        """Return the model a small step away, (18,) in the order and the units of `NAMES`."""
+        """Return the model after a small step, (18,) in the order and the units of `NAMES`."""
         camera, plane = self.camera, self.interface
         turn = quat_to_matrix(quat_from_rotvec(step[3:6]))
         orientation = matrix_to_quat(turn @ np.asarray(camera.R_pc))
@@ -137,7 +137,8 @@ class PoolModel:
         return np.asarray((points - self.camera.position) @ np.asarray(self.camera.R_pc))
 
     def _lens_columns(self, of_lens: Array) -> Array:
-        """Derivatives by fx fy cx cy and distortion as those by log focal, centre and distortion, (N, 2, 8)."""
+        """Convert derivatives by fx fy cx cy and distortion to those by log focal, centre and distortion, (N,
+        2, 8)."""
         lens = self.camera.lens
         focal = of_lens[..., 0] * lens.fx + of_lens[..., 1] * lens.fy
         centre_and_distortion = of_lens[..., 4:9]
@@ -178,10 +179,10 @@ FITTED = {
     "center": ("center_x", "center_y"),
     "distortion": NAMES[13:],
 }
-"""Groups of parameters that may be fitted -> their names."""
+"""Group of parameters that may be fitted -> their names."""
 
 LENS_STD = (0.05, 0.03, 0.03, 0.15, 0.15, 0.02, 0.02, 0.1)
-"""Standard deviations of a rough camera file: log focal, centre in widths of the image, distortion."""
+"""Standard deviations of an approximate camera file: log focal, centre relative to the image width, distortion."""
 
 
 RANGES = {
@@ -195,53 +196,55 @@ RANGES = {
     "center_sigma": ("center sigma", 1.0, 0.0, 1e4),
     "pixel_sigma": ("pixel sigma", 1.0, 1e-3, 100.0),
 }
-"""Setting -> its name in messages, units of the message in one unit of the setting, least and greatest value."""
+"""Setting -> its name in messages, conversion factor to the unit of the message, least and greatest value."""
 
 THICKEST = 0.5
-"""Greatest plausible thickness of a window [m]; a greater one is in another unit."""
+"""Greatest plausible thickness of a window [m]; a greater number is probably in another unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolFitSettings:
-    """Priors and options of the fit; standard deviations are those before the pictures.
+    """Priors and options of the fit; standard deviations are those before the fit.
 
     The interface is the water surface, with its normal along the survey's z, unless a window is given.
     """
 
     window: Layer | None = None
-    """Flat window between camera and water, in any direction; None: the camera looks through the water surface."""
+    """Flat window between camera and water, in any orientation; None: the camera looks through the water surface."""
     plane: tuple[float, float, float, float] | None = None
-    """Surveyed face of the window towards the camera, n . X + b = 0 as n_x, n_y, n_z, b [m]; either sense of n."""
+    """Surveyed face of the window towards the camera, n . X + b = 0 as n_x, n_y, n_z, b [m]; n may have
+    either sign."""
     water_height: float | None = None
     """z of the surface in the survey's frame [m]."""
     water_depth: float | None = None
-    """Distance from the middle of the surveyed points to the surface [m], for a survey of one plane."""
+    """Distance from the centroid of the surveyed points to the surface [m], for a survey of one plane."""
     place_sigma: float = 0.005
-    """Standard deviation of the measured height or depth of the surface, or of the window's place [m]."""
+    """Standard deviation of the measured height or depth of the surface, or of the window's position [m]."""
     index: float = 1.333
     """Refractive index of the water."""
     index_sigma: float = 0.003
-    """Standard deviation of the index; 0 holds it."""
+    """Standard deviation of the index; 0 fixes it."""
     index_near: float = 1.0003
     """Refractive index on the camera's side."""
     tilt_sigma: float | None = None
     """Standard deviation of the plane's direction [rad]; None: 0.2 degrees for a surface, 0.5 for a surveyed window."""
     fit: tuple[str, ...] | None = None
-    """Groups of `FITTED`; None: pose, height, tilt and index, and the lens where held-out points get better by it."""
+    """Groups of `FITTED`; None: pose, height, tilt and index, and the lens if that decreases the held-out error."""
     focal_sigma: float = 0.0
-    """Relative standard deviation of the camera file's focal length; 0 holds it unless `fit` names it [-]."""
+    """Relative standard deviation of the camera file's focal length; 0 fixes it unless it is in `fit` [-]."""
     center_sigma: float = 0.0
-    """Standard deviation of the camera file's optical centre along each axis [px]; 0 holds it unless `fit` names it."""
+    """Standard deviation of the camera file's optical centre along each axis [px]; 0 fixes it unless it is in
+    `fit`."""
     pixel_sigma: float | None = None
-    """Standard deviation of a pixel [px]; None: from the residuals."""
+    """Standard deviation of a pixel [px]; None: estimated from the residuals."""
     survey_sigma: float = 0.002
     """Standard deviation of a surveyed coordinate [m]."""
     survey_yaw_sigma: float = math.radians(0.5)
-    """Standard deviation of a tag's direction [rad]."""
+    """Standard deviation of a tag's heading [rad]."""
     folds: int = 5
-    """Folds of the cross-validation."""
+    """Number of folds of the cross-validation."""
     seed: int = 0
-    """Seed of the folds and of samples."""
+    """Seed of the folds and random samples."""
 
     def __post_init__(self) -> None:
         for name in self.fit or ():
@@ -283,17 +286,17 @@ class PoolFitSettings:
 
     @property
     def layers(self) -> tuple[Layer, ...]:
-        """Solid layers between camera and water, as `Interface` takes them."""
+        """Solid layers between camera and water, as expected by `Interface`."""
         return () if self.window is None else (self.window,)
 
     @property
     def stated_depth(self) -> bool:
-        """True if a measurement of the plane's place is given."""
+        """True if the plane's position was measured."""
         return any(x is not None for x in (self.water_height, self.water_depth, self.plane))
 
     @property
     def unit_plane(self) -> tuple[Array, float]:
-        """n of length 1, (3,), and b [m] of the surveyed plane."""
+        """Unit normal n, (3,), and b [m] of the surveyed plane."""
         assert self.plane is not None
         length = float(np.linalg.norm(self.plane[:3]))
         return np.array(self.plane[:3]) / length, self.plane[3] / length
@@ -312,7 +315,7 @@ def active_names(settings: PoolFitSettings, extra: tuple[str, ...] = ()) -> NDAr
 
 
 def lens_std(settings: PoolFitSettings, width: int) -> tuple[float, ...]:
-    """Return the standard deviations of `LENS_NAMES` before the pictures."""
+    """Return the prior standard deviations of `LENS_NAMES`, in their units."""
     focal, x, y, *distortion = LENS_STD
     center = settings.center_sigma
     across = (center, center) if center > 0.0 else (x * width, y * width)
@@ -320,29 +323,29 @@ def lens_std(settings: PoolFitSettings, width: int) -> tuple[float, ...]:
 
 
 LOST = 500.0
-"""Residual of a point that the model does not see [px]."""
+"""Residual that is assigned to a point that the model cannot project [px]."""
 
 NEARER = 0.1
-"""Part of its distance from a point or the camera that one step must leave the plane."""
+"""Fraction of the plane's distance from a point or the camera that must remain after one step [-]."""
 
 MAX_BOUNDS = 60
-"""Number of points considered in one step, those nearest to the plane."""
+"""Greatest number of points, nearest to the plane first, that bound one step."""
 
 Whitening = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """Gaussian prior; a standard deviation is infinite where nothing is known."""
+    """Gaussian prior; the standard deviation of an unknown quantity is infinite."""
 
     normal: Array | None = None
     """Normal towards the camera, pool frame, unit, (3,)."""
     tilt_std: float = np.inf
-    """[rad]"""
+    """Standard deviation of the tilt about each axis [rad]."""
     depth: float = np.nan
     """Distance of the plane from the reference point [m]."""
     depth_std: float = np.inf
-    """Standard deviation of the water's depth [m]."""
+    """Standard deviation of `depth` [m]."""
     start: PoolModel
     """Model with the index and lens to which `index_std` and `lens_std` refer."""
     index_std: float = np.inf
@@ -351,7 +354,8 @@ class Prior:
     """Standard deviations of log focal, centre [px] and distortion."""
 
     def rows(self, model: PoolModel) -> tuple[Array, Array]:
-        """Return the residuals (M,) of the priors, each over its standard deviation, and their derivatives (M, 18).
+        """Return the residuals of the priors (M,), each divided by its standard deviation, and their
+        derivatives (M, 18).
 
         Derivatives are per unit of each parameter.
         """
@@ -373,13 +377,13 @@ class Prior:
 SURFACE_TILT, PLANE_TILT = np.radians(0.2), np.radians(0.5)
 
 ANYWHERE = 0.5
-"""Prior of the water's depth over the camera's distance where it was not measured, and its standard deviation: so weak
-that it matters only where the pixels contain no information."""
+"""Prior mean and standard deviation of an unmeasured water depth, relative to the camera's distance: so weak
+that it matters only if the pixels contain no information."""
 
 
 def stated_plane(model: PoolModel, settings: PoolFitSettings) -> tuple[Array | None, float]:
-    """Return the normal towards the camera, pool frame (3,), and the distance of the plane from the reference point
-    [m]; None and NaN where unknown."""
+    """Return the measured normal towards the camera, pool frame (3,), and the distance of the plane from the
+    reference point [m]; None and NaN if unknown."""
     towards, depth = model.camera.position - model.reference, settings.water_depth
     if settings.plane is not None:
         normal, offset = settings.unit_plane
@@ -397,8 +401,8 @@ def prior_of(model: PoolModel, start: PoolModel, settings: PoolFitSettings, stds
     """Return the prior of plane, index and lens.
 
     Args:
-        model: Model whose camera gives the side of the points.
-        start: Model with the index and the lens as given.
+        model: Model whose camera is on the plane's near side.
+        start: Model with the given index and lens.
         settings: Options.
         stds: Standard deviations of the lens's parameters in their units, in the order of `LENS_NAMES`.
     """
@@ -424,7 +428,7 @@ def prior_of(model: PoolModel, start: PoolModel, settings: PoolFitSettings, stds
 
 
 class PoolSolution(NamedTuple):
-    """End of the search."""
+    """Result of the minimization."""
 
     model: PoolModel
     cost: float
@@ -432,7 +436,7 @@ class PoolSolution(NamedTuple):
 
 
 def residuals(model: PoolModel, observed: Observations) -> tuple[Array, NDArray[np.bool_]]:
-    """Return measured minus predicted pixels (N, 2) and where the model predicts one (N,); `LOST` elsewhere."""
+    """Return measured minus predicted pixels (N, 2) and a mask of predicted ones (N,); others have residual `LOST`."""
     r = observed.pixels - model.predict(observed.points, observed.dry)
     ok = np.isfinite(r).all(axis=1)
     return np.where(ok[:, None], r, LOST), ok
@@ -451,12 +455,13 @@ def solve(
     """Minimise |whiten(measured - predicted)|² plus the priors.
 
     Args:
-        start: Where to begin.
+        start: Initial model.
         observed: The rows.
-        whiten: Turns residuals (N, 2) and derivatives (N, 2, P) into independent rows of unit variance.
-        active: Which of `NAMES` move, (18,).
-        prior: Of those and of the others.
-        iterations: At most.
+        whiten: Function that converts residuals (N, 2) and derivatives (N, 2, P) to independent rows of unit
+            variance.
+        active: Mask of the `NAMES` to estimate, (18,).
+        prior: Prior of all parameters.
+        iterations: Greatest number of iterations.
         tolerance: Relative change of the cost at which the search ends [-].
     """
     free = np.flatnonzero(active)
@@ -486,7 +491,7 @@ def solve(
 def normal_equations(
     model: PoolModel, observed: Observations, whiten: Whitening, free: NDArray[np.intp], prior: Prior
 ) -> tuple[Array, Array]:
-    """Return information (P, P) and gradient (P,) at a model, by the parameters `free`, priors included."""
+    """Return information matrix (P, P) and gradient (P,) at a model by the parameters `free`, including the priors."""
     r, ok = residuals(model, observed)
     J = model.jacobians(observed.points, observed.dry)[0][..., free]
     J = np.where((ok & np.isfinite(J).all(axis=(1, 2)))[:, None, None], J, 0.0)
@@ -502,7 +507,8 @@ def clearances(model: PoolModel, points: Array) -> Array:
 
 
 def _bounds(model: PoolModel, observed: Observations, free: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Clearances of the points in the water and of the camera (M,), and their derivatives by the parameters (M, P)."""
+    """Return the clearances of the points in the water and of the camera (M,), and their derivatives by the
+    parameters (M, P)."""
     if not model.refractive:
         return np.zeros(0), np.zeros((0, len(free)))
     wet, n = observed.points[~observed.dry], model.interface.normal
@@ -518,9 +524,9 @@ def _bounds(model: PoolModel, observed: Observations, free: NDArray[np.intp]) ->
 
 
 def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> Array:
-    """The least of x H x / 2 - b x among steps that leave every clearance a tenth of what it is.
+    """Return the minimum of x H x / 2 - b x among steps that keep at least a tenth of every clearance.
 
-    A problem of least distance, solved by non-negative least squares (Lawson and Hanson, Solving Least Squares
+    It is a least-distance problem, solved by non-negative least squares (Lawson and Hanson, Solving Least Squares
     Problems, ch. 23).
     """
     x = np.linalg.solve(H, b)
@@ -545,9 +551,9 @@ def _sliding(H: Array, b: Array, scale: Array, bounds: tuple[Array, Array]) -> A
 
 
 def _stepped(model: PoolModel, step: Array, observed: Observations, movable: bool) -> PoolModel | None:
-    """The model a step away, or None where the step leads out of all sense.
+    """Return the model after a step, or None if the step is far too large.
 
-    What a turn of the plane takes from a clearance beyond first order is given back by its depth where that may move.
+    If a rotation of the plane reduces a clearance beyond first order, its depth is corrected, if it is free.
     """
     if not np.isfinite(step).all() or np.abs(step[3:8]).max() > 1.0 or abs(step[10]) > 0.5:
         return None

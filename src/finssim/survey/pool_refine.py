@@ -1,4 +1,5 @@
-"""Fit of camera and plane with the errors of pixels and survey and without wrong rows; errors at points held out."""
+"""Fit of camera and plane with estimated errors of pixels and survey and without outliers; errors at held-out
+points."""
 
 from __future__ import annotations
 
@@ -20,33 +21,34 @@ from finssim.trials.findings import CalibrationError
 Array = NDArray[np.float64]
 
 LEAST_PIXEL = 0.02
-"""Smallest standard error of a pixel that an estimate can take [px]: no corner is found better."""
+"""Smallest estimated standard error of a pixel [px]: no corner is detected more accurately."""
 
 NOISE_ROWS = 2000
-"""Rows from which the size of the errors is estimated."""
+"""Greatest number of rows from which the standard errors are estimated."""
 
 STATED_SURVEY = 0.35
-"""Standard deviation of the logarithm of the survey's error: the stated error is right within about a third."""
+"""Prior standard deviation of the logarithm of the survey's error: the stated error is right within about a third."""
 
 STATED_PIXEL, USUAL_PIXEL = 1.2, 0.4
-"""Standard deviation of the logarithm of a pixel's error, and its usual size [px]."""
+"""Prior standard deviation of the logarithm of a pixel's error, and its usual size [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StandardErrors:
-    """Standard errors."""
+    """Standard errors of pixels and survey."""
 
     pixel: float
     """Standard error of each image coordinate [px]."""
     survey: float = 0.002
-    """Standard error of each coordinate of a location, where the survey does not give its own [m]."""
+    """Standard error of each coordinate of a location, unless the survey states it [m]."""
     survey_yaw: float = 0.0087
-    """Standard error of a tag's direction [rad]."""
+    """Standard error of a tag's heading [rad]."""
     scale: float = 1.0
     """Factor on all survey errors, estimated from the residuals [-]."""
 
     def survey_modes(self, J_point: Array, observed: Observations) -> Array:
-        """Return the change of pixels by one standard error of a place's x, y, z and of a tag's turn [px], (N, 2, 4).
+        """Return the change of pixels by one standard error of a location's x, y, z and of a tag's rotation
+        [px], (N, 2, 4).
 
         Args:
             J_point: Derivative of the pixel by the point, (N, 2, 3).
@@ -58,9 +60,9 @@ class StandardErrors:
 
 
 class Whitener:
-    """Makes residuals independent and of unit variance; rows of one location belong together.
+    """Whitening of residuals: makes them independent and of unit variance; rows of one location are correlated.
 
-    V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: a location is displaced as a whole, and a tag turned, by the survey's error.
+    V_l = sigma² 1 + J_l B_l S B_lᵀ J_lᵀ: the survey's error displaces a complete location, and rotates a tag.
     """
 
     def __init__(self, J_point: Array, observed: Observations, noise: StandardErrors) -> None:
@@ -86,7 +88,7 @@ class Whitener:
             self._groups.append((rows, np.linalg.inv(L)))
 
     def __call__(self, values: Array) -> Array:
-        """Whitened rows of values (N, 2) or (N, 2, P), as (2N,) or (2N, P); locations one after another."""
+        """Return whitened rows of values (N, 2) or (N, 2, P), as (2N,) or (2N, P), in sequence of the locations."""
         tail = values.shape[2:]
         parts = []
         for rows, L_inverse in self._groups:
@@ -105,18 +107,19 @@ def estimate_noise(
     *,
     fixed_pixel: bool,
 ) -> StandardErrors:
-    """Most likely standard errors of pixels and survey (restricted likelihood: what the fit swallowed is given back).
+    """Return the most likely standard errors of pixels and survey (restricted likelihood, which accounts for
+    fitted parameters).
 
     Args:
         residual: Measured minus predicted [px], (N, 2).
         J: Derivative of the prediction in pixels by the fitted parameters, per unit of these, (N, 2, P).
-        J_point: The same by the point [px/m], (N, 2, 3).
+        J_point: Derivative of the prediction by the point [px/m], (N, 2, 3).
         observed: The rows.
-        noise: What is believed before.
+        noise: Prior standard errors.
         prior: Information of the priors on the parameters, per unit of these squared, (P, P).
-        fixed_pixel: The pixel's error is given and stays.
+        fixed_pixel: True if the pixel's error is given and not estimated.
     """
-    if len(observed) > NOISE_ROWS:  # enough for two numbers; complete locations, evenly
+    if len(observed) > NOISE_ROWS:  # enough for two parameters; complete locations, evenly
         every = int(np.ceil(len(observed) / NOISE_ROWS))
         rows = np.flatnonzero(observed.location % every == 0)
         if len(rows) > NOISE_ROWS // 4:
@@ -149,33 +152,33 @@ def estimate_noise(
 
 
 CHANCE = 0.02
-"""Chance that a right row is taken for a wrong one anywhere in a survey."""
+"""Probability that any correct row of a survey is classified as an outlier."""
 
 MAX_WRONG = 0.4
-"""Share of wrong rows beyond which nothing is believed."""
+"""Fraction of outliers above which the fit is refused."""
 
 ROUNDS = 6
 
 
 @dataclass(frozen=True)
 class Refined:
-    """A fit and what it rests on."""
+    """Fit with its noise, outliers and covariance."""
 
     model: PoolModel
     noise: StandardErrors
     used: NDArray[np.bool_]
-    """Rows that are not outliers, (N,)."""
+    """Mask of rows that are not outliers, (N,)."""
     whiten: Whitener
     """Whitening of the rows used."""
     active: NDArray[np.bool_]
-    """Parameters fitted, (18,)."""
+    """Mask of the fitted parameters, (18,)."""
     prior: Prior
     covariance: Array
-    """Covariance of all parameters in their units, zero where held, (18, 18)."""
+    """Covariance of all parameters in their units, zero if fixed, (18, 18)."""
     cost: float
-    """Half the sum of squares that was minimised [-]."""
+    """Minimized half sum of squares [-]."""
     dof: float
-    """Number of rows of residuals less that of parameters."""
+    """Degrees of freedom: number of residuals minus that of parameters."""
 
 
 def refine(
@@ -187,15 +190,15 @@ def refine(
     *,
     fixed_pixel: bool = False,
 ) -> Refined:
-    """Fit with the errors of pixels and survey estimated on the way, and wrong rows named.
+    """Fit with estimated errors of pixels and survey, and detection of outliers.
 
     Args:
-        model: From the search.
+        model: Model from the search.
         observed: All rows.
-        active: Parameters to fit, (18,).
-        prior: What is known beforehand.
-        noise: What is believed of the errors.
-        fixed_pixel: The pixel's error is given.
+        active: Mask of parameters to fit, (18,).
+        prior: Prior of the parameters.
+        noise: Prior standard errors.
+        fixed_pixel: True if the pixel's error is given and not estimated.
 
     Raises:
         CalibrationError: Too many rows do not fit.
@@ -227,7 +230,7 @@ def refine(
 
 
 def _plausible(model: PoolModel, observed: Observations, noise: StandardErrors) -> NDArray[np.bool_]:
-    """Rows whose residual is of the size that the errors of pixel and survey make, whatever it shares with others."""
+    """Return a mask of rows whose residual is consistent with the errors of pixel and survey, correlations ignored."""
     d2 = squared_distance(model, observed, noise)
     inner = max(1.0, float(np.median(d2)) / float(chi2.ppf(0.5, 2)))
     return np.asarray(d2 < inner * chi2.ppf(1.0 - CHANCE / len(observed), 2))
@@ -236,13 +239,14 @@ def _plausible(model: PoolModel, observed: Observations, noise: StandardErrors) 
 def squared_distance(
     model: PoolModel, observed: Observations, noise: StandardErrors, covariance: Array | None = None
 ) -> Array:
-    """Return squared residuals over their variance by errors of pixel and survey [-], (N,); infinite without residual.
+    """Return squared residuals over their variance by errors of pixel and survey [-], (N,); infinite without
+    residual.
 
     Args:
-        model: Predicts the pixels.
+        model: Model that predicts the pixels.
         observed: The rows.
         noise: Standard errors.
-        covariance: That of the model's parameters in their units, if their errors count too, (18, 18).
+        covariance: Covariance of the model's parameters in their units, to include their errors, (18, 18).
     """
     r, ok = residuals(model, observed)
     J, J_point = (
@@ -271,7 +275,7 @@ def _refuse_few(used: NDArray[np.bool_], observed: Observations, parameters: int
 def _covariance(
     model: PoolModel, rows: Observations, whiten: Whitener, free: NDArray[np.intp], prior: Prior
 ) -> Array:
-    """Return the inverse information, in the order of `NAMES`; a very large variance where there is none."""
+    """Return the inverse information, in the order of `NAMES`; a very large variance for undetermined directions."""
     N, _ = normal_equations(model, rows, whiten, free, prior)
     scaled, scale = unit_diagonal(N)
     values, vectors = np.linalg.eigh(scaled)
@@ -282,7 +286,7 @@ def _covariance(
 
 
 FEW = 4
-"""Locations below which single rows are held out instead: a target or two have no parts to leave out."""
+"""Number of locations below which single rows are held out instead: one or two targets cannot be divided."""
 
 
 @dataclass(frozen=True)
@@ -290,15 +294,15 @@ class HeldOut:
     """Errors of K rows, each from a fit without its location."""
 
     pixels: Array
-    """Measured minus predicted [px], (K, 2)."""
+    """Measured minus predicted pixels [px], (K, 2)."""
     points: Array
-    """Back-projected minus surveyed, in the plane of the point [m], (K, 3)."""
+    """Back-projected minus surveyed points, in the plane of the point [m], (K, 3)."""
     rows: NDArray[np.intp]
     """Indices of the observations, (K,)."""
     folds: int
 
     def as_json(self) -> dict[str, float | int | None]:
-        """Root mean squares and 95th percentiles; the error of the survey is in them. Units are in the names."""
+        """Return root mean squares and 95th percentiles, including the error of the survey. Units are in the names."""
         size = np.linalg.norm(self.points, axis=1)
         size = size[np.isfinite(size)]
         return {
@@ -311,14 +315,15 @@ class HeldOut:
 
 
 def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal: Array) -> HeldOut | None:
-    """Refit without each part of the locations in turn; None where too few would be left.
+    """Refit without each fold of the locations in turn; return None if too few would remain.
 
     Args:
-        fit: To all rows; its outliers stay out.
+        fit: Fit to all rows; its outliers stay excluded.
         observed: All rows.
-        folds: Parts, at most one for each location.
-        seed: Of the parts.
-        normal: Of the planes, one through each point, on which pixels are back-projected: unit, pool frame [-], (3,).
+        folds: Number of folds, at most one for each location.
+        seed: Seed of the folds.
+        normal: Normal of the planes, one through each point, onto which pixels are back-projected: unit, pool
+            frame [-], (3,).
     """
     used = np.flatnonzero(fit.used)
     group = observed.location if len(np.unique(observed.location[used])) >= FEW else np.arange(len(observed))
@@ -335,7 +340,7 @@ def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal
         outside = used[fold[group[used]] == k]
         if 2 * inside.sum() < 8 or len(np.unique(observed.points[inside].round(6), axis=0)) < 4:
             return None
-        part = observed.subset(inside)  # the errors stay as they were
+        part = observed.subset(inside)  # the standard errors stay unchanged
         whiten = Whitener(fit.model.jacobians(part.points, part.dry)[1], part, fit.noise)
         model = solve(fit.model, part, whiten, fit.active, fit.prior).model
         here = observed.subset(outside)
@@ -347,7 +352,8 @@ def held_out(fit: Refined, observed: Observations, folds: int, seed: int, normal
 
 
 def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Array:
-    """Return where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN without one.
+    """Return where each pixel's ray meets the plane through its point, minus the point [m], (N, 3); NaN
+    without one.
 
     Args:
         model: Camera and water.
@@ -357,7 +363,7 @@ def error_vectors(model: PoolModel, observed: Observations, normal: Array) -> Ar
     rays, ok = model.camera.lens.rays(observed.pixels)
     origin = np.broadcast_to(np.asarray(model.camera.position), observed.points.shape).copy()
     direction = np.where(ok[:, None], rays, np.nan) @ np.asarray(model.camera.R_pc).T
-    if model.refractive and not observed.dry.all():  # what is dry is seen straight from the camera
+    if model.refractive and not observed.dry.all():  # dry points are seen directly
         water = back_project(model.camera, model.interface, observed.pixels[~observed.dry])
         origin[~observed.dry], direction[~observed.dry] = water.origin, water.direction
     with np.errstate(all="ignore"):

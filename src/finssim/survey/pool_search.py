@@ -1,4 +1,4 @@
-"""Start of the calibration of a pool: camera and plane from surveyed points and pixels, from no guess of either."""
+"""Initial values of a pool calibration: camera and plane from surveyed points and pixels, without an initial guess."""
 
 from __future__ import annotations
 
@@ -30,30 +30,31 @@ from finssim.trials.findings import CalibrationError
 Array = NDArray[np.float64]
 
 DRAWS, DRAWN = 60, 6
-"""Samples of that many points, of which those that suit most of the others are kept."""
+"""Number of random samples and points per sample; samples that agree with most other points are kept."""
 
 FLAT, SOLID = 0.02, 0.2
-"""Thickness of the points, over their lesser width, from which they count as solid, and no longer as flat."""
+"""Thickness of the point set, relative to its lesser width: up to the first it is flat, from the second on solid."""
 
 STARTS = 12
-"""Straight-line poses that are refined."""
+"""Greatest number of straight-line poses that are refined."""
 
 SHARES = (0.1, 0.3, 0.55, 0.8, 1.0, 1.2)
-"""Depth of the water as a part of the straight-line distance between camera and points: the camera is on the surface
-at 1.33."""
+"""Depths of the water relative to the straight-line distance between camera and points; at 1.33 the camera is
+on the surface."""
 
 REACHED = (1.0, 0.75)
-"""Parts of the points that the plane begins before: all, or not the highest, which may be wrong or above the water."""
+"""Quantiles of the points' heights above which the plane may start: all points, or not the highest, which may
+be wrong or above the water."""
 
 ENOUGH = 500
-"""Rows from which the search begins; the fit takes all."""
+"""Greatest number of rows used in the search; the fit uses all."""
 
 MIRRORED = 0.6
-"""Residual of the mirror image over that of the best model, below which the survey's frame is left-handed."""
+"""Ratio of the mirror image's residual to that of the best model, below which the survey's frame is left-handed."""
 
 
 class RobustPixels:
-    """Whitening of rows one by one with Huber's weights, from residuals at one model."""
+    """Whitening of single rows with Huber weights, from residuals of one model."""
 
     def __init__(self, model: PoolModel, observed: Observations, least: float = 0.3) -> None:
         size = _sizes(model, observed)
@@ -66,12 +67,13 @@ class RobustPixels:
 
 
 def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[PoolSolution]:
-    """Poses of a camera that saw the points in straight lines, the best first; costs are comparable.
+    """Return camera poses from straight lines to the points, the best first; costs are comparable.
 
-    Water between changes such a pose much, but not where the search from it ends.
+    Refraction changes such a pose considerably, but the search from it still converges.
 
     Raises:
-        CalibrationError: Fewer than four points, all on one line, or no pixel within the lens's reach.
+        CalibrationError: There are fewer than four points, all points are on one line, or no pixel is within
+            the lens's range.
     """
     rays, ok = lens.rays(observed.pixels)
     front = ok & (rays[:, 2] > 0.05)
@@ -88,7 +90,7 @@ def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[Poo
     for R_cp, C in _candidates(X, rays[:, :2] / rays[:, 2:], np.random.default_rng(seed)):
         camera = Camera(lens, C, matrix_to_quat(R_cp.T))
         near.append(_straightened(PoolModel(camera, plane, reference, refractive=False), observed, 10))
-    # Most starts have met by now, and what has met ends at one pose.
+    # Many starts have converged to the same pose: continue only with distinct ones.
     poses = _distinct([_straightened(s.model, observed, 30) for s in _distinct(near)])
     poses = [s for s in poses if np.median(_sizes(s.model, observed)) <= 0.2 * lens.width]
     if not poses:
@@ -99,9 +101,11 @@ def pinhole_poses(observed: Observations, lens: Lens, seed: int = 0) -> list[Poo
 
 
 def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-    """R_cp and C_p from points and their directions x / z, y / z: of all, of small samples, and of all that agree.
+    """Return R_cp and C_p from points and their directions x / z, y / z: from all points, small samples, and
+    consistent subsets.
 
-    Of flat points each pose has a reflection about the line of sight, which the water may turn into the better one.
+    For flat points each pose has a mirror image about the line of sight, which may be the better one with
+    refraction.
     """
     import cv2
 
@@ -118,7 +122,7 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
                 _, turns, shifts, _ = cv2.solvePnPGeneric(
                     points[rows], xy[rows], np.eye(3), None, flags=solver
                 )
-            except cv2.error:  # a sample on one line, say
+            except cv2.error:  # such as a sample on one line
                 continue
             for turn, shift in zip(turns, shifts, strict=True):
                 R = quat_to_matrix(quat_from_rotvec(turn.ravel()))
@@ -140,25 +144,27 @@ def _candidates(X: Array, xy: Array, rng: np.random.Generator) -> list[tuple[Arr
 
 
 def _straightened(model: PoolModel, observed: Observations, iterations: int) -> PoolSolution:
-    """The straight-line pose nearby that suits the pixels better, judged by a scale common to all."""
+    """Return the straight-line pose that fits the pixels better, from a nearby model, with a score comparable
+    between poses."""
     whiten, prior, pose = RobustPixels(model, observed), Prior(start=model), mask_of(NAMES[:6])
     model = solve(model, observed, whiten, pose, prior, iterations=iterations, tolerance=1e-6).model
     return PoolSolution(model, _score(model, observed))
 
 
 def _sizes(model: PoolModel, observed: Observations) -> Array:
-    """Lengths of the residuals (N,) [px]."""
+    """Return the lengths of the residuals (N,) [px]."""
     return np.asarray(np.linalg.norm(residuals(model, observed)[0], axis=1))
 
 
 def _score(model: PoolModel, observed: Observations) -> float:
-    """Mean length of the residuals [px], long ones counted as three medians."""
+    """Return the mean length of the residuals [px], each limited to three medians."""
     size = _sizes(model, observed)
     return float(np.minimum(size, 3.0 * np.median(size)).mean())
 
 
 def _distinct(solutions: list[PoolSolution]) -> list[PoolSolution]:
-    """The best first, without those that are another's pose to a degree and a hundredth of the distance."""
+    """Return distinct solutions, the best first; poses within a degree and a hundredth of the distance count
+    as equal."""
     selected: list[PoolSolution] = []
     for s in sorted(solutions, key=lambda s: s.cost):
         here, reach = s.model.camera, 0.01 * np.linalg.norm(s.model.camera.position - s.model.reference)
@@ -175,16 +181,16 @@ def _distinct(solutions: list[PoolSolution]) -> list[PoolSolution]:
 def plane_starts(
     pinhole: PoolModel, normals: Sequence[Array], plane: Interface, observed: Observations, depth: float
 ) -> Iterator[PoolModel]:
-    """The straight-line pose with a plane put before the points and the camera moved back to match.
+    """Yield the straight-line pose with a plane inserted above the points and the camera moved accordingly.
 
-    Points d under the surface look as if d / n under it, so a camera found at H stands at H + d (1 - 1 / n).
+    Points at depth d appear at depth d / n, so a camera estimated at height H is at H + d (1 - 1 / n).
 
     Args:
         pinhole: Straight-line pose.
         normals: Unit directions to try, each turned to the camera's side.
-        plane: Holds indices and window.
-        observed: Of which the points under water count.
-        depth: Distance of the plane from the reference point where it is known [m], or NaN.
+        plane: Interface with the indices and the window.
+        observed: Observations; only points under water are used.
+        depth: Distance of the plane from the reference point if known [m], or NaN.
     """
     camera, reference = pinhole.camera, pinhole.reference
     wet = observed.points[~observed.dry]
@@ -208,7 +214,7 @@ def plane_starts(
 
 
 def search(observed: Observations, lens: Lens, settings: PoolFitSettings) -> tuple[PoolModel, PoolModel]:
-    """Return the best of many starts, with robust weights, and the best pose in straight lines.
+    """Return the best model from many starts, with robust weights, and the best straight-line pose.
 
     Raises:
         CalibrationError: No pose explains the pixels, the survey is left-handed, or contradicts what was measured.
@@ -219,7 +225,7 @@ def search(observed: Observations, lens: Lens, settings: PoolFitSettings) -> tup
     poses = pinhole_poses(observed, lens, settings.seed)
     near = [p.model for p in poses[:3] if p.cost < 3.0 * poses[0].cost + 0.5]
     runs = _descents(near, _normals(near[0], observed, settings), observed, settings)
-    # Bent rays come first: straight ones may fit the mirror image of a good survey better than the survey.
+    # Refractive models come first: straight lines may fit the mirror image of a good survey better than the survey.
     _refuse_mirrored(observed, lens, min([_score(near[0], observed), *(run[0] for run in runs)]))
     if not runs:
         raise CalibrationError(
@@ -249,7 +255,7 @@ def _normals(pinhole: PoolModel, observed: Observations, settings: PoolFitSettin
 def _descents(
     poses: Sequence[PoolModel], normals: Sequence[Array], observed: Observations, settings: PoolFitSettings
 ) -> list[tuple[float, PoolModel]]:
-    """Return the ends of the search from all starts: residual [px] and model, the best first."""
+    """Return the results of the search from all starts: residual [px] and model, the best first."""
     plane = Interface(UP, 0.0, settings.index_near, settings.index, settings.layers)
     starts: list[PoolModel] = []
     for pinhole in poses:
@@ -268,7 +274,7 @@ def _descents(
 def _descend(
     model: PoolModel, observed: Observations, settings: PoolFitSettings, counts: tuple[int, int]
 ) -> PoolModel | None:
-    """Fit the pose alone, then pose and plane; return None where the search is lost."""
+    """Fit only the pose, then pose and plane; return None if the search diverges."""
     start = model
     for count, names in zip(counts, (NAMES[:6], NAMES[:9]), strict=True):
         prior, whiten = prior_of(model, start, settings, (np.inf,) * 8), RobustPixels(model, observed)
@@ -279,9 +285,9 @@ def _descend(
 
 
 def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
-    """Refuse a survey whose mirror image, in straight lines, fits clearly better than the best model of it.
+    """Refuse a survey whose mirror image, with straight lines, fits clearly better than its best model.
 
-    A plane of points can always be mirrored, and says nothing.
+    Points on a plane are not checked, since they can always be mirrored.
     """
     values = np.linalg.svd(observed.points - observed.points.mean(axis=0), compute_uv=False)
     if values[2] < 0.02 * values[1]:
@@ -296,7 +302,7 @@ def _refuse_mirrored(observed: Observations, lens: Lens, best: float) -> None:
 
 
 def _refuse_wrong_side(pinhole: PoolModel, settings: PoolFitSettings) -> None:
-    """Refuse a plane on the other side of the points than the camera."""
+    """Refuse a plane on the opposite side of the points from the camera."""
     _, depth = stated_plane(pinhole, settings)
     if np.isfinite(depth) and depth <= 0.0:
         sense = "below" if pinhole.camera.position[2] < pinhole.reference[2] else "above"

@@ -1,4 +1,4 @@
-"""Poses of one frame in another, as the fits of a survey use them."""
+"""Poses of one frame in another, for the fits of a survey."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Array = NDArray[np.float64]
 
 
 class Pose(NamedTuple):
-    """Pose of a frame in another one."""
+    """Pose of a frame in another frame."""
 
     R: Array
     """Rotation matrix from the inner to the outer frame, (3, 3)."""
     t: Array
-    """[m], (3,)"""
+    """Origin of the inner frame in the outer one [m], (3,)."""
 
     def at(self, points: Array) -> Array:
         """Return points of the inner frame in the outer one, (..., 3) [m]."""
@@ -34,5 +34,5 @@ class Pose(NamedTuple):
         return Pose(self.R.T.copy(), -self.R.T @ self.t)
 
     def stepped(self, step: Array) -> Pose:
-        """Return the pose after a small turn about the outer axes [rad] (3) and a shift [m] (3)."""
+        """Return the pose after a small rotation about the outer axes [rad] (3) and a shift [m] (3)."""
         return Pose(quat_to_matrix(quat_from_rotvec(step[:3])) @ self.R, self.t + step[3:])

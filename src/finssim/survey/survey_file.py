@@ -31,7 +31,7 @@ from finssim.vehicles.part import VehicleError
 from finssim.vehicles.tag_layout import TagLayout, read_tag_layout
 
 PRINTED = 0.0005
-"""Standard error of a tag on a board where the file gives none [m]; printers and glue do no better."""
+"""Default standard error of a tag on a board [m]; printers and glue are not more accurate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,9 +40,9 @@ class SurveyFile:
 
     path: Path
     settings: Mapping[str, Any]
-    """Arguments of `PoolFitSettings` that the file gives."""
+    """Arguments of `PoolFitSettings` that the file specifies."""
     points: Path | None = None
-    """Table of surveyed points or tags; None where a grid is given, or where the inputs contain the points."""
+    """Table of surveyed points or tags; None if there is a grid, or if the inputs contain the points."""
     grid: Mapping[int, Placed] = field(default_factory=dict)
     """Tags of a board, by their ids."""
     unit: str | None = None
@@ -52,7 +52,7 @@ class SurveyFile:
     edge: float | None = None
     """Edge of tags in a table without that column [m]."""
     edges: Mapping[int, float] = field(default_factory=dict)
-    """Edges of tags by id [m], which come before `edge`."""
+    """Edges of tags by id [m], with priority over `edge`."""
     family: str | None = None
     """Family of the tags in images."""
     latency: float = 0.0
@@ -60,14 +60,14 @@ class SurveyFile:
 
     @property
     def sources(self) -> list[Path]:
-        """The file itself and its table."""
+        """Survey file and its table."""
         return [self.path] if self.points is None else [self.path, self.points]
 
     def fit_settings(self, **defaults: Any) -> PoolFitSettings:
         """Return the settings of the fit.
 
         Args:
-            defaults: Arguments of `PoolFitSettings` for what the file does not give.
+            defaults: Default arguments of `PoolFitSettings`, which the file overrides.
 
         Raises:
             CalibrationError: The arguments contradict each other, or one is out of its range.
@@ -81,11 +81,11 @@ class SurveyFile:
         """Match files of detections, pixels or images with the surveyed points.
 
         Args:
-            inputs: Detections or pixels (.csv), or images; where the file has neither points nor a grid, tables of
+            inputs: Detections or pixels (.csv), or images; if the file has neither points nor a grid, tables of
                 pixels with points.
 
         Raises:
-            CalibrationError: A file cannot be read, or nothing in it was surveyed.
+            CalibrationError: A file cannot be read, or contains no surveyed point.
         """
         if self.grid:
             return observe(inputs, Survey(str(self.path), tags=dict(self.grid)), family=self.family)
@@ -111,7 +111,7 @@ _SETTINGS = (
     ("camera", "center_sigma_px", "center_sigma"),
     ("camera", "pixel_sigma_px", "pixel_sigma"),
 )
-"""Section, key and argument of `PoolFitSettings` of each number."""
+"""Section, key and argument of `PoolFitSettings` for each number."""
 
 
 def load_survey_file(path: str | Path) -> SurveyFile:
@@ -170,14 +170,14 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
 
 
 def _interface_kind(top: Fields, path: Path) -> str:
-    """Return `surface` or `window`, of which the file has one."""
+    """Return `surface` or `window`, the one of the two that the file contains."""
     kinds = [kind for kind in ("surface", "window") if top.given(kind)]
     if len(kinds) == 1:
         return kinds[0]
     count = "both surface and window are" if kinds else "neither surface nor window is"
     bundle = f"; give this file as points: {path.name} of a survey file" if top.given("tag_bundles") else ""
     raise top.error(
-        f"{count} given, expected one: what the camera looks through (surface: {{}} is enough){bundle}"
+        f"{count} given, expected one: the interface between camera and points (surface: {{}} is enough){bundle}"
     )
 
 
@@ -196,7 +196,7 @@ def _numbers(sections: Mapping[str, Fields]) -> dict[str, Any]:
 
 
 def _interface(fields: Fields, kind: str) -> dict[str, Any]:
-    """Return the window and its plane, where the camera looks through one."""
+    """Return the window and its plane, if the camera looks through a window."""
     if kind == "surface":
         return {}
     try:
@@ -209,12 +209,12 @@ def _interface(fields: Fields, kind: str) -> dict[str, Any]:
 
 
 def _refuse_lone_sigma(fields: Fields, kind: str, options: Mapping[str, Any]) -> None:
-    """Refuse a standard deviation of a place that is not given."""
+    """Refuse a standard deviation of a quantity that is not given."""
     places, sigmas, lack = ("water_height", "water_depth"), ("place_sigma",), "height or depth"
     if kind == "window":
         places, sigmas, lack = ("plane",), ("place_sigma", "tilt_sigma"), "plane"
     if options.keys() & {*sigmas} and not options.keys() & {*places}:
-        raise fields.error(f"a standard deviation is given without {lack}: add what it is of")
+        raise fields.error(f"a standard deviation is given without {lack}: add the {lack}")
 
 
 def _layout(path: Path) -> TagLayout:
@@ -235,9 +235,10 @@ def _word(fields: Fields, key: str) -> str | None:
 def _grid(fields: Fields) -> dict[int, Placed]:
     """Return the tags of a board, by their ids.
 
-    Ids run along a column's x, then from row to row; `spacing` is from centre to centre along the printed x and y (a
-    negative second number counts rows downwards); `position` is the centre of the first tag; `yaw_deg`, `pitch_deg`,
-    `roll_deg` turn the board; `sigma` is the standard error of a tag within the board [m].
+    Ids increase along the board's x, then from row to row; `spacing` is the distance of centres along the
+    printed x and y (a negative second number counts rows downwards); `position` is the centre of the first
+    tag; `yaw_deg`, `pitch_deg`, `roll_deg` rotate the board; `sigma` is the standard error of a tag within
+    the board [m].
     """
     first, columns, rows = (int(fields.number(key)) for key in ("first", "columns", "rows"))
     dx, dy = fields.numbers("spacing", 2)
