@@ -99,7 +99,7 @@ def test_debugging_keeps_every_traceback(monkeypatch):
 def test_interruption_has_its_status(capsys):
     """Control-C ends with 130, as the shell expects, and without a traceback."""
     assert run(app, ["fail", "interrupt"]) == 130
-    assert capsys.readouterr().err == "finssim: interrupted: nothing half-written is left\n"
+    assert capsys.readouterr().err == "finssim: interrupted: no incomplete file is left\n"
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ def test_simulate_writes_what_it_says(capfd, tmp_path):
     capfd.readouterr()  # the first time it may compile, and says so
     assert finssim(*words, "--out", tmp_path / "run.csv") == 0
     out, err = capfd.readouterr()
-    assert err == "" and "wrench given" in out and "run.csv" in out.replace("\n", "")
+    assert err == "" and "delivered wrench" in out and "run.csv" in out.replace("\n", "")
     assert (tmp_path / "run.csv").exists()
 
 

@@ -29,7 +29,7 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
         play(policy)
     with pytest.raises(PlaybackError, match="no directory of a policy"):
         play(tmp_path / "run.mcap", film=FilmSettings(video=tmp_path / "run.mp4"))
-    with pytest.raises(PlaybackError, match="--speed is of a film"):
+    with pytest.raises(PlaybackError, match="--speed applies only to films"):
         play(tmp_path / "run.mcap", film=FilmSettings(speed=4.0))
 
 

@@ -65,7 +65,7 @@ def test_a_task_is_shown_for_a_vehicle(capsys):
     pytest.importorskip("finssim.extensions.teams")
     assert finssim("tasks", "show", "team-pursuit", "--vehicle", "bluerov2_heavy") == 0
     out = capsys.readouterr().out
-    assert "seen with sensors, imu: rate 100" in out and "seen with sensors, fixes: rate 30" in out
+    assert "measured with imu: rate 100" in out and "measured with fixes: rate 30" in out
     for words in ("prey (bluerov2_heavy)", "rad/s", "N m", "the net touches the prey"):
         assert words in out
     assert finssim("tasks", "show", "t1", "--action", "thruster8", "--json") == 0

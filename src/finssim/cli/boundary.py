@@ -1,4 +1,4 @@
-"""The boundary where errors end: the sentence that a person at the command line reads in place of a traceback."""
+"""Error handling of the command line: expected errors become one sentence instead of a traceback."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ INTERRUPTED = 130
 
 
 def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None) -> int:
-    """Run a command and turn what it refuses into one sentence on standard error.
+    """Run a command, and print a refusal as one sentence on standard error.
 
-    A refusal is a usage error, an error of the system (OSError), too little memory, an extra that is not installed, or
-    an exception raised by FinsSim's own code to refuse an input (ValueError, with its families). Any other exception is
-    a fault of FinsSim and keeps its traceback. With FINSSIM_DEBUG=1 in the environment, every error keeps its
-    traceback.
+    A refusal is a usage error, an error of the system (OSError), too little memory, an extra that is not
+    installed, or an exception raised by FinsSim's own code to refuse an input (ValueError, with its
+    families). Any other exception is a bug of FinsSim and keeps its traceback. With FINSSIM_DEBUG=1 in the
+    environment, every error keeps its traceback.
 
     Args:
         app: The commands.
-        arguments: The words after the program's name; without any, `finssim` prints its help.
+        arguments: Arguments after the program's name; without any, `finssim` prints its help.
         script: Module of a program other than `finssim`, whose ValueErrors are refusals too.
 
     Returns:
-        The exit status: 0 well, 2 refused, 130 interrupted, or what the command itself gave.
+        Exit status: 0 success, 2 refused, 130 interrupted, or that of the command.
     """
     show = warnings.showwarning
 
@@ -52,7 +52,8 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
     with warnings.catch_warnings(), lost_interrupts_repeated():
         warnings.showwarning = say_ours
         status = _run(app, arguments, script)
-        # If the last `exec` of a string was interrupted, `python -m` kills itself at exit, even if that was handled.
+        # If the last `exec` of a string was interrupted, `python -m` kills itself at exit, even if the
+        # interrupt was handled.
         exec("")
         return status
 
@@ -64,7 +65,7 @@ def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
         else:
             status = app(list(arguments), standalone_mode=False)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+    except BrokenPipeError:  # the reader of our output has exited, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
@@ -79,12 +80,12 @@ def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
             _say(sentence)
             return REFUSED
     if status == INTERRUPTED:
-        _say("interrupted: nothing half-written is left")
+        _say("interrupted: no incomplete file is left")
     return status if isinstance(status, int) else 0
 
 
 def refusal(error: Exception, script: str = "finssim") -> str | None:
-    """Return the sentence for an error of the input or the system, or None for a fault of FinsSim.
+    """Return the sentence for an error of the input or the system, or None for a bug of FinsSim.
 
     Args:
         error: The error.
@@ -101,7 +102,7 @@ def refusal(error: Exception, script: str = "finssim") -> str | None:
     if isinstance(error, ValueError) and (
         _is_ours(type(error).__module__, script) or _raised_by_us(error.__traceback__, script)
     ):
-        cause = error.__cause__  # as of a user's file that imports what is not installed
+        cause = error.__cause__  # such as a user's file that imports a missing package
         missing = _missing_extra(cause) if isinstance(cause, ModuleNotFoundError) else None
         return f"{error}; {missing}" if missing and "pip install" not in str(error) else str(error)
     return None
@@ -120,7 +121,7 @@ def _system_error(error: OSError) -> str:
 
 
 def _raised_by_us(traceback: TracebackType | None, script: str) -> bool:
-    """Return whether the innermost frame is a `raise` of FinsSim or the script, and not a fault deep in a library."""
+    """Return whether the innermost frame is a `raise` of FinsSim or the script, rather than a failure in a library."""
     while traceback is not None and traceback.tb_next is not None:
         traceback = traceback.tb_next
     return traceback is not None and _is_ours(traceback.tb_frame.f_globals.get("__name__", ""), script)

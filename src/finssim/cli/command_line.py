@@ -1,7 +1,7 @@
-"""A Python function as a command: its signature is the list of options, its docstring their help.
+"""Commands from Python functions: the signature defines the options, the docstring their help.
 
-There is no other list. A function is read from its source, without being imported, so that help and refusals answer at
-once:
+There is no other list. A function is read from its source, without being imported, so that help and refusals are
+immediate:
 
     def simulate(*, duration: Annotated[float, (0.0, None)], out: Path, device: str = "cpu") -> None:
         \"\"\"Simulate a vehicle from rest.
@@ -14,13 +14,14 @@ once:
             device (DEVICE): Compute device: cpu or cuda.
         \"\"\"
 
-What comes before `*` is typed by its place, the rest as `--name`; a bool is a flag, a `Sequence` may be given several
-times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`, another
-`"--name"`, or `","` where one option holds several words. What is no text, number, flag or path, or is annotated
-"python", is no option and keeps its default, but for the types of `MAKERS`, and for a dataclass that is annotated
-"options", whose fields are. `**options`, "As of `module.function`, without rows, robot.", are those of
-that function but for some. What is returned is the exit status, or a result, whose `ok` makes it 0 or 3. In a module
-that defines `tables_of`, every function returns a result, of which `tables_of` makes tables.
+Parameters before `*` are positional, the others are options `--name`; a bool is a flag, a `Sequence` may be given
+several times. A directory `out (DIR)` is written by one command at a time. `Annotated` adds bounds as `(low, high)`,
+another name `"--name"`, or `","` for several values in one option. A parameter that is no text, number, flag or path,
+or is annotated "python", is not an option and keeps its default, except the types in `MAKERS` and dataclasses
+annotated "options", whose fields become options. `**options` with the help "As of `module.function`, without rows,
+robot." stands for the options of that function except the named ones. The return value is the exit status, or a
+result, whose `ok` gives status 0 or 3. In a module that defines `tables_of`, every function returns a result, which
+`tables_of` converts to tables.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ ROOT = Path(__file__).parents[2]
 KINDS: Mapping[str, Any] = {
     "str": str, "int": int, "float": float, "bool": bool, "Path": Path, "Literal": str, "Severity": str, "Format": str
 }  # fmt: skip
-"""Name of an annotation -> what the command line makes of a word."""
+"""Name of an annotation -> type to which an argument is converted."""
 MAKERS = {"OnRobot": "finssim.evaluation.robot_trials:robot_or_none"}
-"""Name of an annotation -> function that makes it, whose options replace the parameter."""
+"""Name of an annotation -> function that creates its value, whose options replace the parameter."""
 SEEDS = (0, 2**31 - 1)
 LARGEST = 1e9
 """Greatest magnitude of a number on the command line, in any unit."""
@@ -71,17 +72,17 @@ class Option:
     name: str
     kind: Any
     many: bool
-    """May be repeated."""
+    """True if the option may be repeated."""
     positional: bool
     default: Any
-    """`inspect.Parameter.empty` where it must be given."""
+    """Default value; `inspect.Parameter.empty` if the option is required."""
     notes: tuple[Any, ...]
     """Notes of `Annotated`: bounds, names, or ","."""
     metavar: str | None
     help: str
 
     def parameter(self) -> inspect.Parameter:
-        """Return the option as Typer reads it."""
+        """Return the option as a parameter for Typer."""
         low, high = next((n for n in self.notes if isinstance(n, tuple)), (None, None))
         if self.name == "seed" and self.kind is int:
             low, high = SEEDS
@@ -103,10 +104,10 @@ class Option:
         )
 
     def value(self, typed: Any) -> Any:
-        """Return the value that the function is called with.
+        """Return the value with which the function is called.
 
         Raises:
-            BadParameter: A number without bounds that is not finite, or beyond any quantity.
+            BadParameter: A number without bounds is not finite or too large.
         """
         if typed is None:
             return self.default
@@ -123,38 +124,38 @@ class Definition:
     path: str
     help: str
     arguments: Mapping[str, Option | Definition]
-    """Parameter -> its option, or the function that makes its value of options, in the order of the signature."""
+    """Parameter -> its option, or the function that creates its value from options, in the order of the signature."""
     positional: bool
-    """Whether its value is given by its place."""
+    """True if its value is positional."""
     extra: bool
-    """Takes whatever words follow, as `*words`."""
+    """True if it accepts further arguments, as `*words`."""
     tabled: bool
-    """Returns a result, of which the module's `tables_of` makes tables."""
+    """True if it returns a result that the module's `tables_of` converts to tables."""
 
     def all_options(self) -> Iterator[Option]:
-        """Yield all options, those of the makers included, in the order of the help."""
+        """Yield all options, including those of the makers, in the order of the help."""
         for argument in self.arguments.values():
             yield from argument.all_options() if isinstance(argument, Definition) else [argument]
 
     def values(self, typed: Mapping[str, Any]) -> dict[str, Any]:
-        """Parameter -> what it is called with, of what was typed."""
+        """Return the arguments of the call by parameter, from the parsed command line."""
         return {
             name: argument.call(typed) if isinstance(argument, Definition) else argument.value(typed[name])
             for name, argument in self.arguments.items()
         }
 
     def call(self, typed: Mapping[str, Any], *extra: str) -> Any:
-        """Call it with what was typed."""
+        """Call the function with the parsed command line."""
         values = self.values(typed)
         positional = [values.pop(name) for name, argument in self.arguments.items() if argument.positional]
         return loaded(self.path)(*positional, *extra, **values)
 
 
 def loaded(path: str) -> Callable[..., Any]:
-    """Import and return a function; Warp starts silently where its module needs it."""
+    """Import and return a function; Warp starts silently if its module needs it."""
     module, _, name = path.partition(":")
     function: Callable[..., Any] = getattr(import_module(module), name)
-    if not gc.isenabled():  # `main` waits for the imports
+    if not gc.isenabled():  # `main` disabled it until the imports are done
         gc.freeze()
         gc.enable()
     if "warp" in sys.modules:
@@ -173,7 +174,7 @@ def _source(module: str) -> str:
 
 
 def _origin(name: str, module: str, source: str) -> str:
-    """Return the module from which a module of this source has a class: itself, or one that it imports from."""
+    """Return the module that defines a class used in a module's source: itself, or one from which it is imported."""
     imported = rf"^from ([\w.]+) import (?:\([^)]*|[^(\n]*)\b{name}\b"
     match = re.search(imported, source, re.MULTILINE)
     return module if match is None else match[1]
@@ -190,7 +191,7 @@ def read(path: str, positional: bool = False) -> Definition:
 
     Args:
         path: The function or class, module:name.
-        positional: Whether what it makes is given by its place.
+        positional: True if the created value is positional.
     """
     module, _, name = path.partition(":")
     source = _source(module)
@@ -228,9 +229,9 @@ def read(path: str, positional: bool = False) -> Definition:
 
 
 Help = tuple[str | None, str]
-"""METAVAR, and words."""
+"""METAVAR, and help text."""
 Arguments = Iterator[tuple[str, ast.expr | None, ast.expr | None, bool, Help]]
-"""Name, annotation, default, whether it is known by its place, and help."""
+"""Name, annotation, default, whether it is positional, and help."""
 
 
 def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Arguments:
@@ -245,7 +246,7 @@ def _arguments(function: ast.FunctionDef, helps: Mapping[str, Help]) -> Argument
 
 
 def _fields(settings: ast.ClassDef) -> Arguments:
-    """Fields, each with the text below it as help."""
+    """Yield the fields, each with the string below it as help."""
     for field, below in pairwise([*settings.body, ast.Pass()]):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
             text = ast.literal_eval(below.value) if isinstance(below, ast.Expr) else ""
@@ -256,7 +257,7 @@ def _fields(settings: ast.ClassDef) -> Arguments:
 
 
 def _helps(about: str) -> dict[str, Help]:
-    """Argument -> its METAVAR, if it has one, and its words."""
+    """Return argument -> its METAVAR, if it has one, and its help text."""
     section = re.search(r"^Args:\n((?: .*\n?|\n(?= ))*)", about, re.MULTILINE)
     entries = re.split(r"^ {4}(?=\w)", section[1], flags=re.MULTILINE)[1:] if section else []
     helps = {}
@@ -268,7 +269,8 @@ def _helps(about: str) -> dict[str, Help]:
 
 
 def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
-    """Return a word's type, whether there may be several, and the notes of `Annotated`; None if it is no option."""
+    """Return the type of an argument, whether it may be repeated, and the notes of `Annotated`; None if it is
+    not an option."""
     if isinstance(annotation, ast.BinOp):
         sides = (_kind(annotation.left), _kind(annotation.right))
         return next((side for side in sides if side[0] is not None), sides[0])
@@ -289,7 +291,7 @@ def _kind(annotation: ast.expr | None) -> tuple[Any, bool, tuple[Any, ...]]:
 
 
 def _literal(default: ast.expr, source: str) -> Any:
-    """Return a default value; a name means a constant of the module."""
+    """Return a default value; a name stands for a constant of the module."""
     if isinstance(default, ast.Call) and ast.unparse(default.func) == "Path":
         return Path(ast.literal_eval(default.args[0]))
     if isinstance(default, ast.Name):
@@ -308,11 +310,11 @@ def command_app(
     """Return the command line with all commands.
 
     Args:
-        sections: Heading of the help -> words after the program's name -> function, as module:function. One of a
-            group's own name is what the group does when nothing follows it; other groups then print their help.
-        groups: Word -> help of a group that does nothing itself.
-        further: Commands of extensions and other packages; each is read when it is asked for.
-        settings: Of the outermost `typer.Typer`.
+        sections: Heading of the help -> command -> function, as module:function. A command with the name of a
+            group runs if no subcommand follows; other groups then print their help.
+        groups: Name -> help of a group without a command of its own.
+        further: Commands of extensions and other packages, each read when it is used.
+        settings: Settings of the outermost `typer.Typer`.
     """
     commands = {name: work for section in sections.values() for name, work in section.items()}
 
@@ -322,7 +324,7 @@ def command_app(
         )
 
     class Sections(typer.core.TyperGroup):
-        """Commands by section, in the order in which they are given, and after them those of other packages."""
+        """Commands by section, in the given order, followed by those of other packages."""
 
         def list_commands(self, context: Any) -> list[str]:
             return [*super().list_commands(context), *others()]
@@ -371,7 +373,7 @@ def _add(app: typer.Typer, commands: Mapping[str, str], groups: Mapping[str, str
 
 
 def _registered(word: str) -> Any:
-    """Return the command of an extension or another package by its first word, with those below it.
+    """Return the command of an extension or another package by its first word, with its subcommands.
 
     Raises:
         RegistryError: Its module cannot be found or imported, or has no such function.
@@ -391,7 +393,7 @@ def _registered(word: str) -> Any:
 
 
 def _short_help(name: str, room: int) -> str:
-    """Return the first sentence of a command of another package, or that it cannot be used."""
+    """Return the first sentence of a command of another package, or a note that it cannot be used."""
     try:
         return str(_registered(name).get_short_help_str(room))
     except RegistryError:
@@ -399,7 +401,7 @@ def _short_help(name: str, room: int) -> str:
 
 
 def run_script(path: str) -> NoReturn:
-    """Run a function as a program whose options are those of its signature, and exit.
+    """Run a function as a program with the options of its signature, and exit.
 
     Args:
         path: The function, module:function; the module may be `__main__`.
@@ -421,7 +423,7 @@ def _group(title: str) -> Callable[..., None]:
 
 
 def _handler(name: str, path: str, *, group: bool = False) -> Callable[..., Any]:
-    """Return a function with the signature that Typer reads, which calls the one that is meant."""
+    """Return a function with the signature for Typer, which calls the original one."""
     definition = read(path)
     options = list(definition.all_options())
     if definition.tabled:
@@ -447,7 +449,7 @@ def _handler(name: str, path: str, *, group: bool = False) -> Callable[..., Any]
 
 
 def _directories(options: Sequence[Option], typed: Mapping[str, Any]) -> list[Path]:
-    """Return the directories that a command writes into, which no other command may do at the same time."""
+    """Return the directories that a command writes, which no other command may write at the same time."""
     return [
         typed[option.name] if typed[option.name] is not None else option.default
         for option in options
@@ -467,7 +469,7 @@ def _experiment(name: str, definition: Definition, typed: Mapping[str, Any]) -> 
 
 
 def _status(result: Any) -> int:
-    """Exit status: a number is it; a result that is not `ok` has 3."""
+    """Return the exit status: the result if it is a number; 3 if it is a result that is not `ok`; else 0."""
     if isinstance(result, Mapping):
         return 0 if result.get("ok", True) else 3
     return result if type(result) is int else 0

@@ -1,4 +1,4 @@
-"""The `finssim` command: what each of its words does. Options and help are those of the functions named here."""
+"""Table of the `finssim` commands and their functions, which define options and help."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ SECTIONS: dict[str, dict[str, str]] = {
         "experiment replay": "finssim.studies.replay:replay_experiment",
     },
 }
-"""Section of the help -> words of a command -> what it does, in the order of a user's path."""
+"""Section of the help -> command -> its function, in the order of a user's workflow."""
 COMMANDS = {words: work for section in SECTIONS.values() for words, work in section.items()}
-"""Words of every command of the core -> its function."""
+"""Command of the core -> its function."""
 
 FAMILY.ship({words.partition(" ")[0]: "finssim.cli.commands:app" for words in COMMANDS})
 
@@ -88,7 +88,7 @@ GROUPS = {
     "Example: finssim experiment replay --help",
     "record": "Inspect records of runs, and repair truncated ones.\n\nExample: finssim record info run.mcap",
 }
-"""Help of what only has commands below it."""
+"""Help of groups that only have subcommands."""
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -106,7 +106,7 @@ app = command_app(
 def main() -> None:
     """Run the command line and exit.
 
-    Statuses: 0 well, 1 a fault of FinsSim, 2 a refused input, 3 a result that is negative, 130 interrupted.
+    Exit status: 0 success, 1 a bug of FinsSim, 2 a refused input, 3 a negative result, 130 interrupted.
     """
     replace_unwritable(sys.stdout, sys.stderr)
     words = itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:3])
@@ -128,7 +128,7 @@ def _finssim(
         bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Units are SI and radians unless an option's name says otherwise; z is up, and 0 on the still water surface."""
+    """Units are SI and radians unless an option's name states otherwise; z is up, and 0 on the still water surface."""
 
 
 def vehicles(*, as_json: bool = False) -> None:
@@ -163,7 +163,7 @@ def show_vehicle(
 
     Args:
         name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        picture: Also draw the thruster layout into this file (.png, .svg).
+        picture: Also draw the thruster layout in this file (.png, .svg).
         as_json: Print one JSON object instead of tables.
     """
     from rich.console import Console
@@ -203,16 +203,16 @@ def show_vehicle(
 def import_vehicle(file: Path, *, out: Path, folder: Sequence[Path] = (), as_json: bool = False) -> None:
     """Write a vehicle file from the model of another simulator, and list what was guessed and what was not read.
 
-    Read are SDF of gz-sim (plugins Hydrodynamics, Thruster and Buoyancy), URDF and xacro with these or with the plugins
-    of uuv_simulator, coefficients of Fossen's equations in Python or MATLAB, which are not executed, scenarios of
-    Stonefish and HoloOcean and parameters of MarineGym.
+    Supported are SDF of gz-sim (plugins Hydrodynamics, Thruster and Buoyancy), URDF and xacro with these or
+    with the plugins of uuv_simulator, coefficients of Fossen's equations in Python or MATLAB, which are not
+    executed, scenarios of Stonefish and HoloOcean and parameters of MarineGym.
 
     Example: finssim vehicles import model.sdf --out rov.yaml
 
     Args:
         file (FILE): Model of the other program; the files that it names are in its folder or below.
-        out (FILE): Vehicle file to write (.yaml); the mesh of the hull goes beside it.
-        folder (FOLDER): Folder in which packages that the file names are sought, besides those around the file.
+        out (FILE): Vehicle file to write (.yaml), with the mesh of the hull in the same folder.
+        folder (FOLDER): Further folder in which packages named by the file are searched.
         as_json: Print one JSON object instead of text.
     """
     from tempfile import TemporaryDirectory
@@ -249,14 +249,14 @@ def export(
     hydrodynamics: str = "calibrated",
     as_json: bool = False,
 ) -> None:
-    """Write a vehicle as SDF or URDF with the plugins of gz-sim, and list what the format does not hold.
+    """Write a vehicle as SDF or URDF with the plugins of gz-sim, and list what the format cannot represent.
 
     Example: finssim vehicles export bluerov2_heavy --format sdf
 
     Args:
         name (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        format: SDF is a world that runs by itself; that of the suffix of the file, or sdf, if not given.
-        out (FILE): File to write; NAME.sdf or NAME.urdf if not given.
+        format: Format of the file; SDF is a complete world. Default: by the suffix of the file, or sdf.
+        out (FILE): File to write; default NAME.sdf or NAME.urdf.
         hydrodynamics (SET): Set of coefficients of the vehicle file.
         as_json: Print one JSON object instead of text.
     """

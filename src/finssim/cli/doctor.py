@@ -1,6 +1,6 @@
 """`finssim doctor`: installed packages, compute devices, missing extras, and what packages register."""
 
-# No postponed annotations here: Warp reads those of its kernels.
+# No postponed annotations here: Warp reads the annotations of its kernels.
 import json
 import os
 import platform
@@ -14,17 +14,17 @@ CORE = (
     "numpy", "scipy", "warp-lang", "pydantic", "PyYAML", "typer", "rich", "onnx", "onnxruntime", "threadpoolctl",
     "matplotlib", "mcap", "rosbags", "pupil-apriltags",
 )  # fmt: skip
-"""Distributions FinsSim cannot do without."""
+"""Required distributions."""
 
 
 @dataclass(frozen=True)
 class Extra:
-    """One optional part of the installation."""
+    """Optional part of the installation."""
 
     distributions: dict[str, str]
     """Distribution that pip installs -> module that Python imports."""
     enables: str
-    """Task that the package enables once it is installed."""
+    """Purpose of the extra, for the report."""
 
 
 EXTRAS = {
@@ -78,9 +78,9 @@ EXTRAS = {
         "calibrate cameras and pools from pictures, locate a vehicle from pictures or video",
     ),
     "render": Extra(
-        {"mitsuba": "mitsuba"}, "let the tests compare the overhead camera's pictures with Mitsuba's"
+        {"mitsuba": "mitsuba"}, "compare, in the tests, the overhead camera's pictures with Mitsuba's"
     ),
-    "ros2": Extra({"cyclonedds": "cyclonedds"}, "be ROS 2 nodes without an installed ROS 2"),
+    "ros2": Extra({"cyclonedds": "cyclonedds"}, "run ROS 2 nodes without an installed ROS 2"),
     "hardware": Extra(
         {
             "pygame": "pygame",
@@ -94,11 +94,12 @@ EXTRAS = {
 EXTRA_OF_MODULE = {
     module: name for name, extra in reversed(EXTRAS.items()) for module in extra.distributions.values()
 }
-"""Module that Python could not import -> extra that installs it."""
+"""Module that could not be imported -> extra that installs it."""
 
 
 def doctor(*, as_json: bool = False) -> int:
-    """List installed packages, compute devices, what each missing extra would enable, and what packages register.
+    """List installed packages, compute devices, missing extras with what they enable, and members registered
+    by packages.
 
     Exit status 1: a core package or a working compute device is missing.
 
@@ -113,12 +114,12 @@ def doctor(*, as_json: bool = False) -> int:
 
 
 def examine() -> dict[str, Any]:
-    """Return what is installed and works, as plain values.
+    """Return the state of the installation, as plain values.
 
     Returns:
-        `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`, `detail`; `extras`
-        (name -> `complete`, `versions`, `missing`, `enables`); `registered` (family -> package -> names); `failures`, a
-        sentence about each member of another package that cannot be used.
+        `healthy`; `machine`; `core` (name -> version or None); `devices`, each with `name`, `works`,
+        `detail`; `extras` (name -> `complete`, `versions`, `missing`, `enables`); `registered` (family ->
+        package -> names); `failures`, a sentence about each member of another package that cannot be used.
     """
     core = package_versions(CORE)
     devices = _devices() if "warp-lang" in core else []
@@ -158,7 +159,7 @@ def _by_package(family: Family) -> dict[str, list[str]]:
 
 
 def _devices() -> list[dict[str, Any]]:
-    """Every device Warp knows, each tried with a real kernel."""
+    """Return every device that Warp lists, each tested with a kernel."""
     import numpy as np
     import warp as wp
 
@@ -179,7 +180,7 @@ def _devices() -> list[dict[str, Any]]:
             wp.launch(square, dim=100, inputs=[x, y], device=device)
             if not np.array_equal(y.numpy(), np.arange(100.0) ** 2):
                 answer.update(works=False, detail="a kernel ran and gave a wrong answer")
-        except Exception as error:  # whatever a driver raises is the finding
+        except Exception as error:  # any error of a driver is a result
             answer.update(works=False, detail=" ".join(str(error).split()) or type(error).__name__)
         return answer
 
@@ -200,7 +201,7 @@ def _print(report: dict[str, Any]) -> None:
         f"Python {machine['python']} on {machine['system']}, {machine['cores']} cores", highlight=False
     )
     table = Table(box=None, pad_edge=False)
-    for heading in ("", "state", "what it is for, or found"):
+    for heading in ("", "state", "purpose, or result"):
         table.add_column(heading, overflow="fold")
     for name, version in report["core"].items():
         table.add_row(

@@ -1,4 +1,4 @@
-"""`finssim new`: a vehicle, task, term, sensor, actuator, agent or study of one's own, from an example that runs."""
+"""`finssim new`: create your own vehicle, task, term, sensor, actuator, agent or study from a working example."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 TEMPLATES = next(
     folder for folder in (PACKAGE / "templates", PACKAGE.parents[1] / "examples" / "own") if folder.is_dir()
 )
-"""The examples, which a wheel contains."""
+"""Folder of the examples, which a wheel contains."""
 
 KINDS: Mapping[str, tuple[str, str, str]] = {
     "vehicle": ("minnow", "", "finssim vehicles show {name}/{name}.yaml"),
@@ -28,7 +28,7 @@ KINDS: Mapping[str, tuple[str, str, str]] = {
     "agent": ("homing", "", "finssim evaluate {name}/{name}.py:{Name} --task t1"),
     "study": ("study", "", "python {name}/{name}.py"),
 }  # fmt: skip
-"""Kind -> name in its example, the entry point by which every command finds it, and the command to try first."""
+"""Kind -> name in its example, entry point by which every command finds it, and command to try first."""
 
 PROJECT = """[build-system]
 requires = ["hatchling"]
@@ -48,14 +48,14 @@ include = ["{name}.py"]
 
 
 class TemplateError(ValueError):
-    """A template that cannot be made; the message is one sentence."""
+    """Template that cannot be created; the message is one sentence."""
 
 
 def new(kind: str, name: str, *, out: Path | None = None, as_json: bool = False) -> Path:
-    """Write a vehicle, task, term, sensor, actuator, agent or study of your own, which runs and passes its tests.
+    """Write your own vehicle, task, term, sensor, actuator, agent or study, which runs and passes its tests.
 
-    The directory holds the file to change, tests of the laws that it must obey, and, where every command can use it
-    once it is installed, the `pyproject.toml` that registers it.
+    The directory contains the file to edit, tests of the laws that it must obey and, for kinds that every
+    command can use after installation, the `pyproject.toml` that registers it.
 
     Example: finssim new vehicle minnow
 
@@ -63,15 +63,16 @@ def new(kind: str, name: str, *, out: Path | None = None, as_json: bool = False)
 
     Args:
         kind: vehicle, task, term, sensor, actuator, agent or study.
-        name: Of the new thing: small letters, digits and underscores.
-        out (DIR): Directory to write; NAME if not given.
+        name: Name of the new object: lower-case letters, digits and underscores.
+        out (DIR): Directory to write; default NAME.
         as_json: Print one JSON object instead of text.
 
     Returns:
         The directory.
 
     Raises:
-        TemplateError: An unknown kind, a name that Python or an installed package has already, or one that is no name.
+        TemplateError: The kind is unknown, or the name is invalid or already used by Python or an installed
+            package.
         OutputError: The directory exists.
     """
     if kind not in KINDS:
@@ -101,13 +102,14 @@ def new(kind: str, name: str, *, out: Path | None = None, as_json: bool = False)
 
 
 def _forms(name: str) -> dict[str, str]:
-    """Return a name as module, as class, as constant and as the name of a task."""
+    """Return a name in the forms of a module, a class, a constant and a task."""
     camel = "".join(part.capitalize() for part in name.split("_"))
     return {"name": name, "Name": camel, "NAME": name.upper(), "dashed": name.replace("_", "-")}
 
 
 def _renamed(text: str, before: Mapping[str, str], after: Mapping[str, str]) -> str:
-    """Return a text with every form of one name replaced by that of another; words that contain it stay."""
+    """Return a text with every form of one name replaced by that of another; words that only contain it are
+    not changed."""
     for form in ("name", "Name", "NAME", "dashed"):
         text = re.sub(rf"(?<![A-Za-z]){re.escape(before[form])}(?![a-z])", after[form], text)
     return text

@@ -1,4 +1,4 @@
-"""`finssim play`: the messages of a record, or an episode of a policy as a film."""
+"""`finssim play`: print the messages of a record, or film an episode of a policy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from finssim.vehicles import catalogue_vehicle, load_vehicle
 
 
 class PlaybackError(ValueError):
-    """Something that cannot be played."""
+    """Path that cannot be played."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,17 +32,17 @@ class FilmSettings:
     """Settings of the film of an episode."""
 
     speed: float = 1.0
-    """(FACTOR) Speed factor of a film relative to the episode [-]."""
+    """(FACTOR) Speed factor of the film relative to the episode [-]."""
     video: Path | None = None
-    """(FILE) Film of an episode to write (.mp4)."""
+    """(FILE) Film to write (.mp4)."""
     task: str | None = None
-    """(TASK) Task of the episode; that of the policy's training if not given. Your own: FILE.py:CLASS."""
+    """(TASK) Task of the episode; default that of the policy's training. Your own: FILE.py:CLASS."""
     vehicle: str | None = None
-    """(NAME|FILE) Vehicle in the episode; that of the policy's training if not given."""
+    """(NAME|FILE) Vehicle in the episode; default that of the policy's training."""
     plant: str = "nominal"
     """(FILE|NAME) Plant of the episode, as in finssim evaluate."""
     seed: int = 1
-    """Of the episode."""
+    """Seed of the episode."""
 
 
 def play(
@@ -65,16 +65,18 @@ def play(
         film: Film of an episode.
 
     Raises:
-        RecordError: Not a record, or no such topic.
-        PlaybackError: A directory without a film to write, or a film or speed of a record.
-        PolicyError, PlantError, EnvironmentSetupError: As they say.
+        RecordError: The file is not a record, or lacks a topic.
+        PlaybackError: A policy directory is given without --video, or a record with --video or --speed.
+        PolicyError: The policy cannot be used.
+        PlantError: The plant cannot be used.
+        EnvironmentSetupError: The task cannot be set up.
     """
     if not path.is_dir():
         if film.video is not None:
-            raise PlaybackError(f"{path} is no directory of a policy: only an episode of a policy is filmed")
+            raise PlaybackError(f"{path} is not a policy directory: only episodes of policies can be filmed")
         if film.speed != 1.0:
             raise PlaybackError(
-                "--speed is of a film: the messages of a record are printed without waiting, leave it out"
+                "--speed applies only to films: the messages of a record are printed without waiting, omit it"
             )
         play_record(path, topics=topics, start=start)
         return
@@ -113,7 +115,7 @@ def _film(path: Path, film: FilmSettings) -> None:
 
 
 def _with_observed(picture: NDArray[np.uint8], environment: Environment) -> NDArray[np.uint8]:
-    """The picture with what the vehicle sees in its corner, a quarter as wide or more."""
+    """Return the picture with the vehicle's own pictures in its corner, each at least about a quarter as wide."""
     if environment.sight is None:
         return picture
     corner = 0
@@ -126,7 +128,7 @@ def _with_observed(picture: NDArray[np.uint8], environment: Environment) -> NDAr
 
 
 def _write_video(path: Path, pictures: list[NDArray[np.uint8]], rate: float) -> None:
-    """Write pictures of one size as a film (.mp4), so many a second [Hz]."""
+    """Write pictures of equal size as a film (.mp4) with a frame rate [Hz]."""
     import cv2
 
     height, width = pictures[0].shape[:2]

@@ -1,4 +1,4 @@
-"""`finssim simulate`: one vehicle from rest under a constant wrench, its motion in a table that opens in pandas."""
+"""`finssim simulate`: simulate one vehicle from rest under a constant wrench, and write its motion as a table."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ UNITS = ("N", "N", "N", "N m", "N m", "N m")
 
 
 class CommandError(ValueError):
-    """The words of a command line do not describe a wrench or a run; the message states which and what to write."""
+    """Command line that does not describe a wrench or a run; the message states which part and how to correct it."""
 
 
 def parse_wrench(text: str) -> NDArray[np.float64]:
-    """Wrench from words such as "surge=10 yaw=-1".
+    """Return the wrench of a text such as "surge=10 yaw=-1".
 
     Args:
-        text: `axis=number` separated by spaces or commas; axes left out are 0.
+        text: `axis=number` separated by spaces or commas; omitted axes are 0.
 
     Returns:
         Wrench, body frame, order surge sway heave roll pitch yaw [N, N m], (6,).
 
     Raises:
-        CommandError: An axis is unknown or given twice, or a number is missing or not finite.
+        CommandError: An axis is unknown or repeated, or a number is missing or not finite.
     """
     wrench: dict[str, float] = {}
     for word in text.replace(",", " ").split():
@@ -66,7 +66,7 @@ CONTROL_STEP = 0.1
 """Time between two rows [s]."""
 
 LONGEST = 86400.0
-"""Longest run that is recorded [s]: a table of a day has a million rows."""
+"""Longest simulated run [s]: a table of a day has a million rows."""
 
 
 def simulate(
@@ -83,8 +83,8 @@ def simulate(
 ) -> None:
     """Simulate a vehicle from rest under a constant wrench and record its motion.
 
-    Columns: t [s], the state as `finssim.sim.recorder` names it, and the delivered thrust of every thruster [N].
-    `OUT.json` beside the table holds the vehicle's hash, the command and the provenance.
+    Columns: t [s], the state with the names of `finssim.sim.recorder`, and the delivered thrust of every
+    thruster [N]. `OUT.json` in the same folder contains the vehicle's hash, the command and the provenance.
 
     Example: finssim simulate --vehicle finsrov --command "surge=10 yaw=1" --duration 10 --out run.csv
 
@@ -96,14 +96,16 @@ def simulate(
         out: Table to write, one row per control step of 0.1 s: a .csv file. OUT.json records its origin.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
         depth: Depth of the body origin at the start [m].
-        water (FILE): Water file (.yaml): currents, a profile over depth and time, waves or a sea state; still water if
-            not given.
+        water (FILE): Water file (.yaml): currents, a profile over depth and time, waves or a sea state;
+            default still water.
         device (DEVICE): Compute device: cpu or cuda.
         as_json: Print one JSON object instead of a table.
 
     Raises:
-        CommandError: The command, a time or the file's name cannot be used, or the motion did not stay finite.
-        VehicleError, SimulatorError, OutputError: As they say.
+        CommandError: The command, a time or the file's name cannot be used, or the motion became infinite.
+        VehicleError: The vehicle cannot be used.
+        SimulatorError: The simulator cannot be set up.
+        OutputError: A file cannot be written.
     """
     if not CONTROL_STEP <= duration <= LONGEST:
         raise CommandError(f"duration is {duration} s, expected {CONTROL_STEP} to {LONGEST:g} s")
@@ -151,16 +153,17 @@ def simulate(
     angles_deg = np.degrees(quat_to_euler(last[4:8]))
     cells = [
         ["requested wrench [N, N m]", *(f"{x:.4g}" for x in tau)],
-        ["wrench given [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
+        ["delivered wrench [N, N m]", *(f"{x:.4g}" for x in achieved.round(4) + 0.0)],
         ["velocity [m/s, rad/s]", *(f"{x:.3f}" for x in last[8:14])],
-        ["place [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],
+        ["pose [m, deg]", *(f"{x:.2f}" for x in last[1:4]), *(f"{x:.1f}" for x in angles_deg)],
     ]
     title, note = f"{chosen.name} after {last[0]:g} s", f"written: {out} and {out}.json"
     print_tables([Table(title=title, heads=["", *AXES], rows=cells, left=(), note=note)], Console())
 
 
 def _run(simulator: Simulator, thrust: NDArray[np.float64], depth: float, steps: int) -> NDArray[np.float64]:
-    """Time [s], state and delivered thrusts [N] at the start and after every control step, (steps + 1, columns)."""
+    """Return time [s], state and delivered thrusts [N] at the start and after every control step, (steps + 1,
+    columns)."""
     simulator.place(position=(0.0, 0.0, -depth))
     simulator.set_thrust(thrust)
     rows = []

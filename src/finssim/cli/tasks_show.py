@@ -1,4 +1,4 @@
-"""`finssim tasks`: all tasks in a table, and one of them in full: as plain data, and as a person reads it."""
+"""`finssim tasks`: table of all tasks, and full description of one, as plain data and as tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from finssim.vehicles import Vehicle
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Field -> the string that follows it, of a class and those it is derived from; where the source can be had."""
+    """Return field -> the string below it, for a class and its bases, as far as their source is available."""
     docs: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         docs |= _own_docs(base)
@@ -36,7 +36,7 @@ def attribute_docs(kind: type) -> dict[str, str]:
 
 @cache
 def _own_docs(kind: type) -> dict[str, str]:
-    """Read the strings of a class's own fields from its source, where alone they are: tasks share their bases."""
+    """Return the strings below a class's own fields from its source; cached, since tasks share their bases."""
     docs: dict[str, str] = {}
     with suppress(OSError, TypeError, SyntaxError):
         (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
@@ -53,18 +53,18 @@ SEPARATE = ("name", "observation", "control_step", "substeps", "time_limit", "tr
 def describe_task(
     task: str | Task, vehicle: Vehicle | str | Sequence[Vehicle | str] = "finsrov", action: str | None = None
 ) -> dict[str, Any]:
-    """Everything about a task.
+    """Return the description of a task.
 
     Args:
-        task: A task, its name, or FILE.py:CLASS of one's own.
-        vehicle: Whose numbers: one for all places, or one for each.
-        action: Mode; the task's own if None.
+        task: A task, its name, or FILE.py:CLASS of your own.
+        vehicle: Vehicle of the description: one for all roles, or one for each.
+        action: Action mode; None: the task's own.
 
     Returns:
         Plain data: title, agents, others, observation, action, reward, success, settings, baselines, ...
 
     Raises:
-        EnvironmentSetupError: There is no such task, or the vehicle cannot do it.
+        EnvironmentSetupError: There is no such task, or the vehicle cannot perform it.
         ControlError: There is no such action mode.
         VehicleError: There is no such vehicle.
     """
@@ -109,7 +109,7 @@ def describe_task(
 
 
 def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
-    """Return the task's text of a term, or the first paragraph of its function's docstring, also of a shared value."""
+    """Return the task's text of a term, or the first paragraph of the docstring of its function or shared value."""
     terms, term = task.terms(), part.term
     while isinstance(term, str):
         term = {**terms.shared, **terms.seen}.get(term)
@@ -119,7 +119,7 @@ def _text(task: Task, part: ObservationPart | RewardTerm | End | Total) -> str:
 
 
 def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
-    """Return the meaning of 1 and -1 of every component."""
+    """Return the limits of every action component at -1 and 1."""
     chosen = action_mode(mode, vehicle)
     components = [
         {"name": label, "low": low, "high": high, "unit": _unit(label, chosen, vehicle)}
@@ -129,7 +129,7 @@ def _action(mode: str, vehicle: Vehicle) -> dict[str, Any]:
 
 
 ORDERS = {"speed": "m/s", "course": "rad", "depth": "m", "pitch": "rad"}
-"""Unit of each order to the autopilot of course."""
+"""Unit of each set-point of the course autopilot."""
 
 
 def _unit(label: str, mode: ActionMode, vehicle: Vehicle) -> str:
@@ -142,7 +142,8 @@ def _unit(label: str, mode: ActionMode, vehicle: Vehicle) -> str:
 
 
 def _reward(task: Task) -> dict[str, Any]:
-    """Terms with their weights, and what is written of them all; of a task in torch, of its function."""
+    """Return the reward terms with their weights and the reward's docstring; for a task in torch, that of its
+    function."""
     reward: Any = getattr(task, "reward", None)
     weights = asdict(reward) if is_dataclass(reward) and not isinstance(reward, type) else {}
     text = inspect.getdoc(type(reward) if weights else reward) if weights or callable(reward) else ""
@@ -153,14 +154,15 @@ def _reward(task: Task) -> dict[str, Any]:
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:
-    """Return the settings, and what is drawn in every episode."""
+    """Return the settings, with the ranges that are drawn in every episode."""
     docs, values = attribute_docs(type(task)), task.record()
     names = (field.name for field in fields(task) if field.name not in SEPARATE)
     return [{"name": name, "value": _limited(values[name]), "told": docs.get(name, "")} for name in names]
 
 
 def _limited(value: Any) -> Any:
-    """None for a limit that is infinite, such as the level speed of a vehicle that never tips over: JSON has no inf."""
+    """Return None for an infinite limit, such as the level speed of a vehicle that never tips over: JSON has
+    no infinity."""
     if isinstance(value, dict):
         return {name: _limited(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -184,17 +186,19 @@ def tasks_show(task: str, *, vehicle: str = "finsrov", action: str | None = None
     Args:
         task (NAME|FILE.py:CLASS): Task, or your own as FILE.py:CLASS.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        action (MODE): wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; the
-            task's own if not given.
+        action (MODE): wrench6, wrench4, thruster8, pilot6, surfaces, course or course_pitch; default the
+            task's own.
 
     Raises:
-        EnvironmentSetupError, ControlError, VehicleError: As `describe_task`.
+        EnvironmentSetupError: There is no such task, or the vehicle cannot perform it.
+        ControlError: There is no such action mode.
+        VehicleError: There is no such vehicle.
     """
     return describe_task(task, vehicle, action)
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each of the tasks; or all of one."""
+    """Return a table with a row for each task, or tables that describe one task."""
     if "observation" not in result:
         rows = [
             [
@@ -205,7 +209,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         ]  # fmt: skip
         heads = ("task", "agents", "observed", "actions", "period [s]", "length [s]", "baseline")
         goals = [[name, task["title"]] for name, task in result.items()]
-        return [  # two tables, which fit into 80 columns
+        return [  # two tables, each at most 80 columns wide
             Table(title="", heads=("task", "goal"), rows=goals, left=(0, 1), whole=(0,)),
             Table(title="", heads=heads, rows=rows, left=(0, 6), whole=(0, 6)),
         ]
@@ -248,7 +252,7 @@ def _head(result: Mapping[str, Any]) -> list[str]:
         f"{result['time_limit_s']:g} s",
         "baselines": ", ".join(result["baselines"]) or "none",
         "noise in training": _value(result["training_noise"]) or "none",
-        **{f"seen with sensors, {name}": _value(sensor) for name, sensor in result["sensors"].items()},
+        **{f"measured with {name}": _value(sensor) for name, sensor in result["sensors"].items()},
     }
     return [f"{name}: {text}" for name, text in lines.items() if text]
 
