@@ -1,4 +1,4 @@
-"""Bench measurements: thrust curves, speed controllers and the response of motors."""
+"""Bench measurements: fits of thrust curves, speed controllers and motor responses."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The thrust curve, the dead zone and the law of the speed controller, fitted to tables."""
+"""Thrust curve, dead zone and speed controller law, fitted to tables."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["DeadZone", "EscFit", "DirectionCurve", "dead_zone", "fit_esc", "fit_
 Array = NDArray[np.float64]
 
 BLOCKS = 10
-"""Parts of equal weight that a table is cut into for intervals."""
+"""Number of parts of equal weight into which a table is divided for intervals."""
 PULSE_BLOCKS = 8
-"""Parts that the pulses of a direction are cut into for intervals."""
+"""Number of parts into which the pulses of one direction are divided for intervals."""
 OUTLIER = 6.0
-"""Scaled median deviations beyond which a row is left out, if it is also off by `COARSE` of the greatest force."""
+"""Scaled median deviations above which a row is excluded, if it also deviates by `COARSE` of the greatest force."""
 COARSE = 0.05
 LEAST_ROWS = 5
 """Turning rows per direction from which the law of a speed controller is fitted."""
@@ -31,14 +31,14 @@ LEAST_ROWS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class DirectionCurve:
-    """The thrust curve of one direction of rotation."""
+    """Thrust curve of one direction of rotation."""
 
     c: float
     """Coefficient of T = c ω² [N s²/rad²]."""
     half_width: float
     """Half-width of its 95 % interval [N s²/rad²]; infinite from a single row."""
     r2: float
-    """Share of the variance of the forces that the curve explains."""
+    """Fraction of the variance of the forces that the curve explains [-]."""
     rmse: float
     """Root mean square of the residual [N]."""
     samples: int
@@ -48,8 +48,9 @@ class DirectionCurve:
 def fit_side(tables: Sequence[tuple[Array, Array]]) -> DirectionCurve | None:
     """Fit |T| = c ω² (paper, eq. 16) to one direction of rotation by least squares.
 
-    The residuals of real tables are the curve's own misfit, alike in neighbouring rows, so the interval comes from the
-    disagreement of blocks of neighbouring speeds, of several tables, and from the rows that count as independent.
+    The residuals of real tables are mostly misfit of the curve and correlated between neighbouring rows, so
+    the interval is the widest of those from the scatter of blocks of neighbouring speeds, of tables, and of
+    the effective number of rows.
 
     Args:
         tables: Speed |ω| [rad/s] and thrust along this direction [N] of the turning rows, (n,) each, per table.
@@ -98,10 +99,10 @@ def fit_side(tables: Sequence[tuple[Array, Array]]) -> DirectionCurve | None:
 
 @dataclass(frozen=True, kw_only=True)
 class DeadZone:
-    """The slowest speed of one direction at which the shaft turns."""
+    """Slowest speed of one direction at which the shaft turns."""
 
     speed: float
-    """[rad/s], at least 0."""
+    """Speed, at least 0 [rad/s]."""
     interval: tuple[float, float]
     """95 % interval of the speed [rad/s]."""
     measured: bool
@@ -110,16 +111,16 @@ class DeadZone:
 
 
 def dead_zone(speed: Array) -> DeadZone | None:
-    """Find the gap between standstill and the slowest turning shaft.
+    """Determine the gap between standstill and the slowest turning shaft.
 
-    The gap counts only if the table goes down to standstill and the gap is more than three times the distance between
-    the speeds above it; otherwise the speeds in between were not tried.
+    The gap counts only if the table includes standstill and the gap is more than three times the spacing of
+    the speeds above it; otherwise the speeds in between were not tested.
 
     Args:
         speed: Speeds along one direction [rad/s], near 0 in rows at standstill, (n,).
 
     Returns:
-        The dead zone; None if nothing turns.
+        The dead zone; None if the shaft never turns.
     """
     fastest = float(np.max(speed, initial=0.0))
     turning = np.sort(speed[speed > STANDING * fastest])
@@ -139,17 +140,17 @@ def dead_zone(speed: Array) -> DeadZone | None:
 
 @dataclass(frozen=True, kw_only=True)
 class EscFit:
-    """A fitted speed controller."""
+    """Fitted speed controller."""
 
     esc: Esc
     intervals: dict[str, tuple[float, float]]
     """95 % interval of every fitted field of `esc`, in the unit of the field."""
     rmse: float
-    """Root mean square of the error of the speed [rad/s]."""
+    """Root mean square error of the speed [rad/s]."""
     fastest: float
     """Greatest speed among the rows [rad/s]."""
     unsure: dict[str, str]
-    """Field -> why the data do not determine it."""
+    """Field -> reason why the data do not determine it."""
 
 
 def fit_esc(
@@ -165,11 +166,11 @@ def fit_esc(
 
     Args:
         pulse: Pulse widths [µs], (n,).
-        speed: Steady shaft speed [rad/s], of the sign of pulse - neutral, 0 at standstill, (n,).
+        speed: Steady shaft speed [rad/s], with the sign of pulse - neutral, 0 at standstill, (n,).
         voltage: Voltage of the battery [V], (n,).
         pulse_range: Full reverse, neutral, full forward [µs].
         weight: Weights of the rows' speeds, (n,); 1 if None.
-        at: Voltage for which the dead band is given [V]; the mean if None.
+        at: Voltage to which the dead band refers [V]; the mean if None.
 
     Raises:
         CalibrationError: A direction has too few turning rows, or the shaft turns against the pulse.
@@ -235,7 +236,8 @@ def _check(omega: Array, name: str) -> None:
 def _edge(
     throw: Array, turning: NDArray[np.bool_], near: NDArray[np.bool_]
 ) -> tuple[float, tuple[float, float], str]:
-    """Return the pulse from neutral at which the shaft starts [µs], its interval, and why it is not known."""
+    """Return the pulse from neutral at which the shaft starts [µs], its interval, and the reason if it is not
+    known."""
     first = float(np.min(throw[turning & near]))
     standing = throw[~turning & near & (throw < first)]
     if standing.size == 0:

@@ -15,21 +15,21 @@ __all__ = ["LevelStep", "find_steps", "levels", "settled_rows"]
 Array = NDArray[np.float64]
 
 LAST = 0.4
-"""Share of a level, at its end, that counts as settled: the last 2 s of 5 s."""
+"""Final fraction of a level that counts as settled, such as the last 2 s of 5 s [-]."""
 SHORTEST = 0.5
-"""Shortest level that can settle [s]."""
+"""Least duration of a level that can settle [s]."""
 LEAST_COVERED = 0.5
-"""Share of the time that levels must cover for a log to be one of levels; a slower sweep is used row by row."""
+"""Least fraction of the time covered by levels; a log with less is a slow sweep and is used row by row [-]."""
 SHORTEST_HELD = 0.2
-"""Shortest level of a command between two steps [s]."""
+"""Least duration of a held command between two steps [s]."""
 SETTLING = 50
-"""Samples of a run after which its median is fixed, so that a slow ramp is not one run."""
+"""Number of samples after which a run's median is fixed, so that a slow ramp does not become one run."""
 TOLERANCE = 0.02
-"""Band around a level within which a measured signal counts as held, as a share of its range."""
+"""Band around a level within which a measured signal counts as held, relative to its range [-]."""
 
 
 class LevelStep(NamedTuple):
-    """A change of a held signal and the level that follows it."""
+    """Change of a held signal and the level that follows it."""
 
     start: float
     """Time of the last sample before the change [s]."""
@@ -42,9 +42,9 @@ class LevelStep(NamedTuple):
 def levels(x: Array, tolerance: float) -> list[tuple[int, int]]:
     """Return runs of samples within `tolerance` of their running median, as [first, last), which cover all samples.
 
-    A single stray sample does not end a run; two do.
+    A single outlier does not end a run; two do.
 
-    Both have the unit of the signal.
+    Signal and tolerance have the same unit.
     """
     runs, first = [], 0
     values = x.tolist()

@@ -1,6 +1,6 @@
 """Response of a vehicle's motors, fitted to step logs.
 
-First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity on which the vehicle file lets the lag act.
+First order plus dead time, K e^(-T_d s) / (τ s + 1), in the quantity to which the vehicle file applies the lag.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ Array = NDArray[np.float64]
 RPM = math.pi / 30.0
 
 UNIT = {"force": "N", "speed": "rad/s"}
-"""Domain of a thruster's lag -> unit of the response there."""
+"""Domain of a thruster's lag -> unit of the response."""
 
 OTHER = {"force": "speed", "speed": "force"}
 """Domain -> the other one."""
 
 BEFORE = 0.3
-"""Longest part of the level before a step that is fitted together with the step [s]."""
+"""Longest part of the level before a step that is included in its fit [s]."""
 
 FEWEST = 5
-"""Samples that a step needs after it."""
+"""Least number of samples after a step."""
 
 SETTLED = 0.4
-"""Share of a level, at its end, that counts as settled."""
+"""Final fraction of a level that counts as settled [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class StepRecord:
     y: Array
     """Response, thrust [N] or shaft speed [rad/s], (n,)."""
     sample: float
-    """Sampling period of the command [s], to which the time of its change is known."""
+    """Sampling period of the command, which limits the accuracy of the time of its change [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,19 +67,19 @@ class MotorLog:
     levels: list[tuple[float, float]]
     """Held commands, in the unit of the command, and the response at the end of each."""
     measured: str
-    """Column of the response."""
+    """Column of the measured response."""
     same_unit: bool
-    """True if command and response are the same quantity; pulses without the law of a speed controller are not."""
+    """True if command and response are the same quantity, unlike pulses without a speed controller law."""
     findings: tuple[Finding, ...]
 
 
 def log_of(trial: Trial, name: str, thruster: Thruster) -> MotorLog | None:
     """Return command and response of a thruster in the domain of its lag; None if the trial lacks one of them.
 
-    The command is the first of `rpm_command_NAME` [rpm], `command_NAME` [N] and `pwm_NAME` [µs] in the trial, or
-    `force_NAME` if the header says that inputs are commanded and speeds are measured. The response is `rpm_NAME`,
-    otherwise `force_NAME`. The thruster's curve converts between thrust and speed. A response without sign takes the
-    command's.
+    The command is the first of `rpm_command_NAME` [rpm], `command_NAME` [N] and `pwm_NAME` [µs] in the trial,
+    or `force_NAME` if the header states that inputs are commanded and speeds are measured. The response is
+    `rpm_NAME`, otherwise `force_NAME`. The thruster's curve converts between thrust and speed. An unsigned
+    response gets the sign of the command.
     """
     columns = _columns(trial, name)
     if columns is None:
@@ -97,7 +97,7 @@ def log_of(trial: Trial, name: str, thruster: Thruster) -> MotorLog | None:
     elif column.startswith("rpm_"):
         command = _converted(raw * RPM, "speed", thruster)
     else:
-        # In the speed, small steps of a force are as visible as large ones.
+        # Steps are detected in the speed, in which small steps of a force are as visible as large ones.
         command, held = _converted(raw, "force", thruster), thruster.speed(raw)
     t, raw = trial.series(measured)
     good = without_spikes(t, raw[:, None])
@@ -137,7 +137,7 @@ def cut_steps(
         t: Times of the response's samples [s], (n,).
         y: Response, thrust [N] or shaft speed [rad/s], (n,).
         command_times: Times of the command's samples [s], (m,).
-        steps: Of the command.
+        steps: Steps of the command.
     """
     records = []
     previous = float(t[0]) if t.size else 0.0
@@ -181,21 +181,21 @@ def _last_sign(command: Array) -> Array:
 
 
 GRID = 21
-"""Dead times, and time constants, of the coarse search."""
+"""Number of dead times, and of time constants, in the coarse search."""
 
 LONGEST_DELAY, DELAY_SHARE = 0.8, 0.45
-"""T_d <= min(0.8 s, 0.45 of the step's duration) (facts, §5)."""
+"""Bounds of the dead time: T_d <= min(0.8 s, 0.45 of the step's duration) (facts, §5)."""
 
 OVERSHOOT, NRMSE = 0.10, 0.10
-"""A step is accepted up to this overshoot and this error over its height (facts, §5)."""
+"""Greatest overshoot and normalized error of an accepted step (facts, §5)."""
 
 FEWEST_TRIALS = 4
-"""Trials from which intervals are over trials; with fewer they are over steps."""
+"""Least number of trials for intervals over trials; with fewer, intervals are over steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorResponse:
-    """The response that all steps have in common."""
+    """Response common to all steps."""
 
     delay: float
     """Dead time T_d [s]."""
@@ -208,11 +208,11 @@ class MotorResponse:
     sample: float
     """Median sampling period of the response [s]."""
     nrmse: Array
-    """Error of every step as a share of its height, (n,)."""
+    """Error of every step relative to its height [-], (n,)."""
     overshoot: Array
-    """Overshoot of every step beyond its final level as a share of its height, without noise, (n,)."""
+    """Overshoot of every step beyond its final level relative to its height, minus noise [-], (n,)."""
     moved: NDArray[np.bool_]
-    """True if the response follows a step at all, which it does not inside a dead zone, (n,)."""
+    """True if the response follows a step, which it does not inside a dead zone, (n,)."""
     accepted: NDArray[np.bool_]
     """True if a step follows first order plus dead time, (n,)."""
     used: NDArray[np.bool_]
@@ -225,7 +225,7 @@ class MotorResponse:
 
     @property
     def error(self) -> float:
-        """Return the median error of the steps used, as a share of their height."""
+        """Return the median error of the steps used, relative to their height [-]."""
         return float(np.median(self.nrmse[self.used]))
 
 
@@ -237,7 +237,7 @@ def fit_response(records: Sequence[StepRecord]) -> MotorResponse:
     T_d and τ gives the first guess.
 
     Args:
-        records: Steps, at least one of which the response follows.
+        records: Steps, of which the response follows at least one.
 
     Returns:
         Estimates with 95 % intervals over the steps, or over the trials if there are four or more; the interval of T_d
@@ -325,8 +325,8 @@ def _solved(
 
 
 def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
-    """Return the error of one step over its height, and its greatest overshoot of means of three samples minus twice
-    their noise."""
+    """Return the error of one step and its greatest overshoot, that of means of three samples minus twice
+    their noise, both relative to its height."""
     start, _, residual = _step_fit(record, x)
     settled = record.y[record.t >= 0.75 * record.t[-1]]
     height = float(np.mean(settled)) - start
@@ -340,15 +340,16 @@ def _figures(record: StepRecord, x: Array) -> tuple[float, float]:
 
 
 STANDING = 0.02
-"""Share of the greatest response below which a held level counts as standing."""
+"""Fraction of the greatest response below which a held level counts as standstill [-]."""
 
 NARROW_DEAD_ZONE = 2.0
-"""Greatest ratio of the smallest command that turns the shaft to the largest that does not, for a known dead zone."""
+"""Greatest ratio of the smallest command that turns the shaft to the largest that does not, for a determined
+dead zone."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """One thruster over all its trials."""
+    """Data and fit of one thruster over all its trials."""
 
     name: str
     thruster: Thruster
@@ -356,11 +357,11 @@ class Study:
     logs: tuple[MotorLog, ...]
     response: MotorResponse
     other_error: float
-    """Error of the same fit in the other domain, as a share of the steps' height; NaN if it could not be made."""
+    """Error of the same fit in the other domain, relative to the steps' height; NaN if it is not possible [-]."""
 
     @property
     def same_unit(self) -> bool:
-        """True if gains and dead zone compare equal quantities."""
+        """True if gains and dead zone compare the same quantity."""
         return all(log.same_unit for log in self.logs)
 
     @property
@@ -378,9 +379,9 @@ class Study:
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Steady response over command by least squares, and the half-width of its interval.
+        """Return the steady response divided by the command, by least squares, and the half-width of its interval.
 
-        Both are in the unit of the response over that of the command.
+        Both are in the unit of the response divided by that of the command.
         """
         _, moving = self.levels
         if not moving:
@@ -393,7 +394,7 @@ class Study:
 
 
 def study(name: str, trials: Sequence[Trial], thruster: Thruster) -> Study | None:
-    """Fit one thruster over all trials that hold it; return None if its command has no steps.
+    """Fit one thruster over all trials that contain it; return None if its command has no steps.
 
     Args:
         name: Name of the thruster.
@@ -426,7 +427,7 @@ def estimates_of(result: Study) -> list[Estimate]:
         late = f"delay {response.delay:.3g} s is below one sample of {response.sample:.3g} s"
     gain, half = result.gain
     unit = "-" if result.same_unit else f"{UNIT[domain]}/µs"
-    steady = f"steady {'thrust' if domain == 'force' else 'speed'} over what was asked"
+    steady = f"steady {'thrust' if domain == 'force' else 'speed'} over its command"
     lag, ends = f"{name}.time_constant", response.time_constant_interval
     certain = result.sure and not response.hidden
     estimates = [
@@ -445,7 +446,7 @@ def estimates_of(result: Study) -> list[Estimate]:
 
 
 def _dead_zones(result: Study) -> list[Estimate]:
-    """Return the slowest speed of each direction, between the last command at rest and the first that turns."""
+    """Return the slowest speed of each direction, between the last command without and the first with rotation."""
     (pairs, moving), thruster = result.levels, result.thruster
     estimates = []
     for side, sign in (("plus", 1.0), ("minus", -1.0)):
@@ -470,9 +471,9 @@ def _dead_zones(result: Study) -> list[Estimate]:
 
 
 def quality_of(result: Study) -> dict[str, float]:
-    """Return figures of the fit: overshoot and steady error of the steps, and their error over the height.
+    """Return figures of the fit: overshoot, steady error and normalized error of the steps.
 
-    Each is a share.
+    Each is a fraction.
     """
     response, (_, moving) = result.response, result.levels
     errors = [abs(y - u) / abs(u) for u, y in moving]
@@ -509,7 +510,7 @@ def findings_of(result: Study) -> list[Finding]:
 
 
 def curve_of(result: Study) -> Curve:
-    """Return the used steps, one after the other, with the common response at each step's own levels."""
+    """Return the used steps in sequence, with the common response at each step's own levels."""
     response, parts = result.response, []
     records = np.array([record for log in result.logs for record in log.records], dtype=object)
     x = np.array([response.delay, math.log(response.time_constant)])
@@ -533,7 +534,7 @@ def fit_motor(trials: Iterable[Trial], vehicle: Vehicle) -> Fit:
         Estimates `THRUSTER.time_constant`, `.delay`, `.gain`, `.dead_rpm_plus`, ...; `delay` of all.
 
     Raises:
-        CalibrationError: No trial holds a command that steps and its response.
+        CalibrationError: No trial contains steps of a command and its response.
     """
     trials = list(trials)
     studies, findings = [], list[Finding]()

@@ -1,4 +1,4 @@
-"""Least squares with 95 % intervals from the disagreement of groups of rows."""
+"""Least squares with 95 % intervals from the scatter of groups of rows."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Solution(NamedTuple):
     x: Array
     """Estimates in the units of the parameters, (P,)."""
     half: Array
-    """Half-widths of their 95 % intervals, in the units of the parameters, (P,); infinite where the rows do not
-    determine them."""
+    """Half-widths of their 95 % intervals, in the units of the parameters, (P,); infinite for parameters that
+    the rows do not determine."""
 
 
 def solve(
@@ -33,19 +33,18 @@ def solve(
     refit: bool = False,
     **options: Any,
 ) -> Solution:
-    """Minimise a sum of squares, and estimate intervals that hold for rows which are not independent.
+    """Minimise a sum of squares, and estimate intervals that are valid for correlated rows.
 
-    The interval of a parameter is the widest of those from the disagreement of each grouping's groups
+    The interval of a parameter is the widest of those from the scatter of each grouping's groups
     (`finssim.identification.uncertainty`).
 
     Args:
         residual: Residuals of all rows as a function of the parameters, (P,) -> (N,).
-        start: First guess in the units of the parameters, (P,).
+        start: Initial guess in the units of the parameters, (P,).
         groupings: Group of every row, (N,) each, such as blocks of neighbours, tables or trials.
         breaks: Rows at which a new series begins.
-        rows_too: Whether an interval is at least that from the scatter of the rows, of which neighbours that are alike
-            count as one.
-        refit: Whether the disagreement of the groups comes from fits without each of them (jackknife) in place of its
+        rows_too: True if an interval is at least that from the scatter of the rows, with their effective number.
+        refit: True to estimate the scatter of the groups from fits without each of them (jackknife) instead of its
             linearisation, as for a law with bounds.
         options: Further options of `scipy.optimize.least_squares`: bounds, x_scale, diff_step.
     """
@@ -67,7 +66,7 @@ def solve(
     if dof < 1:
         return Solution(x, np.full(len(x), np.inf))
     alike = correlated_samples(r, breaks)
-    rounding = 1e-26 * float(np.mean((J @ x) ** 2))  # an exact fit leaves no residual
+    rounding = 1e-26 * float(np.mean((J @ x) ** 2))  # an exact fit has no residual
     variance = float(r @ r) / dof * alike + rounding + 1e-300
     halves = []
     for labels in groupings:
@@ -87,15 +86,15 @@ def solve(
 
 
 def blocks(order: Array, count: int, weight: Array | None = None) -> NDArray[np.int64]:
-    """Return the block of each row when rows are sorted by a quantity and cut into parts of equal weight.
+    """Return the block of each row when rows are sorted by a quantity and divided into parts of equal weight.
 
     Args:
-        order: Quantity of any unit by which rows are neighbours, (N,).
-        count: Number of blocks; of fewer than twice as many rows each is a block.
+        order: Quantity of any unit by which rows are sorted, (N,).
+        count: Number of blocks; with fewer than twice as many rows, each row is a block.
         weight: Weight of each row, (N,); equal weights if None.
 
     Returns:
-        Numbers of blocks, (N,).
+        Block numbers, (N,).
     """
     n = len(order)
     if n < 2 * count:

@@ -1,4 +1,4 @@
-"""Tables of thrust, shaft speed and pulse width as benches and manufacturers write them."""
+"""Tables of thrust, shaft speed and pulse width, as written by test benches and manufacturers."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _UNITS = {
     }
     for quantity, known in _KNOWN.items()
 }
-"""Quantity -> unit, as `_plain` writes it -> rad/s, N, µs, V or s in one of it."""
+"""Quantity -> unit, as normalized by `_plain` -> factor to rad/s, N, µs, V or s."""
 _IMPLIED = {"rpm": ("speed", UNITS["rate"]["rpm"]), "pwm": ("pulse", 1.0)}
-"""Word -> quantity and factor, of words that imply their unit."""
+"""Word that implies its unit -> quantity and factor."""
 
 
 def _recognised(header: str) -> tuple[str, float] | None:
-    """Return the quantity that a header such as `Force (Kg f)`, `speed_rpm` or `omega rad/s` names, and its factor.
+    """Return the quantity named by a header such as `Force (Kg f)`, `speed_rpm` or `omega rad/s`, and its factor.
 
-    The factor is NaN if the header gives no unit.
+    The factor is NaN if the header has no unit.
     """
     text, unit = header.strip(), ""
     if brackets := re.fullmatch(r"(.*?)[\s_]*[(\[{](.*)[)\]}]", text):
@@ -102,7 +102,7 @@ def _columns(headers: Sequence[str], rows: Array, label: str) -> dict[str, tuple
 
 
 STANDING = 0.01
-"""Share of the greatest speed below which a shaft counts as standing."""
+"""Fraction of the greatest speed below which a shaft counts as at standstill [-]."""
 QUANTITIES = ("pulse", "speed", "force", "voltage")
 """Columns of a `ThrustTable`."""
 
@@ -122,9 +122,9 @@ class ThrustTable:
     voltage: Array
     """Voltage of the battery [V], (n,)."""
     sha256: str = ""
-    """Digest of the numbers."""
+    """SHA-256 of the numbers."""
     findings: tuple[Finding, ...] = ()
-    """Offsets, signs and rows that were changed or left out."""
+    """Findings on offsets, signs and rows that were changed or left out."""
 
     def at(self, rows: NDArray[np.bool_]) -> ThrustTable:
         """Return the table with some of its rows."""
@@ -134,16 +134,17 @@ class ThrustTable:
 def read_table(path: str | os.PathLike[str], *, neutral: float = 1500.0) -> ThrustTable:
     """Read a table of thrusts from a CSV file.
 
-    Separators are `,`, `;` or tabs, comment lines begin with `#`, and headers hold the units (rpm, rad/s, N, kgf, lbf,
-    g, ...), as in the files that Blue Robotics publishes. Speeds and forces without a sign take it from each other or
-    from the pulse. In a log over time, the last part of each level is used (see `settled_rows`).
+    Separators are `,`, `;` or tabs, comment lines begin with `#`, and headers contain the units (rpm, rad/s,
+    N, kgf, lbf, g, ...), as in the files that Blue Robotics publishes. Unsigned speeds and forces get their
+    sign from each other or from the pulse. In a log over time, the last part of each level is used (see
+    `settled_rows`).
 
     Args:
         path: The file.
         neutral: Pulse at which the motor is off [µs], for signs.
 
     Raises:
-        CalibrationError: The file is no table of thrusts, or it can be read in two ways.
+        CalibrationError: The file is not a table of thrusts, or it is ambiguous.
     """
     label, findings = os.fspath(path), list[Finding]()
     columns = _columns(*_cells(Path(path), label), label)

@@ -1,4 +1,4 @@
-"""Thrust curve, dead zone, limits and speed controller of a vehicle's thrusters, fitted to tables of a bench."""
+"""Thrust curve, dead zone, limits and speed controller of a vehicle's thrusters, fitted to bench tables."""
 
 from __future__ import annotations
 
@@ -33,33 +33,34 @@ def _around(value: float, half: float) -> tuple[float, float]:
 SIDES = (("plus", 1.0), ("minus", -1.0))
 """Name and sign of the two directions of rotation."""
 SAME_VOLTAGE = 0.75
-"""Voltages closer than this are one level [V], since a battery sags within a run."""
+"""Difference of voltages below which they are one level [V], since a battery sags within a run."""
 PULSE_RANGE = (1100.0, 1500.0, 1900.0)
-"""Reverse, neutral and forward of hobby speed controllers [µs], for vehicle files without a controller."""
+"""Reverse, neutral and forward of hobby speed controllers, for vehicle files without a controller [µs]."""
 TO_RPM = 30.0 / math.pi
 CHOSEN_LIMIT = 0.02
-"""A force limit this far below the curve at the speed limit was chosen rather than measured, and is kept."""
+"""Relative distance of a force limit below the curve at the speed limit from which it was chosen rather than
+measured, and is kept [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Results of the tables of one target."""
+    """Results for the tables of one target."""
 
     levels: dict[float, ThrustTable]
-    """All rows by voltage [V], rounded to 0.1 V; under NaN the rows of unknown voltage."""
+    """All rows by voltage [V], rounded to 0.1 V; rows of unknown voltage under NaN."""
     voltage: float
-    """Voltage at which the numbers hold [V]; NaN if it is not known."""
+    """Voltage to which the numbers refer [V]; NaN if unknown."""
     rows: ThrustTable
-    """Rows that were fitted; the others only check the prediction."""
+    """Rows that were fitted; the others only validate the prediction."""
     sides: dict[str, DirectionCurve]
     """Thrust curves of `plus` and `minus`."""
     dead: dict[str, DeadZone]
     fastest: dict[str, tuple[float, bool, float]]
-    """Greatest speed at the voltage [rad/s, > 0], whether the pulse was at its end there, and the distance to the next
+    """Greatest speed at the voltage [rad/s, > 0], whether the pulse was at its limit, and the distance to the next
     lower speed [rad/s]."""
     esc: EscFit | None
     speeds_measured: bool
-    """True if speeds were measured; otherwise they follow from the forces by the vehicle file's curve."""
+    """True if speeds were measured; otherwise they are computed from the forces with the vehicle file's curve."""
     before: Thruster
     """The thruster of the vehicle file."""
     findings: tuple[Finding, ...]
@@ -81,14 +82,14 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
     """Analyse tables of one thruster or of several equal ones.
 
     Args:
-        tables: At least one.
+        tables: Tables; at least one.
         thruster: The thruster of the vehicle file.
         label: Name of the target in messages.
-        voltage: Voltage at which the numbers shall hold [V]; if None, the only one of the tables, otherwise that of the
-            vehicle file's speed controller, otherwise the middle one.
+        voltage: Voltage to which the numbers shall refer [V]; if None, the only one of the tables, otherwise
+            that of the vehicle file's speed controller, otherwise the middle one.
 
     Raises:
-        CalibrationError: The tables hold no such voltage, or nothing to fit.
+        CalibrationError: The tables do not contain this voltage, or nothing that can be fitted.
     """
     findings: list[Finding] = []
     measured = any(np.isfinite(table.speed).any() for table in tables)
@@ -112,7 +113,7 @@ def bench(tables: Sequence[ThrustTable], thruster: Thruster, label: str, voltage
         if side is not None:
             sides[name] = side
         zones = [zone for table in at if (zone := dead_zone(sign * table.speed)) is not None]
-        if zones and measured:  # their median, over all of their intervals
+        if zones and measured:  # their median, with the union of their intervals
             zones = [zone for zone in zones if zone.measured] or zones
             ends = [end for zone in zones for end in zone.interval]
             middle = float(np.median([zone.speed for zone in zones]))
@@ -149,7 +150,7 @@ def _speed_controller(
     good = np.isfinite(rows.pulse) & np.isfinite(rows.speed) & (rows.pulse > 0.0)
     volts = np.where(np.isfinite(rows.voltage), rows.voltage, voltage)[good]
     speed = rows.speed[good]
-    # Speeds that follow from forces are the surer the faster: dω = dT / (2 c ω).
+    # Speeds computed from forces are the more accurate the faster: dω = dT / (2 c ω).
     weight = None if measured else np.abs(speed) / np.max(np.abs(speed))
     return fit_esc(rows.pulse[good], speed, volts, pulse_range=pulse_range, weight=weight, at=voltage)
 
@@ -160,12 +161,13 @@ def _times_the_file(
     voltage: float,
     pulse_range: tuple[float, float, float],
 ) -> float:
-    """Return the ratio of the forces to those of the file's thruster if they show another thruster, otherwise 0.
+    """Return the ratio of the forces to those of the file's thruster if it is clearly another thruster,
+    otherwise 0.
 
     Args:
-        fastest: Greatest speeds as in a `Bench`, from the forces by the file's curve.
+        fastest: Greatest speeds as in a `Bench`, computed from the forces with the file's curve.
         thruster: The thruster of the vehicle file.
-        voltage: Voltage of these rows [V]; NaN if it is not known.
+        voltage: Voltage of these rows [V]; NaN if unknown.
         pulse_range: Reverse, neutral and forward [µs].
     """
     ratios = [1.0]
@@ -181,7 +183,7 @@ def _times_the_file(
 
 
 def _turning(table: ThrustTable, sign: float) -> tuple[Array, Array]:
-    """Return speed and thrust along one direction of the rows in which the shaft turns that way."""
+    """Return speed and thrust along one direction of the rows in which the shaft turns in that direction."""
     speed = sign * table.speed
     rows = speed > STANDING * float(np.max(np.abs(table.speed)))
     return speed[rows], sign * table.force[rows]
@@ -223,7 +225,8 @@ def _pulse_range(thruster: Thruster, tables: Sequence[ThrustTable]) -> tuple[flo
 def _fastest(
     table: ThrustTable, sign: float, pulse_range: tuple[float, float, float]
 ) -> tuple[float, bool, float]:
-    """Return the greatest speed along a direction, whether the pulse was at its end, and the distance to the next."""
+    """Return the greatest speed along a direction, whether the pulse was at its limit, and the distance to
+    the next speed."""
     speeds = np.sort(np.maximum(sign * table.speed, 0.0))
     low, neutral, high = pulse_range
     end = (high - neutral) if sign > 0.0 else (neutral - low)
@@ -233,7 +236,7 @@ def _fastest(
 
 
 def _with_speeds(table: ThrustTable, thruster: Thruster) -> ThrustTable:
-    """Return the table with the speeds that the vehicle file's curve gives for the forces."""
+    """Return the table with speeds computed from the forces with the vehicle file's curve."""
     force = np.where(np.abs(table.force) <= STANDING * np.max(np.abs(table.force)), 0.0, table.force)
     return replace(table, speed=thruster.speed(force))
 
@@ -249,8 +252,8 @@ def find_targets(
 ) -> tuple[dict[str, tuple[tuple[str, ...], list[ThrustTable]]], list[Finding]]:
     """Return propeller group, thruster or `all` -> its thrusters and its tables; and findings.
 
-    A given group takes all tables. Otherwise a table belongs to the thruster or group whose name is a word of its
-    file's name (`H_LF.csv`, `run2-CCW.csv`), or to all thrusters.
+    If a group is given, it gets all tables. Otherwise a table belongs to the thruster or group whose name is
+    a word of its file's name (`H_LF.csv`, `run2-CCW.csv`), or to all thrusters.
 
     Raises:
         CalibrationError: A group is unknown, or only some of the tables name a thruster.
@@ -294,7 +297,7 @@ def find_targets(
 def quality_of(name: str, result: Bench) -> dict[str, dict[str, float]]:
     """Return figures of the fitted rows, and under `NAME at V V` those of every voltage if there are several.
 
-    `rmse` is in [N] or [rad/s], `nrmse` is the rmse over the greatest magnitude in the rows compared.
+    `rmse` is in [N] or [rad/s], `nrmse` is the rmse divided by the greatest magnitude in the rows compared.
     """
     rows, figures = result.rows, dict[str, float]()
     if result.speeds_measured:
@@ -373,8 +376,8 @@ def _r2(measured: Array, error: Array) -> float:
 def estimates_of(name: str, path: str, result: Bench) -> list[Estimate]:
     """Return the estimates of a target, named `TARGET.c_plus` and so on.
 
-    A speed limit changes if the table reached the end of the pulse or went beyond the vehicle file's limit. The force
-    limit is the curve at the speed limit, unless the vehicle file chose a lower one.
+    A speed limit changes if the table reached the pulse limit or exceeded the vehicle file's speed limit. The force
+    limit is the curve at the speed limit, unless the vehicle file has a lower one.
 
     Args:
         name: Name of the target.
@@ -467,7 +470,7 @@ def _of_law(result: Bench) -> Iterator[Row]:
 
 NOMINAL = "nominal: no shaft speed was measured, the vehicle file's curve gives it from the force"
 ANOTHER = 1.15
-"""Factor on the vehicle file's greatest speed beyond which speeds from forces show another thruster."""
+"""Ratio to the vehicle file's greatest speed above which speeds computed from forces indicate another thruster [-]."""
 
 WRITTEN = ("c_", "dead_rpm_", "rpm_", "force_")
 """Prefixes of the thruster's keys that estimates are written to."""
@@ -486,9 +489,9 @@ def fit_thruster(
         tables: CSV files (see `finssim.bench.tables.read_table`), or tables that were read from them.
         vehicle: Vehicle of the thrusters.
         group: Propeller group of all tables.
-        voltage: Voltage at which the numbers shall hold [V], and of tables without a voltage column the voltage they
-            were measured at; if None, the tables' only one, otherwise that of the vehicle file's speed controller,
-            otherwise the middle one. Tables of other voltages check the prediction.
+        voltage: Voltage to which the numbers shall refer [V], also that of tables without a voltage column;
+            if None, the tables' only one, otherwise that of the vehicle file's speed controller, otherwise
+            the middle one. Tables of other voltages validate the prediction.
 
     Returns:
         Estimates named `GROUP.c_plus`, `THRUSTER.c_plus` or `all.c_plus` and so on; changes for every thruster.
@@ -521,7 +524,7 @@ def fit_thruster(
         for estimate in estimates_of(target, path, result):
             estimates[estimate.name] = estimate
             key = estimate.name.rpartition(".")[2]
-            # A nominal speed limit has to rise, so that pulses give the forces that were measured.
+            # A nominal speed limit must increase if needed, so that pulses give the measured forces.
             old = abs(getattr(result.before, key)) if key.startswith("rpm_") else math.inf
             raised = not result.speeds_measured and abs(estimate.estimate) > old
             if key.startswith(WRITTEN) and (estimate.identifiable or raised):
@@ -546,7 +549,7 @@ def fit_thruster(
 
 
 def _distinct_names(read: Sequence[tuple[Any, ThrustTable]]) -> list[ThrustTable]:
-    """Return the tables; those of files with the same name are named with their folder, as in `H_LF/sweep`."""
+    """Return the tables; those of files with equal names are named with their folder, as in `H_LF/sweep`."""
     names = [table.name for _, table in read]
     return [
         replace(table, name=f"{Path(item).parent.name}/{table.name}")

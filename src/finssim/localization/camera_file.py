@@ -29,7 +29,7 @@ class Fields:
         """
         Args:
             values: The section.
-            Label of the file and section in messages.
+            label: Label of the file and section in messages.
         """
         self._values = dict(values)
         self._known: list[str] = []

@@ -162,7 +162,7 @@ def position_model(state: InertialState, lever: Array) -> Prediction:
 
     Args:
         state: The state.
-        Position of the point relative to the IMU, body frame [m], (3,).
+        lever: Position of the point relative to the IMU, body frame [m], (3,).
     """
     arm = (quat_to_matrix(state.q) @ lever[:, None])[..., 0]
     H = np.zeros((*arm.shape[:-1], 3, state.P.shape[-1]))
@@ -176,9 +176,9 @@ def depth_model(state: InertialState, lever: Array, up: Array, offset: float) ->
 
     Args:
         state: The state.
-        Position of the point relative to the IMU, body frame [m], (3,).
+        lever: Position of the point relative to the IMU, body frame [m], (3,).
         up: Unit normal of the surface, pool frame, (3,).
-        Offset of the height: up . p + offset [m].
+        offset: Offset of the height: up . p + offset [m].
     """
     point, H, *_ = position_model(state, lever)
     return Prediction(np.asarray(point @ up[:, None] + offset), np.asarray(up[None, :] @ H))
