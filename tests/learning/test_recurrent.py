@@ -96,10 +96,10 @@ def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
 
 def test_a_module_that_remembers_is_not_exported(tmp_path):
     """Torch's exporter knows nothing of memories."""
-    with pytest.raises(ExportError, match="a torch module that remembers cannot be written"):
+    with pytest.raises(ExportError, match="a torch module with memory cannot be written"):
         written(Counting(), tmp_path / "p", StationKeeping(), 6)
     size = StationKeeping().schema.size
-    with pytest.raises(ExportError, match="a torch module that remembers cannot be written"):
+    with pytest.raises(ExportError, match="a torch module with memory cannot be written"):
         written(torch.nn.LSTM(size, 6), tmp_path / "p", StationKeeping(), 6)
 
 

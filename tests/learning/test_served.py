@@ -35,7 +35,7 @@ def test_an_environment_is_taken_as_it_is():
 
 
 def test_several_agents_are_sent_to_the_libraries_that_take_them():
-    with pytest.raises(EnvironmentSetupError, match="task 'pair' has 2 agents, Gymnasium takes one: use"):
+    with pytest.raises(EnvironmentSetupError, match="task 'pair' has 2 agents, Gymnasium supports one: use"):
         Env(Pair())
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations on disk: Minari data sets in a folder of one's own, and the arrays that learners take from them."""
+"""Demonstrations on disk: Minari data sets in a user's folder, and their arrays for the learners."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from finssim.tasks import Environment, make
 DATASET_FILE = "metadata.json"
 """File that marks a data set of Minari."""
 STATE = "state"
-"""Key of the row of numbers in an observation with pictures."""
+"""Key of the numbers in an observation with pictures."""
 OURS = "finssim"
 """Key of the metadata for the demonstrations: task, vehicle, expert, seed, provenance."""
 
 
 class DatasetError(ValueError):
-    """A data set that is not there, or that does not fit."""
+    """A data set is missing, or does not fit."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Episode:
     """One episode of one agent: T actions, T + 1 observations."""
 
     observation: NDArray[np.float32]
-    """Observations, (T + 1, n); the last one was not acted on."""
+    """Observations, (T + 1, n); no action followed the last one."""
     action: NDArray[np.float32]
-    """(T, m), what the expert wanted, in [-1, 1]."""
+    """Actions of the expert before disturbance, (T, m), in [-1, 1]."""
     reward: NDArray[np.float32]
     """Rewards, (T,)."""
     terminated: bool
-    """Ended by the task; else by its time."""
+    """True if the task ended the episode; False if the time limit did."""
     metrics: Mapping[str, float]
     """Metrics of the task in their units, such as success."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
@@ -53,7 +53,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """All steps of a data set in a row."""
+    """All steps of a data set in one sequence."""
 
     observation: NDArray[np.float32]
     """Observations, (N, n)."""
@@ -71,16 +71,16 @@ class Demonstrations:
 
 
 def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, Any]) -> Path:
-    """Write a data set completely or not at all; an earlier one at that place is replaced.
+    """Write a data set completely or not at all; an existing data set there is replaced.
 
     Args:
-        out: Folder of the data set; `minari.MinariDataset(out)` reads it too.
+        out: Folder of the data set; `minari.MinariDataset(out)` can read it.
         episodes: At least one.
-        described: What is kept of task, vehicle, expert, seed and provenance; plain data.
+        described: Description of task, vehicle, expert, seed and provenance; plain data.
 
     Raises:
         DatasetError: There is no episode.
-        OutputError: The folder cannot be written, or has other files.
+        OutputError: The folder cannot be written, or contains other files.
     """
     if not episodes:
         raise DatasetError("no episode to write: none ended")
@@ -97,7 +97,7 @@ def save(out: str | Path, episodes: Sequence[Episode], described: Mapping[str, A
             observation_space=spaces.Dict({STATE: state, **pictures}) if pictures else state,
             action_space=spaces.Box(-1.0, 1.0, (m,), np.float32),
             data_format="arrow",
-            jpeg_encoding=False,  # which is lossy: a policy would learn from other pictures than it acts on
+            jpeg_encoding=False,  # lossy: a policy would learn from other pictures than it acts on
         )
         storage.update_metadata(
             {
@@ -137,7 +137,7 @@ def load(folder: str | Path) -> Demonstrations:
     """Read a data set.
 
     Raises:
-        DatasetError: There is none, or it was not made by FinsSim.
+        DatasetError: There is no data set, or FinsSim did not write it.
     """
     described, episodes = about(folder), list(read_episodes(folder))
     return Demonstrations(
@@ -154,7 +154,7 @@ def load(folder: str | Path) -> Demonstrations:
 
 
 def read_episodes(folder: str | Path) -> Iterator[Episode]:
-    """The episodes of a data set, one after another."""
+    """Yield the episodes of a data set, one after another."""
     import minari
 
     dataset = minari.MinariDataset(Path(folder))
@@ -176,7 +176,7 @@ def about(folder: str | Path) -> dict[str, Any]:
     steps.
 
     Raises:
-        DatasetError: There is none, or it was not made by FinsSim.
+        DatasetError: There is no data set, or FinsSim did not write it.
     """
     from minari.dataset.minari_storage import MinariStorage
 
@@ -191,10 +191,10 @@ def about(folder: str | Path) -> dict[str, Any]:
 
 
 def data_sets_in(folder: str | Path) -> list[Path]:
-    """The data sets at a place: itself, or those right under it.
+    """Return the data sets at a path: the folder itself, or its direct subfolders.
 
     Raises:
-        DatasetError: There is none.
+        DatasetError: There is no data set.
     """
     here = Path(folder)
     data_sets = (
@@ -208,11 +208,11 @@ def data_sets_in(folder: str | Path) -> list[Path]:
 
 
 def _word(name: str) -> str:
-    """Return a name as Minari takes it: letters, digits and dashes."""
+    """Return a name in Minari's alphabet: letters, digits and dashes."""
     return "".join(c if c.isalnum() else "-" for c in name).strip("-") or "expert"
 
 
-# `finssim collect`: episodes of an expert as a data set.
+# `finssim collect`: record episodes of an expert as a data set.
 
 
 WORLDS = 64
@@ -221,7 +221,7 @@ WORLDS = 64
 
 @dataclass(frozen=True, kw_only=True)
 class CollectSettings:
-    """Settings of demonstrations: the vehicle and its water, its actions, and what the expert observes."""
+    """Settings of demonstrations: the vehicle and its water, its actions, and the expert's observations."""
 
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
@@ -233,10 +233,11 @@ class CollectSettings:
     randomize: str | None = None
     """(FILE) Ranges of vehicle and water parameters, by name or file."""
     observe: str = "training"
-    """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes,
-    through a filter), a file of other fixes, estimator (about what localization is off by) or truth."""
+    """(FILE|NAME) Observation: training (the task's noise), sensors (the vehicle's own and position fixes, through a
+    filter), a file of other fixes, estimator (typical errors of localization) or truth."""
     disturb: float = 0.0
-    """Noise on the executed but not on the stored action, as a fraction of full action: shows recoveries."""
+    """Noise on the executed but not on the stored action, as a fraction of full action, so that the data contain
+    recoveries."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
 
@@ -250,22 +251,22 @@ def collect(
     settings: CollectSettings = CollectSettings(),
     show: Callable[[float], None] = lambda part: None,
 ) -> dict[str, Any]:
-    """Run an expert and write what it did.
+    """Run an expert and write its episodes as a data set.
 
     Args:
         expert: A policy directory, or a baseline of the task by name.
         task: Key of `TASKS`.
-        episodes: How many; of a task with several agents each one's is an episode of its own.
-        out: Folder of the data set; an earlier one there is replaced.
+        episodes: Number of episodes; with several agents, each agent's is a separate episode.
+        out: Folder of the data set; an existing data set there is replaced.
         settings: Vehicle, actions, observations, noise and seed.
-        show: Called with the part done.
+        show: Called with the completed fraction.
 
     Returns:
-        What the data set says of itself, with `episodes`, `steps`, and in `metrics` the means of the task's measures.
+        The description in the data set, with `episodes`, `steps`, and in `metrics` the means of the task's metrics.
 
     Raises:
-        DatasetError: A number does not fit.
-        EnvironmentSetupError, AgentError, PolicyError, VehicleError, OutputError: As they say.
+        DatasetError: A number is out of range.
+        EnvironmentSetupError, AgentError, PolicyError, VehicleError, OutputError: See these exceptions.
     """
     seed, disturb = settings.seed, settings.disturb
     if episodes < 1 or not 0.0 <= disturb < 1.0:
@@ -313,20 +314,21 @@ def record_episodes(
     seed: int = 0,
     show: Callable[[float], None] = lambda part: None,
 ) -> list[Episode]:
-    """Episodes of every agent; every world gives as many, one more or less, so that short ones are not favoured.
+    """Return episodes of every agent; every world contributes an equal number, give or take one, so that short episodes
+    are not overrepresented.
 
-    Those of a world in which a number stopped being finite are left out, and counted.
+    Episodes of a world in which a number stopped being finite are omitted, and counted.
 
     Args:
-        environment: Its episodes start over here.
-        expert: Who acts.
-        count: How many episodes.
-        disturb: Noise on what is done [part of full action].
-        seed: Of that noise.
-        show: Called with the part done.
+        environment: Environment; its episodes are restarted.
+        expert: Agent that acts.
+        count: Number of episodes.
+        disturb: Noise on executed actions [fraction of full action].
+        seed: Seed of that noise.
+        show: Called with the completed fraction.
 
     Raises:
-        DatasetError: Far more episodes are left out than kept.
+        DatasetError: Far more episodes are omitted than kept.
     """
     rng = np.random.default_rng(seed)
     worlds, agents = environment.worlds, environment.agents
@@ -379,7 +381,7 @@ def record_episodes(
 
 
 def _separated(observation: Any, rows: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.uint8]]]:
-    """Numbers (rows, n) and pictures by name of an observation, as copies."""
+    """Return numbers (rows, n) and pictures by name of an observation, as copies."""
     if not isinstance(observation, dict):
         return observation.reshape(rows, -1).copy(), {}
     pictures = {name: x.copy() for name, x in observation.items() if name != STATE}

@@ -1,4 +1,4 @@
-"""Statistics of episodes, kept on the device of the worlds: on a GPU no step waits for the host."""
+"""Statistics of episodes, stored on the device of the worlds, so that on a GPU no step waits for the host."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from finssim.tasks import Environment
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.environment import GREATEST_SEED
 
-# How episodes went, kept where the worlds are: on a GPU no step waits for the host.
+# Results of episodes, stored on the device of the worlds: on a GPU no step waits for the host.
 
 
 TOTALS = ("final_return", "final_length", "final_held", "final_totals", "final_earned")
-"""Measures of the episode that ended last in each world."""
+"""Metrics of the last finished episode in each world."""
 
 
 class EpisodeEnds:
-    """The last end of an episode in each world since the start, or since `clear`.
+    """The latest finished episode in each world since the start, or since `clear`.
 
     Attributes:
-        ended: Where there was one, bool, (worlds,), of the library of `arrays`.
+        ended: True where an episode ended, bool, (worlds,), of the library of `arrays`.
     """
 
     def __init__(self, environment: Environment, arrays: Arrays) -> None:
-        """Watch an environment's worlds."""
+        """Observe an environment's worlds."""
         self._environment, self._arrays = environment, arrays
         a = environment.arrays
         self._copy = TaskArrays()
@@ -49,7 +49,7 @@ class EpisodeEnds:
         return (self._terminated | self._truncated) != 0
 
     def look(self, worlds: Any) -> None:
-        """Keep how the episodes went that ended in the step just done, in the worlds `worlds`, bool, (worlds,)."""
+        """Store the results of the episodes that ended in the last step, in the worlds `worlds`, bool, (worlds,)."""
         if self._arrays.device is None and not worlds.any():
             return
         self.ended |= worlds
@@ -58,42 +58,42 @@ class EpisodeEnds:
             target[...] = self._arrays.xp.where(mask, source, target)
 
     def clear(self) -> None:
-        """Forget them."""
+        """Discard the stored results."""
         self.ended[...] = False
 
     def earned(self) -> dict[str, NDArray[np.float64]]:
-        """Return what each reward and each end added to the return, by world; see `Task.earned`."""
+        """Return the contribution of each reward and each end to the return, by world; see `Task.earned`."""
         return self._environment.task.earned(self._copy)
 
     def metrics(self) -> tuple[NDArray[np.bool_], dict[str, NDArray[np.float64]]]:
-        """Return where an episode ended, and the task's measures by world in their units, as NumPy: the one copy
-        through the host."""
+        """Return where an episode ended, and the task's metrics by world in their units, as NumPy: the only copy to
+        the host."""
         ended = self._arrays.numpy(self.ended)
         return ended, self._environment.task.metrics(self._copy)
 
 
-# How the episodes of a training go: means over those that ended last.
+# Progress of a training: means over the last episodes.
 
 
 SHORTEST_WINDOW = 100
-"""Episodes that a mean is taken over, at least; with more worlds, one of each."""
+"""Least number of episodes in a mean; with more worlds, one of each world."""
 
 
 class EpisodeTally:
-    """Watches an environment whose first episodes may be shortened; those are not counted.
+    """Statistics of an environment whose first episodes may be shortened; those are not counted.
 
-    Of several episodes of a world that end between two rows, the last one counts.
+    If several episodes of a world end between two rows, only the last one counts.
     """
 
     def __init__(
         self, environment: Environment, shortened: bool = True, arrays: Arrays | None = None
     ) -> None:
-        """Watch the worlds.
+        """Observe the worlds.
 
         Args:
-            environment: Theirs.
-            shortened: Whether their present episodes began before.
-            arrays: Library in which the ends are kept until a row is asked for; NumPy if None.
+            environment: Their environment.
+            shortened: True if their current episodes began earlier.
+            arrays: Library that stores the results until a row is requested; NumPy if None.
         """
         arrays = arrays or Arrays(0, None if environment.device.is_cpu else str(environment.device))
         self.environment = environment
@@ -104,7 +104,7 @@ class EpisodeTally:
         self._reward, self._looks = arrays.zeros(1), arrays.zeros(1)
 
     def look(self) -> None:
-        """Count the episodes that ended in the step just done, and its reward."""
+        """Count the episodes that ended in the last step, and its reward."""
         self._reward += self._rewards.mean()
         self._looks += 1.0
         done = self._ends.done()
@@ -112,7 +112,8 @@ class EpisodeTally:
         self._shortened &= ~done
 
     def row(self) -> dict[str, float]:
-        """Means over the last episodes, also of what each reward gave, and of the reward since the row before."""
+        """Return means over the last episodes, of each reward's contribution, and of the reward since the previous
+        row."""
         ended, measured = self._ends.metrics()
         if ended.any():
             success = measured.get("success", np.zeros(self.environment.worlds))
@@ -137,29 +138,29 @@ class EpisodeTally:
         self._looks[:] = 0.0
 
     def state(self) -> dict[str, Any]:
-        """Return the state that `load` takes."""
+        """Return the state that `load` restores."""
         return {
             "shortened": self._arrays.numpy(self._shortened),
             "episodes": np.array(self._episodes),
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from a state that was taken between two updates."""
+        """Continue from a state saved between two updates."""
         self._shortened[...] = self._arrays.bools(state["shortened"])
         self._episodes.clear()
         self._episodes.extend(tuple(row) for row in state["episodes"].tolist())
         self._start_row()
 
 
-# How well the mean policy does while it is being trained: on episodes that it never learns from, always the same.
+# Evaluation of the mean policy during training: on a fixed set of episodes that it never learns from.
 
 
 HELD_WORLDS = 32
-"""Episodes of an evaluation: a share of successes to some 9 %, for less time than two updates take."""
+"""Number of episodes in an evaluation: resolves the success rate to about 9 %, in less time than two updates."""
 
 
 def held_seed(seed: int) -> int:
-    """Seed of the held episodes, far from the training's own."""
+    """Return the seed of the evaluation episodes, far from the training's own."""
     return (seed + 1_000_003) % (GREATEST_SEED + 1)
 
 
@@ -167,19 +168,19 @@ class HeldEvaluation:
     """Evaluation of a network in the first episode of every world of a separate environment."""
 
     def __init__(self, environment: Environment, device: str = "cpu") -> None:
-        """Take an environment that resets itself, and torch's device."""
+        """Use an environment that resets itself, and a device of torch."""
         self.environment, self.device = environment, device
         task = environment.task
         self._limit = max(1, round(task.time_limit / task.control_step))
 
     def __call__(self, network: Any) -> dict[str, float]:
-        """Means over the episodes, of each measure over those that have it: a time that was never reached is none.
+        """Return the task's metrics averaged over the episodes, each over those in which it is defined.
 
         Args:
             network: A `Network` in the library of the device (NumPy on `cpu`), or a torch module; of one agent.
 
         Returns:
-            The task's metrics by `evaluation_` and their name, such as evaluation_return and evaluation_success.
+            The task's metrics under `evaluation_` and their name, such as evaluation_return and evaluation_success.
         """
         plain = isinstance(network, Network) and self.device == "cpu"
         arrays = Arrays(0, None if plain else self.device)

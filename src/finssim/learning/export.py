@@ -1,4 +1,4 @@
-"""A trained network as a policy directory that runs without the library that learnt it."""
+"""Export of a trained network as a policy directory that runs without the training library."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 
-# Networks written out as ONNX, operator by operator: layers, with what they remember in front of them or none.
+# Networks written as ONNX, operator by operator: layers, with or without memory in front of them.
 #
 # torch's own exporter traces and decomposes the network, which takes seconds for a handful of operators.
 
@@ -48,13 +48,13 @@ OPSET = 18
 """ONNX operator set of every exported network."""
 
 IR_VERSION = 10
-"""ONNX file version; the newest that the onnxruntime of 2024 reads."""
+"""ONNX file version; the newest that onnxruntime of 2024 can read."""
 
 
 def write_graph(network: Network, n: int, m: int) -> bytes:
-    """An ONNX file: `observation` (N, n) to `action` (N, m) in [-1, 1].
+    """Return an ONNX file that maps `observation` (N, n) to `action` (N, m) in [-1, 1].
 
-    Of a network that remembers, `memory` (N, k) goes in too, and `memory_after` comes out.
+    A network with memory has the additional input `memory` (N, k) and output `memory_after`.
     """
     network = network.as_type(np.float32)
     graph, x = _Graph(), "observation"
@@ -93,42 +93,42 @@ def write_graph(network: Network, n: int, m: int) -> bytes:
 
 
 class _Graph:
-    """Operators and weights, as they are added."""
+    """An ONNX graph under construction: its operators and weights."""
 
     def __init__(self) -> None:
         self._nodes: list[Any] = []
         self._weights: list[Any] = []
 
     def node(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
-        """Append an operator; the name of its output."""
+        """Append an operator, and return the name of its output."""
         output = output or f"{kind.lower()}_{len(self._nodes)}"
         self._nodes.append(helper.make_node(kind, inputs, [output], **attributes))
         return output
 
     def weight(self, values: Any) -> str:
-        """Append numbers; their name."""
+        """Append weights, and return their name."""
         name = f"weight_{len(self._weights)}"
         self._weights.append(numpy_helper.from_array(np.ascontiguousarray(values), name))
         return name
 
     def split(self, x: str, sizes: dict[str, int]) -> dict[str, str]:
-        """Columns of a row by name."""
+        """Split a row into named columns."""
         names = {name: f"{x}_{name}" for name in sizes}
         lengths = self.weight(np.array(list(sizes.values()), np.int64))
         self._nodes.append(helper.make_node("Split", [x, lengths], list(names.values()), axis=1))
         return names
 
     def linear(self, layer: Linear, x: str) -> str:
-        """y = x W + b."""
+        """Append y = x W + b."""
         bias = [] if layer.bias is None else [self.weight(layer.bias)]
         return self.node("Gemm", [x, self.weight(layer.weight), *bias])
 
     def scaled(self, x: str, mean: Any, scale: Any) -> str:
-        """(x - mean) scale."""
+        """Append (x - mean) scale."""
         return self.node("Mul", [self.node("Sub", [x, self.weight(mean)]), self.weight(scale)])
 
     def integrals(self, errors: Sequence[int], before: str, n: int) -> tuple[str, str]:
-        """The observation as the policy sees it and the integrals after, as of `with_integrals`."""
+        """Append `with_integrals`: the augmented observation, and the integrals after the step."""
         rate, steepness, low, high = (
             self.weight(np.full((), value, np.float32))
             for value in (INTEGRAL_RATE, -1.0 / INTEGRAL_REACH**2, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
@@ -141,7 +141,7 @@ class _Graph:
         return self.node("Add", ["observation", self.node("MatMul", [z, self.weight(selection)])]), z
 
     def cell(self, cell: Cell, x: str, before: str) -> str:
-        """One step of a GRU, as `Cell.step` has it."""
+        """Append one step of a GRU, as `Cell.step`."""
         from_x, from_h = (
             self.gates(self.linear(layer, row), "rzn")
             for layer, row in ((cell.from_x, x), (cell.from_h, before))
@@ -152,7 +152,7 @@ class _Graph:
         return self.node("Add", [n, change])
 
     def gates(self, x: str, names: str) -> dict[str, str]:
-        """Equal parts of a row, a letter each."""
+        """Split a row into equal parts, named by one letter each."""
         outputs = {name: f"{x}_{name}" for name in names}
         self._nodes.append(
             helper.make_node("Split", [x], list(outputs.values()), axis=1, num_outputs=len(names))
@@ -160,7 +160,7 @@ class _Graph:
         return outputs
 
     def modules(self, layers: Any, x: str) -> str:
-        """Torch's layers one after the other: instance norm, convolutions, linear layers, ELU and flattening."""
+        """Append torch layers in sequence: instance norm, convolutions, linear layers, ELU and flattening."""
         for layer in layers:
             weights = [self.weight(w.detach().cpu().numpy()) for w in layer.parameters()]
             if hasattr(layer, "kernel_size"):
@@ -178,7 +178,7 @@ class _Graph:
         return x
 
     def stack(self, layers: Sequence[Linear | Activation], x: str) -> None:
-        """Layers one after the other, and the limits of the action."""
+        """Append layers in sequence, and the limits of the action."""
         for layer in layers:
             if isinstance(layer, Linear):
                 x = self.linear(layer, x)
@@ -195,7 +195,7 @@ class _Graph:
         outputs: Sequence[tuple[str, int]],
         pictures: Mapping[str, Sequence[int]] | None = None,
     ) -> bytes:
-        """The graph as an ONNX file."""
+        """Return the graph as an ONNX file."""
         rows = [
             [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name, size in side]
             for side in (inputs, outputs)
@@ -212,7 +212,7 @@ class _Graph:
 
 
 def write_seeing(network: Any, n: int, m: int) -> bytes:
-    """The ONNX file of a `SeeingNetwork`: beside `observation` each picture, uint8 (N, *shape), by name."""
+    """Return the ONNX file of a `SeeingNetwork`: besides `observation` each picture, uint8 (N, *shape), by name."""
     graph = _Graph()
     scale = graph.weight(np.full((), 1.0 / 255.0, np.float32))
     mean, factor = (x.cpu().numpy() for x in (network.mean, network.scale))
@@ -231,7 +231,7 @@ EVALUATION_FILE = "evaluation.json"
 
 
 class ExportError(ValueError):
-    """A network cannot be written as a policy, or what was written does not compute the same."""
+    """A network cannot be written as a policy, or the written one computes something else."""
 
 
 def export_policy(
@@ -244,24 +244,23 @@ def export_policy(
     also: Callable[[Path], None] | None = None,
     tolerance: float = 1e-6,
 ) -> Path:
-    """Write a policy directory completely or not at all, after checking that onnxruntime computes what the network
-    does.
+    """Write a policy directory completely or not at all, after comparing onnxruntime with the network.
 
     Args:
         network: A `Network`, or a torch module that maps observations (N, n) float32 to the mean action (N, m); the
-            written one clips the action to [-1, 1]. Or what `onnx_bytes` made of one, which is not compared again.
-        directory: Folder to write. An earlier policy directory is replaced; any other folder with files is refused.
-        description: What it was trained with; `memory`, `files`, `provenance` and `created` are filled in.
+            written one clips the action to [-1, 1]. Or the result of `onnx_bytes`, which is not compared again.
+        directory: Folder to write. An existing policy directory is replaced; any other folder with files is refused.
+        description: Description of the training; `memory`, `files`, `provenance` and `created` are filled in.
         curves: Rows of `curves.csv`, with equal keys.
         evaluation: Content of `evaluation.json`.
-        also: Writes more files into the folder before it takes its place.
-        tolerance: Largest difference allowed between the network's actions and onnxruntime's, beyond rounding [1].
+        also: Function that writes more files into the folder before it replaces the old one.
+        tolerance: Largest allowed difference between the actions of network and onnxruntime, beyond rounding [1].
 
     Returns:
         The folder.
 
     Raises:
-        ExportError: The network's sizes do not fit the description, or the two disagree.
+        ExportError: The network's sizes do not fit the description, or the two results differ.
         OutputError: The folder cannot be written.
     """
     content = network if isinstance(network, bytes) else onnx_bytes(network, description)
@@ -294,11 +293,11 @@ def export_policy(
 
 
 def description_of(environment: Environment, **training: Any) -> PolicyDescription:
-    """Return the description of a policy directory for the environment that its policy was trained in.
+    """Return the description of a policy directory for the environment of its training.
 
     Args:
-        environment: Its task, vehicle, action mode and scale, model and ranges.
-        training: More of how it was trained, as plain data.
+        environment: Environment with task, vehicle, action mode and scale, model and ranges.
+        training: Further facts on the training, as plain data.
     """
     task, vehicle, ranges = environment.task, environment.nominal[0], environment.randomization
     wrench = MODES[environment.action_mode].wrench
@@ -323,20 +322,20 @@ def description_of(environment: Environment, **training: Any) -> PolicyDescripti
 
 
 def save_policy(model: Any, environment: Environment, directory: str | Path, **training: Any) -> Path:
-    """Write what another library has learnt, or a network of one's own, as a policy directory that runs everywhere.
+    """Write a network trained with another library, or any other network, as a policy directory.
 
     Args:
         model: Maps observations (N, n) to the mean action (N, m): a torch module, a `Network`, an algorithm of
             Stable-Baselines3 (PPO, A2C, SAC) or a runner of RSL-RL.
-        environment: In which it was trained; of an adapter its `environment`.
-        directory: Folder to write; an earlier policy directory is replaced.
-        training: More of how it was trained, as plain data: learner, steps, ...
+        environment: Environment of the training; for an adapter its `environment`.
+        directory: Folder to write; an existing policy directory is replaced.
+        training: Further facts on the training, as plain data: learner, steps, ...
 
     Returns:
         The folder.
 
     Raises:
-        ExportError: The model is of another kind, scales what it sees by itself, or does not fit the environment.
+        ExportError: The model is of another kind, scales its observations itself, or does not fit the environment.
         OutputError: The folder cannot be written.
 
     Example:
@@ -348,7 +347,7 @@ def save_policy(model: Any, environment: Environment, directory: str | Path, **t
 
 
 def _mean_of(model: Any, kind: str) -> nn.Module | Network:
-    """Observation to mean action, of what libraries call a model."""
+    """Return the map from observation to mean action of a library's model."""
     if isinstance(model, Network):
         return model
     from torch import nn
@@ -363,7 +362,7 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
         policy = model.policy
         if hasattr(policy, "lstm_actor"):
             raise ExportError(
-                f"{kind}: has an LSTM, which no policy directory holds: ppo has a GRU (--set memory=32)"
+                f"{kind}: has an LSTM, which a policy directory does not support: ppo has a GRU (--set memory=32)"
             )
         if hasattr(policy, "mlp_extractor"):
             return nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
@@ -381,10 +380,10 @@ def _mean_of(model: Any, kind: str) -> nn.Module | Network:
 
 
 def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> bytes:
-    """The ONNX file of a network that fits a description.
+    """Return the ONNX file of a network that fits a description.
 
     Raises:
-        ExportError: Its sizes do not fit, or it is of a kind that cannot be written.
+        ExportError: Its sizes do not fit, or its kind is not supported.
     """
     n, m = description.observation.size, description.action_size
     try:
@@ -396,7 +395,7 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
     except (
         RuntimeError,
         ValueError,
-    ) as error:  # torch's and NumPy's ways of saying that matrix sizes do not fit
+    ) as error:  # errors of torch and NumPy for matrix sizes that do not fit
         raise ExportError(f"the network does not take observations of {n} elements ({error})") from error
     k = int(getattr(network, "memory_size", 0))
     if shape != (2, m + k):
@@ -416,7 +415,7 @@ def onnx_bytes(network: nn.Module | Network, description: PolicyDescription) -> 
 
 
 def _trace(network: nn.Module, n: int) -> bytes:
-    """The graph of any other network, from torch's exporter (seconds)."""
+    """Return the graph of any other network from torch's exporter (takes seconds)."""
     import torch
     from torch import nn
 
@@ -435,17 +434,17 @@ def _trace(network: nn.Module, n: int) -> bytes:
         dynamic_shapes=({0: torch.export.Dim("N")},),
         verbose=False,
     )
-    assert program is not None  # it is None only where a file is given to write to
+    assert program is not None  # None only if a file name is given
     model = program.model_proto
     model.ir_version = IR_VERSION
     return bytes(model.SerializeToString())
 
 
 def _check_agreement(network: nn.Module | Network, policy: Policy, tolerance: float) -> None:
-    """Compares onnxruntime with the network to `tolerance` beyond what float32 rounds off in it.
+    """Compare onnxruntime with the network, to `tolerance` beyond its float32 rounding.
 
-    That rounding, seen between float32 and float64, is 1e-7 for a fresh network and above 1e-6 for a trained one with
-    large gains; a wrong graph is off by far more.
+    That rounding, the difference between float32 and float64, is 1e-7 for a fresh network and above 1e-6 for a trained
+    one with large gains; a wrong graph differs by far more.
     """
     rng = np.random.default_rng(0)
     observation = rng.normal(size=(512, policy.description.observation.size))
@@ -481,7 +480,8 @@ def _answer(
     pictures: Mapping[str, NDArray[np.uint8]],
     limited: bool = True,
 ) -> NDArray[Any]:
-    """Return the action, in [-1, 1] if `limited`, and the memory after, (N, m + k), computed with that type."""
+    """Return the action, in [-1, 1] if `limited`, and the memory after the step, (N, m + k), in the given
+    precision."""
     inputs = [None if x is None else np.asarray(x, dtype=kind) for x in (observation, memory)]
     if isinstance(network, Network):
         action, after = network.as_type(kind).step(*inputs)
@@ -494,7 +494,7 @@ def _answer(
             parts = answer_of(copy, *(None if x is None else torch.from_numpy(x) for x in inputs), tensors)
         if memory is not None or isinstance(parts[0], tuple):
             raise ExportError(
-                "a torch module that remembers cannot be written: ppo has a GRU (--set memory=32), and a "
+                "a torch module with memory cannot be written: ppo has a GRU (--set memory=32), and a "
                 "finssim.learning.network.Network may have one"
             )
         action, after = (None if x is None else x.numpy() for x in parts)

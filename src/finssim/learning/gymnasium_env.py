@@ -1,8 +1,8 @@
-"""The environment in Gymnasium's two forms: one world as an `Env`, a batch as a `VectorEnv`.
+"""The environment for Gymnasium: one world as an `Env`, a batch as a `VectorEnv`.
 
-Importing this module registers every task of one agent by its class: `gymnasium.make("finssim/StationKeeping-v0")`, and
-`make_vec` likewise. Gymnasium imports it by itself where the name says so:
-`gymnasium.make("finssim.learning.gymnasium_env:finssim/StationKeeping-v0")`.
+Importing this module registers every task of one agent under the name of its class:
+`gymnasium.make("finssim/StationKeeping-v0")`, and likewise for `make_vec`. Gymnasium imports the module itself if the
+name contains it: `gymnasium.make("finssim.learning.gymnasium_env:finssim/StationKeeping-v0")`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 
 
 def observation_space(environment: Environment) -> spaces.Box | spaces.Dict:
-    """Bounds of one world's observation: each part's clip, or none; of a task that sees, `state` and the pictures."""
+    """Return the bounds of one world's observation: each part's clip, or none; with pictures, `state` and the
+    pictures."""
     parts = environment.task.observation
     high = np.concatenate([np.full(part.size, np.inf if part.clip is None else part.clip) for part in parts])
     state = spaces.Box(-high.astype(np.float32), high.astype(np.float32), dtype=np.float32)
@@ -36,23 +37,23 @@ def observation_space(environment: Environment) -> spaces.Box | spaces.Dict:
 
 
 def action_space(environment: Environment) -> spaces.Box:
-    """One world's action: each component in [-1, 1]."""
+    """Return the space of one world's action: each component in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, shape=(environment.action_size,), dtype=np.float32)
 
 
 Observation = Any
-"""float32 (size,); of a task that sees a dictionary of that and uint8 pictures."""
+"""float32 (size,); for a task with pictures, a dictionary of these numbers and uint8 pictures."""
 
 
 class Env(gymnasium.Env[Any, Any]):
-    """One world. An episode that ended is simulated further, if stepped, until `reset`.
+    """One world. After its end, an episode can be stepped further until `reset`.
 
     A world in which a number stopped being finite reports its episode as terminated, with the last finite observation
-    and reward 0. On a CPU a new episode has begun there when `step` returns, and the rest of `info` is of that one; on
-    a GPU it may take up to 100 steps, each reported as terminated.
+    and reward 0. On a CPU a new episode has begun there when `step` returns, and the remaining `info` refers to it; on
+    a GPU this may take up to 100 steps, each reported as terminated.
 
-    `info` holds, in SI units, `position_error` (distance to the task's goal [m]), `held` (time within the success
-    tolerance without a break [s]) and, at the end, `episode` with return `r`, length `l` and the task's other metrics.
+    `info` contains, in SI units, `position_error` (distance to the task's goal [m]), `held` (uninterrupted time within
+    the success tolerance [s]) and, at the end, `episode` with return `r`, length `l` and the task's other metrics.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -61,11 +62,11 @@ class Env(gymnasium.Env[Any, Any]):
         """Set up one world.
 
         Args:
-            task: A task or its name; or an environment of one world made with auto_reset=False.
-            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+            task: A task or its name; or an environment of one world created with auto_reset=False.
+            options: Other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
 
         Raises:
-            EnvironmentSetupError: As `finssim.make`; or the task has several agents, or there are several worlds.
+            EnvironmentSetupError: As for `finssim.make`; or there are several agents or several worlds.
         """
         self.render_mode = options.pop("render_mode", None)
         self.environment = single_agent(served(task, options, auto_reset=False, pictures=True), "Gymnasium")
@@ -79,7 +80,8 @@ class Env(gymnasium.Env[Any, Any]):
         self._onlooker: Any = None
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the vehicle from behind, uint8 (360, 640, 3), with `render_mode="rgb_array"`; otherwise None."""
+        """Return a rendered view from behind the vehicle, uint8 (360, 640, 3), with `render_mode="rgb_array"`;
+        otherwise None."""
         if self.render_mode != "rgb_array":
             return None
         self._onlooker = self._onlooker or described_world("pool").onlooker(self.environment)
@@ -88,12 +90,12 @@ class Env(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; with a seed the random streams start over."""
+        """Start an episode; a seed restarts the random streams."""
         super().reset(seed=seed)
         return copied(self.environment.reset(seed=seed), 0), self._info()
 
     def step(self, action: Observation) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for one control step; action (size,), each in [-1, 1]."""
+        """Simulate one control step; action (size,), each in [-1, 1]."""
         step = self.environment.step(np.asarray(action, dtype=np.float32)[None])
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         info = self._info()
@@ -111,15 +113,15 @@ class Env(gymnasium.Env[Any, Any]):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any]]):
-    """A batch of worlds, with Gymnasium's two ways to begin the next episode.
+    """A batch of worlds, with Gymnasium's two modes of automatic reset.
 
     `AutoresetMode.SAME_STEP`, the default: the step that ends an episode begins the next one. `info` then has
     `final_obs` (an array of observations, None elsewhere) and `final_info` (`episode_return`, `episode_length` and the
-    task's other metrics, such as `held`: time within the success tolerance when it ended [s]), with their masks.
+    task's other metrics, such as `held`: time within the success tolerance at the end [s]), with their masks.
 
     `AutoresetMode.NEXT_STEP`, which Gymnasium's own wrappers expect: the step that ends an episode returns its last
-    observation, and these metrics in `info` itself; the next step begins an episode there, whatever the action, with
-    reward 0.
+    observation, and these metrics in `info` itself; the next step begins an episode there, with any action and reward
+    0.
     """
 
     def __init__(
@@ -133,13 +135,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         """Set up the worlds.
 
         Args:
-            num_envs: How many, Gymnasium's word for `worlds`; 1 if neither is given.
-            task: A task or its name; or an environment, made with auto_reset=False for NEXT_STEP.
-            autoreset_mode: When the next episode begins: SAME_STEP or NEXT_STEP, or Gymnasium's text for it.
-            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+            num_envs: Number of worlds, Gymnasium's name for `worlds`; 1 if neither is given.
+            task: A task or its name; or an environment, created with auto_reset=False for NEXT_STEP.
+            autoreset_mode: Mode of automatic reset: SAME_STEP or NEXT_STEP, or Gymnasium's text for it.
+            options: Other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
 
         Raises:
-            EnvironmentSetupError: As `finssim.make`; the task has several agents, or there is no such mode.
+            EnvironmentSetupError: As for `finssim.make`; or there are several agents, or the mode is unknown.
         """
         self.render_mode = options.pop("render_mode", None)
         modes = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
@@ -164,7 +166,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode in every world, or in those of `options["reset_mask"]`; one seed serves the batch."""
+        """Start an episode in every world, or in those of `options["reset_mask"]`; one seed applies to the batch."""
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
         self._ended &= False if mask is None else ~np.asarray(mask, bool)
@@ -173,7 +175,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
     def step(
         self, actions: Observation
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Act for one control step; actions (worlds, size), each in [-1, 1]."""
+        """Simulate one control step; actions (worlds, size), each in [-1, 1]."""
         before, step = self._ended, self.environment.step(actions)
         observation, reward = copied(step.observation), step.reward.copy()
         terminated, truncated = step.terminated & ~before, step.truncated & ~before
@@ -190,7 +192,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         return observation, reward, terminated, truncated, info
 
     def _metrics(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the measures of the episodes that have ended, with masks."""
+        """Return the metrics of the finished episodes, with masks."""
         totals: dict[str, Any] = {}
         for key, value in self.environment.task.metrics(self.environment.arrays).items():
             name = f"episode_{key}" if key in ("return", "length") else key
@@ -210,7 +212,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
 
 
 def _replace(observation: Observation, other: Observation, rows: NDArray[np.bool_]) -> None:
-    """Put rows of other observations in the place of these."""
+    """Replace rows of observations by those of others."""
     if not isinstance(observation, dict):
         observation, other = {"": observation}, {"": other}
     for name, array in observation.items():

@@ -1,7 +1,7 @@
-"""Networks with gradients written by hand, for NumPy and torch: linear layers with tanh, a GRU, and Adam.
+"""Networks with hand-written gradients, for NumPy and torch: linear layers with tanh, a GRU, and Adam.
 
-Every function is written once with what the two libraries share (`@`, `tanh`, `where`, `out=`), so that the same lines
-learn with NumPy on a processor, without torch, and with torch on a GPU, without a copy through the host. Rows are
+Every function is written once with the common subset of the two libraries (`@`, `tanh`, `where`, `out=`), so that the
+same code trains with NumPy on a CPU, without torch, and with torch on a GPU, without copies to the host. Rows are
 samples.
 """
 
@@ -25,7 +25,8 @@ Array = Any
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Matrix products on one thread: a second gains little on so small networks, and loses much on a busy machine."""
+    """Limit matrix products to one thread: a second gains little on such small networks, and loses much on a busy
+    machine."""
     from threadpoolctl import threadpool_limits
 
     if torch := sys.modules.get("torch"):
@@ -35,17 +36,17 @@ def single_thread() -> Iterator[None]:
 
 
 class Arrays:
-    """A library of arrays and a place for them: NumPy's, or torch's on one of its devices.
+    """A library of arrays and their device: NumPy, or torch on one of its devices.
 
     Attributes:
         xp: The library.
     """
 
     def __init__(self, seed: int, torch_device: str | None = None, group: Group | None = None) -> None:
-        """Take torch on a device such as `cuda`, or NumPy if that is None.
+        """Use torch on a device such as `cuda`, or NumPy if that is None.
 
         Args:
-            seed: Seed of everything random.
+            seed: Seed of all random numbers.
             torch_device: Device of torch.
             group: Processes that share a training, with torch; None: this process alone.
         """
@@ -53,9 +54,9 @@ class Arrays:
         self.device, self.group = torch_device, group
         self.processes = 1 if group is None else group.size
         self._rng: Any = np.random.Generator(np.random.SFC64(seed))
-        """Of first weights and orders of samples; of noise too with NumPy."""
+        """Stream of initial weights and sample orders; with NumPy also of noise."""
         self._pool: Any = None
-        """Memory of all recordings."""
+        """Memory pool of all recordings."""
         if torch_device is not None:
             import torch
 
@@ -64,7 +65,7 @@ class Arrays:
             self._noise.manual_seed(seed if group is None else group.seed(seed))
 
     def view(self, array: Any) -> Array:
-        """A Warp array in the same memory."""
+        """Return a view of a Warp array."""
         if self.device is None:
             return array.numpy()
         import warp as wp
@@ -72,68 +73,69 @@ class Arrays:
         return wp.to_torch(array, requires_grad=False)
 
     def empty(self, *shape: int) -> Array:
-        """Room for numbers."""
+        """Return an uninitialised array."""
         return (
             np.empty(shape, np.float32) if self.device is None else self.xp.empty(shape, device=self.device)
         )
 
     def zeros(self, *shape: int) -> Array:
-        """Zeros."""
+        """Return an array of zeros."""
         return (
             np.zeros(shape, np.float32) if self.device is None else self.xp.zeros(shape, device=self.device)
         )
 
     def array(self, values: Any) -> Array:
-        """A copy of NumPy's numbers."""
+        """Return a copy of numbers from NumPy."""
         if self.device is None:
             return np.array(values, np.float32)
         return self.xp.tensor(np.asarray(values, np.float32), device=self.device)
 
     def bools(self, values: Any) -> Array:
-        """A copy of NumPy's truths."""
+        """Return a copy of boolean values from NumPy."""
         return np.array(values, bool) if self.device is None else self.xp.tensor(values, device=self.device)
 
     def plain(self) -> Any:
-        """A context in which torch records no operations, and NumPy warns of none: who computes checks the results."""
+        """Return a context without gradient recording of torch and without warnings of NumPy: the caller checks the
+        results."""
         return np.errstate(all="ignore") if self.device is None else self.xp.no_grad()
 
     def numpy(self, array: Array) -> Any:
-        """A copy as NumPy."""
+        """Return a copy as a NumPy array."""
         return np.array(array) if self.device is None else array.detach().cpu().numpy().copy()
 
     def copy(self, array: Array) -> Array:
-        """A copy."""
+        """Return a copy."""
         return array.copy() if self.device is None else array.clone()
 
     def average(self, array: Array) -> Array:
-        """Return an array after replacing it by its mean over the processes of a training."""
+        """Replace an array by its mean over the processes of a training, and return it."""
         if self.group is not None:
             self.group.average(array)
         return array
 
     def noise(self, out: Array) -> Array:
-        """Fill with standard normal numbers."""
+        """Fill an array with standard normal numbers, and return it."""
         if self.device is None:
             return self._rng.standard_normal(out=out, dtype=np.float32)
         return out.normal_(generator=self._noise)
 
     def order(self, n: int) -> Array:
-        """The numbers below n in random order, as indices."""
+        """Return the integers below n in random order, as indices."""
         if self.device is None:
             return self._rng.permutation(n)
         return self.xp.randperm(n, generator=self._noise, device=self.device)
 
     def orthogonal(self, rows: int, columns: int, gain: float) -> Any:
-        """An orthogonal matrix (Saxe et al. 2014), as NumPy. `gain` is a factor."""
+        """Return an orthogonal matrix (Saxe et al. 2014), as NumPy. `gain` is a factor."""
         q, r = np.linalg.qr(self._rng.standard_normal((max(rows, columns), min(rows, columns))))
         q *= np.sign(np.diag(r))
         return (gain * (q if rows >= columns else q.T)).astype(np.float32)
 
     def recorded(self, function: Callable[..., None]) -> Callable[..., None]:
-        """Return a function that does the same; on a GPU it repeats a recording, see `CudaGraph`.
+        """Return an equivalent function; on a GPU it replays a recording, see `CudaGraph`.
 
         Args:
-            function: It takes arrays, and writes its results into arrays that stay where they are.
+            function: Function of arrays that writes its results into arrays at fixed addresses.
         """
         if self.device is None or self.group is not None or not self.device.startswith("cuda"):
             return function
@@ -141,41 +143,41 @@ class Arrays:
         return CudaGraph(function, self._pool)
 
     def state(self) -> dict[str, Any]:
-        """The random streams, for `load`."""
+        """Return the states of the random streams, for `load`."""
         saved: dict[str, Any] = {"numpy": self._rng.bit_generator.state}
         if self.device is not None:
             saved["torch"] = self._noise.get_state().cpu().numpy()
         return saved
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from `state`."""
+        """Restore the states that `state` returned."""
         self._rng.bit_generator.state = state["numpy"]
         if self.device is not None:
             self._noise.set_state(self.xp.from_numpy(np.asarray(state["torch"])))
 
 
 class CudaGraph:
-    """A function of torch tensors, repeated on a GPU as one CUDA graph for each shape of its arguments.
+    """A function of torch tensors, replayed on a GPU as one CUDA graph for each shape of its arguments.
 
-    Launching the kernels of a small network one by one takes longer than they run. A graph repeats the same kernels at
-    the same addresses with the same scalars: whatever changes between calls must be in the arguments, or in tensors
-    that are written in place. Nothing in it may wait for the host. The first calls run as written, in which torch's
-    libraries allocate what they need.
+    Launching the kernels of a small network one by one takes longer than their execution. A graph replays the same
+    kernels at the same addresses with the same scalars: everything that changes between calls must be in the arguments,
+    or in tensors that are written in place. The function must not wait for the host. The first calls run without a
+    recording, so that torch's libraries can allocate their memory.
     """
 
     FIRST_CALLS = 2
 
     def __init__(self, function: Callable[..., None], pool: Any) -> None:
-        """Take the function, whose results are what it writes in place, and torch's handle of memory for graphs.
+        """Store the function, which writes its results in place, and torch's handle of memory for graphs.
 
-        Recordings share the memory: none needs what it holds after a call.
+        Recordings share this memory: none needs its content after a call.
         """
         self._function, self._pool = function, pool
         self._calls: dict[Any, int] = {}
         self._graphs: dict[Any, tuple[Any, list[Array]]] = {}
 
     def __call__(self, *arguments: Array) -> None:
-        """Call the function, or repeat its recording with the values of these arguments."""
+        """Call the function, or replay its recording with the values of these arguments."""
         import torch
 
         shapes = tuple(argument.shape for argument in arguments)
@@ -200,7 +202,7 @@ class CudaGraph:
 
 
 class NetworkParameters:
-    """All numbers of some networks in one row, and their gradient in another: an optimiser needs no more."""
+    """All parameters of some networks in one row, and their gradient in another, for an optimiser."""
 
     def __init__(self, arrays: Arrays, *networks: Any) -> None:
         """Allocate the memory of the networks: `shapes()` of each gives the shapes, `bind` assigns the arrays."""
@@ -219,18 +221,18 @@ class NetworkParameters:
 
 
 class FreeRow:
-    """Numbers that depend on no input."""
+    """Parameters that do not depend on any input."""
 
     def __init__(self, size: int) -> None:
-        """Take how many."""
+        """Set the number of parameters."""
         self.size = size
 
     def shapes(self) -> list[tuple[int, ...]]:
-        """Return the shape of the numbers."""
+        """Return the shape of the parameters."""
         return [(self.size,)]
 
     def bind(self, weights: list[Array], gradients: list[Array]) -> None:
-        """Take memory for the numbers and for their gradient."""
+        """Set the memory of the parameters and of their gradient."""
         self.values, self.gradient = weights[0], gradients[0]
 
 
@@ -238,7 +240,7 @@ class TanhLayers:
     """Linear layers with tanh between them: tanh(... tanh(x W_1 + b_1) ...) W_n + b_n."""
 
     def __init__(self, arrays: Arrays, sizes: Sequence[int]) -> None:
-        """Take the numbers of inputs, hidden units and outputs, in order."""
+        """Set the numbers of inputs, hidden units and outputs, in order."""
         self.arrays, self.sizes = arrays, tuple(sizes)
         self.weights: list[Array] = []
         """W and b of each layer, one after the other."""
@@ -249,11 +251,11 @@ class TanhLayers:
         return [shape for a, b in zip(self.sizes, self.sizes[1:], strict=False) for shape in ((a, b), (b,))]
 
     def bind(self, weights: list[Array], gradients: list[Array]) -> None:
-        """Take memory for the weights and for their gradients."""
+        """Set the memory of the weights and of their gradients."""
         self.weights, self._gradients = weights, gradients
 
     def initialize(self, last_gain: float) -> None:
-        """Orthogonal weights of gain √2, `last_gain` in the last layer, and no bias."""
+        """Initialise orthogonal weights of gain √2, `last_gain` in the last layer, and zero biases."""
         last = len(self.sizes) - 2
         for i in range(last + 1):
             gain = last_gain if i == last else math.sqrt(2.0)
@@ -263,7 +265,8 @@ class TanhLayers:
             self.weights[2 * i + 1][:] = 0.0
 
     def __call__(self, x: Array) -> Array:
-        """The outputs, (N, outputs), for inputs (N, inputs): memory that the next call of as many rows takes."""
+        """Return the outputs, (N, outputs), for inputs (N, inputs); the next call with as many rows overwrites
+        them."""
         self._inputs = [x]
         last = len(self.sizes) - 2
         for i in range(last + 1):
@@ -277,7 +280,7 @@ class TanhLayers:
         return x
 
     def backward(self, dy: Array, inputs: bool = False) -> Array | None:
-        """Write the gradient of the weights, from that of the last call's outputs; that of its inputs if asked for."""
+        """Write the gradient of the weights, from that of the last outputs; return that of the inputs if requested."""
         xp = self.arrays.xp
         for i in reversed(range(len(self.sizes) - 1)):
             x = self._inputs[i]
@@ -302,7 +305,8 @@ class TanhLayers:
         return self.__dict__["one"]
 
     def _memory(self, kind: str, layer: int, rows: int) -> Array:
-        """Room for a layer's numbers, the same every time: a new array costs more than what is computed."""
+        """Return the memory of a layer's numbers, always the same: allocating a new array costs more than the
+        computation."""
         size = self.sizes[layer + 1] if kind == "y" else self.sizes[layer]
         key = (kind, layer, rows)
         if key not in self._room:
@@ -311,16 +315,16 @@ class TanhLayers:
 
 
 class Gru:
-    """A gated recurrent unit (Cho et al. 2014) as torch and ONNX have it, over a piece of time.
+    """A gated recurrent unit (Cho et al. 2014) with the equations of torch and ONNX, over a time series.
 
     r = σ(x W_xr + b_xr + h W_hr + b_hr), z likewise, n = tanh(x W_xn + b_xn + r (h W_hn + b_hn)), h' = (1 - z) n + z h
     """
 
     def __init__(self, arrays: Arrays, inputs: int, units: int) -> None:
-        """Take the number of inputs, and of units, whose outputs are also what it remembers."""
+        """Set the number of inputs, and of units, whose outputs are also the memory."""
         self.arrays, self.inputs, self.units = arrays, inputs, units
         self.weights: list[Array] = []
-        """W_x (inputs, 3 units), b_x, W_h (units, 3 units), b_h, with r, z and n side by side."""
+        """W_x (inputs, 3 units), b_x, W_h (units, 3 units), b_h, with r, z and n concatenated."""
 
     def shapes(self) -> list[tuple[int, ...]]:
         """Return the shapes of the weights."""
@@ -328,22 +332,22 @@ class Gru:
         return [(self.inputs, k), (k,), (self.units, k), (k,)]
 
     def bind(self, weights: list[Array], gradients: list[Array]) -> None:
-        """Take memory for the weights and for their gradients."""
+        """Set the memory of the weights and of their gradients."""
         self.weights, self._gradients = weights, gradients
 
     def initialize(self) -> None:
-        """Orthogonal weights gate by gate, and no bias."""
+        """Initialise orthogonal weights gate by gate, and zero biases."""
         for weight, rows in ((self.weights[0], self.inputs), (self.weights[2], self.units)):
             gates = [self.arrays.orthogonal(rows, self.units, 1.0) for _ in range(3)]
             weight[:] = self.arrays.array(np.concatenate(gates, axis=1))
 
     def __call__(self, x: Array, h: Array, keep: Array) -> Array:
-        """Outputs of a piece of time.
+        """Return the outputs of a time series.
 
         Args:
             x: Inputs, (time, rows, inputs).
-            h: What is remembered before it, (rows, units).
-            keep: 0 where an episode starts with these inputs, else 1, (time, rows).
+            h: Memory before the series, (rows, units).
+            keep: 0 where an episode starts with these inputs, otherwise 1, (time, rows).
 
         Returns:
             (time, rows, units).
@@ -365,7 +369,8 @@ class Gru:
         return out
 
     def backward(self, dy: Array) -> None:
-        """Write the gradient of the weights from that of the last call's outputs, (time, rows, units), through time."""
+        """Write the gradient of the weights by backpropagation through time from that of the outputs, (time, rows,
+        units)."""
         k, W_h = self.units, self.weights[2]
         d_x = self.arrays.empty(*dy.shape[:2], 3 * k)
         d_h = self.arrays.empty(*dy.shape[:2], 3 * k)
@@ -390,25 +395,25 @@ class Gru:
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015), after shortening gradients that are longer than `largest`."""
+    """Adam (Kingma and Ba 2015), with gradients clipped to the norm `largest`."""
 
     B1, B2, EPSILON = 0.9, 0.999, 1e-5
 
     def __init__(self, parameters: NetworkParameters, arrays: Arrays, largest: float) -> None:
-        """Take what to optimise."""
+        """Set the parameters to optimise."""
         self.parameters, self.arrays, self.xp, self.largest = parameters, arrays, arrays.xp, largest
         n = len(parameters.values)
         self.mean, self.square = arrays.zeros(n), arrays.zeros(n)
         self.count = 0
 
     def schedule(self, rate: float, steps: int) -> Array:
-        """Count coming steps of a learning rate [-]; return what `step` takes for each, (steps, 2)."""
+        """Count future steps of a learning rate [-]; return the coefficients of each for `step`, (steps, 2)."""
         counts = self.count + 1.0 + np.arange(steps)
         self.count += steps
         return self.arrays.array(np.stack([rate / (1.0 - self.B1**counts), 1.0 - self.B2**counts], axis=1))
 
     def step(self, scheduled: Array) -> None:
-        """One step down the gradient, with a row of `schedule`, (2,)."""
+        """Make one gradient step, with a row of `schedule`, (2,)."""
         g = self.arrays.average(self.parameters.gradient)
         norm = self.xp.sqrt((g * g).sum())
         g *= self.largest / self.xp.clip(norm, self.largest, None)

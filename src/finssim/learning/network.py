@@ -1,4 +1,4 @@
-"""A trained network as plain arrays: what is evaluated and exported, whichever library it was learnt with."""
+"""A trained network as plain arrays, for evaluation and export, independent of the training library."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = Any
 
 @dataclass(frozen=True)
 class Linear:
-    """y = x W + b."""
+    """A linear layer, y = x W + b."""
 
     weight: Array
     """(inputs, outputs)."""
@@ -25,29 +25,29 @@ class Linear:
 
 @dataclass(frozen=True)
 class Activation:
-    """An ONNX operator that acts on each number: Tanh, Relu, Elu or Identity."""
+    """An elementwise ONNX operator: Tanh, Relu, Elu or Identity."""
 
     kind: str
     alpha: float = 1.0
-    """Factor of Elu below zero; the others have none."""
+    """Factor of Elu below zero; unused by the others."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A GRU of torch's equations (gates r, z, n), one step at a time; its memory is what it put out."""
+    """A GRU with torch's equations (gates r, z, n), one step at a time; its memory is its previous output."""
 
     from_x: Linear
-    """Weights from its inputs to all gates, side by side."""
+    """Weights from the inputs to all gates, concatenated."""
     from_h: Linear
-    """Weights from its previous output to all gates."""
+    """Weights from the previous output to all gates."""
 
     @property
     def units(self) -> int:
-        """Numbers that it puts out."""
+        """Number of outputs."""
         return int(self.from_h.weight.shape[0])
 
     def step(self, x: Array, h: Array) -> Array:
-        """Outputs (N, k) after those before."""
+        """Return the outputs (N, k) after the previous ones."""
         xp, k = _library(x), self.units
         a, b = _linear(self.from_x, x), _linear(self.from_h, h)
         r, z = _sigmoid(xp, a[:, :k] + b[:, :k]), _sigmoid(xp, a[:, k : 2 * k] + b[:, k : 2 * k])
@@ -57,44 +57,44 @@ class Cell:
 
 @dataclass(frozen=True)
 class Network:
-    """Observation to mean action: scaling, what is remembered, layers.
+    """Map from observation to mean action: scaling, memory, layers.
 
-    What it remembers is one row of numbers, zeros at an episode's start: integrals of the errors that it observes; the
-    scaled observations of the last control steps, newest first; the last action, limited to [-1, 1]; and the memory of
-    its cell.
+    Its memory is one row of numbers, zeros at an episode's start: integrals of the observed errors; the scaled
+    observations of the last control steps, newest first; the last action, limited to [-1, 1]; and the memory of its
+    cell.
     """
 
     layers: tuple[Linear | Activation, ...]
     mean: Array | None = None
-    """Taken off each observation, (n,)."""
+    """Mean that is subtracted from each observation, (n,)."""
     scale: Array | None = None
     """Factor after the mean is subtracted, (n,)."""
     history: int = 0
-    """Earlier observations that it sees."""
+    """Number of previous observations in the input."""
     last_action: int = 0
-    """Numbers of the last action that it sees: all or none."""
+    """Numbers of the last action in the input: all or none."""
     observation_size: int = 0
-    """n; needed where there is a history."""
+    """n; required with a history."""
     cell: Cell | None = None
     errors: tuple[int, ...] = ()
     """Elements of the observation to which their integrals are added, see `with_integrals`."""
 
     @property
     def window_size(self) -> int:
-        """Numbers of the history and the last action together."""
+        """Numbers in the history and the last action together."""
         return self.history * self.observation_size + self.last_action
 
     @property
     def memory_size(self) -> int:
-        """Numbers that it hands on from a control step to the next."""
+        """Numbers that are passed from one control step to the next."""
         return len(self.errors) + self.window_size + (self.cell.units if self.cell else 0)
 
     def step(self, observation: Array, memory: Array | None) -> tuple[Array, Array | None]:
-        """Mean action (N, m), not limited, and the memory after.
+        """Return the mean action (N, m), not limited, and the memory after the step.
 
         Args:
             observation: (N, n).
-            memory: (N, `memory_size`); None where it remembers nothing.
+            memory: (N, `memory_size`); None without memory.
         """
         xp, i, k = _library(observation), len(self.errors), self.window_size
         x, after = observation, []
@@ -117,7 +117,7 @@ class Network:
         return y, (xp.concatenate(after, 1) if len(after) > 1 else after[0]) if after else None
 
     def as_type(self, kind: Any) -> Network:
-        """Return the network with all numbers as NumPy's of that type."""
+        """Return the network with all numbers as NumPy arrays of that type."""
 
         def cast(value: Any) -> Any:
             if isinstance(value, tuple):
@@ -132,14 +132,14 @@ class Network:
 
 
 def advance_history(xp: Any, window: Array, x: Array, action: Array | None, history: int) -> Array:
-    """The window of history and last action after a control step.
+    """Return the window of history and last action after a control step.
 
     Args:
         xp: NumPy or torch.
-        window: Before it, (N, history * n + m).
-        x: The scaled observation of the step, (N, n).
-        action: What was done, in [-1, 1], (N, m); None where it is not remembered.
-        history: Observations that are remembered.
+        window: Previous window, (N, history * n + m).
+        x: Scaled observation of the step, (N, n).
+        action: Action of the step, in [-1, 1], (N, m); None if it is not in the window.
+        history: Number of stored observations.
     """
     n = x.shape[1]
     past = [x, window[:, : (history - 1) * n]] if history else []
@@ -147,17 +147,17 @@ def advance_history(xp: Any, window: Array, x: Array, action: Array | None, hist
 
 
 INTEGRAL_LIMIT = 0.1
-"""An integral changes what is observed by this at most, as the task scales it."""
+"""Greatest change of an observed error by its integral, in the task's scaling."""
 INTEGRAL_REACH = 0.04
-"""Errors far beyond this are hardly collected: a way to go is no disturbance."""
+"""Scale of the errors that are integrated; much larger ones are not, because they are distances, not disturbances."""
 INTEGRAL_RATE = 0.015
-"""Share of the collected error in a control step: several seconds at ten a second, slow relative to the policy."""
+"""Fraction of the error that is added in a control step: several seconds at 10 Hz, slow relative to the policy."""
 
 
 def with_integrals(
     xp: Any, observation: Array, integral: Array, errors: Sequence[int]
 ) -> tuple[Array, Array]:
-    """An observation in which errors that last grow until the policy has done away with them.
+    """Return an observation in which persistent errors grow until the policy has removed them.
 
     For an error e and its integral z, in a control step:
 
@@ -165,12 +165,12 @@ def with_integrals(
 
     Args:
         xp: NumPy or torch.
-        observation: As the task defines it, (N, n).
+        observation: Observation as defined by the task, (N, n).
         integral: z before the step, (N, k).
-        errors: Which elements, k of them.
+        errors: Indices of the k elements.
 
     Returns:
-        The observation as the policy sees it, and z after the step.
+        The augmented observation, and z after the step.
     """
     index = list(errors)
     e = observation[:, index]
@@ -182,12 +182,12 @@ def with_integrals(
 
 
 def first_memory(network: Any, rows: int, device: str | None = None) -> Array | None:
-    """Return the memory of a network at the start of so many episodes, (rows, k); None if it has none.
+    """Return the initial memory of a network for a number of episodes, (rows, k); None if it has none.
 
     Args:
         network: A `Network` or a torch module.
-        rows: How many.
-        device: Torch's, for a torch tensor; NumPy if None.
+        rows: Number of episodes.
+        device: Device of a torch tensor; NumPy if None.
     """
     size = getattr(network, "memory_size", 0)
     if not size:
@@ -202,7 +202,8 @@ def first_memory(network: Any, rows: int, device: str | None = None) -> Array | 
 def answer_of(
     network: Any, observation: Array, memory: Array | None, pictures: Mapping[str, Array] | None = None
 ) -> tuple[Array, Array | None]:
-    """Action (N, m) and the memory after, of a `Network` or a torch module; one that sees takes pictures by name."""
+    """Return action (N, m) and memory after the step of a `Network` or a torch module, which may take pictures by
+    name."""
     if isinstance(network, Network):
         return network.step(observation, memory)
     if memory is None:

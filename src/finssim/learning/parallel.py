@@ -1,8 +1,8 @@
-"""One training in several processes, each with its share of the worlds, its own GPU or a thread of a processor.
+"""Training in several processes, each with some of the worlds, on its own GPU or thread of a CPU.
 
-Every process takes its part of each batch of PPO, and `torch.distributed` averages the gradients before each step of
-the optimiser, so that all have the same networks. The process of the caller is the first of the group: it evaluates and
-writes checkpoints, and ends the others.
+Every process computes its part of each batch of PPO, and `torch.distributed` averages the gradients before each step
+of the optimiser, so that all have the same networks. The caller's process is the first of the group: it evaluates and
+writes checkpoints, and terminates the others.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from finssim.core.system import prepare_worker
 from finssim.learning.layers import Array
 
 LOOPBACK = {"linux": "lo", "darwin": "lo0"}
-"""Platform -> network interface by which gloo connects the processes."""
+"""Platform -> network interface over which gloo connects the processes."""
 PATIENCE = timedelta(minutes=30)
-"""Time that a process waits for the others, of which the first evaluates and writes checkpoints."""
+"""Time for which a process waits for the others; the first one also evaluates and writes checkpoints."""
 
 
 class Group:
-    """Processes of one training."""
+    """Group of processes that share one training."""
 
     def __init__(self, rank: int, size: int, meeting: Path, device: str) -> None:
-        """Join the others; returns when all have joined.
+        """Join the group, and wait until all processes have joined.
 
         Args:
             rank: Number of this process, from 0.
             size: Number of processes.
-            meeting: File by which they find one another.
-            device: cpu (gloo connects them) or cuda (NCCL does).
+            meeting: File for the rendezvous of the processes.
+            device: cpu (connected by gloo) or cuda (by NCCL).
         """
         import torch
         from torch import distributed
@@ -55,7 +55,7 @@ class Group:
         )  # fmt: skip
 
     def average(self, array: Array) -> None:
-        """Replace an array by its mean over all processes; every process calls this in the same order."""
+        """Replace an array by its mean over all processes; every process must call this in the same order."""
         from torch import distributed
 
         distributed.all_reduce(array)
@@ -76,12 +76,12 @@ class Group:
 
 @contextmanager
 def leading(size: int, device: str, follow: Callable[..., None], *arguments: Any) -> Iterator[Group | None]:
-    """Start the other processes of a training, and end them with the block.
+    """Start the other processes of a training, and terminate them at the end of the block.
 
     Args:
-        size: Number of processes, this one included; with 1 there is no group.
+        size: Number of processes, including this one; with 1 there is no group.
         device: cpu or cuda.
-        follow: Function of a module, which each of the others calls with its `Group` and the arguments.
+        follow: Module-level function that each of the others calls with its `Group` and the arguments.
         arguments: Further arguments of `follow`.
 
     Yields:

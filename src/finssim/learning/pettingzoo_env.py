@@ -17,9 +17,9 @@ Observation = NDArray[np.float32]
 
 
 class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
-    """The task's agents by their names; a task of one agent is a world with one. Agents end together.
+    """The task's agents by their names; a task of one agent is a world with one. All agents end together.
 
-    With the end come the last observations and, in every agent's info, `episode`: the task's metrics.
+    At the end there are the last observations and, in every agent's info, `episode`: the task's metrics.
     """
 
     metadata = {"render_modes": [], "is_parallelizable": True}
@@ -28,8 +28,8 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         """Set up one world.
 
         Args:
-            task: A task or its name; or an environment of one world made with auto_reset=False.
-            options: The other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
+            task: A task or its name; or an environment of one world created with auto_reset=False.
+            options: Other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
         """
         self.render_mode = options.pop("render_mode", None)
         self.environment = environment = served(task, options, auto_reset=False)
@@ -40,7 +40,7 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         self.metadata = {**self.metadata, "name": f"finssim/{environment.task.name}"}
         self.possible_agents = list(environment.task.agents)
         self.agents: list[str] = []
-        # PettingZoo asks for the same object every time: it has the random stream of sampled actions.
+        # PettingZoo requires the same object every time, because it contains the random stream of sampled actions.
         self.observation_spaces = {name: observation_space(environment) for name in self.possible_agents}
         self.action_spaces = {name: action_space(environment) for name in self.possible_agents}
         space = observation_space(environment)
@@ -49,21 +49,21 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         )
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """Bounds of an agent's observation."""
+        """Return the bounds of an agent's observation."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
-        """An agent's action: each component in [-1, 1]."""
+        """Return the space of an agent's action: each component in [-1, 1]."""
         return self.action_spaces[agent]
 
     def state(self) -> Observation:
-        """The observations of all agents, one after the other, for critics that see everything."""
+        """Return the concatenated observations of all agents, for centralised critics."""
         return self.environment.arrays.observation.numpy()[0].copy()
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
-        """Start an episode; with a seed the random streams start over. There are no options."""
+        """Start an episode; a seed restarts the random streams. There are no options."""
         self.environment.reset(seed=seed)
         self.agents = list(self.possible_agents)
         return self._observations(self.environment.arrays.observation), {name: {} for name in self.agents}
@@ -77,7 +77,7 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Act for one control step; an action for every agent, each component in [-1, 1].
+        """Simulate one control step with an action for every agent, each component in [-1, 1].
 
         Raises:
             EnvironmentSetupError: An agent has no action, or the episode is over.
@@ -109,4 +109,4 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
         return dict(zip(self.possible_agents, rows, strict=True))
 
     def close(self) -> None:
-        """Nothing to release: the arrays go with the environment."""
+        """Do nothing: the arrays are released with the environment."""

@@ -1,4 +1,4 @@
-"""State of a training that continues to the same result: random streams, and arrays in a file."""
+"""State of a training for an exact continuation: random streams, and arrays in a file."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ARRAY, TENSOR, PAIRS = "__array__", "__tensor__", "__pairs__"
 
 
 class ResumeError(ValueError):
-    """A training that cannot continue from the existing files."""
+    """A training cannot continue from the existing files."""
 
 
 def random_state() -> dict[str, Any]:
-    """The global random streams of Python, NumPy, and torch where it was imported."""
+    """Return the states of the global random streams of Python, NumPy and, if imported, torch."""
     name, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002  SB3 draws from it
     version, state, extra = random.getstate()
     streams: dict[str, Any] = {
@@ -38,7 +38,7 @@ def random_state() -> dict[str, Any]:
 
 
 def set_random_state(state: dict[str, Any]) -> None:
-    """Set the streams to where `random_state` found them."""
+    """Restore the streams to the states that `random_state` returned."""
     version, numbers, extra = state["python"]
     random.setstate((version, tuple(numbers), extra))
     np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
@@ -62,10 +62,10 @@ def write_state(state: dict[str, Any], path: Path) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read what `write_state` wrote; no code in the file is run.
+    """Read a file of `write_state`; code in the file is never executed.
 
     Raises:
-        ResumeError: It is not whole, or no such file.
+        ResumeError: The file is missing or incomplete.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -77,7 +77,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def _packed(value: Any, arrays: list[Any]) -> Any:
-    """Return a value in JSON's types; arrays are appended to the list, and their index replaces them."""
+    """Return a value in JSON's types; arrays are appended to the list and replaced by their index."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return {ARRAY: len(arrays) - 1}

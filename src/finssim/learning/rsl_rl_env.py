@@ -15,14 +15,14 @@ from finssim.tasks import Environment, Task
 
 
 class RslRlVecEnv(VecEnv):
-    """Observation groups "policy", what the agent sees, and "critic": that, and with privileged=True what was drawn.
+    """RSL-RL environment with the observation groups "policy", the agent's observation, and "critic", which with
+    privileged=True also contains the randomised parameters.
 
-    Several agents of a world are as many rows, one after the other, which end together: RSL-RL trains one network for
-    all of them.
+    Several agents of a world are consecutive rows, which end together: RSL-RL trains one network for all of them.
 
-    Where an episode ends, the observation is the next one's first, `extras["time_outs"]` says where time ended it
-    (RSL-RL then adds the discounted value of the state before to the reward), `extras["final_observations"]` has the
-    last ones, and `extras["log"]` the mean of the task's metrics over the episodes that ended.
+    Where an episode ends, the observation is the first of the next one, `extras["time_outs"]` marks ends by the time
+    limit (RSL-RL then adds the discounted value of the previous state to the reward), `extras["final_observations"]`
+    has the last observations, and `extras["log"]` the mean of the task's metrics over the finished episodes.
     """
 
     def __init__(self, task: str | Task | Environment = "t1", **options: Any) -> None:
@@ -30,7 +30,7 @@ class RslRlVecEnv(VecEnv):
 
         Args:
             task: A task or its name; or an environment.
-            options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
+            options: Other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
         """
         self.environment = environment = served(task, options)
         self._tensors = Tensors(environment)
@@ -50,9 +50,9 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Return the number of control steps since the episode began, (num_envs,); assigned to, it ages them.
+        """Number of control steps since the episode began, (num_envs,); assigning to it changes the age of episodes.
 
-        A world has one age.
+        All agents of a world have the same age.
         """
         return self._by_row(self._steps.long())
 
@@ -61,16 +61,16 @@ class RslRlVecEnv(VecEnv):
         self._steps.copy_(steps.view(-1, self.environment.agents)[:, 0])
 
     def get_observations(self) -> TensorDict:
-        """Observations as they are now."""
+        """Return the current observations."""
         return self._groups(self._tensors.observation)
 
     def reset(self, seed: int | None = None) -> TensorDict:
-        """Start new episodes everywhere; with a seed the random streams start over."""
+        """Start new episodes in all worlds; a seed restarts the random streams."""
         self.environment.reset(seed=seed)
         return self.get_observations()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Act for one control step; actions (num_envs, num_actions), each in [-1, 1].
+        """Simulate one control step; actions (num_envs, num_actions), each in [-1, 1].
 
         Returns:
             Observations, rewards, dones and extras; new tensors, (num_envs, ...).

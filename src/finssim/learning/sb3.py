@@ -16,11 +16,11 @@ from finssim.tasks import Environment, Task
 
 
 class Sb3VecEnv(VecEnv):
-    """One SB3 environment per agent, stepped together: a world's agents are rows one after the other, and end together.
+    """One SB3 environment per agent, stepped together: agents of a world are consecutive rows, which end together.
 
     Where an episode ends, `info` has `terminal_observation`, `TimeLimit.truncated` (SB3 then adds the value of the
-    terminal observation to the reward) and `episode` (return, of a world's agents together, length, and the task's
-    metrics, such as `held`: time within the success tolerance, without a break, when it ended [s]).
+    terminal observation to the reward) and `episode` (mean return of a world's agents, length, and the task's metrics,
+    such as `held`: uninterrupted time within the success tolerance at the end [s]).
     """
 
     def __init__(self, task: str | Task | Environment = "t1", stagger: bool = False, **options: Any) -> None:
@@ -28,9 +28,9 @@ class Sb3VecEnv(VecEnv):
 
         Args:
             task: A task or its name; or an environment.
-            stagger: Let the first episodes start at random ages, so that from then on some end in every step: learning
-                from all stages of an episode at once is steadier. A shortened episode has no `episode` in its info.
-            options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, ...
+            stagger: True to start the first episodes at random ages, so that some end in every step: training on all
+                stages of an episode at once is more stable. A shortened episode has no `episode` in its info.
+            options: Other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, ...
         """
         self.environment = environment = served(task, options, pictures=True)
         rows = environment.worlds * environment.agents
@@ -40,10 +40,10 @@ class Sb3VecEnv(VecEnv):
         self._whole = np.ones(environment.worlds, dtype=np.bool_)
 
     def reset(self) -> Any:
-        """Start new episodes everywhere; with the seed given to `seed`, if any.
+        """Start new episodes in all worlds, with the seed given to `seed`, if any.
 
         Returns:
-            Observations, (rows, size); of a task that sees a dictionary of `state` and uint8 pictures.
+            Observations, (rows, size); for a task with pictures, a dictionary of `state` and uint8 pictures.
         """
         first = self._seeds[0]
         observation = copied(self._rows(self.environment.reset(seed=first)))
@@ -56,13 +56,13 @@ class Sb3VecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep the actions for `step_wait`, (rows, size)."""
+        """Store the actions for `step_wait`, (rows, size)."""
         self._actions = actions
 
     def step_wait(
         self,
     ) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Observations, rewards, ends and infos; new arrays, which SB3 keeps and changes."""
+        """Return observations, rewards, ends and infos; new arrays, which SB3 may store and modify."""
         assert self._actions is not None, "step_wait without step_async"
         agents = self.environment.agents
         joint = (
@@ -91,11 +91,11 @@ class Sb3VecEnv(VecEnv):
         )
 
     def _rows(self, observation: Any) -> Any:
-        """(worlds, size) or (worlds, agents, size) as rows; a view. Who sees is alone in its world."""
+        """Return (worlds, size) or (worlds, agents, size) as rows, a view. Tasks with pictures have one agent."""
         return observation if isinstance(observation, dict) else observation.reshape(self.num_envs, -1)
 
     def _episodes(self, ended: NDArray[np.intp]) -> dict[int, dict[str, float]]:
-        """World to what SB3 notes of an episode, where one ended that was not shortened."""
+        """Return world -> SB3's summary of a finished episode, for episodes that were not shortened."""
         short = {"return": "r", "length": "l"}
         metrics = self.environment.task.metrics(self.environment.arrays)
         columns = {short.get(key, key): value for key, value in metrics.items()}
@@ -108,26 +108,26 @@ class Sb3VecEnv(VecEnv):
         }
 
     def close(self) -> None:
-        """Nothing to release: the arrays go with the environment."""
+        """Do nothing: the arrays are released with the environment."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environment, once per asked row."""
+        """Return an attribute of the environment, once per requested row."""
         return [getattr(self.environment, attr_name, None)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refused: worlds share their settings."""
+        """Refuse the call: worlds share their settings."""
         raise ValueError(f"cannot set '{attr_name}' of single worlds: make a new Environment")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refused: worlds are no objects with methods."""
+        """Refuse the call: worlds are not objects with methods."""
         raise ValueError(f"worlds have no method '{method_name}': call the environment's own")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Never."""
+        """Return False for every row."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """None: there is nothing to see."""
+        """Return None for every row: there are no images."""
         return [None] * self.num_envs

@@ -1,4 +1,5 @@
-"""Common part of the adapters: they make an environment from the arguments of `finssim.make`, and age its episodes."""
+"""Common part of the adapters: creation of an environment from the arguments of `finssim.make`, and aging of its
+episodes."""
 
 from __future__ import annotations
 
@@ -16,17 +17,17 @@ def served(
     auto_reset: bool = True,
     pictures: bool = False,
 ) -> Environment:
-    """The environment that an adapter serves.
+    """Return the environment of an adapter.
 
     Args:
-        task: A task or its name; or an environment that is there already.
-        options: The other arguments of `finssim.make`; none beside an environment.
-        auto_reset: Whether the adapter needs episodes to start by themselves.
-        pictures: Whether it passes on observations that are dictionaries with pictures.
+        task: A task or its name; or an existing environment.
+        options: Other arguments of `finssim.make`; none with an existing environment.
+        auto_reset: True if the adapter needs episodes to restart automatically.
+        pictures: True if the adapter supports observations with pictures.
 
     Raises:
-        EnvironmentSetupError: As `finssim.make`; or an environment that comes with options or resets otherwise, or
-            that sees where the adapter passes no pictures on.
+        EnvironmentSetupError: As for `finssim.make`; or an environment is given with options or with another reset
+            mode, or has pictures that the adapter does not support.
     """
     seeing = task.task if isinstance(task, Environment) else task_named(task)
     if seeing.pictures and not pictures:
@@ -52,26 +53,26 @@ def served(
 
 
 def copied(observation: Any, rows: Any = ...) -> Any:
-    """A copy of some rows of observations, of all if not given: arrays, or a dictionary of them."""
+    """Return a copy of some rows of observations, of all by default: arrays, or a dictionary of arrays."""
     if isinstance(observation, dict):
         return {name: array[rows].copy() for name, array in observation.items()}
     return observation[rows].copy()
 
 
 def single_agent(environment: Environment, library: str) -> Environment:
-    """The environment, if it has one agent, which is all that the library's interface takes."""
+    """Return the environment if it has one agent; the library's interface supports no more."""
     if environment.agents > 1:
         raise EnvironmentSetupError(
-            f"task '{environment.task.name}' has {environment.agents} agents, {library} takes one: "
+            f"task '{environment.task.name}' has {environment.agents} agents, {library} supports one: "
             "use the adapter of PettingZoo, TorchRL, RSL-RL or Stable-Baselines3"
         )
     return environment
 
 
 def age_episodes(environment: Environment) -> None:
-    """Let the episodes that run be of random age, so that from then on some end in every step.
+    """Set the running episodes to random ages, so that some end in every step.
 
-    Learning from all stages of an episode at once is steadier. The ages are drawn from the environment's seed.
+    Training on all stages of an episode at once is more stable. The ages are drawn from the environment's seed.
     """
     task, rng = environment.task, np.random.default_rng(environment.seed)
     limit = max(1, round(task.time_limit / task.control_step))

@@ -9,7 +9,7 @@ from finssim.tasks import Environment, EnvironmentSetupError
 
 
 class Tensors:
-    """Views that the environment writes in every step; copy those that are kept over a step.
+    """Views that the environment overwrites in every step; copy them to keep their values.
 
     Attributes:
         observation: (worlds, agents, size); the first of the new episode where one ended.
@@ -18,7 +18,7 @@ class Tensors:
     """
 
     def __init__(self, environment: Environment) -> None:
-        """Look at an environment's arrays."""
+        """Create views of an environment's arrays."""
         self.environment = environment
         self.device = torch.device(wp.device_to_torch(environment.device))
         a, rows = environment.arrays, (environment.worlds, environment.agents, -1)
@@ -29,11 +29,10 @@ class Tensors:
         self._terminated, self._truncated = wp.to_torch(a.terminated), wp.to_torch(a.truncated)
 
     def step(self, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Act for one control step.
+        """Simulate one control step.
 
         Args:
-            action: (worlds, agents, size), or anything of as many numbers in that order, each in [-1, 1]; beyond is
-                limited.
+            action: (worlds, agents, size), or any shape with as many numbers in that order, each clipped to [-1, 1].
 
         Returns:
             Flags terminated and truncated [bool], (worlds,); new tensors.
@@ -47,7 +46,7 @@ class Tensors:
             raise EnvironmentSetupError(
                 f"action has shape {tuple(action.shape)}, expected {e.worlds * e.agents} rows of {e.action_size}"
             )
-        # A sum is finite where every summand is, and takes a tenth of the time of looking at each.
+        # A sum is finite if every summand is, and takes a tenth of the time of checking each one.
         if not torch.isfinite(flat.sum()):
             raise EnvironmentSetupError("action has a number that is not finite: the network has diverged")
         self._action.view(-1).copy_(flat)

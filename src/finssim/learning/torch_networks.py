@@ -1,4 +1,4 @@
-"""Torch's networks: as learners begin with them, one that sees, and any as a plain `Network`."""
+"""Torch networks: initial ones for learners, one for pictures, and conversion to a plain `Network`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import nn
 from finssim.learning.network import Activation, Linear, Network
 
 ACTIVATIONS = {nn.Tanh: "Tanh", nn.ReLU: "Relu", nn.ELU: "Elu", nn.Identity: "Identity"}
-"""Activations with one ONNX operator of the same meaning."""
+"""Activations with an equivalent ONNX operator."""
 
 
 class SeeingNetwork(nn.Module):
-    """A convolutional encoder for each picture, and layers on what they give beside the row: to the mean action.
+    """A convolutional encoder for each picture, and layers from their outputs and the numbers to the mean action.
 
-    The row is scaled first: less `mean`, times `scale`, 0 and 1 until a learner sets them.
+    The numbers are scaled first: minus `mean`, times `scale`, 0 and 1 until a learner sets them.
     """
 
     mean: torch.Tensor
@@ -33,15 +33,15 @@ class SeeingNetwork(nn.Module):
         features: int = 96,
         hidden: Sequence[int] = (128, 64),
     ) -> None:
-        """Draw the first weights.
+        """Draw the initial weights.
 
         Args:
-            inputs: Numbers in the row.
-            shapes: Of the pictures by name: height, width, channels.
-            outputs: Numbers in the action.
-            channels: Of the convolutions, 3x3 with stride 2 and ELU.
-            features: Numbers that an encoder gives.
-            hidden: Units of the layers behind them.
+            inputs: Size of the observation's numbers.
+            shapes: Shapes of the pictures by name: height, width, channels.
+            outputs: Size of the action.
+            channels: Channels of the convolutions, 3x3 with stride 2 and ELU.
+            features: Size of an encoder's output.
+            hidden: Units of the layers behind the encoders.
         """
         super().__init__()
         self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
@@ -49,7 +49,9 @@ class SeeingNetwork(nn.Module):
         self.register_buffer("scale", torch.ones(inputs))
         self.encoders = nn.ModuleDict()
         for name, (rows, columns, depth) in self.shapes.items():
-            layers: list[nn.Module] = [nn.InstanceNorm2d(depth)]  # effect of water on a complete picture
+            layers: list[nn.Module] = [
+                nn.InstanceNorm2d(depth)
+            ]  # removes the overall effect of the water on a picture
             for a, b in zip([depth, *channels], channels, strict=False):
                 layers += [nn.Conv2d(a, b, 3, stride=2, padding=1), nn.ELU()]
                 rows, columns = (rows + 1) // 2, (columns + 1) // 2
@@ -58,23 +60,24 @@ class SeeingNetwork(nn.Module):
         self.layers = stack(inputs + len(self.shapes) * features, hidden, outputs, 0.01)
 
     def encode(self, pictures: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Features of pictures, 0 to 255, (N, height, width, channels), side by side in the order of `shapes`."""
+        """Return the features of pictures, 0 to 255, (N, height, width, channels), concatenated in the order of
+        `shapes`."""
         kind = self.layers[0].weight.dtype
         scaled = {name: pictures[name].to(kind) / 255.0 for name in self.shapes}
         return torch.cat([self.encoders[name](x.permute(0, 3, 1, 2)) for name, x in scaled.items()], dim=1)
 
     def act(self, observation: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """Action (N, m) for rows (N, n) and the features of their pictures."""
+        """Return the action (N, m) for rows (N, n) and the features of their pictures."""
         answer: torch.Tensor = self.layers(torch.cat([(observation - self.mean) * self.scale, features], 1))
         return answer
 
     def forward(self, observation: torch.Tensor, **pictures: torch.Tensor) -> torch.Tensor:
-        """Action (N, m) for rows (N, n) and pictures."""
+        """Return the action (N, m) for rows (N, n) and pictures."""
         return self.act(observation, self.encode(pictures))
 
 
 def plain_network(network: nn.Module) -> Network | None:
-    """The network as plain arrays; None unless it is linear layers and these activations."""
+    """Return the network as plain arrays; None unless it consists of linear layers and these activations."""
     layers: list[Linear | Activation] = []
     for layer in _layers(network):
         if isinstance(layer, nn.Linear):
@@ -88,7 +91,7 @@ def plain_network(network: nn.Module) -> Network | None:
 
 
 def _layers(module: nn.Module) -> Iterable[nn.Module]:
-    """The layers of nested `nn.Sequential`s, in order."""
+    """Yield the layers of nested `nn.Sequential`s, in order."""
     if isinstance(module, nn.Sequential):
         for child in module:
             yield from _layers(child)
@@ -97,9 +100,10 @@ def _layers(module: nn.Module) -> Iterable[nn.Module]:
 
 
 def stack(inputs: int, hidden: Sequence[int], outputs: int, last_gain: float) -> nn.Sequential:
-    """Linear layers with ELU between them: orthogonal weights of gain √2, `last_gain` in the last, and no bias.
+    """Return linear layers with ELU between them: orthogonal weights of gain √2, `last_gain` in the last, and zero
+    biases.
 
-    A small last gain lets a policy begin at action 0 whatever it sees.
+    With a small last gain a policy begins at action 0 for any observation.
     """
     layers: list[nn.Module] = []
     sizes = [inputs, *hidden, outputs]

@@ -17,14 +17,14 @@ from finssim.tasks.environment import GREATEST_SEED
 
 
 class TorchRlEnv(EnvBase):
-    """Batch size (worlds,). Keys: observation, action, reward, done, terminated, truncated.
+    """TorchRL environment of batch size (worlds,). Keys: observation, action, reward, done, terminated, truncated.
 
     Several agents have them in groups, ("agents", "observation") and so on with batch size (worlds, agents), as
     TorchRL's multi-agent losses expect; done, terminated and truncated stay at the root: a world ends for all agents.
 
     ("next", "observation") is the last observation of the old episode where one ended, so TorchRL's value estimators
-    bootstrap from it where time ended the episode, and from nothing where the task did. The world has begun its next
-    episode by then, so that `maybe_reset` costs no step of the simulator.
+    bootstrap from it after a time limit, and do not bootstrap after an end by the task. The world has already begun its
+    next episode, so `maybe_reset` costs no step of the simulator.
     """
 
     def __init__(
@@ -39,12 +39,12 @@ class TorchRlEnv(EnvBase):
 
         Args:
             task: A task or its name; or an environment.
-            groups: Of several agents: group to names, each agent in one group. All in "agents" if None.
-            stagger: Let episodes be of random age after each reset of all worlds.
-            options: The other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
+            groups: Groups of several agents: group -> names, each agent in one group. All in "agents" if None.
+            stagger: True to set episodes to random ages after each reset of all worlds.
+            options: Other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
 
         Raises:
-            EnvironmentSetupError: As `finssim.make`, or groups that do not have every agent once.
+            EnvironmentSetupError: As for `finssim.make`; or groups do not contain every agent exactly once.
         """
         environment = served(task, options)
         tensors = Tensors(environment)
@@ -53,7 +53,7 @@ class TorchRlEnv(EnvBase):
         self._seed: int | None = None
         self._begun = torch.zeros(environment.worlds, dtype=torch.bool, device=tensors.device)
         self.group_map = _checked(groups, environment) if environment.agents > 1 else {}
-        # A group of all agents in their order is a view; another one picks its rows.
+        # A group of all agents in their order is a view; other groups are copies of rows.
         names = environment.task.agents
         self._rows = {
             group: None if tuple(members) == names else [names.index(member) for member in members]
@@ -89,7 +89,8 @@ class TorchRlEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """The next reset starts the random streams over; TorchRL's seeds exceed what kernels take, and are wrapped."""
+        """Restart the random streams at the next reset; TorchRL's larger seeds are wrapped to the range of the
+        kernels."""
         self._seed = None if seed is None else seed % (GREATEST_SEED + 1)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -123,8 +124,8 @@ class TorchRlEnv(EnvBase):
         return out
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Return TorchRL's step; the first observations of new episodes are in place already, and are not merged into
-        every row."""
+        """Return TorchRL's step; the first observations of new episodes already exist, and only their rows are
+        updated."""
         tensordict = self.step(tensordict)
         following = self._step_mdp(tensordict)
         if self._begun.any():
@@ -150,7 +151,7 @@ class TorchRlEnv(EnvBase):
         return action
 
     def _by_group(self, observation: torch.Tensor, reward: torch.Tensor | None = None) -> TensorDict:
-        """A TensorDict of (worlds, agents, size) and (worlds, agents)."""
+        """Return a TensorDict of (worlds, agents, size) and (worlds, agents)."""
         worlds = self.environment.worlds
         if not self.group_map:
             fields: dict[str, Any] = {"observation": observation[:, 0]}

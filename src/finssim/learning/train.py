@@ -26,7 +26,7 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 
 class TrainingError(ValueError):
-    """A training that cannot be started."""
+    """A training cannot be started."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +34,9 @@ class TrainingSettings:
     """Settings of a training: the vehicle, its actions and observations, and the learner."""
 
     learner: str | None = None
-    """(NAME) Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; one agent also torchrl-ppo, several
-    torchrl-ippo or torchrl-mappo; from demonstrations bc or dagger; tasks with images distill, their default; or your
-    own, FILE.py:CLASS."""
+    """(NAME) Learner: ppo (FinsSim's own, the default), sb3-ppo or rsl-rl; for one agent also torchrl-ppo, for several
+    torchrl-ippo or torchrl-mappo; from demonstrations bc or dagger; for tasks with images distill, their default; or
+    your own, FILE.py:CLASS."""
     vehicle: str | Vehicle = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
     hydrodynamics: str = "calibrated"
@@ -48,11 +48,11 @@ class TrainingSettings:
     """(FILE) Ranges of vehicle and water parameters: hold_for_position, fossen_learn_to_swim, equivalent_box, pool,
     open_water, cruise, no_thruster_dynamics, or a file."""
     observe: str = "training"
-    """(FILE|NAME) What is seen: training (the task's noise), sensors (the vehicle's own and position fixes, through a
-    filter), a file of other fixes, estimator (about what localization is off by) or truth."""
+    """(FILE|NAME) Observation: training (the task's noise), sensors (the vehicle's own and position fixes, through a
+    filter), a file of other fixes, estimator (typical errors of localization) or truth."""
     water: Path | None = None
-    """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state, beside what
-    --randomize draws."""
+    """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state, in addition to the
+    draws of --randomize."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
     worlds: Annotated[int | None, (1, 10_000_000)] = None
@@ -60,7 +60,7 @@ class TrainingSettings:
     steps: Annotated[int | None, (1, 1_000_000_000_000)] = None
     """Control steps of the training, summed over all worlds; the task's default if not given."""
     until: float | None = None
-    """(SHARE) Share of successes, such as 0.95, that ends the training early if reached in two consecutive
+    """(FRACTION) Success rate, such as 0.95, that ends the training early if reached in two consecutive
     evaluations."""
     init: str | Path | None = None
     """(NAME|DIR) Controller to imitate first (ppo only): a baseline of the task, such as pid, a policy directory, or
@@ -78,7 +78,7 @@ class TrainingSettings:
     process is faster."""
 
     def check(self) -> None:
-        """Refuse numbers that do not fit, and Weights & Biases where it is missing.
+        """Refuse numbers that are out of range, and a missing installation of Weights & Biases.
 
         Raises:
             TrainingError: A number is out of its range.
@@ -90,18 +90,18 @@ class TrainingSettings:
         if self.until is not None and not 0.0 < self.until <= 1.0:
             raise TrainingError(f"until is {self.until}, expected a share of successes above 0, at most 1")
         if self.wandb is not None:
-            import_module("wandb")  # where it is missing it is missed before anything is made
+            import_module("wandb")  # fails here if the package is missing, before anything is created
 
     def environment(
         self, task: Task, worlds: int, randomization: Randomization | None, seed: int, **options: Any
     ) -> Environment:
-        """Return worlds of a task, with the vehicle's authority as the scale of wrenches.
+        """Return worlds of a task, with the vehicle's authority as the wrench scale.
 
         Args:
             task: Task.
             worlds: Number of worlds.
             randomization: Ranges of their parameters; None for none.
-            seed: Seed of every random number.
+            seed: Seed of all random numbers.
             options: Further arguments of `finssim.make`.
         """
         body = load_vehicle(self.vehicle)
@@ -125,8 +125,8 @@ def train(
 ) -> Path:
     """Train a policy and write it to a directory that runs without the learner.
 
-    The folder `OUT-training` beside it holds the TensorBoard log and the last two checkpoints: policy directories
-    from which a killed training resumes, with the same result.
+    The folder `OUT-training` beside it contains the TensorBoard log and the last two checkpoints: policy directories
+    from which an interrupted training resumes, with the same result.
 
     Example: finssim train t1 --vehicle finsrov --seed 1 --out runs/hold
 
@@ -138,23 +138,23 @@ def train(
         task (TASK): Task to learn: t1 (station keeping), t2 (trajectory tracking), t3 (moving target), velocity6
             (velocity and attitude), docking, path, waypoints, terrain, homing, pursuit, team-pursuit, formation; with
             a camera camera-docking, pipeline or gate, with a sonar net; or your own, FILE.py:CLASS.
-        settings: What it is trained with.
-        out (DIR): Directory of the policy; an earlier policy there is replaced at the end.
-        resume: Resume a killed training from its last checkpoint.
+        settings: Settings of the training.
+        out (DIR): Directory of the policy; an existing policy there is replaced at the end.
+        resume: Resume an interrupted training from its last checkpoint.
         saved: Called with the directory of every checkpoint.
-        console: Where progress is shown; standard error if None.
+        console: Console for the progress; standard error if None.
         as_json: Print one JSON object about the policy, to standard output.
 
     Returns:
-        The policy directory. After Ctrl-C the unfinished policy is there, or in `OUT-training/interrupted` where `out`
+        The policy directory. After Ctrl-C the unfinished policy is there, or in `OUT-training/interrupted` if `out`
         contains an earlier policy.
 
     Raises:
         EnvironmentSetupError: Unknown task.
-        TrainingError: Numbers that do not fit.
-        LearningError: Unknown learner or setting, a task that the learner cannot train, or numbers that ran away.
-        ResumeError: Nothing to go on from, or another training.
-        KeyboardInterrupt: After Ctrl-C, when the policy so far, if there is one, has been written.
+        TrainingError: A number is out of range.
+        LearningError: Unknown learner or setting, a task that the learner does not support, or a diverged training.
+        ResumeError: There is nothing to resume, or it is another training.
+        KeyboardInterrupt: After Ctrl-C, once the policy so far, if there is one, has been written.
     """
     console = console or Console(stderr=True)
     settings.check()
@@ -197,13 +197,13 @@ def train(
         **({} if settings.water is None else {"water": asdict(load_water(settings.water))}),
     )  # fmt: skip
     began = time.perf_counter()
-    full = randomization and randomization.at_full_width()  # as it is measured, whatever it grew from
+    full = randomization and randomization.at_full_width()  # the evaluation always uses the full ranges
     held = settings.environment(fitted, HELD_WORLDS, full, held_seed(seed))
     with (
         single_thread(), leading(settings.processes, device, _follow, task, settings) as group,
         TrainingView(values.steps, console) as view, warnings.catch_warnings(),
     ):  # fmt: skip
-        warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a last small batch does no harm
+        warnings.filterwarnings("ignore", message=".*mini-batch.*")  # a small last batch does no harm
         warnings.filterwarnings("ignore", message=".*on the GPU.*")
         loop = TrainingLoop(
             _learner(kind, environment, values, settings, group), description, side,
@@ -269,7 +269,7 @@ def _share(settings: TrainingSettings, task: Task, values: Any, seed: int) -> En
 
 
 def _learner(kind: Any, environment: Environment, values: Any, settings: TrainingSettings, group: Any) -> Any:
-    """Return the learner, whose arrays are the group's where several processes train."""
+    """Return the learner; with several processes its arrays are those of the group."""
     from finssim.learning.layers import Arrays
 
     shared = {} if group is None else {"arrays": Arrays(settings.seed, group.device, group)}
@@ -277,7 +277,7 @@ def _learner(kind: Any, environment: Environment, values: Any, settings: Trainin
 
 
 def _follow(group: Any, task: str | Task, settings: TrainingSettings) -> None:
-    """Take part in the training of a group's first process, until that ends this one."""
+    """Participate in the training of a group's first process, until that terminates this process."""
     from finssim.learning.layers import single_thread
 
     start_warp()
@@ -295,12 +295,12 @@ def _follow(group: Any, task: str | Task, settings: TrainingSettings) -> None:
 
 
 def training_folder(policy: Path) -> Path:
-    """Return the folder of checkpoints and logs of the training that writes a policy directory."""
+    """Return the folder of checkpoints and logs of the training of a policy directory."""
     return Path(policy).with_name(f"{Path(policy).name}-training")
 
 
 def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> Any:
-    """Return the learner's own settings for a task, with the changes and whom to imitate first.
+    """Return the learner's own settings for a task, with the changes and the teacher.
 
     Args:
         settings: Settings of the training.
@@ -310,7 +310,7 @@ def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> 
     """
     given = settings.settings
     changes = dict(given) if isinstance(given, Mapping) else parse_settings(given)
-    teacher = settings.init not in (None, "none") or "teacher" in changes  # which acts on the host
+    teacher = settings.init not in (None, "none") or "teacher" in changes  # a teacher acts on the host
     values = kind.settings(
         task, randomized=settings.randomize is not None, worlds=settings.worlds, steps=settings.steps, changes=changes,
         device="cpu" if teacher else settings.device,
@@ -319,7 +319,7 @@ def _values(settings: TrainingSettings, kind: Any, learner: str, task: Task) -> 
 
 
 def _taught(values: Any, init: str | Path | None, learner: str, default_action: bool) -> Any:
-    """The settings with whom to imitate first; the task's own teacher acts in the task's own action mode alone."""
+    """Return the settings with the teacher; the task's default teacher is used only in the task's own action mode."""
     if not hasattr(values, "teacher"):
         if init is None:
             return values
@@ -330,7 +330,7 @@ def _taught(values: Any, init: str | Path | None, learner: str, default_action: 
 
 
 def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
-    """Changes of settings from NAME=VALUE; a value with commas is a list.
+    """Return changes of settings from NAME=VALUE; a value with commas is a list.
 
     Raises:
         TrainingError: A word has no name or no value.
@@ -345,7 +345,7 @@ def parse_settings(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def _finish(loop: Any, folder: Path, stopped: bool, console: Console, took: float) -> None:
-    """Write the policy, or the policy so far; after Ctrl-C the interrupt is raised again."""
+    """Write the final policy, or the policy so far; re-raise the interrupt after Ctrl-C."""
     from finssim.learning.export import export_policy
     from finssim.learning.training_loop import after
 
@@ -371,7 +371,7 @@ def _path_beside(out: Path, side: Path) -> Path:
 
 
 def _identity(description: PolicyDescription) -> dict[str, Any]:
-    """Return what must be equal for a training to continue to the same result, by the name used in messages."""
+    """Return the values that must be equal for an exact continuation of a training, by their names in messages."""
     described = plain_data(
         description.model_dump(mode="json", include={"task", "action", "hydrodynamics", "seed"})
     )

@@ -1,4 +1,4 @@
-"""The loop around a learner: progress, curves, held evaluation, checkpoints, Ctrl-C, and going on after a kill."""
+"""The loop around a learner: progress, curves, evaluation on fixed episodes, checkpoints, Ctrl-C, and resuming."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from finssim.learning.export import export_policy, onnx_bytes
 from finssim.learning.learners import Learner, LearningError
 from finssim.learning.resume import RESUME_FILE, ResumeError, read_state, write_state
 
-# What a person sees while training: how far, how fast, how well, how long still.
+# Progress display: completed fraction, speed, results, remaining time.
 
 
 class _Results(ProgressColumn):
-    """Rate, mean return and share of episodes held."""
+    """Rate, mean return and success rate."""
 
     def render(self, task: Task) -> Text:
         return Text(summary(task.fields), style="cyan")
 
 
 def summary(row: Mapping[str, Any]) -> str:
-    """The figures of a row of the training curve in a few words."""
+    """Return a short summary of a row of the training curve."""
     if not row.get("steps_per_s"):
         return ""
     rate, held = row["steps_per_s"] / 1e3, 100.0 * row["held"]
@@ -53,10 +53,10 @@ def summary(row: Mapping[str, Any]) -> str:
 
 
 class TrainingView:
-    """A live bar on a terminal; elsewhere a line for every tenth of the way."""
+    """Live progress bar on a terminal; otherwise a line for every tenth of the training."""
 
     def __init__(self, total: int, console: Console | None = None) -> None:
-        """Watch a training of `total` control steps."""
+        """Show the progress of a training of `total` control steps."""
         self.total = total
         self.console = console or Console(stderr=True)
         self._live = self.console.is_terminal
@@ -82,13 +82,14 @@ class TrainingView:
         self._progress.stop()
 
     def go_on(self, steps: int) -> None:
-        """Begin where so many steps were done before: they took no time of this training's."""
+        """Start at a number of earlier steps, which do not count in the time of this training."""
         self._first = steps
         self._next = (int(steps / self.total * 10.0) + 1) / 10.0
         self._progress.reset(self._task, completed=steps)
 
     def update(self, row: Mapping[str, Any]) -> None:
-        """Show a row of the training curve: steps, steps_per_s, mean_return, held, evaluation_success if there."""
+        """Show a row of the training curve: steps, steps_per_s, mean_return, held, and evaluation_success if
+        present."""
         self._progress.update(self._task, completed=row["steps"], **row)
         part = row["steps"] / self.total
         if not self._live and part >= self._next:
@@ -102,61 +103,62 @@ class TrainingView:
 
 
 CHECKPOINTS = 4
-"""Least number of checkpoints in a training: after each such part, or `CHECKPOINT_STEPS`, whichever is first."""
+"""Least number of checkpoints in a training; their interval is at most `CHECKPOINT_STEPS`."""
 CHECKPOINT_STEPS = 500_000
-"""Control steps of all worlds together between two checkpoints, at most."""
+"""Greatest number of control steps, summed over all worlds, between two checkpoints."""
 RETAINED = 2
-"""Checkpoints that stay: should the newest be damaged, there is one before it."""
+"""Number of checkpoints that are kept: if the newest is damaged, there is an earlier one."""
 EVALUATIONS = 10
-"""Held evaluations in a training; each takes about as long as an update."""
+"""Number of evaluations in a training; each takes about as long as an update."""
 
 
 @dataclass(frozen=True)
 class Best:
-    """A network of a training, and how well it did."""
+    """A network of a training, with its score."""
 
     score: tuple[float, float]
-    """Share of successes and return in the held evaluation."""
+    """Success rate and return (a sum of rewards) in the evaluation."""
     steps: int
-    """After which it was measured."""
+    """Number of training steps before the evaluation."""
     network: bytes
     """Network as ONNX."""
 
 
 @dataclass
 class TrainingLoop:
-    """Trains a learner to its end, or until Ctrl-C."""
+    """Loop that trains a learner to its end, or until Ctrl-C."""
 
     learner: Learner
     description: PolicyDescription
     """Description of the final policy."""
     side: Path
-    """Folder of checkpoints and log."""
+    """Folder of checkpoints and logs."""
     evaluate: Callable[[Any], Mapping[str, float]]
-    """Measures a network on held episodes."""
+    """Function that evaluates a network on fixed episodes."""
     show: Callable[[Mapping[str, Any]], None]
     """Called with every row of the curves."""
     progress: Callable[[float], None]
-    """Function that receives the finished share of the training before each update: ranges may grow with it."""
+    """Function that is called with the completed fraction of the training before each update: ranges may grow with
+    it."""
     identity: Mapping[str, Any]
     """Values that must be equal for a training to continue from a checkpoint."""
     until: float | None = None
-    """Share of successes among the held episodes: reached in two evaluations in a row, the training is done."""
+    """Success rate [-] that ends the training if reached in two consecutive evaluations; None: no early end."""
     saved: Callable[[Path], None] = lambda checkpoint: None
     """Called with the directory of every checkpoint."""
     project: str | None = None
-    """Project of Weights & Biases that receives the curves too; None: nothing is sent."""
+    """Project of Weights & Biases to which the curves are sent; None: nothing is sent."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     best: Best | None = None
-    """The network that did best in the held evaluations, the later of equals: what a training leaves behind."""
+    """Network with the best evaluation, the later of equals: the result of the training."""
     seconds: float = 0.0
-    """Time of the updates and evaluations so far [s], over all the pieces of a training that was resumed."""
+    """Time of the updates and evaluations so far [s], summed over all runs of a resumed training."""
 
     def run(self) -> bool:
-        """Update until the steps are done, or the held episodes succeed as often as `until` requires.
+        """Update until all steps are done, or the evaluation reaches `until`.
 
         Returns:
-            Whether it was interrupted by Ctrl-C.
+            True if it was interrupted by Ctrl-C.
 
         Raises:
             LearningError: A number of the learner stopped being finite.
@@ -181,7 +183,7 @@ class TrainingLoop:
 
     @property
     def reached(self) -> bool:
-        """Return whether the last two held evaluations reached `until`."""
+        """Return whether the last two evaluations reached `until`."""
         if self.until is None:
             return False
         every = math.ceil(self.learner.settings.steps / EVALUATIONS)
@@ -201,7 +203,7 @@ class TrainingLoop:
         if bad:
             raise LearningError(
                 f"{bad[0]} stopped being finite after {self.learner.steps:,} steps: the learner has diverged; "
-                "take a smaller learning rate, or another seed"
+                "use a smaller learning rate, or another seed"
             )
         if self._passed(math.ceil(total / EVALUATIONS)) or self.learner.steps >= total or not self.curves:
             network = self.learner.network()
@@ -221,7 +223,7 @@ class TrainingLoop:
         return {**counted, **learned, **held}
 
     def _passed(self, every: int) -> bool:
-        """Return whether the last update passed a multiple of so many steps."""
+        """Return whether the last update passed a multiple of `every` steps."""
         rows = (
             self.curves if self.curves and self.curves[-1]["steps"] < self.learner.steps else self.curves[:-1]
         )
@@ -229,9 +231,10 @@ class TrainingLoop:
         return bool(self.learner.steps // every > before // every)
 
     def _save(self) -> None:
-        """Write a checkpoint: a policy that can be run, and the state to continue from; older ones are removed.
+        """Write a checkpoint: a policy that can be run, and the state to continue from. Remove older checkpoints.
 
-        So do those after more steps, which an earlier training has left: `last_checkpoint` would take them for newer.
+        Checkpoints of an earlier training with more steps are also removed: `last_checkpoint` would take them for
+        newer.
         """
         steps = self.learner.steps
         state = {
@@ -262,7 +265,7 @@ class TrainingLoop:
         """Continue from the result of `last_checkpoint`.
 
         Raises:
-            ResumeError: It is of another training.
+            ResumeError: The checkpoint is of another training.
         """
         for name, value in self.identity.items():
             saved = state["identity"].get(name)
@@ -284,18 +287,18 @@ class TrainingLoop:
 
 
 def _score(row: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the score of a held evaluation: the share of successes, if the task has one, then the return."""
+    """Return the score of an evaluation: the success rate, if the task defines success, then the return."""
     share, total = (float(row.get(f"evaluation_{name}", 0.0)) for name in ("success", "return"))
     return (share if math.isfinite(share) else 0.0, total if math.isfinite(total) else -1e300)
 
 
 def _checkpoints(side: Path) -> list[Path]:
-    """Checkpoints in a folder, the newest last; half-written ones have other names."""
+    """Return the checkpoints in a folder, the newest last; incomplete ones have other names."""
     return sorted(path for path in side.glob("checkpoint-*") if (path / DESCRIPTION_FILE).is_file())
 
 
 def last_checkpoint(side: Path) -> dict[str, Any] | None:
-    """The newest state that can be read; None if no checkpoint was written yet.
+    """Return the newest readable state; None if no checkpoint was written yet.
 
     Raises:
         ResumeError: There was no training, or none of its checkpoints can be read.
@@ -314,26 +317,26 @@ def last_checkpoint(side: Path) -> dict[str, Any] | None:
 
 
 def after(description: PolicyDescription, steps: int, complete: bool, best: int) -> PolicyDescription:
-    """The description of a network after so many steps of training; it was best after `best` of them."""
+    """Return the description of a network after a number of training steps; it was best after `best` of them."""
     record = {**description.training, "steps_done": steps, "best_after": best, "complete": complete}
     return description.model_copy(update={"training": record})
 
 
 def has_tensorboard() -> bool:
-    """Return whether TensorBoard is installed; without it a training writes its curves as CSV alone."""
+    """Return whether TensorBoard is installed; otherwise a training only writes its curves as CSV."""
     return find_spec("tensorboard") is not None
 
 
 class _CurveLog:
-    """Rows of the curves as TensorBoard reads them, where it is installed; and for Weights & Biases."""
+    """Log of the curves for TensorBoard, if installed, and for Weights & Biases."""
 
     def __init__(self, folder: Path, steps: int, run: Any = None) -> None:
-        """Continue after so many steps: TensorBoard drops what a killed or an earlier training logged later.
+        """Continue after a number of steps: TensorBoard discards later entries of an interrupted or earlier training.
 
         Args:
-            folder: Of TensorBoard.
-            steps: Done so far.
-            run: Of Weights & Biases, which takes the rows too.
+            folder: Folder of TensorBoard.
+            steps: Steps done so far.
+            run: Run of Weights & Biases that also receives the rows.
         """
         self._run, self._writer = run, None
         if not has_tensorboard():
@@ -358,7 +361,7 @@ class _CurveLog:
             self._run.log({_tag(name): value for name, value in row.items()}, step=row["steps"])
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining rows."""
         if self._writer is not None:
             self._writer.close()
         if self._run is not None:
@@ -369,7 +372,7 @@ def _wandb_run(project: str, side: Path, identity: Mapping[str, Any]) -> Any:
     """Return the run of Weights & Biases for a training; a resumed training continues the same run.
 
     Raises:
-        LearningError: It cannot be begun: nobody is logged in, or nothing answers.
+        LearningError: It cannot be started: there is no login, or the server does not respond.
     """
     import wandb
 
@@ -391,7 +394,7 @@ def _wandb_run(project: str, side: Path, identity: Mapping[str, Any]) -> Any:
 
 
 def _tag(name: str) -> str:
-    """Name of a curve in TensorBoard, in groups."""
+    """Return the name of a curve in TensorBoard, with its group."""
     for group, names in {
         "time": ("seconds", "steps_per_s", "steps"),
         "episodes": ("mean_return", "mean_length", "held", "mean_reward"),

@@ -77,7 +77,7 @@ def test_a_policy_refuses_to_act_blind(trained):
 
 
 def test_learners_of_rows_refuse_tasks_that_see_and_the_other_way_round():
-    with pytest.raises(LearningError, match="observes pictures: take bc, distill"):
+    with pytest.raises(LearningError, match="observes pictures: use bc, distill"):
         learner_named("ppo").check(CameraDocking())
     with pytest.raises(LearningError, match="observes no pictures"):
         learner_named("distill").check(CameraDocking().for_teacher())

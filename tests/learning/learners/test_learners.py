@@ -96,7 +96,7 @@ def test_it_finds_the_best_action(name, task):
 @pytest.mark.parametrize(("name", "task"), [("torchrl-ppo", "team-pursuit"), ("torchrl-mappo", "t1")])
 def test_one_agent_is_not_several(name, task):
     """With what to take instead."""
-    with pytest.raises(LearningError, match="has .* and this learner trains .*: take "):
+    with pytest.raises(LearningError, match="has .* and this learner trains .*: use "):
         made(name, task)
 
 

@@ -1,4 +1,4 @@
-"""The learners by name: each turns an environment into a network, with any library."""
+"""The learners by name: each trains a network in an environment, with any library."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Common parts of the learners: settings, those that differ by task, and acting in an environment."""
+"""Common parts of the learners: settings, their task-specific defaults, and acting in an environment."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from finssim.learning.layers import Arrays
 from finssim.learning.resume import random_state, set_random_state
 from finssim.tasks import Environment, Task
 
-# What a learner's settings are for a task, where they are not the defaults: the one place for them.
+# Task-specific changes of the learners' default settings; they are defined here only.
 
 
 ON_POLICY = ("sb3-ppo", "rsl-rl", "torchrl-ppo", "torchrl-ippo", "torchrl-mappo")
-"""The learners that `on-policy` means below: those of outside libraries with `OnPolicySettings`."""
+"""Learners that `on-policy` stands for below: those of external libraries with `OnPolicySettings`."""
 
 Table = dict[str, dict[str, dict[str, Any]]]
-"""Task -> `on-policy` or a learner's name, which outranks it -> changes of the defaults. `*` is every task, which the
-task's own lines outrank."""
+"""Task -> `on-policy` or a learner's name, which takes precedence -> changes of the defaults. `*` is every task;
+entries of a task take precedence."""
 
 CHASE: dict[str, dict[str, Any]] = {
-    # A capture or delivery is far ahead: ten seconds of foresight. Its reward so exceeds a step's that what the
-    # value is wrong by must not use up the gradient that policy and value share; RSL-RL's do not share one.
+    # A capture or delivery is far ahead: ten seconds of foresight. Its reward exceeds that of a step by so much that
+    # the value error must not use up the gradient norm that policy and value share; RSL-RL's do not share one.
     "on-policy": {"discount": 0.99, "value_weight": 0.05, "learning_rate": 2.0e-3, "steps": 1_000_000},
     "rsl-rl": {"value_weight": 1.0},
     "ppo": {"discount": 0.99, "steps": 600_000},
@@ -37,29 +37,29 @@ SIGHT: dict[str, dict[str, Any]] = {"bc": {"steps": 600_000, "hidden": (128, 64)
 """Settings of tasks with pictures, which need separate networks."""
 
 SETTINGS: Table = {
-    # Smaller networks than the default are as good here, and are learnt in three quarters of the time.
+    # Smaller networks than the default are as good here, and train in three quarters of the time.
     "t1": {"ppo": {"hidden": (48, 48)}},
     "t2": {
-        # A reference is close all the time: one second of foresight is enough, and learns faster than five.
+        # A reference is always close: one second of foresight is enough, and learns faster than five.
         "ppo": {"discount": 0.9, "steps": 500_000},
         "on-policy": {"discount": 0.9},
     },
-    # So is a target that moves, once it has been reached.
+    # The same holds for a moving target, once it has been reached.
     "t3": {"on-policy": {"discount": 0.95}, "ppo": {"steps": 600_000}},
     "velocity6": {"on-policy": {"discount": 0.95}},
     "docking": {"ppo": {"steps": 900_000}},
-    # Its teacher succeeds in all episodes after a quarter of these steps, and its student after half of them.
+    # The teacher succeeds in all episodes after a quarter of these steps, and the student after half of them.
     "pipeline": {"distill": {"teacher_steps": 600_000, "steps": 60_000}, **SIGHT},
     "gate": {"distill": {"teacher_steps": 600_000}, **SIGHT},
-    # Its student succeeds in all episodes after a quarter of these steps.
+    # The student succeeds in all episodes after a quarter of these steps.
     "net": {"distill": {"teacher_steps": 300_000, "steps": 12_800, "learning_rate": 2.0e-3}, **SIGHT},
     "camera-docking": SIGHT,
     "pursuit": {**CHASE, "ppo": {**CHASE["ppo"], "teacher": "lead"}},
-    # After 1.5 million steps, half of the seeds have only started to capture.
+    # After 1.5 million steps, half of the seeds have only begun to capture.
     "team-pursuit": {
         "on-policy": {**CHASE["on-policy"], "steps": 3_600_000},
         "rsl-rl": CHASE["rsl-rl"],
-        # The first captures are found by luck, which half of the seeds did not have; the baseline shows them.
+        # The first captures are a matter of luck, which half of the seeds lacked; the baseline demonstrates them.
         "ppo": {
             "discount": 0.99,
             "learning_rate": 2.0e-3,
@@ -77,12 +77,12 @@ SETTINGS: Table = {
 """Settings of every training."""
 
 RANDOMIZED: Table = {
-    # What must be learnt is more.
+    # There is more to learn.
     "*": {
         "ppo": {"steps": 1_000_000},
         "on-policy": {"steps": 3_000_000},
     },
-    # Observations and actions of the latest steps show how this vehicle responds: thrust, lag, and delay of the state.
+    # The latest observations and actions reveal this vehicle's response: thrust, lag, and delay of the state.
     "t1": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
     "t2": {
         "ppo": {"steps": 2_000_000, "history": 2, "last_action": True},
@@ -91,9 +91,9 @@ RANDOMIZED: Table = {
     "t3": {"ppo": {"steps": 1_500_000}},
     "velocity6": {"ppo": {"steps": 2_000_000, "history": 2, "last_action": True}},
     "docking": {"ppo": {"steps": 2_000_000}},
-    # In `open_water` its student succeeds in all episodes after half of these steps.
+    # In `open_water` the student succeeds in all episodes after half of these steps.
     "camera-docking": {"distill": {"teacher_steps": 1_500_000, "steps": 60_000}},
-    # After a third of these steps its teacher is too slow in some currents along the net.
+    # After a third of these steps the teacher is too slow along the net in some currents.
     "net": {"distill": {"teacher_steps": 900_000}},
     "pursuit": {"ppo": {"steps": 1_500_000}, "on-policy": {"steps": 2_500_000}},
     "team-pursuit": {"ppo": {"steps": 3_000_000}, "on-policy": {"steps": 6_000_000}},
@@ -103,7 +103,7 @@ RANDOMIZED: Table = {
 
 
 def task_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
-    """Changes of a learner's defaults for a task; none for a task that no table names."""
+    """Return the task-specific changes of a learner's defaults; none for a task that is not in the tables."""
     changes: dict[str, Any] = {}
     for name in ("*", task):
         for table in (SETTINGS, RANDOMIZED) if randomized else (SETTINGS,):
@@ -113,28 +113,28 @@ def task_settings(task: str, learner: str, randomized: bool) -> dict[str, Any]:
     return changes
 
 
-# Settings that all PPO learners share, whichever library they are of.
+# Settings that all PPO learners share, of any library.
 
 
 ROLLOUT_SAMPLES = 8192
-"""Fewest samples between two updates of the learners of outside libraries."""
+"""Fewest samples between two updates of the learners of external libraries."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicySettings:
-    """Settings of PPO; the defaults, T1's, hold setpoints to a centimetre after some twenty seconds."""
+    """Settings of PPO; the defaults, for T1, hold setpoints to a centimetre after some twenty seconds of training."""
 
     worlds: int = 256
     steps: int = 1_300_000
-    """Control steps of all worlds together."""
+    """Control steps, summed over all worlds."""
     rollout: int = 32
     """Control steps of each world between two updates."""
     batch: int = 2048
-    """Samples in a gradient step. At equal arithmetic, many small steps learn faster here than few large ones."""
+    """Samples in a gradient step. For equal computation, many small steps learn faster here than few large ones."""
     epochs: int = 5
     """Passes over a rollout."""
     learning_rate: float = 1.5e-3
-    """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
+    """Initial learning rate; it decreases linearly to zero, which yields the last centimetres."""
     discount: float = 0.98
     """Discount factor per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
@@ -144,20 +144,21 @@ class OnPolicySettings:
     value_weight: float = 0.5
     """Weight of the value's squared error relative to the policy's objective, if both share a gradient norm."""
     largest_gradient: float = 0.5
-    """Longer gradients are shortened to this norm: an odd batch must not undo the work of many."""
+    """Norm to which larger gradients are clipped, so that an outlier batch does not undo the progress of many."""
     entropy_weight: float = 0.0
-    """No reward for noise: it would keep the vehicle from settling."""
+    """Weight of the entropy; 0 by default, because rewarded noise would keep the vehicle from settling."""
     log_std: float = -1.0
-    """Logarithm of the action noise at the start: more hides the goal's last centimetres."""
+    """Logarithm of the initial standard deviation of the action noise; more noise hides the goal's last
+    centimetres."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of the hidden layers, ELU, of the policy and of the value each."""
+    """Units of the hidden layers, ELU, of policy and value each."""
 
 
 def expert_in(environment: Environment, name: str) -> Any:
     """Return the expert of a learner in an environment: a baseline of the task by name, or a policy directory.
 
     Raises:
-        AgentError: There is neither, or it acts in another mode than the environment's.
+        AgentError: There is neither, or its action mode differs from the environment's.
         PolicyError: The policy was trained for another vehicle or task.
     """
     e = environment
@@ -166,19 +167,19 @@ def expert_in(environment: Environment, name: str) -> Any:
     return expert_for(name, vehicle, e.task, e.action_mode, scale)
 
 
-# What all learners share that act in an environment: its tally, their steps, and a state that holds everything.
+# Common part of all learners that act in an environment: episode statistics, step count, and the complete state.
 
 
 class ActingLearner:
-    """Base of the learners; `learned` and `load_learned` are its own part of the state."""
+    """Base class of the learners; `learned` and `load_learned` are the learner-specific part of the state."""
 
     Settings: ClassVar[Any]
     """Class of its settings."""
     rollout_samples: ClassVar[int] = 0
-    """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as the settings say."""
+    """Fewest samples between two updates: with few worlds, rollouts are longer. 0: as in the settings."""
 
     gpu_factor: ClassVar[int] = 1
-    """Factor on worlds, batch and steps on a GPU, which keeps the number of gradient steps."""
+    """Factor on worlds, batch and steps on a GPU, which preserves the number of gradient steps."""
 
     @classmethod
     def settings_for(
@@ -191,8 +192,8 @@ class ActingLearner:
     ) -> Any:
         """Return the settings of a training: defaults with the task's changes, and with worlds and steps unless None.
 
-        On a GPU a gradient step takes samples in proportion to the worlds. A teacher acts on the host, so that a
-        training with one has the settings of a processor.
+        On a GPU the samples in a gradient step scale with the number of worlds. A teacher acts on the host, so a
+        training with a teacher has the settings of a CPU.
         """
         stated = {name: value for name, value in (("worlds", worlds), ("steps", steps)) if value is not None}
         settings = replace(cls.Settings(), **changes)
@@ -207,26 +208,26 @@ class ActingLearner:
         return replace(settings, rollout=max(settings.rollout, least))
 
     def __init__(self, environment: Environment, settings: Any, arrays: Arrays | None = None) -> None:
-        """Take the environment, whose first episodes are going to be aged, and the library of the learner's arrays."""
+        """Store the environment, whose first episodes will be aged, and the library of the learner's arrays."""
         self.environment, self.settings = environment, settings
         self.tally = EpisodeTally(environment, arrays=arrays)
         self.steps = 0
 
     @property
     def remaining(self) -> float:
-        """Part of the training that is still to come, in [0, 1]."""
+        """Remaining fraction of the training, in [0, 1]."""
         return max(0.0, 1.0 - self.steps / self.settings.steps)
 
     def learned(self) -> dict[str, Any]:
-        """Parameters, optimisers and what else is the learner's own."""
+        """Return the learner-specific state, such as parameters and optimisers."""
         raise NotImplementedError
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         raise NotImplementedError
 
     def state(self) -> dict[str, Any]:
-        """Everything that decides what comes next, as copies."""
+        """Return the complete state of the training, as copies."""
         return {
             "steps": self.steps,
             "environment": self.environment.state(),
@@ -236,7 +237,7 @@ class ActingLearner:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from a state of a learner that was made in the same way."""
+        """Continue from the state of a learner that was created in the same way."""
         self.steps = int(state["steps"])
         self.environment.load_state(state["environment"])
         self.tally.load(state["tally"])

@@ -1,4 +1,4 @@
-"""The protocol of learners, and all learners by name. Nothing here imports a library of learning before it is used."""
+"""The protocol of learners, and all learners by name. Training libraries are imported only when they are used."""
 
 from __future__ import annotations
 
@@ -21,55 +21,55 @@ if TYPE_CHECKING:
 
 
 class LearningError(ValueError):
-    """A learner that there is not, that cannot do what is asked, or whose numbers ran away."""
+    """A learner does not exist, does not support a request, or has diverged."""
 
 
 class Learner(Protocol):
-    """Learns in an environment, one update at a time; who calls `update` owns progress, checkpoints and export."""
+    """A learner in an environment, with one update at a time; its caller handles progress, checkpoints and export."""
 
     settings: Any
     """A frozen dataclass with at least `worlds` and `steps`; recorded in policy.yaml."""
     steps: int
-    """Control steps of all worlds together so far."""
+    """Control steps so far, summed over all worlds."""
 
     def update(self) -> dict[str, float]:
-        """One rollout and what is learnt from it.
+        """Run one rollout and learn from it.
 
         Returns:
-            A row of the training curve with the same keys every time: mean_return, mean_length, held (share of the
-            last episodes that succeeded), mean_reward, and the learner's own numbers.
+            A row of the training curve, always with the same keys and units: mean_return, mean_length, held (success
+            rate of the last episodes), mean_reward, and the learner's own numbers.
         """
 
     def network(self) -> nn.Module | Network:
-        """Observation of one agent to its mean action, for evaluation and export; a torch module or a `Network`."""
+        """Return the map from one agent's observation to its mean action, for evaluation and export."""
 
     def state(self) -> dict[str, Any]:
-        """Everything that decides what comes next: parameters, optimisers, random streams, the environment."""
+        """Return the complete state: parameters, optimisers, random streams, the environment."""
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from a state of a learner that was made in the same way, bit for bit."""
+        """Continue from the state of a learner that was created in the same way, bit for bit."""
 
 
 @dataclass(frozen=True)
 class LearnerKind:
-    """A learner that can be made: call it for one."""
+    """A kind of learner; calling it creates a learner."""
 
     key: str
-    """Name that commands take; FILE.py:CLASS of a user's own."""
+    """Name on the command line; FILE.py:CLASS for a user's own."""
     module: str
     """Module of its class."""
     name: str
-    """Its class."""
+    """Name of its class."""
     what: str
     """Short description."""
     extra: str = "learn"
-    """Extra of FinsSim that it needs, as pip takes it."""
+    """Extra of FinsSim that it needs, in pip's notation."""
     agents: str = "any"
-    """Number of agents of a task that it can train: one, several, or any."""
+    """Supported number of agents of a task: one, several, or any."""
     sees: bool | None = False
-    """True if it trains only tasks that observe pictures, False only tasks without; None: both."""
+    """True if it trains only tasks with pictures, False only tasks without; None: both."""
     own: type | None = None
-    """The class itself, of a learner from outside the package."""
+    """Class of a learner from outside the package."""
 
     def settings(
         self,
@@ -81,10 +81,10 @@ class LearnerKind:
         changes: Mapping[str, Any] | None = None,
         device: str = "cpu",
     ) -> Any:
-        """The settings of a training; what is None keeps its default for the task and the device, cpu or cuda.
+        """Return the settings of a training; None keeps the default for the task and the device, cpu or cuda.
 
         Raises:
-            LearningError: A change names no setting, has another type than the setting's own, or counts too few.
+            LearningError: A change names an unknown setting, has the wrong type, or is out of range.
         """
         task_changes = {}
         if self.own is None:
@@ -97,39 +97,39 @@ class LearnerKind:
     def __call__(
         self, environment: Environment, settings: Any, *, seed: int, device: str = "cpu", **options: Any
     ) -> Learner:
-        """A learner in an environment; it owns the environment's episodes from then on.
+        """Create a learner in an environment, whose episodes it controls from then on.
 
         Args:
             environment: Environment.
             settings: Settings of the learner.
-            seed: Seed of everything random.
+            seed: Seed of all random numbers.
             device: cpu or cuda.
             options: Further arguments of the learner's class.
 
         Raises:
-            LearningError: It cannot train the task's number of agents.
+            LearningError: It does not support the task.
         """
         self.check(environment.task)
         learner: Learner = self._class()(environment, settings, seed=seed, device=device, **options)
         return learner
 
     def check(self, task: Task) -> None:
-        """Refuse a task with a number of agents that it cannot train.
+        """Refuse a task with pictures or a number of agents that the learner does not support.
 
         Raises:
-            LearningError: It cannot.
+            LearningError: The learner does not support the task.
         """
         sees = bool(task.pictures)
         if self.sees not in (sees, None) and self.own is None:
             able = [name for name, kind in _ours() if kind.sees in (sees, None)]
             observes = "pictures" if task.pictures else "no pictures"
-            raise LearningError(f"task '{task.name}' observes {observes}: take {', '.join(able)}")
+            raise LearningError(f"task '{task.name}' observes {observes}: use {', '.join(able)}")
         n = len(task.agents)
         if (self.agents == "one" and n > 1) or (self.agents == "several" and n == 1):
             able = [name for name, kind in _ours() if kind.agents in ("any", "one" if n == 1 else "several")]
             has = "one agent" if n == 1 else f"{n} agents"
             raise LearningError(
-                f"task '{task.name}' has {has}, and this learner trains {self.agents}: take {', '.join(able)}"
+                f"task '{task.name}' has {has}, and this learner trains {self.agents}: use {', '.join(able)}"
             )
 
     def _class(self) -> Any:
@@ -182,14 +182,14 @@ DISTILL = LearnerKind(
 
 
 def check_registered(name: str, learner: Any) -> None:
-    """Refuse what is no learner.
+    """Refuse a registered object that is not a learner.
 
     Args:
         name: Name of the learner.
         learner: The object that is registered under it.
 
     Raises:
-        LearningError: It is no class derived from `ActingLearner` with settings.
+        LearningError: It is not a class derived from `ActingLearner` with settings.
     """
     if not (
         isinstance(learner, type) and issubclass(learner, ActingLearner) and hasattr(learner, "Settings")
@@ -201,7 +201,7 @@ def check_registered(name: str, learner: Any) -> None:
 
 
 MAY_BE_ZERO = ("warm_up", "expert_rounds", "history", "memory")
-"""Settings that count what may be left out; of all others there is at least one."""
+"""Counts that may be 0; all other counts are at least 1."""
 LARGEST = 10**9
 """Greatest value of any count."""
 SIGNED = ("log_std", "entropy")
@@ -211,10 +211,10 @@ SHARES = ("discount", "gae_lambda", "smoothing", "taught")
 
 
 def learner_named(name: str) -> LearnerKind:
-    """Return the learner of a name; or a user's own, FILE.py:CLASS or MODULE:CLASS, derived from `ActingLearner`.
+    """Return a learner by its name; or a user's own, FILE.py:CLASS or MODULE:CLASS, derived from `ActingLearner`.
 
     Raises:
-        LearningError: There is none, or the class is no learner.
+        LearningError: There is none with that name, or the class is not a learner.
         EnvironmentSetupError: There is no such file or class, or its code fails.
     """
     if ":" in name:
@@ -241,7 +241,7 @@ def _ours() -> list[tuple[str, LearnerKind]]:
 
 
 def _fitting(settings: Any, name: str, value: Any) -> Any:
-    """The value, as the type of the setting of that name."""
+    """Return the value with the type of the setting of that name."""
     values = {field.name: getattr(settings, field.name) for field in fields(settings)}
     if name not in values:
         raise LearningError(f"unknown setting '{name}'; available: {', '.join(values)}")

@@ -1,8 +1,8 @@
-"""Teacher and student: PPO on privileged numbers, then DAgger by a student that has the pictures alone.
+"""Teacher and student: PPO on privileged observations, then DAgger by a student that observes only the pictures.
 
-The teacher learns the task without its pictures, on `Task.teacher`, in worlds that nobody renders. The student then
-drives in worlds that it sees; each step is labelled with what the teacher would have done (Ross et al. 2011). The
-student's encoder also learns to predict the teacher's row, which takes fewer pictures than actions alone.
+The teacher learns the task without pictures, on `Task.teacher`, in worlds that are not rendered. The student then acts
+in rendered worlds; each step is labelled with the teacher's action (Ross et al. 2011). The student's encoder also
+learns to predict the teacher's observation, which needs fewer pictures than actions alone.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from finssim.learning.torch_networks import SeeingNetwork
 from finssim.tasks import Environment
 
 LEAST_DEVIATION = 0.02
-"""Least standard deviation by which a number of the row is divided [-]: what hardly varies stays small."""
+"""Least standard deviation by which an observed number is divided [-], so that nearly constant numbers stay small."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,34 +34,34 @@ class DistillSettings:
     worlds: int = 64
     """Number of the student's worlds."""
     steps: int = 100_000
-    """Control steps of the student, all worlds together."""
+    """Control steps of the student, summed over all worlds."""
     teacher_worlds: int = 256
     teacher_steps: int = 2_000_000
-    """Control steps of the teacher, before the first of the student."""
+    """Control steps of the teacher, which is trained before the student."""
     rollout: int = 25
     """Control steps of each world between two rounds of learning."""
     expert_rounds: int = 4
-    """Rounds in which the teacher drives itself; after them the student does."""
+    """Initial rounds in which the teacher acts; after them the student does."""
     kept: int = 60_000
-    """Samples that are kept, the newest; a picture of 48 x 27 takes 4 kB."""
+    """Size of the sample buffer, with the newest samples; a picture of 48 x 27 takes 4 kB."""
     passes: float = 6.0
-    """Times that each new sample's number of samples is drawn from what is kept, in each round."""
+    """Ratio of the samples that are drawn from the buffer in each round to the new samples."""
     batch: int = 256
     learning_rate: float = 1.0e-3
-    """Learning rate at the start; it falls linearly to zero."""
+    """Initial learning rate; it decreases linearly to zero."""
     auxiliary: float = 0.3
-    """Weight of the squared error of the predicted teacher's row."""
+    """Weight of the squared error of the predicted teacher's observation."""
     colour: float = 0.3
-    """Variation of the pictures' colours and levels during learning; other waters vary them much more."""
+    """Strength of the colour and brightness augmentation of pictures, since waters differ much in both."""
     hidden: tuple[int, ...] = (128, 64)
     """Units of the layers behind the encoder, ELU."""
 
 
 def varied(pictures: torch.Tensor, amount: float) -> torch.Tensor:
-    """Pictures as other water, light and cameras might have them: each is given its own change of colours.
+    """Augment pictures as in other water, light and cameras, each with its own change of colours.
 
-    Channels are mixed, the level rises or falls from top to bottom, of a sonar's from left to right, contrast is bent
-    by a power, and noise is added.
+    Channels are mixed, a brightness gradient is added from top to bottom, for a sonar from left to right, contrast is
+    changed by a power, and noise is added.
 
     Args:
         pictures: Pictures, uint8 (N, height, width, channels).
@@ -84,7 +84,7 @@ def varied(pictures: torch.Tensor, amount: float) -> torch.Tensor:
 
 
 class Distill(ActingLearner):
-    """A teacher, and a student that sees."""
+    """A teacher, and a student that observes pictures."""
 
     Settings = DistillSettings
     settings: DistillSettings
@@ -117,10 +117,10 @@ class Distill(ActingLearner):
         self._count = self._rounds = 0
         self.teacher: Network | None = None
         self.teacher_held = 0.0
-        """Share of the teacher's last episodes that succeeded, while it was still trying."""
+        """Success rate of the teacher's last episodes, during its exploration."""
 
     def _train_teacher(self) -> None:
-        """PPO on the task's `teacher` observation."""
+        """Train the teacher by PPO on the task's `teacher` observation."""
         e, s = self.environment, self.settings
         environment = Environment(
             e.task.for_teacher(), e.simulator.vehicles, nominal=e.nominal, worlds=s.teacher_worlds,
@@ -135,9 +135,9 @@ class Distill(ActingLearner):
         self.teacher, self.teacher_held = ppo.network(), row["held"]
 
     def update(self) -> dict[str, float]:
-        """One rollout, labelled by the teacher, and regression on what is kept.
+        """Run one rollout, labelled by the teacher, and regression on the sample buffer.
 
-        Its row of the training curve has the units of the curve.
+        The result is a row of the training curve, in the units of the curve.
         """
         if self.teacher is None:
             self._train_teacher()
@@ -178,7 +178,8 @@ class Distill(ActingLearner):
         return torch.as_tensor(action).clamp(-1.0, 1.0)
 
     def _fit(self, batches: int) -> tuple[float, float]:
-        """Regression on batches drawn with replacement; mean squared errors of the action and of the teacher's row."""
+        """Fit batches drawn with replacement; return mean squared errors of the action and of the teacher's
+        observation."""
         s, total = self.settings, torch.zeros(2, device=self.device)
         for group in self.optimizer.param_groups:
             group["lr"] = s.learning_rate * max(self.remaining, 0.02)
@@ -196,11 +197,11 @@ class Distill(ActingLearner):
         return tuple((total / batches).tolist())  # type: ignore[return-value]
 
     def network(self) -> nn.Module:
-        """Row and pictures to the student's action."""
+        """Return the map from numbers and pictures to the student's action."""
         return self.student
 
     def learned(self) -> dict[str, Any]:
-        """Networks, optimiser, what is kept, and the teacher."""
+        """Return networks, optimiser, sample buffer, and the teacher."""
         return {
             "student": self.student.state_dict(),
             "predictor": self._predictor.state_dict(),
@@ -216,10 +217,10 @@ class Distill(ActingLearner):
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave.
+        """Restore the state that `learned` returned.
 
         Raises:
-            ResumeError: It is of a version whose students did not scale their row.
+            ResumeError: The state is of a version whose students did not scale their numbers.
         """
         if "mean" not in state["student"]:
             raise ResumeError("the checkpoint is of an earlier version: leave out --resume")

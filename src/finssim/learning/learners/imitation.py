@@ -1,4 +1,5 @@
-"""Imitation on torch: behaviour cloning from demonstrations, and DAgger, which asks the expert on the learner's way."""
+"""Imitation with torch: behaviour cloning from demonstrations, and DAgger, in which an expert labels the learner's
+states."""
 
 from __future__ import annotations
 
@@ -32,19 +33,19 @@ class BcSettings:
     demonstrations: str = ""
     """Folder of a data set, from `finssim collect`."""
     worlds: int = 32
-    """Number of worlds in which the policy is evaluated during learning; it learns nothing from them."""
+    """Number of worlds in which the policy is evaluated during training; it does not learn from them."""
     steps: int = 4_000_000
-    """Demonstrated steps that are looked at, all passes together."""
+    """Samples drawn from the demonstrations, summed over all passes."""
     rollout: int = 8192 * 8
-    """Looked at between two rows of the curve."""
+    """Samples between two rows of the curve."""
     batch: int = 512
     learning_rate: float = 1.0e-3
-    """Learning rate at the start; it falls linearly to zero."""
+    """Initial learning rate; it decreases linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
-    """Units of the hidden layers, ELU; of a task that sees, those behind the encoder of `distill`."""
+    """Units of the hidden layers, ELU; for a task with pictures, those behind the encoder of `distill`."""
     colour: float = 0.3
-    """Variation of the pictures' colours during learning, as in `distill`."""
+    """Strength of the colour augmentation of pictures, as in `distill`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,27 +55,27 @@ class DaggerSettings:
     expert: str = "pid"
     """A baseline of the task by name, or a policy directory."""
     demonstrations: str = ""
-    """A data set to begin with; none if empty."""
+    """Data set to begin with; none if empty."""
     worlds: int = 64
     steps: int = 300_000
-    """Control steps of all worlds together."""
+    """Control steps, summed over all worlds."""
     rollout: int = 100
     """Control steps of each world between two rounds of learning."""
     expert_rounds: int = 2
-    """Rounds in which the expert drives itself; after them the learner does."""
+    """Initial rounds in which the expert acts; after them the learner does."""
     kept: int = 500_000
-    """Samples that are kept, the newest."""
+    """Size of the sample buffer, with the newest samples."""
     passes: float = 2.0
-    """Number of passes over what is kept, in each round."""
+    """Number of passes over the sample buffer in each round."""
     batch: int = 512
     learning_rate: float = 1.0e-3
-    """Learning rate at the start; it falls linearly to zero."""
+    """Initial learning rate; it decreases linearly to zero."""
     weight_decay: float = 1.0e-5
     hidden: tuple[int, ...] = (64, 64)
 
 
 def demonstrations_for(environment: Environment, folder: str) -> Demonstrations:
-    """A data set that fits an environment.
+    """Load a data set that fits an environment.
 
     Raises:
         LearningError: None is named, or it is of another task, vehicle or action mode.
@@ -96,13 +97,13 @@ def demonstrations_for(environment: Environment, folder: str) -> Demonstrations:
     ):
         if has != required:
             raise LearningError(
-                f"{folder} is of {quantity} {has}, expected {required}: collect for what is trained"
+                f"{folder} is of {quantity} {has}, expected {required}: collect demonstrations for this training"
             )
     return data
 
 
 class _Cloner(ActingLearner):
-    """Common part of both: a network that is fitted to actions, and worlds in which it acts."""
+    """Common part of both learners: a network that is fitted to actions, and worlds in which it acts."""
 
     settings: Any
 
@@ -131,7 +132,7 @@ class _Cloner(ActingLearner):
         count: int,
         pictures: Mapping[str, torch.Tensor] = MappingProxyType({}),
     ) -> float:
-        """Regression on batches drawn with replacement; the mean squared error over all of them."""
+        """Fit batches drawn with replacement; return the mean squared error over all of them."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * self.remaining
         total, rounds = 0.0, max(1, count // self.settings.batch)
@@ -149,20 +150,22 @@ class _Cloner(ActingLearner):
         with torch.no_grad():
             for _ in range(steps):
                 observation = self._worlds.observation.to(self.device, copy=True)
-                observation = observation[:, 0] if self._pictures else observation  # only one vehicle can see
+                observation = (
+                    observation[:, 0] if self._pictures else observation
+                )  # tasks with pictures have one agent
                 self._worlds.step(self.policy(observation, **self._pictures).clamp(-1.0, 1.0))
                 self.tally.look()
 
     def network(self) -> nn.Module:
-        """Observation of one agent to its action."""
+        """Return the map from one agent's observation to its action."""
         return self.policy
 
     def learned(self) -> dict[str, Any]:
-        """Network and optimiser."""
+        """Return network and optimiser."""
         return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         self.policy.load_state_dict(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
 
@@ -184,7 +187,7 @@ class Bc(_Cloner):
         self._shown = {name: torch.from_numpy(x).to(device) for name, x in data.pictures.items()}
 
     def update(self) -> dict[str, float]:
-        """One round of regression, then a while of driving, which only measures.
+        """Run one round of regression, then a few control steps for the statistics only.
 
         The result is a row of the training curve, in the units of the curve.
         """
@@ -204,7 +207,7 @@ class Dagger(_Cloner):
     def __init__(
         self, environment: Environment, settings: DaggerSettings, *, seed: int, device: str = "cpu"
     ) -> None:
-        """Find the expert and what it has shown already."""
+        """Load the expert and the initial demonstrations."""
         super().__init__(environment, settings, seed=seed, device=device)
         self._expert = expert_in(environment, settings.expert)
         rows = environment.worlds * environment.agents
@@ -223,7 +226,7 @@ class Dagger(_Cloner):
         self._action = torch.cat([self._action, action])[-limit:]
 
     def update(self) -> dict[str, float]:
-        """One rollout, labelled by the expert, and regression on all that is kept.
+        """Run one rollout, labelled by the expert, and regression on the sample buffer.
 
         The result is a row of the training curve, in the units of the curve.
         """
@@ -255,7 +258,7 @@ class Dagger(_Cloner):
         return torch.cat(observations), torch.cat(labels)
 
     def learned(self) -> dict[str, Any]:
-        """Network, optimiser, what is kept, and the expert's memory."""
+        """Return network, optimiser, sample buffer, and the expert's memory."""
         return {
             **super().learned(),
             "observation": self._observation,
@@ -265,7 +268,7 @@ class Dagger(_Cloner):
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         super().load_learned(state)
         self._observation, self._action = state["observation"], state["action"]
         self._memory, self._rounds = memory_from(state["memory"], self._fresh), state["rounds"]

@@ -1,19 +1,20 @@
-"""PPO (Schulman et al. 2017), the learner of `finssim train`: one file, with gradients by hand.
+"""PPO (Schulman et al. 2017), the learner of `finssim train`: one file, with hand-written gradients.
 
-NumPy on a processor, without torch; the same lines with torch on a GPU, on the environment's own memory. Several
-agents of a world are rows of their own and share the networks.
+It uses NumPy on a CPU, without torch, and the same code with torch on a GPU, on the environment's own memory. Several
+agents of a world are separate rows and share the networks.
 
     rollout     every row acts for T control steps: a ~ N(μ(x), σ²)
     advantage   A_t = Σ (γ λ)^k δ_(t+k),  δ_t = r_t + γ V(x_(t+1)) - V(x_t)                     (Schulman et al. 2016)
     policy      minimise -E min(ρ A, clip(ρ, 1 ± ε) A) - c H,  ρ = π(a|x) / π_old(a|x)
     value       minimise E (V(x) - A - V_old(x))² / 2
 
-A teacher, where one is named, is imitated first: for a share of the steps its action at everything seen is what the
-policy learns (DAgger, Ross et al. 2011), while the value learns what that is worth:
+An optional teacher is imitated first: for a fraction of the steps the policy learns the teacher's action for every
+observation (DAgger, Ross et al. 2011), while the value learns the resulting returns:
 
     policy      minimise E |μ(x) - a_teacher|² / 2
 
-Where time ends an episode, the value of its last observation follows; where the task ends it, nothing does.
+If the time limit ends an episode, the return includes the value of its last observation; if the task ends it, nothing
+follows.
 """
 
 from __future__ import annotations
@@ -38,19 +39,19 @@ ROLLOUT_SAMPLES = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class PpoSettings:
-    """Default settings; those that differ by task are in `task_settings`."""
+    """Default settings; task-specific ones are in `task_settings`."""
 
     worlds: int = 256
     steps: int = 400_000
-    """Control steps of all worlds together."""
+    """Control steps, summed over all worlds."""
     rollout: int = 16
     """T, control steps of each world between two updates."""
     batch: int = 512
-    """Samples in a gradient step. At equal arithmetic, many small steps learn faster here than few large ones."""
+    """Samples in a gradient step. For equal computation, many small steps learn faster here than few large ones."""
     epochs: int = 3
     """Passes over a rollout."""
     learning_rate: float = 4.0e-3
-    """Learning rate at the start; it falls linearly to zero, which gives the last centimetres."""
+    """Initial learning rate; it decreases linearly to zero, which yields the last centimetres."""
     discount: float = 0.98
     """Discount factor γ per control step: 5 s of foresight at 10 Hz, a few time constants of the vehicle."""
     gae_lambda: float = 0.95
@@ -58,31 +59,34 @@ class PpoSettings:
     clip: float = 0.2
     """Bound ε on the ratio of probabilities, less 1."""
     largest_gradient: float = 0.5
-    """Longer gradients, of policy and value each, are shortened to this norm: an odd batch must not undo many."""
+    """Norm to which larger gradients of policy and value are clipped, so that an outlier batch does not undo many
+    others."""
     entropy_weight: float = 0.0
-    """c: no reward for noise, which would keep the vehicle from settling."""
+    """Weight c of the entropy; 0 by default, because rewarded noise would keep the vehicle from settling."""
     log_std: float = -1.0
-    """Logarithm of the action noise at the start: more hides the goal's last centimetres."""
+    """Logarithm of the initial standard deviation of the action noise; more noise hides the goal's last
+    centimetres."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of the hidden layers, tanh, of the policy and of the value each."""
+    """Units of the hidden layers, tanh, of policy and value each."""
     normalize: bool = False
-    """Scale observations by their running mean and standard deviation; the scales become part of the policy."""
+    """True to scale observations by their running mean and standard deviation, which become part of the policy."""
     history: int = 0
-    """Observations of earlier control steps that the policy sees beside the newest."""
+    """Number of previous observations in the policy's input, besides the newest."""
     last_action: bool = False
     """True if the policy observes its last action."""
     integral: bool = True
-    """True if the integrals of the task's `errors`, if it names some, are added to them, so that no error lasts."""
+    """True to add the integrals of the task's `errors`, if it names any, to these errors, so that no error
+    persists."""
     memory: int = 0
-    """Units of a GRU in front of the policy's hidden layers, which remembers what cannot be seen; 0: none."""
+    """Units of a GRU in front of the policy's hidden layers, as a memory of unobserved quantities; 0: none."""
     asymmetric: bool = True
-    """True if the value observes what randomisation has drawn, which the policy does not."""
+    """True if the value observes the randomised parameters, which the policy does not."""
     teacher: str = ""
-    """A baseline of the task by name, or a policy directory, that is imitated first; none if empty."""
+    """Controller to imitate first: a baseline of the task by name, or a policy directory; none if empty."""
     taught: float = 0.2
-    """Share of the steps in which it is; in the first third of these it also acts."""
+    """Fraction of the steps with imitation; in the first third of these the teacher also acts."""
     recorded: bool = True
-    """True if a GPU repeats recordings of its kernels (CUDA graphs), except with a teacher or several processes."""
+    """True if a GPU replays recordings of its kernels (CUDA graphs), except with a teacher or several processes."""
 
 
 class Ppo(ActingLearner):
@@ -104,11 +108,11 @@ class Ppo(ActingLearner):
         """Set up networks and optimisers, and age the first episodes.
 
         Args:
-            environment: Its episodes are the learner's from now on.
-            settings: Of the training.
-            seed: Of first weights, action noise and the order of samples.
+            environment: Environment, whose episodes the learner controls from now on.
+            settings: Settings of the training.
+            seed: Seed of initial weights, action noise and the order of samples.
             device: cpu or cuda.
-            arrays: NumPy on a processor and torch on a GPU, unless given; in a training of several processes theirs.
+            arrays: Library of arrays; by default NumPy on a CPU and torch on a GPU; required with several processes.
         """
         self.arrays = A = arrays or Arrays(seed, None if device == "cpu" else device)
         super().__init__(environment, settings, A)
@@ -131,7 +135,7 @@ class Ppo(ActingLearner):
         self.critic = TanhLayers(A, [judged, *s.hidden, 1])
         self._policy = NetworkParameters(A, self.actor, self.noise, *([self.gru] if self.gru else []))
         self._value = NetworkParameters(A, self.critic)
-        self.actor.initialize(last_gain=0.01)  # begin at action 0, whatever is seen
+        self.actor.initialize(last_gain=0.01)  # begin at action 0 for any observation
         self.critic.initialize(last_gain=1.0)
         self.noise.values[:] = s.log_std
         if self.gru:
@@ -142,36 +146,37 @@ class Ppo(ActingLearner):
         self._errors = e.task.errors if s.integral else ()
         self._integral = A.zeros(self._rows, len(self._errors))
         self._x = A.empty(s.rollout + 1, self._rows, inputs)
-        """What the policy saw."""
+        """Inputs of the policy."""
         self._c = self._x if judged == inputs else A.empty(s.rollout + 1, self._rows, judged)
-        """What the critic saw."""
+        """Inputs of the critic."""
         self._u, self._noise = A.empty(s.rollout, self._rows, m), A.empty(self._rows, m)
         self._teacher = expert_in(environment, s.teacher) if s.teacher else None
         self._fresh = self._teacher.reset(self._rows) if self._teacher else None
         self._remembered = self._fresh
-        """What the teacher remembers."""
+        """Memory of the teacher."""
         self._label = A.empty(s.rollout, self._rows, m) if self._teacher else None
-        """What the teacher would have done."""
+        """Actions of the teacher."""
         self._r, self._go, self._density = (A.empty(s.rollout, self._rows) for _ in range(3))
-        """Rewards; 0 where an episode ended, else 1; logarithms of the actions' densities, but for what all share."""
+        """Rewards; 0 where an episode ended, otherwise 1; log densities of the actions, without the term common to
+        all."""
         self._advantage, self._target = (A.empty(s.rollout, self._rows) for _ in range(2))
         """Advantages, and targets of the value."""
         self._before, self._old_log_std = A.zeros(self._rows, s.memory), A.zeros(m)
-        """What the GRU remembered before the rollout, and the action noise then."""
+        """Memory of the GRU before the rollout, and the action noise at that time."""
         self._losses = A.zeros(4)
         """Sums over the gradient steps of an update."""
-        # A teacher acts on the host, where nothing can be recorded.
+        # A teacher acts on the host, which cannot be recorded.
         recorded = A.recorded if s.recorded and self._teacher is None else lambda function: function
         self._decide = [recorded(partial(self._act, t)) for t in range(s.rollout)]
         self._conclude = [recorded(partial(self._close, t)) for t in range(s.rollout)]
         self._judge, self._take_step = recorded(self._advantages), recorded(self._gradient_step)
 
     def _views(self, name: str) -> Array:
-        """An array of the environment's, a row for each agent."""
+        """Return an array of the environment, with a row for each agent."""
         return self.arrays.view(getattr(self.environment.arrays, name)).reshape(self._rows, -1)
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it; a row of the training curve.
+        """Run one rollout, and `epochs` passes over it; return a row of the training curve.
 
         The row has the units of the curve.
         """
@@ -189,7 +194,7 @@ class Ppo(ActingLearner):
     # Rollout
 
     def _roll_out(self) -> None:
-        """Act for `rollout` control steps, and keep what was seen, done and earned."""
+        """Act for `rollout` control steps, and store observations, actions and rewards."""
         for decide, conclude in zip(self._decide, self._conclude, strict=True):
             self.arrays.noise(self._noise)
             decide()
@@ -198,7 +203,7 @@ class Ppo(ActingLearner):
         self._c[-1] = self._encode(self._integrated(self._observation)[0], self._drawn)[3]
 
     def _act(self, t: int) -> None:
-        """Decide what every row does in step t."""
+        """Compute the action of every row in step t."""
         A = self.arrays
         observation, integral = self._integrated(self._observation)
         x, self._x[t], h, judged = self._encode(observation, self._drawn)
@@ -220,7 +225,7 @@ class Ppo(ActingLearner):
         return self._teacher is not None and 1.0 - self.remaining < self.settings.taught
 
     def _ask(self, t: int) -> None:
-        """Note what the teacher would do at step t, and at first do it."""
+        """Store the teacher's action in step t, and at first execute it."""
         reading = Known(self.arrays.numpy(self._observation))
         answer, self._remembered = self._teacher.act(self._remembered, reading, NOWHERE)  # type: ignore[union-attr]
         label = self._label[t] = self.arrays.array(answer)  # type: ignore[index]
@@ -228,13 +233,13 @@ class Ppo(ActingLearner):
             self._u[t] = label
 
     def _integrated(self, observation: Array) -> tuple[Array, Array]:
-        """The observation with the errors' integrals in it, and these after the step."""
+        """Return the observation with the integrals added to the errors, and the integrals after the step."""
         if not self._errors:
             return observation, self._integral
         return with_integrals(self.arrays.xp, observation, self._integral, self._errors)
 
     def _encode(self, observation: Array, drawn: Array | None) -> tuple[Array, Array, Array | None, Array]:
-        """The scaled observation, what the policy sees, what its GRU makes of that, and what the critic sees."""
+        """Return the scaled observation, the policy's input, the output of its GRU, and the critic's input."""
         xp, k = self.arrays.xp, self._window
         x = (observation - self._mean) * self._scale if self.settings.normalize else observation
         policy_input = xp.concatenate([x, self._memory[:, :k]], 1) if k else x
@@ -251,7 +256,7 @@ class Ppo(ActingLearner):
             self._memory[:, k:] = h
 
     def _close(self, t: int) -> None:
-        """Store the result of step t; where time ended an episode, the value of its last observation is part of the
+        """Store the result of step t; if the time limit ended an episode, add the value of its last observation to the
         reward."""
         A, e = self.arrays, self.environment
         self.tally.look()
@@ -259,7 +264,7 @@ class Ppo(ActingLearner):
         terminated, truncated = self._terminated != 0, self._truncated != 0
         done = terminated | truncated
         if A.device is None and not done.any():
-            return  # on a GPU, testing takes longer than continuing
+            return  # on a GPU, the test takes longer than continuing
         late, done = (
             A.xp.broadcast_to(mask[:, None], (e.worlds, e.agents)).reshape(-1)
             for mask in (truncated & ~terminated, done)
@@ -288,7 +293,7 @@ class Ppo(ActingLearner):
     # Learning
 
     def _learn(self, rate: float) -> dict[str, float]:
-        """Take gradient steps on samples in random order; with a GRU, on complete rows in random order."""
+        """Make gradient steps on samples in random order; with a GRU, on complete rows in random order."""
         A, s, T = self.arrays, self.settings, self.settings.rollout
         n, size = (self._rows, s.batch // T) if self.gru else (T * self._rows, s.batch)
         size = max(1, size // A.processes)
@@ -308,12 +313,12 @@ class Ppo(ActingLearner):
         return {"action_std": std, **dict(zip(names, means, strict=True))}
 
     def _gradient_step(self, i: Array, policy_rate: Array, value_rate: Array) -> None:
-        """Take a gradient step of policy and value.
+        """Make one gradient step of policy and value.
 
         Args:
-            i: Numbers of the samples; with a GRU, of the rows.
-            policy_rate: Of `Adam.schedule`, for the policy.
-            value_rate: Of `Adam.schedule`, for the value.
+            i: Indices of the samples; with a GRU, of the rows.
+            policy_rate: Row of `Adam.schedule` for the policy.
+            value_rate: Row of `Adam.schedule` for the value.
         """
         s, T = self.settings, self.settings.rollout
         actions = self._label if self._taught else self._u
@@ -332,17 +337,17 @@ class Ppo(ActingLearner):
         self._losses[3] += self._improve_value(c, v, value_rate)
 
     def _improve_policy(self, mean: Array, u: Array, advantage: Array, old: Array, rate: Array) -> Array:
-        """One gradient step, after the actor's answers `mean` to a batch.
+        """Make one gradient step of the policy, from the actor's outputs `mean` for a batch.
 
         Args:
             mean: μ, (N, m).
-            u: What was done, (N, m).
+            u: Executed actions, (N, m).
             advantage: A, (N,).
-            old: log π_old(u|x) but for its constant, (N,).
-            rate: Of `Adam.schedule`.
+            old: log π_old(u|x) without its constant, (N,).
+            rate: Row of `Adam.schedule`.
 
         Returns:
-            The loss, the mean divergence from the old policy, and the part of the batch that is clipped.
+            The loss, the mean divergence from the old policy, and the clipped fraction of the batch.
         """
         s, xp, log_std = self.settings, self.arrays.xp, self.noise.values
         advantage = advantage - advantage.mean()
@@ -352,7 +357,7 @@ class Ppo(ActingLearner):
         log_ratio = -0.5 * (z * z).sum(1) - log_std.sum() - old
         ratio = xp.exp(log_ratio)
         free = xp.where(advantage >= 0.0, ratio < 1.0 + s.clip, ratio > 1.0 - s.clip)
-        slope = (ratio * advantage * free / -float(len(u)))[:, None]  # of the loss, by log π
+        slope = (ratio * advantage * free / -float(len(u)))[:, None]  # derivative of the loss by log π
         self.noise.gradient[:] = (slope * (z * z - 1.0)).sum(0) - s.entropy_weight
         self._step_policy(slope * z * inverse, rate)
         limited = xp.where(free, ratio, xp.clip(ratio, 1.0 - s.clip, 1.0 + s.clip))
@@ -363,7 +368,7 @@ class Ppo(ActingLearner):
         return numbers
 
     def _step_policy(self, slope: Array, rate: Array) -> None:
-        """One step of the policy's optimiser, from the loss's slope by the actor's answers, (N, m)."""
+        """Make one step of the policy's optimiser, from the derivative of the loss by the actor's outputs, (N, m)."""
         s = self.settings
         slope = self.actor.backward(slope, inputs=self.gru is not None)
         if self.gru:
@@ -371,27 +376,28 @@ class Ppo(ActingLearner):
         self._optimizers[0].step(rate)
 
     def _imitate(self, mean: Array, label: Array, rate: Array) -> Array:
-        """One gradient step towards the teacher's actions, (N, m); the loss."""
+        """Make one gradient step towards the teacher's actions, (N, m); return the loss."""
         error = mean - label
         self.noise.gradient[:] = 0.0
         self._step_policy(error / float(len(error)), rate)
         return 0.5 * (error * error).sum(1).mean()
 
     def _improve_value(self, judged: Array, target: Array, rate: Array) -> Array:
-        """One gradient step; the loss."""
+        """Make one gradient step of the value; return the loss."""
         error = self.critic(judged)[:, 0] - target
         self.critic.backward((error / float(len(error)))[:, None])
         self._optimizers[1].step(rate)
         return 0.5 * (error * error).mean()
 
     def _keep(self) -> Array:
-        """0 where an episode starts with a step of the rollout, else 1; the memory before it is right already."""
+        """Return 0 where an episode starts with a step of the rollout, otherwise 1; the initial memory is already
+        correct."""
         keep = self.arrays.zeros(*self._go.shape) + 1.0
         keep[1:] = self._go[:-1]
         return keep
 
     def _rescale(self) -> None:
-        """Take the rollout's observations into the running mean and variance (Chan et al. 1979)."""
+        """Update the running mean and variance with the rollout's observations (Chan et al. 1979)."""
         A, n = self.arrays, self.environment.observation_size
         x = self._x[:-1, :, :n].reshape(-1, n)
         centre = A.average(x.mean(0))
@@ -409,14 +415,15 @@ class Ppo(ActingLearner):
         return 1.0 / self.arrays.xp.sqrt(self._variance + 1e-6)
 
     def _cell_of(self, take: Callable[[Array], Array] = lambda array: array) -> Cell:
-        """Return the GRU's weights, each as `take` makes it."""
+        """Return the GRU's weights, each transformed by `take`."""
         W_x, b_x, W_h, b_h = map(take, self.gru.weights)  # type: ignore[union-attr]
         return Cell(Linear(W_x, b_x), Linear(W_h, b_h))
 
-    # What others need of a learner
+    # Interface of a learner
 
     def network(self) -> Network:
-        """Observation to mean action, with what the policy remembers; a copy, in NumPy where training is on a CPU."""
+        """Return a copy of the policy with its memory, from observation to mean action; in NumPy after training on
+        a CPU."""
         A, s = self.arrays, self.settings
         copy = A.numpy if A.group is not None and A.device == "cpu" else A.copy
         weights = [copy(x) for x in self.actor.weights]
@@ -435,7 +442,7 @@ class Ppo(ActingLearner):
         )
 
     def _numbers(self) -> dict[str, Array]:
-        """Arrays that decide what comes next."""
+        """Return the arrays of the training's state."""
         numbers = {"mean": self._mean, "variance": self._variance, "memory": self._memory}
         numbers["integral"] = self._integral
         for name, optimizer in zip(("policy", "value"), self._optimizers, strict=True):
@@ -444,7 +451,7 @@ class Ppo(ActingLearner):
         return numbers
 
     def learned(self) -> dict[str, Any]:
-        """Networks, optimisers, scales, memories and random streams."""
+        """Return networks, optimisers, scales, memories and random streams."""
         return {
             "teacher": memory_leaves(self._remembered) if self._teacher else None,
             "numbers": {name: self.arrays.numpy(array) for name, array in self._numbers().items()},
@@ -453,7 +460,7 @@ class Ppo(ActingLearner):
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the arrays that `learned` returned."""
         for name, array in self._numbers().items():
             array[...] = self.arrays.array(state["numbers"][name])
         self._seen, *counts = (int(count) for count in state["counts"])

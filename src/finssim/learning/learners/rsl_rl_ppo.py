@@ -1,4 +1,5 @@
-"""PPO of RSL-RL on the batched environment, with a critic that sees the plant's parameters where they are drawn."""
+"""PPO of RSL-RL on the batched environment, with a critic that observes the plant's parameters if they are
+randomised."""
 
 from __future__ import annotations
 
@@ -22,18 +23,19 @@ from finssim.tasks import Environment
 
 @dataclass(frozen=True, kw_only=True)
 class RslRlSettings(OnPolicySettings):
-    """Settings as those of PPO. RSL-RL clips the gradients of policy and value separately."""
+    """Settings of PPO. RSL-RL clips the gradients of policy and value separately."""
 
     value_weight: float = 1.0
-    """Policy and value share no weights: it scales the value's learning rate alone."""
+    """Weight of the value's error; policy and value share no weights, so it only scales the value's learning rate."""
     clip_values: bool = False
-    """Values here are of the order of tens; steps limited to `clip` would take long to reach them."""
+    """True to limit changes of the values by `clip`; values here are of the order of tens, and would take long to
+    reach."""
     asymmetric: bool = True
-    """True if the critic observes the drawn parameters of vehicle and water, if the environment gives them."""
+    """True if the critic observes the randomised parameters of vehicle and water, if the environment provides them."""
 
 
 class RslRlPpo(ActingLearner):
-    """PPO; several agents of a world are rows of their own and share the networks."""
+    """PPO; several agents of a world are separate rows and share the networks."""
 
     Settings = RslRlSettings
     rollout_samples = ROLLOUT_SAMPLES
@@ -52,7 +54,7 @@ class RslRlPpo(ActingLearner):
         groups = {"actor": ["policy"], "critic": list(groups_now.keys())}
         noise = {
             "class_name": "GaussianDistribution",
-            "std_type": "log",  # the optimiser's step cannot take it to zero
+            "std_type": "log",  # a step of the optimiser cannot make it zero
             "init_std": float(torch.tensor(settings.log_std).exp()),
         }
         sizes = {"hidden_dims": list(settings.hidden), "activation": "elu"}
@@ -79,13 +81,13 @@ class RslRlPpo(ActingLearner):
             learning_rate=settings.learning_rate,
             max_grad_norm=settings.largest_gradient,
             use_clipped_value_loss=settings.clip_values,
-            schedule="fixed",  # what is set before each update falls linearly to zero
+            schedule="fixed",  # the rate is set before each update, and decreases linearly to zero
             normalize_advantage_per_mini_batch=True,
             device=device,
         )
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it.
+        """Run one rollout, and `epochs` passes over it.
 
         The result is a row of the training curve, in the units of the curve.
         """
@@ -108,20 +110,20 @@ class RslRlPpo(ActingLearner):
         return {**self.tally.row(), "action_std": self.ppo.actor.output_std.mean().item(), **row}
 
     def network(self) -> nn.Module:
-        """Observation to mean action, as a plain stack of layers."""
+        """Return the map from observation to mean action, as a plain stack of layers."""
         return nn.Sequential(*self.ppo.actor.mlp)
 
     def learned(self) -> dict[str, Any]:
-        """Networks and optimiser."""
+        """Return networks and optimiser."""
         saved: dict[str, Any] = self.ppo.save()
         return saved
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         self.ppo.load(state, None, True)
 
     def _observe(self, final: bool = False) -> TensorDict:
-        """Copies of what actor and critic see now, or saw at the end of the episodes that ended in this step."""
+        """Return copies of the current observations of actor and critic, or of the last ones of finished episodes."""
         e, w = self.environment, self._worlds
         groups = {"policy": (w.final_observation if final else w.observation).reshape(self._rows, -1).clone()}
         privileged = privileged_rows(e, "final_privileged" if final else "privileged")
@@ -130,9 +132,9 @@ class RslRlPpo(ActingLearner):
         return TensorDict(groups, batch_size=[self._rows])
 
     def _add_last_values(self, reward: torch.Tensor, timed_out: torch.Tensor) -> None:
-        """Add the discounted value of an episode's last observation to the reward where time ended the episode.
+        """Add the discounted value of an episode's last observation to the reward if the time limit ended the episode.
 
-        RSL-RL's own way takes the value of the observation before.
+        RSL-RL itself would use the value of the previous observation.
         """
         rows = self._by_row(timed_out).nonzero().flatten()
         if len(rows):
@@ -150,7 +152,7 @@ class RslRlPpo(ActingLearner):
 
 
 def _begin(mlp: Any, last_gain: float) -> None:
-    """Give a network of RSL-RL the first weights that the other learners start from."""
+    """Set the initial weights of a network of RSL-RL to those of the other learners."""
     linear = [layer for layer in mlp if isinstance(layer, nn.Linear)]
     sizes = [layer.out_features for layer in linear]
     model = stack(linear[0].in_features, sizes[:-1], sizes[-1], last_gain)
@@ -159,13 +161,13 @@ def _begin(mlp: Any, last_gain: float) -> None:
 
 
 def privileged_rows(environment: Environment, name: str = "privileged") -> torch.Tensor | None:
-    """Return the observations that only a critic may have, one row per agent; None if there is nothing.
+    """Return the privileged observations of a critic, one row per agent; None if there are none.
 
     They are a view of the environment's memory.
 
     Args:
         environment: The worlds.
-        name: `privileged`, or `final_privileged` of the episode before, where one ended in this step.
+        name: `privileged`, or `final_privileged` for the previous episode, where one ended in this step.
     """
     array = getattr(environment.arrays, name, None)
     if array is None or not array.size:

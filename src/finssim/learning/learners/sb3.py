@@ -19,10 +19,10 @@ from finssim.tasks import Environment
 
 
 class TalliedWorlds(Sb3VecEnv):
-    """Worlds of which some episodes end in every step, and each step is tallied."""
+    """Worlds in which some episodes end in every step, with statistics of each step."""
 
     def __init__(self, tally: EpisodeTally) -> None:
-        """Adapt the tally's environment."""
+        """Adapt the environment of the statistics."""
         super().__init__(tally.environment, stagger=True)
         self.tally = tally
 
@@ -36,9 +36,9 @@ class TalliedWorlds(Sb3VecEnv):
 
 
 class Sb3Ppo(ActingLearner):
-    """SB3's PPO an update at a time: what its `learn` does, without its loop.
+    """SB3's PPO, one update at a time: its `learn` method without the loop.
 
-    Several agents of a world are rows of their own and share the network.
+    Several agents of a world are separate rows and share the network.
     """
 
     Settings = OnPolicySettings
@@ -68,12 +68,12 @@ class Sb3Ppo(ActingLearner):
             seed=seed,
             device=device,
         )
-        self.model.set_logger(Logger(None, []))  # one that only collects
+        self.model.set_logger(Logger(None, []))  # a logger that only collects values
         _, callback = self.model._setup_learn(s.steps * environment.agents)
         self.callback: BaseCallback = callback
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it.
+        """Run one rollout, and `epochs` passes over it.
 
         The result is a row of the training curve, in the units of the curve.
         """
@@ -87,17 +87,17 @@ class Sb3Ppo(ActingLearner):
         return {**self.tally.row(), "action_std": torch.exp(m.policy.log_std).mean().item(), **logged}
 
     def _count(self) -> None:
-        """Update the steps and the share of the training."""
+        """Update the number of steps and the remaining fraction of the training."""
         self.steps = self.model.num_timesteps // self.environment.agents
         self.model._update_current_progress_remaining(self.steps, self.settings.steps)
 
     def network(self) -> nn.Module:
-        """Observation to mean action, as a plain stack of layers."""
+        """Return the map from observation to mean action, as a plain stack of layers."""
         policy: Any = self.model.policy
         return nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
 
     def learned(self) -> dict[str, Any]:
-        """Parameters, the optimiser and counters."""
+        """Return parameters, optimiser and counters."""
         m = self.model
         return {
             "policy": m.policy.state_dict(),
@@ -109,7 +109,7 @@ class Sb3Ppo(ActingLearner):
         }
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         m = self.model
         m.policy.load_state_dict(state["policy"])
         m.policy.optimizer.load_state_dict(state["optimizer"])

@@ -1,7 +1,7 @@
 """PPO of TorchRL on the batched environment: for one agent, and for several that share a network (IPPO, MAPPO).
 
-TorchRL's losses and its generalised advantage, with a rollout of our own on the environment's memory: its collectors
-copy every step several times.
+It uses TorchRL's losses and its generalised advantage, with FinsSim's own rollout on the environment's memory:
+TorchRL's collectors copy every step several times.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from finssim.tasks import Environment
 
 @dataclass(frozen=True, kw_only=True)
 class TorchRlSettings(OnPolicySettings):
-    """Settings as those of PPO."""
+    """Settings of PPO."""
 
 
 class Head(nn.Module):
-    """Mean and standard deviation of the action; the latter is the same wherever the vehicle is."""
+    """Mean and standard deviation of the action; the latter does not depend on the observation."""
 
     def __init__(self, mean: nn.Module, size: int, log_std: float) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Head(nn.Module):
 
 
 class OwnValue(nn.Module):
-    """Value of what an agent sees, (..., agents, size) to (..., agents, 1)."""
+    """Value of an agent's own observation, (..., agents, size) to (..., agents, 1)."""
 
     def __init__(self, environment: Environment, hidden: tuple[int, ...]) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ class OwnValue(nn.Module):
 
 
 class TeamValue(nn.Module):
-    """Value for each agent of what all agents see: their observations in a row, and which of them it is for."""
+    """Value for each agent from the concatenated observations of all agents and the agent's index."""
 
     def __init__(self, environment: Environment, hidden: tuple[int, ...]) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class TeamValue(nn.Module):
 
 
 class TorchRlPpo(ActingLearner):
-    """PPO of one agent. Tensors are (worlds, agents, size), the time in front where there is one."""
+    """PPO of one agent. Tensors are (worlds, agents, size), or (time, worlds, agents, size)."""
 
     Settings = TorchRlSettings
     rollout_samples = ROLLOUT_SAMPLES
@@ -117,7 +117,7 @@ class TorchRlPpo(ActingLearner):
         )
 
     def update(self) -> dict[str, float]:
-        """One rollout, and `epochs` passes over it.
+        """Run one rollout, and `epochs` passes over it.
 
         The result is a row of the training curve, in the units of the curve.
         """
@@ -132,7 +132,7 @@ class TorchRlPpo(ActingLearner):
         return {**self.tally.row(), **row, "policy_gradient_loss": policy}
 
     def _rollout(self) -> TensorDict:
-        """Act for `rollout` control steps: samples (rollout * worlds, agents, ...)."""
+        """Act for `rollout` control steps; return samples (rollout * worlds, agents, ...)."""
         w, s, observations = self._worlds, self.settings, []
         actions, rewards, ends, kills, lasts = [], [], [], [], []
         for _ in range(s.rollout):
@@ -144,12 +144,12 @@ class TorchRlPpo(ActingLearner):
             rewards.append(w.reward.clone())
             ends.append(terminated | truncated)
             kills.append(terminated)
-            lasts.append(w.final_observation[ends[-1]])  # by the mask: a copy
+            lasts.append(w.final_observation[ends[-1]])  # indexing by a mask copies
         observation, action = torch.stack(observations), torch.stack(actions)
         value = self.critic(observation)
         after = torch.cat([value[1:], self.critic(w.observation)[None]])
         done = torch.stack(ends)
-        # Where an episode ended, what follows has the value of its own last observation, not of the next's first.
+        # At the end of an episode, the next value is that of its own last observation, not of the next episode's first.
         after[done] = self.critic(torch.cat(lasts))
         advantage, target = self._advantage(value, after, torch.stack(rewards), done, torch.stack(kills))
         loc, scale = self.actor(observation)
@@ -171,7 +171,7 @@ class TorchRlPpo(ActingLearner):
         done: torch.Tensor,
         killed: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Advantages and value targets, (time, worlds, agents, 1), from values of that shape."""
+        """Return advantages and value targets, (time, worlds, agents, 1), from values of that shape."""
         s = self.settings
 
         def time_last(x: torch.Tensor) -> torch.Tensor:
@@ -190,7 +190,7 @@ class TorchRlPpo(ActingLearner):
             yield samples[index.to(samples["observation"].device)]
 
     def _learn(self, batch: TensorDict) -> torch.Tensor:
-        """One gradient step: the losses of policy and value."""
+        """Make one gradient step; return the losses of policy and value."""
         losses = self.loss(batch)
         parts = [losses[f"loss_{name}"] for name in ("objective", "critic")]
         extra = losses["loss_entropy"] if self.settings.entropy_weight > 0.0 else 0.0
@@ -201,30 +201,31 @@ class TorchRlPpo(ActingLearner):
         return torch.stack([part.detach() for part in parts])
 
     def network(self) -> nn.Module:
-        """Observation of one agent to its mean action, as a plain stack of layers."""
+        """Return the map from one agent's observation to its mean action, as a plain stack of layers."""
         return self.actor.mean
 
     def learned(self) -> dict[str, Any]:
-        """Networks and optimiser."""
+        """Return networks and optimiser."""
         parts = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
         return {name: part.state_dict() for name, part in parts.items()}
 
     def load_learned(self, state: dict[str, Any]) -> None:
-        """Take what `learned` gave."""
+        """Restore the state that `learned` returned."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.optimizer.load_state_dict(state["optimizer"])
 
 
 class TorchRlIppo(TorchRlPpo):
-    """Several agents share a network; each one's value is of what it sees itself (de Witt et al. 2020)."""
+    """PPO of several agents with a shared network; each value depends on the agent's own observation (de Witt et
+    al. 2020)."""
 
     def _loss(self, actor: Any, critic: Any, **options: Any) -> Any:
         return IPPOLoss(actor, critic, **options)
 
 
 class TorchRlMappo(TorchRlPpo):
-    """Several agents share a network; values are of what all of them see (Yu et al. 2022)."""
+    """PPO of several agents with a shared network; values depend on all agents' observations (Yu et al. 2022)."""
 
     value = TeamValue
 
