@@ -146,7 +146,7 @@ def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--robot", "pool", "--pool-file", "p.yaml", "--plants", "2"], "leave --plants"),
+        (["--robot", "pool", "--pool-file", "p.yaml", "--plants", "2"], "omit --plants"),
         (["--robot", "pool", "--arm"], "give --pool-file"),
         (
             ["--robot", "pool", "--arm", "--pool-file", "p.yaml", "--let-in", "0,0"],

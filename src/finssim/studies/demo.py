@@ -64,22 +64,25 @@ from finssim.vehicles.defaults import SITES, room
 __all__ = ["demo"]
 
 SHARE = 0.9
-"""Largest level, part of the wrench limit: the rest is for the controller that holds the other axes."""
+"""Greatest excitation level as a fraction of the wrench limit [-]; the rest is for the controller of the
+other axes."""
 
 
 def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str, list[float]]:
-    """Levels that take a vehicle as fast as given ones take FinsROV, in its own lengths, and tilt it as far.
+    """Scale excitation levels from FinsROV to a vehicle, so that speeds in its own lengths and tilt angles
+    are equal.
 
-    A linear axis comes to FinsROV's terminal speed times the vehicle's `room`, yaw to FinsROV's rate, roll and pitch to
-    FinsROV's angle at rest. Surge and sway stay slower where the vehicle's own righting moment would not hold it: see
-    `level_speed`. Programmes then last as long and go as far, in a pool that is `room` times as large.
+    A linear axis reaches FinsROV's terminal speed times the vehicle's `room`, yaw FinsROV's rate, roll and
+    pitch FinsROV's angle at rest. Surge and sway stay slower if the vehicle's righting moment would not keep
+    it level: see `level_speed`. Programmes then have equal durations, and distances that fit a pool `room`
+    times as large.
 
     Args:
         levels: Axis -> levels for FinsROV [N, N m].
-        vehicle: Whose file gives damping, stiffness and limits; axes that it does not control are left out.
+        vehicle: Vehicle with damping, stiffness and limits; axes that it does not control are left out.
 
     Returns:
-        Axis -> levels, to three digits and at most `SHARE` of the limit; FinsROV's own as they are.
+        Axis -> levels, to three digits and at most `SHARE` of the limit; those of FinsROV unchanged.
     """
     published = load_vehicle("finsrov")
     if vehicle.name == published.name:
@@ -106,23 +109,23 @@ def matched(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> dict[str
 
 
 PERIODS = {"surge": 4.0, "sway": 4.0, "heave": 2.4, "roll": 2.0, "pitch": 2.0, "yaw": 4.0}
-"""Period of the wave, some five time constants of a small vehicle [s]."""
+"""Period of the square wave, about five time constants of a small vehicle [s]."""
 WAVES = 2.5
-"""The first and the last half of a half wave, so that the middle of the way is where it began."""
+"""Number of periods; the wave begins and ends with half a pulse, so that the path is centred on its start."""
 
 
 def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Programme]:
-    """Square waves, two and a half periods each, which begin with half of a push.
+    """Return square-wave programmes of two and a half periods each, which begin with half a pulse.
 
-    Steps tell the drag, for most of a step is steady; mass is told by what is not, and the propellers of the two
-    directions, which differ, average out within a trial.
+    Steps identify the drag, since most of a step is steady; square waves identify the mass from the
+    transients, and the difference of forward and reverse thrust averages out within a trial.
 
     Args:
         levels: Axis -> magnitudes [N, N m].
-        vehicle: Must control the axes.
+        vehicle: Vehicle that must control the axes.
 
     Raises:
-        CalibrationError: An axis that the vehicle does not control.
+        CalibrationError: The vehicle does not control an axis.
     """
     plan = []
     for axis in which_axes(list(levels), vehicle):
@@ -130,7 +133,7 @@ def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Pr
         phase = np.repeat(np.array(["rest", "baseline", "excitation", "coast", "rest"]), counts)
         turns = (np.arange(counts[2]) / RATE + 1e-6) / PERIODS[axis]
         tau = np.zeros((len(phase), 6))
-        # A cosine's sign: a quarter of the period forward, half of it back, and so on.
+        # The sign of a cosine: a quarter of the period forward, half of it backward, and so on.
         tau[phase == "excitation", AXES.index(axis)] = np.sign(np.cos(2.0 * math.pi * turns))
         for level in levels[axis]:
             name = f"{axis}_shuttle_{level:.4g}"
@@ -138,43 +141,45 @@ def shuttles(levels: Mapping[str, Sequence[float]], vehicle: Vehicle) -> list[Pr
     return plan
 
 
-# An unmeasured vehicle, trials, and what they determine.
+# Identification of an unmeasured vehicle from trials.
 
 
 TRIALS = "trials"
 VEHICLE_FILES = ("{}_rough.yaml", "{}_identified.yaml")
-"""Files of the vehicle before and after."""
+"""Vehicle files before and after the identification."""
 SET = "hydrodynamics.calibrated"
 
 HELD_OUT = {"surge": [9.0], "sway": [6.0], "heave": [7.0], "yaw": [1.0]}
-"""Levels that no trial of the fit has [N, N m]."""
+"""Levels that are not used in the fit [N, N m]."""
 
 Record = Callable[[Mapping[str, Path], str], Mapping[str, Sequence[Trial]]]
-"""Makes trials: folders by role (fit, held-out), file of the rough vehicle -> the trials by role."""
+"""Function of folders by role (fit, held-out) and the file of the rough vehicle that records trials and
+returns them by role."""
 
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of the trials."""
+    """Result of the identification."""
 
     vehicle: Vehicle
-    """Vehicle as read back from its file."""
+    """Identified vehicle, as read back from its file."""
     fit: Fit
     replay: Replay
-    """Replay of the held-out trials by the identified vehicle."""
+    """Replay of the held-out trials with the identified vehicle."""
     truth: Vehicle
-    """The vehicle of the catalogue that made the trials, or around which the pool's own was drawn."""
+    """Catalogue vehicle that was used for the trials, or around which the pool's own vehicle was drawn."""
     findings: tuple[Finding, ...]
     seconds: float
-    """Time that the trials took [s]."""
+    """Duration of recording and identification [s]."""
 
 
 def rough_vehicle(truth: Vehicle) -> Vehicle:
-    """Return what is known of a vehicle before any trial: its weight and size, and thrusters from a bench.
+    """Return a vehicle with the knowledge before any trial: weight, size, and bench data of the thrusters.
 
-    Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the order of
-    other small vehicles, forces growing with the square of the length, moments with its fourth power and moments of
-    inertia with its fifth. Moments are guessed low: a controller that counts on damping which is not there rings.
+    Its hydrodynamics are guesses: added mass of half the displaced water on every linear axis, damping of the
+    order of other small vehicles, forces growing with the square of the length, moments with its fourth power
+    and moments of inertia with its fifth. Moments are guessed low, since a controller that relies on missing
+    damping oscillates.
     """
     half = 0.5 * truth.water.density * truth.body.displaced_volume
     size = room(truth.body.size)
@@ -190,24 +195,24 @@ def rough_vehicle(truth: Vehicle) -> Vehicle:
 
 
 def _named(vehicle: Vehicle, title: str, description: str) -> Vehicle:
-    """Return the same vehicle with another name and description."""
+    """Return a copy of the vehicle with another title and description."""
     return vehicle.model_copy(update={"title": title, "description": description})
 
 
 def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identification:
-    """Make trials of a vehicle, identify it from some, replay the others; write all of it.
+    """Record trials of a vehicle, identify it from some of them, replay the others, and write all results.
 
-    Into the folder go `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
+    The folder then contains `NAME_rough.yaml` (the vehicle before), `trials/fit` and `trials/held-out`,
     `NAME_identified.yaml`, `calibration` (the report), and `replay.json` with `replay.png`.
 
     Args:
         folder: Existing directory.
         name: Name or file of a vehicle.
-        seed: Of initial conditions and noise of the trials.
-        record: Makes the trials.
+        seed: Seed of initial conditions and noise of the trials.
+        record: Function that records the trials.
 
     Returns:
-        What was found.
+        Result of the identification.
     """
     began = time.perf_counter()
     truth = load_vehicle(name)
@@ -243,7 +248,7 @@ def identify(folder: Path, name: str, *, seed: int, record: Record) -> Identific
 
 
 def commands(folder: Path, name: str) -> list[str]:
-    """Command lines that identify and replay from the trials again."""
+    """Return the command lines that repeat identification and replay from the trials."""
     start, vehicle = (folder / file.format(name) for file in VEHICLE_FILES)
     trials = folder / TRIALS
     return [
@@ -263,7 +268,7 @@ UNSURE = (
 )
 POOL_VEHICLE = (
     " The catalogue's vehicle is the one around which the pool drew its own: the plant's coefficients are known to the "
-    "pool alone. Its propellers push up to 15 % more or less than the bench said, so the estimates "
+    "pool alone. Its propellers push up to 15 % more or less than the bench data, so the estimates "
     "are effective masses and dampings: those for the nominal thrust of the vehicle file."
 )
 
@@ -271,12 +276,12 @@ POOL_VEHICLE = (
 def _paths(
     motions: Sequence[NDArray[np.float64]], site: str, goals: NDArray[np.float64] | None = None
 ) -> Any:
-    """Draw paths from above and from the side, in the water.
+    """Draw the paths of trials from above and from the side.
 
     Args:
         motions: Positions of each trial in the world [m], (n, 3).
-        site: A name of `SITES`.
-        goals: Position [m] and yaw [rad] that each trial was to hold, (trials, 4); None: it had none.
+        site: A name in `SITES`.
+        goals: Goal position [m] and yaw [rad] of each trial, (trials, 4); None: no goals.
     """
     size = SITES[site]
     pool = (
@@ -314,7 +319,7 @@ CURVES = {
 
 
 def _training(curves: NDArray[Any]) -> Any:
-    """Draw the first two of `CURVES` that a training measured, over its control steps."""
+    """Draw the first two of `CURVES` that a training recorded, over its control steps."""
     names = [
         name for name in CURVES if name in (curves.dtype.names or ()) and np.isfinite(curves[name]).any()
     ]
@@ -329,22 +334,22 @@ def _training(curves: NDArray[Any]) -> Any:
 
 
 def _hydrodynamic(result: Identification) -> dict[str, Any]:
-    """Return the estimates of the hydrodynamics by their names."""
+    """Return the estimates of hydrodynamic parameters by name."""
     return {
         name: e for name, e in result.fit.estimates.items() if str(e.path or "").startswith("hydrodynamics.")
     }
 
 
 def _identification(result: Identification, hardware: bool) -> list[Table]:
-    """Return tables of what the trials determined, and of the replay of other trials."""
+    """Return tables of the identified parameters, and of the replay of held-out trials."""
     score = result.replay.aggregate(result.replay.models[0]).value
     source, same = ("a robot", "on the same robot") if hardware else ("the virtual pool", "in the same pool")
     lead = (
         f"Identified in {result.seconds:.0f} s from {len(result.fit.trials)} trials of {source}, beginning with "
         "guessed hydrodynamics: the robot's own software played each programme, and its record became a trial. "
         f"{len(result.replay.pairs)} other trials, at levels that were not fitted, are replayed with an NRMSE of "
-        f"{'unknown' if score is None else f'{score:.3f}'}. What follows was trained and tuned in the identified "
-        f"vehicle, and tried {same}."
+        f"{'unknown' if score is None else f'{score:.3f}'}. Controllers were trained and tuned in the identified "
+        f"vehicle, and tested {same}."
     )
     rows = [
         [
@@ -384,7 +389,7 @@ def _lead(result: Mapping[str, Any], spec: Spec, seconds: float) -> str:
 
 
 def _known(result: Identification) -> str:
-    """Return in one sentence which numbers of the hydrodynamics are known after the trials."""
+    """Return a sentence that states which hydrodynamic parameters are known after the trials."""
     states = {name: state_text(e, result.fit, result.vehicle) for name, e in _hydrodynamic(result).items()}
     kept = [name for name, state in states.items() if state == "file kept"]
     alone = sum(state == "written" for state in states.values())
@@ -394,7 +399,7 @@ def _known(result: Identification) -> str:
 
 
 def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
-    """Every setpoint of every controller."""
+    """Return the table of every setpoint and controller."""
     rows = [
         [f"{spec.rows[name].title}, {target}", *cells(figures, T1_COLUMNS)]
         for name, row in result["rows"].items()
@@ -406,13 +411,13 @@ def _setpoints(result: Mapping[str, Any], spec: Spec) -> Table:
 
 
 PLANT_FILE = "pool.yaml"
-"""The plant, for `finssim pool --plant`."""
+"""File of the plant, for `finssim pool --plant`."""
 REPORT_FILE = "report.html"
 SEVERITY, RANGES = "realistic", "pool"
 POLICY, WITH_PICTURES = "calibrated-pool", "with-pictures"
-"""Rows of station keeping: the policy that is trained here; and the same, with pictures drawn and searched for tags."""
+"""Rows of station keeping: the policy that is trained here, and the same with rendered pictures and tag detection."""
 COAST = 4.0
-"""Longest, after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
+"""Longest coast after a dive [s]: the pool is shallow, and this vehicle hardly rises."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -420,15 +425,15 @@ class Scope:
     """Extent of a demonstration."""
 
     levels: dict[str, list[float]]
-    """Axis -> levels of the steps and pulses that the fit is made from, for FinsROV [N, N m]."""
+    """Axis -> levels of the steps and pulses used for the fit, for FinsROV [N, N m]."""
     shuttles: dict[str, list[float]]
     """Levels of the square waves by axis [N, N m]."""
     held_out: dict[str, list[float]]
     """Levels of the replayed trials by axis [N, N m]."""
     setpoints: tuple[str, ...]
-    """Tried by every controller, with the tags' corners computed."""
+    """Setpoints for every controller, with computed tag corners."""
     pictures: tuple[str, ...]
-    """Tried by the policy with pictures drawn and searched."""
+    """Setpoints for the policy with rendered pictures."""
     duration: float = 60.0
     """Duration of a trial [s]."""
 
@@ -459,15 +464,15 @@ class DemoSettings:
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
     steps: Annotated[int | None, (1, None)] = None
-    """Control steps of the training, summed over all worlds; the task's default if not given."""
+    """Control steps of the training, summed over all worlds; default that of the task."""
     firmware: str = "mcu"
     """(NAME) Firmware of the vehicle: mcu (FinsROV's motor controller) or ardusub (an autopilot over
     MAVLink: the policy uses its axes, `pilot6`, in a tank with a DVL and a compass instead of the pool and
     its camera, with setpoints three times as far)."""
     scope: Scope | None = None
-    """`FULL` if None."""
+    """Extent of the demonstration; None: `FULL`."""
     processes: Annotated[int | None, "python"] = None
-    """As many as there are processors if None."""
+    """Number of parallel processes; None: one per processor."""
 
 
 def demo(
@@ -481,9 +486,8 @@ def demo(
     """Identify a vehicle in the virtual pool or on a robot, train and deploy a policy, write a report.
 
     Trials are recorded and controllers deployed through the robot's complete software: camera, localization,
-    fusion,
-    controller, allocation, bridge and the motor controller's protocol. For comparison, `pid`, tuned from the
-    identified vehicle, runs the same setpoints in the same pool.
+    fusion, controller, allocation, bridge and the motor controller's protocol. For comparison, `pid`, tuned
+    from the identified vehicle, runs the same setpoints in the same pool.
 
     A vehicle that must move to steer, such as remus100, is identified from manoeuvres of its autopilot, and follows
     paths in open water.
@@ -497,16 +501,16 @@ def demo(
     Args:
         out (DIR): Directory of trials, vehicle, policy, results and report.
         settings: Vehicle, training and extent.
-        robot: Where trials are made and setpoints held, in place of the virtual pool.
-        console: Where progress is shown; standard error if None.
+        robot: Robot for trials and setpoints, instead of the virtual pool.
+        console: Console for progress; None: standard error.
         as_json: Print one JSON object instead of tables.
 
     Returns:
         Path of the report.
 
     Raises:
-        RobotError: The folder is of another demonstration.
-        KeyboardInterrupt: After Ctrl-C; the same command goes on.
+        RobotError: The folder belongs to another demonstration.
+        KeyboardInterrupt: Ctrl-C was pressed; the same command continues.
     """
     console, standing = console or Console(stderr=True), load_vehicle(settings.vehicle)
     settings = replace(settings, firmware=firmware_of(settings.firmware, standing, robot))
@@ -519,7 +523,7 @@ def demo(
     if must_move(standing):
         if robot is not None or settings.firmware != "mcu":
             raise RobotError(
-                f"{standing.name} must move to steer: its demonstration is in the virtual site alone, without --robot "
+                f"{standing.name} must move to steer: its demonstration runs only in the virtual site, without --robot "
                 "and --firmware"
             )
         tables, report = demo_course(
@@ -533,13 +537,13 @@ def demo(
 
 
 def must_move(vehicle: Vehicle) -> bool:
-    """Return whether a vehicle steers with fins: it does not control yaw by thrusters."""
+    """Return whether a vehicle steers with fins, that is, does not control yaw by thrusters."""
     fins = any(actuator.kind == "fin" for actuator in vehicle.actuators.values())
     return fins and "yaw" not in vehicle.controlled_axes
 
 
 def _shown(tables: list[Table], report: Path, as_json: bool) -> Path:
-    """Print the tables, or one JSON object, and show the report where there is a screen."""
+    """Print the tables, or one JSON object, and open the report if there is a screen."""
     if as_json:
         rows = [
             {"title": t.title, "heads": list(t.heads), "rows": [list(r) for r in t.rows if r]} for t in tables
@@ -555,7 +559,7 @@ def _shown(tables: list[Table], report: Path, as_json: bool) -> Path:
 
 
 def _compile_training(vehicle: str, action: str | None) -> None:
-    """Train for one rollout, so that the kernels of the training are compiled."""
+    """Train for one rollout, to compile the training's kernels."""
     settings = TrainingSettings(vehicle=vehicle, action=action, randomize=RANGES, steps=1)
     with tempfile.TemporaryDirectory() as folder:
         train(T1.name, settings, out=Path(folder) / "policy", console=Console(stderr=True, quiet=True))
@@ -563,18 +567,18 @@ def _compile_training(vehicle: str, action: str | None) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Demonstration:
-    """A demonstration: its steps, with their arguments and places."""
+    """Steps of a demonstration, with their arguments and paths."""
 
     out: Path
     """Directory of the results."""
     settings: DemoSettings
-    """The seed is also that of the pool, and the firmware that of the robot."""
+    """Settings; the seed is also that of the pool, and the firmware that of the robot."""
     standing: Vehicle
     console: Console
     robot: OnRobot | None
 
     def run(self) -> list[Table]:
-        """Identify, train, deploy and report; returns the tables of what was held."""
+        """Identify, train, deploy and report; return the result tables."""
         identification, spec = self._identified(), self._spec()
         title, held = self._title, self.out / "t1"
         found, known = _identification(identification, self.robot is not None), _known(identification)
@@ -621,7 +625,7 @@ class _Demonstration:
         return tables
 
     def _spec(self) -> Spec:
-        """Station keeping by the policy and a PID; one setpoint with pictures, which takes longest, first."""
+        """Return station keeping by the policy and a PID, with the slow row of rendered pictures first."""
         names = (POLICY, "pid")
         scope, by_camera = self.settings.scope or FULL, self.robot is None and self.settings.firmware == "mcu"
         rows = {name: replace(T1.rows[name], changes={"duration": scope.duration}) for name in names}
@@ -640,7 +644,7 @@ class _Demonstration:
         return replace(T1, rows=rows, targets=scope.setpoints, bases=(POLICY,))
 
     def _transfer(self, spec: Spec) -> TransferSettings:
-        """Settings of the training and of the trials of its policy."""
+        """Return the settings of the training and of the policy's trials."""
         settings, vehicle = self.settings, self.out / VEHICLE_FILES[1].format(self.standing.name)
         chosen = TransferSettings(
             seeds=1, seed=settings.seed, rows=list(spec.rows), vehicle=str(vehicle), steps=settings.steps,
@@ -657,7 +661,7 @@ class _Demonstration:
 
     @property
     def site(self) -> str:
-        """Return the place of the trials."""
+        """Return the site of the trials."""
         return FIRMWARES[self.settings.firmware].site if self.robot is None else self.robot.site
 
     def report(self, text: str) -> None:
@@ -666,14 +670,14 @@ class _Demonstration:
 
     @contextmanager
     def _working(self, doing: str) -> Iterator[Progress]:
-        """Show the current work and its progress; a robot's session has a separate line."""
+        """Show the current work and its progress; on a robot, the session has its own progress line."""
         text = f"{doing} {'in the virtual pool' if self.robot is None else 'on the robot'}"
         self.report(text)
         with nullcontext() if self.robot is not None else self.console.status(text) as status:
             yield lambda part, detail: status.update(f"{text}: {detail}") if status else None
 
     def _identified(self) -> Identification:
-        """Trials, and the vehicle that they make identifiable."""
+        """Record trials and identify the vehicle from them."""
         standing, settings, scope = self.standing, self.settings, self.settings.scope or FULL
         levels = {
             role: matched(x, standing) for role, x in (("fit", scope.levels), ("held-out", scope.held_out))
@@ -724,7 +728,7 @@ class _Demonstration:
         return result
 
     def _show_recorded(self, trials: Sequence[Trial]) -> None:
-        """Begin the report with the paths of the recorded trials."""
+        """Start the report with the paths of the recorded trials."""
         paths = [
             np.column_stack([t.channels[c] for c in ("x", "y", "z")]) for t in trials if t.has("x", "y", "z")
         ]
@@ -749,7 +753,7 @@ class _Demonstration:
         self.report(f"  {job.row} at {job.target}: {held}")
 
     def _commands(self) -> list[str]:
-        """Command lines that repeat the demonstration's steps by hand."""
+        """Return command lines that repeat the demonstration's steps manually."""
         out, seed, name = self.out, self.settings.seed, self.standing.name
         drawn_around = self.settings.vehicle
         rough, identified = (out / file.format(name) for file in VEHICLE_FILES)

@@ -1,4 +1,4 @@
-"""`finssim demo` of a vehicle that must move to steer: identify it, train it along a path, dive in open water."""
+"""`finssim demo` of a vehicle that must move to steer: identification, training along a path, dives in open water."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ __all__ = ["demo_course", "drawn_body"]
 
 TASK, BASELINE = "path", "line-of-sight"
 FIT, HELD_OUT = ("speeds", "zigzag_fast", "dives_fast"), ("corkscrew",)
-"""Manoeuvres that the fit uses, and those that are replayed."""
+"""Manoeuvres used in the fit, and manoeuvres that are replayed."""
 AXES_FITTED = ("surge", "sway", "heave", "pitch", "yaw")
 SLOPE = "fin.lift_slope"
 RATE = 20.0
 """Rows of the trials [Hz]."""
 SPREAD = 0.18
-"""Standard deviation of the logarithm of a coefficient, the body's to the file's."""
+"""Standard deviation of the logarithm of a true coefficient relative to the file's [-]."""
 HORIZON = 3.0
-"""Time ahead for which a measured state is continued [s]."""
+"""Prediction horizon from a measured state [s]."""
 DIVES = 3
-"""Paths that each controller follows."""
+"""Number of paths that each controller follows."""
 GENTLE: dict[str, Any] = {"offset": 0.3, "yaw": 0.1, "slope": math.radians(6.0)}
-"""Fields of `path` in the dives, which start from rest: near the path, about along it, on gentle slopes."""
+"""Fields of `path` in the dives, which start from rest: near the path, roughly along it, with gentle slopes."""
 SITE, POSITIONING, SEVERITY, RANGES = "open-water", "usbl", "realistic", "cruise"
 
 
@@ -60,7 +60,7 @@ def drawn_body(vehicle: Vehicle, seed: int) -> tuple[Vehicle, float]:
 
     Args:
         vehicle: The file.
-        seed: Of the draw.
+        seed: Seed of the draw.
     """
     rng, chosen = np.random.default_rng([35, seed]), vehicle.hydrodynamics["calibrated"]
     changes: dict[str, Any] = {}
@@ -81,16 +81,16 @@ def demo_course(
 ) -> tuple[list[Table], Path]:
     """Identify a vehicle with fins, train `path`, and follow paths in open water by DVL, compass and USBL.
 
-    The vehicle is ballasted to be neutral. That in the water has coefficients of its own, drawn around those of the
-    file. Its autopilot, tuned to the file, runs the manoeuvres in the simulator with the noise of its sensors; the
+    The vehicle is ballasted to be neutral. The true vehicle has its own coefficients, drawn around those of the
+    file. Its autopilot, tuned to the file, runs the manoeuvres in the simulator with sensor noise; the
     paths are followed by the robot's complete software in the virtual site. An interrupted demonstration continues.
 
     Args:
         out: Existing directory of the results.
-        vehicle: With an autopilot of course.
+        vehicle: Vehicle with a course autopilot.
         seed: Seed of every random number.
-        steps: Control steps of the training; the task's default if None.
-        console: Where progress is shown.
+        steps: Control steps of the training; None: the task's default.
+        console: Console for progress.
 
     Returns:
         The tables, and the path of the report.
@@ -100,7 +100,7 @@ def demo_course(
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     name, ballasted = vehicle.name, out / f"{vehicle.name}_ballasted.yaml"
-    # From rest under water, a torpedo that floats rises faster than its fins begin to work.
+    # From rest under water, a buoyant torpedo rises before its fins become effective.
     neutral = {"body.displaced_volume": vehicle.body.mass / vehicle.water.density}
     write_vehicle(vehicle.replace(neutral, Provenance("derived", "", "ballasted to be neutral")), ballasted)
     vehicle = load_vehicle(ballasted)
@@ -147,7 +147,7 @@ def demo_course(
                 for axis in AXES
                 if all(axis in found for found in ahead.values())
             ],
-            note="NRMSE. Without its autopilot such a vehicle does not keep its way, so no whole trial is replayed.",
+            note="NRMSE. Without autopilot the vehicle does not keep its course, so only short predictions are made.",
         ),
         _dived(rows),
     ]
@@ -160,7 +160,7 @@ def demo_course(
 
 
 def _trials(out: Path, vehicle: Vehicle, body: Vehicle, names: Sequence[str], seed: int) -> list[Trial]:
-    """Return the trials of some manoeuvres, which are made if the folder lacks them."""
+    """Return the trials of some manoeuvres, which are simulated if the folder lacks them."""
     folders = [out / "trials" / name for name in names]
     if not all((folder / "trial.yaml").is_file() for folder in folders):
         chosen = [one for one in manoeuvres(vehicle) if one.name in names]
@@ -172,7 +172,7 @@ def _trials(out: Path, vehicle: Vehicle, body: Vehicle, names: Sequence[str], se
 def _dive(
     out: Path, vehicle: Vehicle, body: Vehicle, controller: str, number: int, seed: int, report: Any
 ) -> dict[str, Any]:
-    """Return the figures of one path that is followed by the robot's software, from its file if there is one."""
+    """Return the figures of one path followed by the robot's software, from its file if it exists."""
     folder = out / "dives" / f"{controller}-{number + 1}"
     file = folder / "result.json"
     if file.is_file():
@@ -195,14 +195,12 @@ def _dive(
     result = {"controller": controller, "dive": number + 1, "metrics": measured, "path": path}
     keep_result(file, result)
     error = measured["error"]
-    report(
-        f"  {controller}, path {number + 1}: {'lost' if error is None else f'{error:.2f} m RMS beside it'}"
-    )
+    report(f"  {controller}, path {number + 1}: {'lost' if error is None else f'{error:.2f} m RMS distance'}")
     return result
 
 
 def _compared(fit: Fit, body: Vehicle, slope: float) -> list[list[str]]:
-    """Return rows of what was identified, beside the numbers of the vehicle in the water."""
+    """Return rows of the identified parameters, next to those of the true vehicle."""
     M, D = body.mass_matrix(), body.hydrodynamics["calibrated"]
     true = {f"{axis}.m_eff": float(M[i, i]) for i, axis in enumerate(AXES)}
     true |= {f"{axis}.d2": float(np.diag(D.quadratic_damping)[i]) for i, axis in enumerate(AXES)}
@@ -237,7 +235,7 @@ def _dived(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _lead(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the result in one sentence for each controller."""
+    """Return the result as one sentence for each controller."""
     sentences = []
     for controller in ("policy", BASELINE):
         own = [row["metrics"] for row in rows if row["controller"] == controller]
@@ -277,7 +275,7 @@ def _picture(out: Path, rows: Sequence[Mapping[str, Any]]) -> Any:
 
 
 def _commands(out: Path, name: str, seed: int) -> list[str]:
-    """Command lines that repeat the demonstration's steps by hand."""
+    """Return command lines that repeat the demonstration's steps manually."""
     identified, trials = out / f"{name}_identified.yaml", " ".join(str(out / "trials" / one) for one in FIT)
     file = out / f"{name}_ballasted.yaml"
     pool = f"finssim pool --vehicle {out / f'{name}_in_water.yaml'} --site {SITE} --positioning {POSITIONING}"

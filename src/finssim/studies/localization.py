@@ -1,4 +1,5 @@
-"""`finssim experiment localization`: the paper's Table II, calibrated on half of the places, measured on the others."""
+"""`finssim experiment localization`: the paper's Table II, calibrated on half of the locations, measured at
+the others."""
 
 from __future__ import annotations
 
@@ -43,37 +44,37 @@ from finssim.vehicles.equipment import TagMount
 Array = NDArray[np.float64]
 
 LOCATIONS = (17, 10)
-"""170 surveyed places, along and across the pool."""
+"""Numbers of surveyed locations along and across the pool, 170 in all."""
 IMAGES = 720
 REACH = (1.84, 0.84)
-"""Outermost places from the middle of the 4 m x 2 m pool [m]."""
+"""Coordinates of the outermost locations from the middle of the 4 m x 2 m pool [m]."""
 WATER_HEIGHT = 1.0
 """Height of the surface over the floor, where z = 0 [m]."""
 
 TAG = Tags(family="tag25h9", edge=0.098, mounts={1: TagMount(position=np.zeros(3))})
-"""The tag of the published test; its own frame is the body."""
+"""Tag of the published test; its own frame is the body frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Errors, as standard deviations."""
+    """Standard deviations of the errors."""
 
     depth: float = 0.01
-    """Error of the depth reading, drawn once a visit [m]."""
+    """Error of the depth reading, drawn once per visit [m]."""
     tilt: float = float(np.radians(0.5))
-    """Error of the roll and pitch readings, drawn once a visit [rad]."""
+    """Error of the roll and pitch readings, drawn once per visit [rad]."""
     survey: float = 0.002
-    """Error of a surveyed place along each axis [m]."""
+    """Error of a surveyed location along each axis [m]."""
     heading: float = float(np.radians(0.5))
     """Error of the tag's yaw [rad]."""
     lens: float = 0.5
     """Error of focal length and principal point in the camera file [px]."""
     tape: float = 0.003
-    """Error of the water's height by tape [m]."""
+    """Error of the measured water height [m]."""
     level: float = float(np.radians(0.1))
-    """Error of the survey's frame against the plumb line, about x and about y [rad]."""
+    """Tilt error of the survey's frame, about x and about y [rad]."""
     ripples: float = 0.01
-    """Rms slope of the surface [-]."""
+    """RMS slope of the surface [-]."""
 
 
 CONDITIONS: Mapping[str, Conditions] = {
@@ -81,52 +82,52 @@ CONDITIONS: Mapping[str, Conditions] = {
     "flat": Conditions(ripples=0.0),
     "quiet": Conditions(**dict.fromkeys(Conditions.__dataclass_fields__, 0.0)),
 }
-"""`published`: every error; `flat`: every error but ripples; `quiet`: noise of the pictures alone."""
+"""`published`: all errors; `flat`: all errors except ripples; `quiet`: only picture noise."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """The tag at one surveyed place."""
+    """Tag at one surveyed location."""
 
     nominal: Array
-    """Position as surveyed, pool frame [m], (3,); the yaw as surveyed is 0."""
+    """Surveyed position, pool frame [m], (3,); the surveyed yaw is 0."""
     position: Array
     """True position [m], (3,)."""
     R_pb: Array
     """True attitude, (3, 3)."""
     depth_read: float
-    """Depth of the tag by the pressure sensor [m]."""
+    """Depth of the tag measured by the pressure sensor [m]."""
     roll_read: float
-    """Roll as read [rad]."""
+    """Measured roll [rad]."""
     pitch_read: float
-    """Pitch as read [rad]."""
+    """Measured pitch [rad]."""
     images: int
-    """Pictures taken there."""
+    """Number of pictures at the location."""
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """One drawing of the test."""
+    """One random realization of the test."""
 
     seed: int
     conditions: Conditions
     truth: Pool
-    """Camera and water as they are."""
+    """True camera and water."""
     lens: Lens
     """Lens of the camera file."""
     water_read: float
-    """Height of the water as measured with a tape [m]."""
+    """Measured height of the water [m]."""
     visits: tuple[Visit, ...]
     calibrates: NDArray[np.bool_]
-    """True for visits that calibrate; the others are held out, (170,)."""
+    """Mask of visits used for calibration; the others are held out, (170,)."""
 
 
 def published_pool(*, tilt_x: float = 0.0, tilt_y: float = 0.0) -> Pool:
-    """Camera of the FinsROV pool, 1.17 m above 1 m of water; the floor is z = 0.
+    """Return the camera of the FinsROV pool, 1.17 m above 1 m of water; the floor is z = 0.
 
     Args:
-        tilt_x: How far the normal of the water surface leans towards the pool's +x [rad].
-        tilt_y: How far it leans towards +y [rad].
+        tilt_x: Tilt of the water surface's normal towards the pool's +x [rad].
+        tilt_y: Tilt towards +y [rad].
     """
     lens = Lens(
         width=1280,
@@ -147,13 +148,13 @@ def published_pool(*, tilt_x: float = 0.0, tilt_y: float = 0.0) -> Pool:
 def draw_campaign(
     conditions: Conditions, seed: int, *, locations: tuple[int, int] = LOCATIONS, images: int = IMAGES
 ) -> Campaign:
-    """Draw places, readings and the split into two halves.
+    """Draw locations, readings and the split into two halves.
 
     Args:
-        conditions: What goes wrong.
-        seed: Of all random numbers.
-        locations: Places along and across the pool.
-        images: Pictures in all, spread evenly.
+        conditions: Standard deviations of the errors.
+        seed: Seed of all random numbers.
+        locations: Numbers of locations along and across the pool.
+        images: Total number of pictures, spread evenly.
     """
     random = np.random.default_rng(seed)
     truth = published_pool(
@@ -176,11 +177,11 @@ def draw_campaign(
 
 
 def lifted(campaign: Campaign, height: float) -> Campaign:
-    """The held-out visits again with the tag higher in the water, every error the same.
+    """Return the held-out visits with the tag raised in the water, with the same errors.
 
     Args:
-        campaign: As it was.
-        height: How much higher [m].
+        campaign: Original campaign.
+        height: Height by which the tag is raised [m].
     """
     up = np.array([0.0, 0.0, height])
     visits = tuple(
@@ -201,7 +202,7 @@ def _visit(
 ) -> Visit:
     nominal = np.array([*spot, 0.0])
     position = nominal + random.normal(0.0, conditions.survey, 3)
-    # It lies as flat as the floor; what its bearer reads of the tilt is off by the same spread again.
+    # The tag lies on an uneven floor; the readings of its tilt have an error of the same spread.
     roll, pitch = random.normal(0.0, conditions.tilt, 2)
     R_pb = quat_to_matrix(quat_from_euler(roll, pitch, random.normal(0.0, conditions.heading)))
     off = random.normal(0.0, [conditions.depth, conditions.tilt, conditions.tilt])
@@ -211,15 +212,15 @@ def _visit(
 
 (TAG_ID,) = TAG.mounts
 MARGIN = 0.011
-"""White rim around the tag [m]: its sheet is 0.12 m wide."""
+"""White margin around the tag [m]: its sheet is 0.12 m wide."""
 SURROUND = 40
-"""Pixels around the tag that the detector is given."""
+"""Width of the margin around the tag in the detector's region [px]."""
 INTERVAL = 0.5
-"""Between pictures, as the published replay ran [s]."""
+"""Interval between pictures, as in the published replay [s]."""
 CORNER_NOISE = 0.2
-"""Noise of the corners of `geometry` [px]."""
+"""Corner noise of `geometry` [px]."""
 RENDERERS = ("own", "geometry")
-"""Source of a visit's pictures: the overhead camera, or exact projection and noise, without pictures."""
+"""Sources of detections: `own` renders pictures of the overhead camera, `geometry` projects exactly and adds noise."""
 
 
 @dataclass(frozen=True)
@@ -229,14 +230,14 @@ class CampaignPicture:
     visit: int
     name: str
     detection: Detection | None
-    """None where the detector did not find the tag."""
+    """Detection of the tag; None if the detector missed it."""
 
 
 def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[CampaignPicture]:
-    """All pictures of a campaign, visit by visit.
+    """Yield all pictures of a campaign, visit by visit.
 
     Args:
-        campaign: What was laid where.
+        campaign: Campaign with the true positions.
         renderer: One of `RENDERERS`.
 
     Raises:
@@ -253,7 +254,7 @@ def pictures(campaign: Campaign, renderer: str = "own") -> Iterator[CampaignPict
 
 
 def scene_of(campaign: Campaign) -> Scene:
-    """The pool as the overhead camera sees it, without the tag."""
+    """Return the scene of the overhead camera, without the tag."""
     slope = campaign.conditions.ripples
     return Scene(
         camera=campaign.truth.camera,
@@ -265,7 +266,7 @@ def scene_of(campaign: Campaign) -> Scene:
 
 
 def tag_of(visit: Visit) -> TagInScene:
-    """The tag where it truly lies."""
+    """Return the tag at its true pose."""
     x, y, z = visit.position.tolist()
     q = matrix_to_quat(visit.R_pb).tolist()
     return TagInScene(
@@ -277,7 +278,8 @@ def tag_of(visit: Visit) -> TagInScene:
 
 
 def _rendered(campaign: Campaign, renderer: str) -> Callable[..., Detection | None]:
-    """A picture, and what the default detector finds in it; of `geometry` exact projection with white noise."""
+    """Return the function that renders a picture and detects the tag; for `geometry`, one that projects and
+    adds white noise."""
     from finssim.localization.detection.detector import detector
 
     find, lens = detector(TAG.family), campaign.truth.camera.lens
@@ -304,23 +306,23 @@ Row = dict[str, float | int | str]
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Result of the calibration."""
+    """Result of a calibration."""
 
     refractive: Pool
     pinhole: Pool
-    """Straight lines fitted to the same half."""
+    """Straight-line calibration of the same half."""
     fit: PoolFit
     frames: list[Frame]
-    """Detections of the half that calibrates."""
+    """Detections in the calibration half."""
     survey: list[Row]
-    """Surveyed place of the tag in each of them [m]."""
+    """Surveyed location of the tag in each of them [m]."""
 
 
 def calibrate(campaign: Campaign, observed: Sequence[CampaignPicture]) -> Calibrated:
-    """Calibrate on the visits chosen for it; the truth is not looked at.
+    """Calibrate on the visits chosen for it, without use of the truth.
 
     Args:
-        campaign: What was surveyed and read.
+        campaign: Campaign with survey and readings.
         observed: Its pictures.
     """
     chosen = [p for p in observed if campaign.calibrates[p.visit] and p.detection is not None]
@@ -347,7 +349,7 @@ def calibrate(campaign: Campaign, observed: Sequence[CampaignPicture]) -> Calibr
 
 
 def survey_rows(campaign: Campaign, chosen: Sequence[CampaignPicture]) -> list[Row]:
-    """Return the survey as a table: the surveyed place of the tag in each picture."""
+    """Return the survey as a table: the surveyed location of the tag in each picture."""
     rows: list[Row] = []
     for picture in chosen:
         x, y, z = campaign.visits[picture.visit].nominal.tolist()
@@ -358,12 +360,12 @@ def survey_rows(campaign: Campaign, chosen: Sequence[CampaignPicture]) -> list[R
 
 
 def write_survey(rows: Sequence[Row], path: Path) -> None:
-    """Write the table of the surveyed tags. Places are in [m]."""
+    """Write the table of the surveyed tags. Positions are in [m]."""
     write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
 
 
 def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
-    """Through files, as a user's data come."""
+    """Return the observations after writing and reading files, as for a user's data."""
     with TemporaryDirectory() as folder:
         detections, survey = Path(folder) / "detections.csv", Path(folder) / "survey.csv"
         write_detections(frames, detections)
@@ -374,18 +376,19 @@ def _observed(frames: list[Frame], rows: list[Row]) -> Observations:
 RESULT_FILE = "localization.json"
 
 PAPER_TABLE_2: Mapping[str, Sequence[float]] = PAPER["localization"]
-"""Method -> RMSE and 95th percentile in the paper [cm]: its camera over its pool, calibrated on the same places."""
+"""Method -> RMSE and 95th percentile in the paper [cm], of its camera over its pool, calibrated on the same
+locations."""
 
 METHOD_TITLES = {
     **{name: (name, "refractive") for name in ("refractive", "refractive-weighted", "refractive-6dof")},
     **{name: (name, "pinhole") for name in ("pinhole-depth", "pinhole")},
     "pinhole, refractive pose": ("pinhole", "refractive"),
 }
-"""Row of the table -> method and the calibration it uses. The last is as the paper has it, with the camera pose of the
-refractive calibration."""
+"""Row of the table -> method and the calibration that it uses. The last row follows the paper: pinhole
+localization with the camera pose of the refractive calibration."""
 
 LIFT = 0.4
-"""Height of the additional visit above the places of the calibration [m]."""
+"""Height of the additional visits above the calibration locations [m]."""
 Z_STD = 0.01
 TILT_STD = float(np.radians(0.5))
 TAGS_B = tag_corners_b(TAG)
@@ -399,7 +402,7 @@ TITLES = {
     "published": "every error",
     "flat": "no ripples",
     "quiet": "noise of the pictures alone",
-    "lifted": "every error, and the tag higher than the calibration saw it",
+    "lifted": "every error, and the tag higher than in the calibration",
     "refractive": "refractive",
     "refractive-weighted": "refractive, weighted",
     "refractive-6dof": "refractive, 6 DOF",
@@ -421,22 +424,22 @@ CALIBRATION: Columns = {
 
 @dataclass(frozen=True)
 class Scores:
-    """One method on one campaign's held-out visits."""
+    """Result of one method at the held-out visits of one campaign."""
 
     visits: NDArray[np.intp]
-    """Visits that were located at least once, (n,)."""
+    """Visits that were localized at least once, (n,)."""
     surveyed: Array
-    """Mean estimate minus surveyed place, x and y [m], (n, 2)."""
+    """Mean estimate minus surveyed position, x and y [m], (n, 2)."""
     true: Array
-    """Mean estimate minus true place [m], (n, 2)."""
+    """Mean estimate minus true position [m], (n, 2)."""
     pictures: int
     located: int
     reasons: Mapping[str, int]
-    """Reasons why pictures gave no position, with their numbers."""
+    """Reason for a missing position -> number of pictures."""
 
     @property
     def rmse(self) -> float:
-        """Horizontal error against the surveyed places [m]; NaN where nothing was located."""
+        """RMS horizontal error relative to the surveyed positions [m]; NaN without any position."""
         return float(np.sqrt(np.mean(np.sum(self.surveyed**2, 1)))) if len(self.visits) else math.nan
 
 
@@ -446,14 +449,14 @@ def locate(
     """Locate the tag in every picture of the held-out visits and average over each visit.
 
     Args:
-        campaign: What lay where.
+        campaign: Campaign with the true positions.
         observed: Its pictures.
-        pool: As calibrated.
+        pool: Calibrated pool.
         method: Key of `finssim.localization.poses.methods.METHODS`.
-        pixel_std: Standard deviation of a corner, as the calibration found it [px].
+        pixel_std: Standard deviation of a corner, estimated by the calibration [px].
     """
     places: dict[int, list[tuple[float, float]]] = {}
-    reasons, water = Counter[str](), pool.interface  # depth is measured along its normal, which is up
+    reasons, water = Counter[str](), pool.interface  # depth is measured along the water's normal, which is up
     held_out = [picture for picture in observed if not campaign.calibrates[picture.visit]]
     for picture in held_out:
         if picture.detection is None:
@@ -482,13 +485,13 @@ def locate(
 
 
 def pooled(scores: Sequence[Scores]) -> dict[str, Any]:
-    """RMSE and 95th percentile over all seeds, with intervals from a bootstrap of seeds, then of visits.
+    """Return RMSE and 95th percentile over all seeds, with intervals from a bootstrap of seeds, then of visits.
 
     Args:
-        scores: One for each seed.
+        scores: Scores of each seed.
 
     Returns:
-        Centimetres, as the paper's table has them; None where nothing was located.
+        Figures in centimetres, as in the paper's table; None without any position.
     """
     scored = [s for s in scores if len(s.visits)]
     errors = [np.linalg.norm(100.0 * s.surveyed, axis=1) for s in scored]
@@ -522,7 +525,7 @@ def _figures(errors: Sequence[Array]) -> tuple[float, float]:
 
 
 def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, path: Path) -> None:
-    """Arrows from every held-out place to where each method puts it, longer than true as the titles say."""
+    """Draw arrows from every held-out location to the estimates of each method, scaled as stated in the titles."""
     places = np.array([visit.nominal[:2] for visit in campaign.visits])
     figure = new_figure(12.0, 4.2)
     panels = (("pinhole PnP", pinhole, 3.0, COLORS[1]), ("refractive", refractive, 10.0, COLORS[0]))
@@ -540,7 +543,7 @@ def _draw_error_map(campaign: Campaign, pinhole: Scores, refractive: Scores, pat
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """The tables, ours by conditions, then the paper's; and what the calibrations got wrong."""
+    """Return the tables: ours by conditions, the paper's, and the errors of the calibrations."""
     title, origin = "Horizontal localization through water", result["provenance"]
     headline = (
         f"{len(result['seeds'])} seeds, each {result['pictures_per_seed']} pictures at {result['places']} places, "
@@ -580,7 +583,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
             pictures=shown,
         ),
         Table(
-            title="what the calibrations got wrong",
+            title="errors of the calibrations",
             heads=[heading for heading, *_ in CALIBRATION.values()],
             rows=[cells(c, CALIBRATION) for c in result["calibration"]],
             left=(),
@@ -606,7 +609,7 @@ def _gain(result: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class LocalizationSeed:
-    """One drawing of the test under one set of conditions."""
+    """One realization of the test under one set of conditions."""
 
     campaign: Campaign
     calibration: Calibrated
@@ -623,25 +626,26 @@ def localization_experiment(
     progress: Progress = lambda part, text: None,
     **size: Any,
 ) -> dict[str, Any]:
-    """Locate a tag at places held out from the calibration, by refractive and pinhole methods: RMSE, P95 [cm].
+    """Locate a tag at locations held out from the calibration, by refractive and pinhole methods: RMSE, P95 [cm].
 
-    Every seed draws the places' survey errors, readings, camera file, plumb line, ripples and noise again.
+    Every seed draws new survey errors, readings, camera file, frame tilt, ripples and noise.
 
     Example: finssim experiment localization --seeds 3 --out localization
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
         renderer (NAME): own, or geometry (exact corners with noise instead of images).
-        seeds: Repetitions with other errors.
+        seeds: Number of repetitions with different errors.
         seed: Seed of every random number; equal seeds give equal results.
-        progress: Told the share that is done and what comes next.
-        size: Of `draw_campaign`: locations (places along and across the pool) and images; as published if not given.
+        progress: Function that receives the completed fraction and the next step.
+        size: Arguments of `draw_campaign`: locations (along and across the pool) and images; by default as
+            published.
 
     Returns:
-        What `localization.json` holds.
+        Content of `localization.json`.
 
     Raises:
-        ValueError: No seeds, or an unknown renderer.
+        ValueError: The number of seeds is below 1, or the renderer is unknown.
     """
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}, expected at least 1")
@@ -655,7 +659,7 @@ def localization_experiment(
             progress((k + j / len(CONDITIONS)) / seeds, f"seed {seed + k}, {name} conditions")
             drawn[name].append(_play_seed(name, seed + k, renderer, size))
         progress((k + 0.8) / seeds, f"seed {seed + k}, another depth")
-        campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, the tag at another depth
+        campaign = lifted(runs[k].campaign, LIFT)  # the same calibration, with the tag at another depth
         higher.append(_scored(campaign, list(pictures(campaign, renderer)), runs[k].calibration))
     scores = {
         **{name: [seed_result.scores for seed_result in each] for name, each in drawn.items()},
@@ -684,7 +688,8 @@ def localization_experiment(
 
 
 def _write(result: Mapping[str, Any], out: Path, first: LocalizationSeed) -> None:
-    """Write the directory: result, page, figures, and what a user needs to do the first seed by hand."""
+    """Write the directory: result, page, figures, and the files with which a user can repeat the first seed
+    manually."""
     with atomic_directory(out, replaces=RESULT_FILE) as folder:
         scores, calibration = first.scores, first.calibration
         _draw_error_map(first.campaign, scores["pinhole"], scores["refractive"], folder / "error_map.png")
@@ -722,7 +727,7 @@ def _scored(
 
 
 def _errors(seed_result: LocalizationSeed) -> dict[str, Any]:
-    """Return the errors of the calibration of one seed, whose truth is known here."""
+    """Return the calibration errors of one seed, relative to its truth."""
     true, fit = seed_result.campaign.truth, seed_result.calibration.refractive
     (x, y, height), (x_fit, y_fit, height_fit) = true.camera.position, fit.camera.position
     over = height - true.interface.height(x, y)

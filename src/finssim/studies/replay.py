@@ -1,4 +1,4 @@
-"""`finssim experiment replay`: the paper's Table III against a hidden plant that none of the models can be."""
+"""`finssim experiment replay`: the paper's Table III with a hidden plant outside the class of every model."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ Array = NDArray[np.float64]
 PLANT_FILE = Path(__file__).with_name("replay_plant.yaml")
 
 SLOWEST = 3.0
-"""Below this propeller speed the loss of thrust is taken as at it [1/s]: there is hardly any thrust to lose."""
+"""Propeller speed below which the loss of thrust is constant [1/s]: there is hardly any thrust to lose."""
 
 
 class ReplayPlant:
-    """The hidden plant of `replay_plant.yaml`; inertia, buoyancy, thrusters and allocation are the vehicle file's."""
+    """Hidden plant of `replay_plant.yaml`; inertia, buoyancy, thrusters and allocation are those of the
+    vehicle file."""
 
     def __init__(self) -> None:
         self.spec: Mapping[str, Any] = yaml.safe_load(PLANT_FILE.read_text(encoding="utf-8"))
@@ -51,7 +52,7 @@ class ReplayPlant:
         self.linear_damping = CoupledMatrix(**self.spec["linear_damping"])
 
     def record(self, programmes: Sequence[Programme], vehicle: Vehicle, seed: int) -> Recording:
-        """The true motion under some programmes, commanded as the vehicle file has it; see `record`."""
+        """Return the true motion in some programmes, commanded with the vehicle file's parameters; see `record`."""
         fields: dict[str, Any] = {
             "mass": self.spec["mass"],
             "M_A": self.added_mass.matrix(),
@@ -70,7 +71,8 @@ class ReplayPlant:
         )
 
     def trials(self, programmes: Sequence[Programme], vehicle: Vehicle, seed: int) -> list[Trial]:
-        """Trials as sensors and telemetry log them: propeller speeds, velocity, IMU, attitude, position, depth."""
+        """Return trials logged by sensors and telemetry: propeller speeds, velocity, IMU, attitude, position,
+        depth."""
         recording = self.record(programmes, vehicle, seed)
         logged = trials_of(recording, programmes, vehicle, noise="sensors", seed=seed, inputs=("rpm",))
         random = np.random.default_rng([seed, 2])
@@ -85,7 +87,8 @@ class ReplayPlant:
         return trials
 
     def forces(self, vehicle: Vehicle) -> Callable[[Simulator], None]:
-        """Return the function that writes forces besides the engine's own: coupled damping and the loss of thrust."""
+        """Return the function that writes forces outside the engine's models: coupled damping and the loss of
+        thrust."""
         D = self.linear_damping.matrix()
         p = SimpleNamespace(**self.spec["propellers"])
         thrusters = list(vehicle.thrusters.values())
@@ -125,7 +128,7 @@ LEVELS = {
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Ours by set of levels, then the paper's."""
+    """Return tables of our results by set of levels, then the paper's."""
     axes = list(next(iter(result["same_levels"]["models"].values()))["by_axis"])
     tables = [Table(title="Replay error of three hydrodynamic models", headline=_headline(result))]
     for key, title in LEVELS.items():
@@ -171,23 +174,23 @@ AXES: tuple[Axis, ...] = ("surge", "sway", "heave", "yaw")
 MODELS = ("calibrated", "mesh", "simplified")
 
 PAPER_TABLE_3: Mapping[str, Any] = PAPER["replay"]
-"""Model -> NRMSE and 95 % interval in the paper: Unity against its real vehicle in its pool."""
+"""Model -> NRMSE and 95 % interval in the paper: Unity compared with its real vehicle in its pool."""
 
 REPEATS = 8
-"""Repeats of every published level and direction; the odd ones are fitted, the even ones replayed."""
+"""Number of repeats of every published level and direction; odd ones are fitted, even ones replayed."""
 
 
 @dataclass(frozen=True)
 class ReplaySeed:
-    """One seed: the fit and its replays on trials it has not seen."""
+    """One seed: the fit and its replays of held-out trials."""
 
     seed: int
     fit: Fit
     vehicle: Vehicle
     same_levels: Replay
-    """The held-out repeats of the levels that were fitted."""
+    """Replay of the held-out repeats of the fitted levels."""
     other_levels: Replay
-    """The published validation sweeps, of levels that no fit has seen."""
+    """Replay of the published validation sweeps, at levels that were not fitted."""
 
 
 def replay_experiment(
@@ -202,24 +205,24 @@ def replay_experiment(
 ) -> dict[str, Any]:
     """Identify on half of the trials of a plant outside the model class, replay three models on the other half.
 
-    The calibrated model is the fit; mesh and simplified have the vehicle file's published numbers.
+    The calibrated model is the fit; mesh and simplified use the vehicle file's published numbers.
 
     Example: finssim experiment replay --seeds 3 --out experiment
 
     Args:
         out (DIR): Directory for JSON, Markdown and figures.
-        seeds: Repetitions with different noise and initial states.
+        seeds: Number of repetitions with different noise and initial states.
         seed: Seed of every random number; equal seeds give equal results.
-        vehicle: Name or file of the vehicle whose file the operator starts from.
-        repeats: Of every level and direction, an even number.
-        axes: Which are excited, fitted and replayed.
-        progress: Told the share that is done and what comes next.
+        vehicle: Name or file of the initial vehicle.
+        repeats: Number of repeats of every level and direction, even.
+        axes: Axes that are excited, fitted and replayed.
+        progress: Function that receives the completed fraction and the next step.
 
     Returns:
-        What `replay_experiment.json` holds.
+        Content of `replay_experiment.json`.
 
     Raises:
-        ValueError: A number of seeds or repeats that cannot be.
+        ValueError: The number of seeds or repeats is invalid.
     """
     if seeds < 1 or repeats < 2 or repeats % 2:
         raise ValueError(
@@ -272,7 +275,7 @@ def replay_experiment(
 def experiment_seed(
     vehicle: Vehicle, plant: ReplayPlant, seed: int, repeats: int = REPEATS, axes: Sequence[str] = AXES
 ) -> ReplaySeed:
-    """One seed of the experiment; arguments as for `replay_experiment`."""
+    """Run one seed of the experiment; arguments as in `replay_experiment`."""
     trials = plant.trials(programmes(axes, vehicle, kind="published", repeats=repeats), vehicle, seed)
     fit = fit_by_simulation(trials[0::2], vehicle, axes=axes)
     fitted = calibrated(fit)
@@ -282,12 +285,12 @@ def experiment_seed(
 
 
 def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
-    """NRMSE of each model over all seeds: median over trials, mean of the axes, with its interval.
+    """Return the NRMSE of each model over all seeds: median over trials, mean of the axes, with its interval.
 
     The bootstrap draws seeds with replacement, then trials within each and axis by axis.
 
     Args:
-        replays: One for each seed, of the same models.
+        replays: One replay per seed, of the same models.
     """
     models: dict[str, Any] = {}
     for model in replays[0].models:
@@ -313,7 +316,7 @@ def pooled(replays: Sequence[Replay]) -> dict[str, Any]:
 
 
 def _values(seed_replay: Replay, model: str) -> dict[str, NDArray[np.float64]]:
-    """NRMSE of every trial by axis."""
+    """Return the NRMSE of every trial by axis."""
     values: dict[str, list[float]] = {}
     for scores in seed_replay.scores[model]:
         for axis, s in scores.items():

@@ -30,12 +30,12 @@ from finssim.vehicles import load_vehicle
 
 RESULT_FILE = "sweep.json"
 SAME_FOR_ALL = ("seed", "device", "vehicle")
-"""Settings of a training that a sweep sets itself."""
+"""Settings of a training that are set by the sweep itself."""
 MEASURES: dict[str, tuple[str, ...]] = {
     "t1": ("success", "e_p_m", "e_psi_deg", "t_s_s"),
     "t2": ("horizontal_rmse_m", "vertical_rmse_m", "p95_m"),
 }
-"""Task of the paper -> columns of its table; the table of another task has all its metrics."""
+"""Task of the paper -> columns of its table; tables of other tasks show all metrics."""
 FILES = ("vehicle", "plants", "randomize")
 """Keys whose values may name files."""
 TRAINING_SHARE = 0.9
@@ -55,9 +55,10 @@ class Training:
     """Name of the combination."""
     seed: int
     options: Mapping[str, Any]
-    """Fields of `TrainingSettings`."""
+    """Fields of `TrainingSettings` that differ from the defaults."""
     run: str
-    """Name of its directory: setting, a digest of everything that determines the policy but the seed, and the seed."""
+    """Name of its directory: setting, a digest of everything that determines the policy except the seed, and
+    the seed."""
 
 
 class Evaluate(BaseModel):
@@ -77,9 +78,9 @@ class Sweep(BaseModel):
     task: str
     vehicle: str = "finsrov"
     seeds: tuple[int, ...]
-    """Seeds of the trainings: a list, or their number, from 1."""
+    """Seeds of the trainings: a list, or their number, starting at 1."""
     train: dict[str, Any] = Field(default_factory=dict)
-    """Options of every training, as those of `finssim train`."""
+    """Options of every training, as in `finssim train`."""
     grid: dict[str, list[Any]] = Field(default_factory=dict)
     """Option of a training, or settings.NAME of its learner -> values; every combination is trained."""
     evaluate: Evaluate = Evaluate()
@@ -106,7 +107,8 @@ class Sweep(BaseModel):
         return self
 
     def trainings(self) -> list[Training]:
-        """Return every combination with every seed; seed by seed, so that each combination has some results early.
+        """Return every combination with every seed; ordered by seed, so that each combination has some
+        results early.
 
         Raises:
             SweepError: A combination cannot name a directory.
@@ -145,7 +147,7 @@ def _name(combination: Mapping[str, Any]) -> str:
     """Return the name of a combination, which is also that of a directory.
 
     Raises:
-        SweepError: It cannot name a directory.
+        SweepError: The combination cannot name a directory.
     """
     parts = [
         f"{name.removeprefix('settings.')}-{Path(value).stem if isinstance(value, str) else value}"
@@ -158,8 +160,8 @@ def load_sweep(path: str | Path) -> Sweep:
     """Read a sweep file; files that it names are relative to its own directory.
 
     Raises:
-        SweepError: The file is missing, or something in it is not as expected; the message names the place.
-        PlantError: A plant is missing or wrong, which is reported before the first training.
+        SweepError: The file is missing or invalid; the message names the key.
+        PlantError: A plant is missing or invalid, which is reported before the first training.
     """
     data = read_mapping(Path(path), SweepError, such_as="task: t1")
     try:
@@ -176,7 +178,7 @@ def load_sweep(path: str | Path) -> Sweep:
 
 
 def _placed(value: Any, folder: Path, key: Any = "") -> Any:
-    """Return the content of a sweep file, with the full paths of files beside it."""
+    """Return the content of a sweep file, with absolute paths of files in its folder."""
     if isinstance(value, dict):
         return {name: _placed(item, folder, key if key in FILES else name) for name, item in value.items()}
     if isinstance(value, list):
@@ -195,7 +197,8 @@ def sweep(
     processes: Annotated[int | None, (1, None)] = None,
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Train every combination of a grid with every seed on one machine or several, and evaluate each policy; resumes.
+    """Train every combination of a grid with every seed on one machine or several, and evaluate each policy;
+    resumes.
 
     Exit status 3: a training failed, as the table shows.
 
@@ -204,8 +207,8 @@ def sweep(
     Args:
         file (FILE): Sweep file: task, seeds, grid (.yaml).
         out (DIR): Directory of the runs; existing ones are kept.
-        address (ADDRESS): Ray cluster to use, HOST:PORT or auto; only this machine if not given.
-        processes: Parallel trainings on this machine; one per processor if not given.
+        address (ADDRESS): Ray cluster to use, HOST:PORT or auto; default only this machine.
+        processes: Parallel trainings on this machine; default one per processor.
         progress: Receives the completed fraction and the remaining work.
 
     Returns:
@@ -215,7 +218,7 @@ def sweep(
     Raises:
         SweepError: The file cannot be used.
         ClusterError: No cluster answers.
-        KeyboardInterrupt: After Ctrl-C; finished policies and evaluations stay.
+        KeyboardInterrupt: Ctrl-C was pressed; finished policies and evaluations are kept.
     """
     plan = load_sweep(file)
     trainings, errors = {out / "runs" / training.run: training for training in plan.trainings()}, {}

@@ -1,4 +1,4 @@
-"""Experiments of the virtual pool: what their rows need is trained, every trial played, and a table written."""
+"""Experiments in the virtual pool: train the policies of the rows, run every trial, and write a table."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ Results = Mapping[str, Sequence[Mapping[str, Any]]]
 """Row -> results of its trials."""
 
 TRAINING_SHARE = 0.4
-"""Width of the progress bar."""
+"""Fraction of the progress bar for trainings [-]."""
 DIFFERENCES_NOTE = (
-    "Each figure is the mean of row less reference, over pairs of trials with the same pool, seed and target; in "
+    "Each figure is the mean of row minus reference, over pairs of trials with the same pool, seed and target; in "
     "brackets 95 % from a bootstrap of plants and seeds. paper: the difference of its rows, on hardware, single runs."
 )
 FORGETFUL = {"integral": False, "history": 0, "last_action": False}
-"""Settings of the learner, for policies as the paper's."""
+"""Settings of the learner for policies without memory, as in the paper."""
 
 MEASURES: Columns = {
     "success_rate": ("held [points]", "+.0f", 100.0),
@@ -65,12 +65,12 @@ MEASURES: Columns = {
     "p95_m": ("P95 [cm]", "+.1f", 100.0),
     "energy": ("energy [N^1.5 s]", "+.0f"),
 }
-"""Key in which rows are compared, for the table of differences."""
+"""Key for comparing rows -> heading, format and factor, for the table of differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerRow:
-    """One row of a table: who steers and what is taken from it; see `rows.yaml`."""
+    """One row of a table: its controller and job settings; see `rows.yaml`."""
 
     title: str
     training: Mapping[str, Any] | None = None
@@ -78,11 +78,11 @@ class ControllerRow:
     controller: str = ""
     """Name of the PID."""
     paper: str | None = None
-    """Row of the paper's table; None where it has none."""
+    """Name of the row in the paper's table; None if it has none."""
     changes: dict[str, Any] = field(default_factory=dict)
-    """Fields of its jobs."""
+    """Fields of its jobs that differ."""
     targets: Sequence[str] | None = None
-    """Played targets, if not all."""
+    """Targets of this row; None: all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,14 +90,14 @@ class Spec:
     """One experiment."""
 
     name: str
-    """Its command, and the name of its files."""
+    """Name of its command and of its files."""
     title: str
     rows: Mapping[str, ControllerRow]
     """Rows in the order of the table."""
     targets: Sequence[str]
-    """Setpoints or trajectories that are played."""
+    """Setpoints or trajectories of the experiment."""
     allowed_targets: Sequence[str]
-    """All that may be requested."""
+    """All targets that may be requested."""
     kind: str
     """Kind of the targets, in the plural."""
     by_target: bool
@@ -106,20 +106,21 @@ class Spec:
     """Columns of a row: key -> heading with its unit, format, and a factor."""
     note: str
     bases: Sequence[str]
-    """The rows that the others are compared with, a table for each that was played."""
+    """Rows with which the others are compared, one table for each that was run."""
     figures: Mapping[str, Statistic]
-    """Key of a trial's result -> how the trials that have it become one figure."""
+    """Key of a trial's result -> statistic over the trials that have it."""
     differences: Sequence[str]
-    """Keys of `MEASURES` in which rows are compared."""
+    """Keys of `MEASURES` by which rows are compared."""
     paper: Callable[[str, str], Mapping[str, Any] | None]
-    """Row of the paper's table and target -> key -> its figure; None where it has none."""
+    """Function of a row of the paper's table and a target that returns its figures by key; None if it has none."""
     draw: Callable[[Results, Path], Path | None]
-    """Draws the results of the rows into the folder."""
+    """Function that draws the results of the rows into the folder."""
     picture: tuple[str, str]
-    """File of that figure, and what it shows."""
+    """File name of that figure, and its caption."""
 
     def paper_differences(self, row: ControllerRow, base: str) -> dict[str, float] | None:
-        """Key of `differences` -> the paper's row less that of a base; None where it has not both.
+        """Return, by key of `differences`, the paper's row minus that of a base; None if the paper lacks one
+        of them.
 
         Units are those of the rows.
         """
@@ -136,7 +137,7 @@ class Spec:
         }
 
     def tables(self, result: Mapping[str, Any]) -> list[Table]:
-        """The table of a result, and those of the differences from the bases, where there are some."""
+        """Return the table of a result, and those of the differences from the bases, if any."""
         units: Columns = {key: MEASURES[key] for key in self.differences}
         tables = [self._table(result)]
         for base, of_base in result["differences"].items():
@@ -156,7 +157,7 @@ class Spec:
         return tables
 
     def _table(self, result: Mapping[str, Any]) -> Table:
-        """The table of a result; on hardware its rows say so."""
+        """Return the table of a result; the rows state if it was measured on hardware."""
         hardware, rows = result.get("robot"), []
         for name, of_row in result["rows"].items():
             row = self.rows[name]
@@ -192,11 +193,11 @@ class TransferSettings:
     plants: Annotated[int, (1, 1000)] = 3
     """Number of virtual pools, each with different vehicle, water and camera."""
     seeds: Annotated[int, (1, 1000)] = 3
-    """Trainings of each policy, each tested with different noise."""
+    """Number of trainings of each policy, each tested with different noise."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
     severity: str = "realistic"
-    """(WORD) How much the pools differ from the vehicle file: nominal, realistic or hard."""
+    """(WORD) Deviation of the pools from the vehicle file: nominal, realistic or hard."""
     camera: str = "corners"
     """(MODE) corners (projected through the rippling water, with noise), or pictures (rendered, with tag
     detection: several times slower)."""
@@ -208,28 +209,27 @@ class TransferSettings:
     """(MODE) State estimator: error-state, with the IMU's accelerations, or constant-velocity, as in
     the paper."""
     rows: Annotated[Sequence[str] | None, ","] = None
-    """(NAMES) Rows of the table, separated by commas; all except nmpc, which needs an extra, if not given."""
+    """(NAMES) Rows of the table, separated by commas; default all except nmpc, which needs an extra."""
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
     pool_vehicle: Annotated[str | None, "python"] = None
-    """Name or file of the vehicle around which the pools' own are drawn; `vehicle` if None."""
+    """Name or file of the vehicle around which the pools' vehicles are drawn; `vehicle` if None."""
     steps: Annotated[int | None, (1, None)] = None
-    """Control steps of the training, summed over all worlds; the task's default if not given."""
+    """Control steps of the training, summed over all worlds; default that of the task."""
     processes: Annotated[int | None, (1, None)] = None
-    """Parallel trainings or trials; one per processor if not given."""
+    """Parallel trainings or trials; default one per processor."""
     address: str | None = None
     """(ADDRESS) Ray cluster to use instead, HOST:PORT or auto."""
 
     def check(self, robot: OnRobot | None) -> None:
-        """Refuse what does not exist, and what a robot determines itself.
+        """Refuse invalid settings, and settings that a robot determines itself.
 
         Raises:
-            ValueError: An unknown severity, camera or estimator, a number below 1, or a pool together with a robot.
+            ValueError: A severity, camera or estimator is unknown, a number is below 1, or pool settings are
+                combined with a robot.
         """
         if robot is not None and (self.plants, self.severity, self.camera) != (3, "realistic", "corners"):
-            raise ValueError(
-                "a robot has its own plant and camera: leave --plants, --severity and --camera out"
-            )
+            raise ValueError("a robot has its own plant and camera: omit --plants, --severity and --camera")
         check_choices([self.severity], ("nominal", "realistic", "hard"), "severity", ValueError)
         check_choices([self.camera], ("corners", "pictures"), "camera", ValueError)
         check_choices([self.estimator], MODELS, "estimator", ValueError)
@@ -248,26 +248,26 @@ def transfer_experiment(
     progress: Progress = lambda part, text: None,
     show: Show = lambda job, result: None,
 ) -> dict[str, Any]:
-    """Train what the rows need, play every target in every plant with every seed, and write the table.
+    """Train the policies of the rows, run every target in every plant with every seed, and write the table.
 
-    The directory keeps policies and trials: a run that was interrupted goes on where it was, and one with more seeds
-    plays only what is new.
+    The directory stores policies and trials: an interrupted run continues, and a run with more seeds
+    executes only the new trials.
 
     Args:
-        spec: Which experiment.
+        spec: The experiment.
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
-        targets: What is played; the published ones if None.
+        targets: Targets; None: the published ones.
         settings: Pools, vehicle, rows and trainings.
-        robot: Play on a robot, one trial after the other, instead of in pools; plants, severity and camera are its own.
-        console: Where a robot's state is told; standard error if None.
-        progress: Told the share that is done and what comes next.
-        show: Given each trial of a pool and its result, as soon as there is one.
+        robot: Robot on which trials run in sequence instead of in pools; it has its own plant, severity and camera.
+        console: Console for the robot's state; None: standard error.
+        progress: Function that receives the completed fraction and the next step.
+        show: Function that receives each trial of a pool and its result as soon as it is complete.
 
     Returns:
-        What NAME.json holds.
+        Content of NAME.json.
 
     Raises:
-        ValueError: An unknown row, target, severity or camera, or a number below 1.
+        ValueError: A row, target, severity or camera is unknown, or a number is below 1.
     """
     settings.check(robot)
     usual = [name for name, row in spec.rows.items() if row.controller not in COSTLY]
@@ -285,7 +285,7 @@ def transfer_experiment(
         spec.name, chosen, run_seeds, folder, TrainingSettings(vehicle=vehicle, steps=settings.steps, action=action),
         lambda part, text: progress(TRAINING_SHARE * part, text), **spread_over,
     )  # fmt: skip
-    if robot is not None:  # there is one plant, whose severity was not chosen
+    if robot is not None:  # there is only one plant, and its severity cannot be chosen
         pools, severity, camera = range(1), HARDWARE, HARDWARE
         site = robot.site if firmware != "mcu" else site
     elif firmware != "mcu":
@@ -305,7 +305,7 @@ def transfer_experiment(
     controllers = {(name, s): chosen[name].controller for name in ready for s in run_seeds}
     if (
         robot is None and settings.address is None and settings.seeds == 1
-    ):  # so few trainings leave processors to other rows
+    ):  # with few trainings, the remaining processors run other rows
         learned = [name for name in chosen if name not in ready]
         beside["more"] = lambda: jobs_of(learned, train_missing())
     else:
@@ -315,7 +315,9 @@ def transfer_experiment(
         progress=lambda part, text: progress(TRAINING_SHARE + (1.0 - TRAINING_SHARE) * part, text),
     )  # fmt: skip
     by_row = {name: [r for r in results if r["job"]["row"] == name] for name in chosen}
-    by_row = {name: played for name, played in by_row.items() if played}  # all of a row may have been skipped
+    by_row = {
+        name: played for name, played in by_row.items() if played
+    }  # all trials of a row may have been skipped
     body = load_vehicle(vehicle)
     result = {
         "experiment": spec.name, "severity": severity, "camera": camera, "estimator": settings.estimator,
@@ -339,16 +341,17 @@ def controllers_of(
     processes: int | None = None,
     address: str | None = None,
 ) -> dict[tuple[str, int], str]:
-    """Return the controllers by row and seed; policies that are not finished in the folder are trained.
+    """Return the controllers by row and seed; policies that are not complete in the folder are trained.
 
     Args:
-        task: Of the policies.
-        rows: Of a table.
-        seeds: Of the trainings.
-        folder: Of the experiment, whose `policies` has the directories.
-        training: Vehicle, action mode and control steps of each training; a row and its seed change the rest.
-        progress: Told the share that is done and what is left.
-        processes, address: Where and how many at once, as of `campaign.spread`.
+        task: Task of the policies.
+        rows: Rows of a table.
+        seeds: Seeds of the trainings.
+        folder: Folder of the experiment, whose `policies` contains the directories.
+        training: Vehicle, action mode and control steps of each training; a row and its seed change the other
+            settings.
+        progress: Function that receives the completed fraction and the remaining work.
+        processes, address: Number of parallel processes and cluster, as in `campaign.spread`.
 
     Returns:
         (row, seed) -> directory of a policy, or the name of a PID.
@@ -384,10 +387,10 @@ def train_policies(
 
     Args:
         trainings: Directory of the policy -> its task, and the settings of its training.
-        processes, address: As of `campaign.spread`.
+        processes, address: Number of parallel processes and cluster, as in `campaign.spread`.
 
     Yields:
-        A directory as soon as its policy is written, and None; or the error of its training.
+        A directory and None as soon as its policy is written; or a directory and the error of its training.
     """
     work = _train_here if address is None else _train_away
     at_once = 1 if len(trainings) == 1 else processes
@@ -415,12 +418,12 @@ def _train_here(planned: Planned) -> None:
 def _train_away(
     planned: Planned, checkpoint: Mapping[str, bytes], store: Callable[[dict[str, bytes]], None]
 ) -> dict[str, bytes]:
-    """Train on whatever machine; return the files of the policy directory by name.
+    """Train on any machine; return the files of the policy directory by name.
 
     Args:
         planned: The training.
-        checkpoint: Files of the checkpoint from which it resumes, by name; none at first.
-        store: Stores the files of a checkpoint.
+        checkpoint: Files of the checkpoint from which it resumes, by name; empty at the start.
+        store: Function that stores the files of a checkpoint.
     """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "policy"
@@ -434,9 +437,9 @@ def _train_away(
 
 
 def _train(planned: Planned, out: Path, **options: Any) -> None:
-    """Train a policy into a directory, from the last checkpoint beside it if that is of the same training.
+    """Train a policy into a directory, resuming from the last checkpoint if that is of the same training.
 
-    A training of several processes begins anew: its checkpoints do not hold the state of all.
+    A training with several processes restarts: its checkpoints do not contain the state of all processes.
     """
     console = Console(stderr=True, quiet=True)
     if planned[1][1].processes == 1 and training_folder(out).is_dir():
@@ -444,16 +447,16 @@ def _train(planned: Planned, out: Path, **options: Any) -> None:
             train(*planned[1], out=out, resume=True, console=console, **options)
             return
         except ResumeError:
-            pass  # of other settings, or of an earlier version
+            pass  # it has other settings, or was written by an earlier version
     train(*planned[1], out=out, console=console, **options)
 
 
 def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
-    """Return whether a complete policy is there: not one that was interrupted, or cut short while it was written.
+    """Return whether a directory contains a complete policy, not an interrupted or truncated one.
 
     Args:
         directory: Directory.
-        vehicle: That it must be for; any if None.
+        vehicle: Vehicle that the policy must be for; None: any.
     """
     try:
         return bool(Policy.load(directory, vehicle=vehicle).description.training.get("complete"))
@@ -462,7 +465,7 @@ def finished(directory: Path, vehicle: Vehicle | None = None) -> bool:
 
 
 def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
-    """Figures of every row, all targets together and each alone; differences from the reference."""
+    """Return the figures of every row, over all targets and for each target, and differences from the reference."""
     rows = {}
     for name, results in by_row.items():
         targets = dict.fromkeys(result["job"]["target"] for result in results)
@@ -487,15 +490,16 @@ def scores(spec: Spec, by_row: Results) -> dict[str, Any]:
 
 
 def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Statistic]) -> dict[str, Any]:
-    """The figures of one row.
+    """Return the figures of one row.
 
     Args:
-        results: Of its trials, as `run_jobs` gives them.
-        figures: Key -> how the trials that have it become one figure.
+        results: Results of its trials, as returned by `run_jobs`.
+        figures: Key -> statistic over the trials that have it.
 
     Returns:
-        `trials`, `success` (count), `stopped` (trials that ended in a fault), `worst_success` (fewest successes of a
-        plant and seed, of `per_cluster` trials each), and by key an interval, or None where no trial has a figure.
+        `trials`, `success` (count), `stopped` (trials that ended in a fault), `worst_success` (fewest
+        successes of a plant and seed, of `per_cluster` trials each), and by key an interval, or None if no
+        trial has a figure.
     """
     clusters = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results)
     held = Counter((r["job"]["plant"], r["job"]["seed"]) for r in results if r["success"])
@@ -515,7 +519,7 @@ def row_figures(results: Sequence[Mapping[str, Any]], figures: Mapping[str, Stat
 
 
 def _by_trial(results: Sequence[Mapping[str, Any]], key: str) -> dict[tuple[int, int, str], float]:
-    """Plant, seed and target -> the figure of that trial, where it has one."""
+    """Return plant, seed and target -> figure of that trial, if it has one."""
     measure = "success" if key == "success_rate" else key
     return {
         (r["job"]["plant"], r["job"]["seed"], r["job"]["target"]): float(r[measure])
@@ -530,16 +534,16 @@ ROWS: Mapping[str, Mapping[str, ControllerRow]] = {
         Path(__file__).with_name("rows.yaml").read_text(encoding="utf-8")
     ).items()
 }
-"""Task -> the rows of its table, in their order."""
+"""Task -> rows of its table, in their order."""
 T1_DRAWN = ("calibrated", "mesh", "simplified", "pid-paper", "pid", "calibrated-pool")
-"""The paper's four curves, and ours."""
+"""Rows in the figure: the paper's four curves, and ours."""
 
 T2_DRAWN = 4
-"""Greatest number of drawn rows, which can still be distinguished."""
+"""Greatest number of rows in the figure that can be distinguished."""
 
 
 def played_in(result: Mapping[str, Any], targets_name: str) -> str:
-    """Return the place of an experiment, and its vehicle, as text."""
+    """Return the site of an experiment, and its vehicle, as text."""
     plants, seeds = len(result["plants"]), len(result["seeds"])
     of = f"{targets_name}: {len(result['targets'])}; {result['vehicle']['name']} {result['vehicle']['sha256'][:12]}"
     if result.get("robot"):
@@ -550,7 +554,7 @@ def played_in(result: Mapping[str, Any], targets_name: str) -> str:
 
 
 def _draw_t1(by_row: Results, folder: Path) -> Path:
-    """Position and yaw error against time of the rows of `T1_DRAWN` that were played, or of all."""
+    """Draw position and yaw error over time, for the rows of `T1_DRAWN` that were run, or all rows."""
     drawn = {name: by_row[name] for name in T1_DRAWN if name in by_row} or by_row
     runs = {
         ROWS["t1"][name].title: [played_trial(r, folder / "trials") for r in results]
@@ -604,7 +608,7 @@ T1 = Spec(
     draw=_draw_t1,
     picture=("t1_envelopes.png", ENVELOPE),
 )
-"""`finssim experiment t1`."""
+"""Specification of `finssim experiment t1`."""
 T2 = Spec(
     name="t2",
     title="Trajectory tracking",
@@ -629,21 +633,24 @@ T2 = Spec(
     draw=_draw_t2,
     picture=("t2_paths.png", TRACKS),
 )
-"""`finssim experiment t2`."""
+"""Specification of `finssim experiment t2`."""
 SPECS: Mapping[str, Spec] = {"t1": T1, "t2": T2}
 
 
 def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
-    """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle [s], jitter.
+    """Station keeping in the virtual pool (the paper's Table IV): success, errors [m, deg], time to settle
+    [s], jitter.
 
-    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
+    With --robot, run the published protocol on a vehicle, with instructions on the screen; results are marked
+    as hardware.
 
     Example: finssim experiment t1 --rows calibrated,pid --seeds 1 --out t1
 
-    Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm --out hw
+    Example: finssim experiment t1 --rows pid --seeds 1 --robot serial:/dev/ttyUSB0 --pool-file p.yaml --arm
+    --out hw
 
     Args:
-        setpoints (NAMES): Setpoints, separated by commas; all published ones if not given.
+        setpoints (NAMES): Setpoints, separated by commas; default all published ones.
         options: As of `studies.transfer.transfer_experiment`.
     """
     return transfer_experiment(T1, targets=setpoints, **options)
@@ -652,17 +659,18 @@ def t1(*, setpoints: Annotated[Sequence[str] | None, ","] = None, **options: Any
 def t2(*, trajectories: Annotated[Sequence[str] | None, ","] = None, **options: Any) -> dict[str, Any]:
     """Trajectory tracking in the virtual pool (the paper's Table V): horizontal and vertical RMSE, 3-D P95 [m].
 
-    With --robot, run the published protocol on a vehicle, with instructions on the screen, marked as hardware.
+    With --robot, run the published protocol on a vehicle, with instructions on the screen; results are marked
+    as hardware.
 
     Example: finssim experiment t2 --rows calibrated-dr,pid --trajectories lemniscate --seeds 1 --out t2
 
     Args:
-        trajectories (NAMES): Trajectories, separated by commas; all published ones if not given.
+        trajectories (NAMES): Trajectories, separated by commas; default all published ones.
         options: As of `studies.transfer.transfer_experiment`.
     """
     return transfer_experiment(T2, targets=trajectories, **options)
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Return the tables of either."""
+    """Return the tables of an experiment."""
     return SPECS[result["experiment"]].tables(result)
