@@ -27,14 +27,14 @@ from finssim.vehicles import load_vehicle
 TRAINING_SHARE = 0.3
 """Fraction of the progress bar for training."""
 HELD = 0.9
-"""Fraction of its trials that a row must hold at an amount, and at all smaller ones, to tolerate it."""
+"""Fraction of its trials that a row must hold at an amount, and at all smaller ones, to tolerate the error [-]."""
 FIGURES: Columns = {
     "success": ("held", ".3f"),
     "e_p_m": ("e_p, median [mm]", ".2f", 1000.0),
     "t_s_s": ("t_s, mean [s]", ".2f"),
 }
 LEAST = 0.1
-"""Smallest error in the figure [mm]; smaller ones are drawn at it."""
+"""Smallest error in the figure [mm]; smaller ones are drawn at this value."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Cause:
     amounts: tuple[float, ...]
     """Amounts in the unit of the parameter, the first of which is zero."""
     plant: Callable[[float], Mapping[str, Any]]
-    """Amount -> keys of the plant."""
+    """Function of an amount that returns keys of the plant."""
 
 
 def _ranges(**entries: Any) -> dict[str, Any]:
@@ -91,7 +91,7 @@ ROWS = (
 )  # fmt: skip
 """Rows of station keeping with different controllers."""
 FOREIGN = "foreign"
-"""Plant with errors of all parameters together, drawn for each trial."""
+"""Plant with errors of all parameters, drawn for each trial."""
 
 
 def anatomy(
@@ -114,15 +114,15 @@ def anatomy(
 
     Args:
         out (DIR): Directory for JSON, Markdown, figure, policies and trials; an interrupted one is continued.
-        causes (NAMES): Wrong parameters, separated by commas; all if not given.
-        rows (NAMES): Rows of experiment t1 with different controllers, separated by commas; all if not given.
-        seeds: Trainings of each policy.
+        causes (NAMES): Wrong parameters, separated by commas; default all.
+        rows (NAMES): Rows of experiment t1 with different controllers, separated by commas; default all.
+        seeds: Number of trainings of each policy.
         seed: Seed of every random number; equal seeds give equal results.
         trials: Trials of each policy in each plant, over the published setpoints; ten times as many in the last
             plant.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        steps: Control steps of the training, summed over all worlds; the task's default if not given.
-        processes: Parallel plants; one per processor if not given.
+        steps: Control steps of the training, summed over all worlds; default that of the task.
+        processes: Parallel plants; default one per processor.
         address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto.
         progress: Receives the completed fraction and the next trial.
 
@@ -191,7 +191,7 @@ def _figures(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tolerated(cause: Mapping[str, Any], row: str) -> float | None:
-    """Return the amount up to which a row holds `HELD` of its trials at every amount; None: not even at 0.
+    """Return the amount up to which a row holds `HELD` of its trials at every amount; None if not even at 0.
 
     It has the unit of the cause.
     """
@@ -214,13 +214,13 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         lines.append([f"{cause['title']} [{cause['unit']}]", *amounts])
     return [
         Table(
-            title="What is tolerated (T1)", headline=f"T1 with one thing wrong, {about}",
+            title="Tolerated errors (T1)", headline=f"T1 with one wrong parameter, {about}",
             heads=["wrong", *rows], rows=lines,
             note=f"the largest amount at which {100.0 * HELD:.0f} % of the trials hold, there and at all smaller ones; "
-            "+: the largest that was tried. The rest of the plant is as the file has it, the state exact.",
+            "+: the largest that was tested. All other parameters are those of the file, and the state is exact.",
         ),
         Table(
-            title="Everything wrong at once", headline=f"T1 in the plant '{FOREIGN}', another in each trial, {about}",
+            title="All parameters wrong", headline=f"T1 in the plant '{FOREIGN}', another in each trial, {about}",
             heads=["", *(heading for heading, *_ in FIGURES.values())],
             rows=[[title, *cells(result[FOREIGN][row], FIGURES)] for row, title in rows.items()],
             note="in brackets 95 % from a bootstrap of the trials of these trainings; times to settle are of those "
@@ -234,7 +234,9 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     causes, rows = result["causes"], result["rows"]
     across = min(4, len(causes))
     down = math.ceil(len(causes) / across)
-    heading = f"median error with one thing wrong; hollow: fewer than {100.0 * HELD:.0f} % of the trials hold"
+    heading = (
+        f"median error with one wrong parameter; hollow: fewer than {100.0 * HELD:.0f} % of the trials hold"
+    )
     figure = new_figure(3.0 * across, 2.3 * down + 0.9, heading)
     panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
     for axes, cause in zip(panels, causes.values(), strict=False):

@@ -1,8 +1,9 @@
-"""What a changed vehicle costs, and what following the change gives back: `python -m studies.changes --out changes`.
+"""Cost of a changed vehicle, and benefit of tracking the change: `python -m studies.changes --out changes`.
 
-In each pool the vehicle is first followed as it is, which gives the model. Then it gets a payload of 1 kg, a thruster
-with 70 % of its thrust, or 30 % more drag. After a minute of driving the estimates are compared with the truth, and
-controllers hold setpoints of T1 with the model of before and with the followed one.
+In each pool, the parameters of the vehicle are first tracked in its original state, which gives the model.
+Then it gets a payload of 1 kg, a thruster with 70 % of its thrust, or 30 % more drag. After a minute of
+driving, the estimates are compared with the truth, and controllers hold setpoints of T1 with the earlier
+model and with the tracked one.
 """
 
 from __future__ import annotations
@@ -44,24 +45,24 @@ MODELS = ("unchanged", "changed", "followed")
 SETPOINTS = ("P02", "P05")
 """Setpoints of T1 that are held."""
 LEG = 8.0
-"""Time at each setpoint while the vehicle is followed [s]."""
+"""Time at each setpoint during tracking [s]."""
 MINUTE = 60.0
-"""Time for which the vehicle is followed [s]."""
+"""Duration of tracking [s]."""
 LOAD, LOAD_DENSITY, LOAD_PLACE = 1.0, 3000.0, (0.1, 0.0, -0.1)
-"""Payload: mass [kg], density [kg/m³] and place in the body frame [m]."""
+"""Payload: mass [kg], density [kg/m³] and position in the body frame [m]."""
 WEAK, MORE_DRAG = 0.7, 1.3
 """Factors on the thrust of the first horizontal thruster and on the drag [-]."""
 
 
 @dataclass(frozen=True)
 class Tour:
-    """The published setpoints one after the other, again and again."""
+    """Published setpoints in sequence, repeated."""
 
     poses: Array
     """x, y, z [m] and yaw [rad], world frame, (n, 4)."""
     name: str = "tour"
     duration: float = float("inf")
-    """[s]"""
+    """Duration [s]."""
 
     def at(self, t: npt.ArrayLike) -> Reference:
         """Return the reference at times t [s]."""
@@ -100,7 +101,7 @@ def changed(spec: PlantSpec, change: str, thruster: str) -> PlantSpec:
 
 
 def follow(plan: PoolPlan, vehicle: Vehicle, seed: int) -> Adaptation:
-    """Drive a tour of a minute by the tuned PID of `vehicle` and return what has changed on it."""
+    """Drive a tour of a minute with the tuned PID of `vehicle` and return the estimated changes of the vehicle."""
     follower = Follower(vehicle)
 
     def watch(runtime: Runtime) -> None:
@@ -119,7 +120,7 @@ def follow(plan: PoolPlan, vehicle: Vehicle, seed: int) -> Adaptation:
 
 
 def hold(plan: PoolPlan, vehicle: Vehicle, controller: str, setpoint: str, seed: int) -> dict[str, Any]:
-    """Hold one setpoint of T1 by the robot's software, and return its measures by the truth."""
+    """Hold one setpoint of T1 with the robot's software, and return its measures from the truth."""
     guide = guide_of(setpoint, vehicle)
     *position, yaw = in_room(T1_START, vehicle).tolist()
     trial = RobotTrial(
@@ -145,9 +146,9 @@ def found(adaptation: Adaptation, change: str, thruster: str, density: float) ->
     """Return the estimate of a change, its truth, and the other estimates that differ from the model.
 
     Args:
-        adaptation: After the minute.
-        change: In `CHANGES`.
-        thruster: Name of the weak one.
+        adaptation: Result of the tracking.
+        change: Change in `CHANGES`.
+        thruster: Name of the weak thruster.
         density: Density of the water [kg/m³].
     """
     name, truth = {
@@ -176,17 +177,17 @@ def changes(
     controllers: str = "pid,nmpc,policy",
     progress: Progress = lambda part, text: None,
 ) -> dict[str, Any]:
-    """Follow vehicles that change, and compare controllers with and without the followed model.
+    """Track vehicles that change, and compare controllers with and without the tracked model.
 
     Example: python -m studies.changes --seeds 1 --controllers pid --out changes
 
     Args:
         out (DIR): Directory for the result, and the vehicles and policies of each pool.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        severity (WORD): Deviation of the pools from the vehicle file: nominal, realistic or hard.
         seeds: Number of pools.
         seed: Seed of the first pool; equal seeds give equal results.
-        controllers (NAMES): Of pid,nmpc,policy.
+        controllers (NAMES): Controllers to compare, of pid,nmpc,policy.
         progress: Receives the completed fraction and the state.
 
     Returns:
@@ -237,7 +238,7 @@ def changes(
                 row = {"pool": pool, "change": change}
                 followed.append({**row, **found(adaptation, change, weak, body.water.density)})
                 held({"changed": known, "followed": adaptation.adapted}, plan, row, place / change)
-    finally:  # after Ctrl-C with what there is
+    finally:  # after Ctrl-C, write the results so far
         write_json(folder / "changes.json", result(), tables_of(result()))
     return result()
 
@@ -248,7 +249,7 @@ def _severity(word: str) -> Severity:
 
 
 def _policy(vehicle: Vehicle, place: Path, first: Path | None) -> Path:
-    """Return a policy for a vehicle, trained from that of the unchanged one if there is one."""
+    """Return a policy for a vehicle, trained from that of the unchanged vehicle if it exists."""
     out = place / "policy"
     if place.name == "changed" and first is not None:
         return first / "unchanged" / "policy"

@@ -1,6 +1,6 @@
 """Faults injected while a vehicle drives: `python -m studies.faults --out faults`.
 
-Faults of the wire are injected in lock-step, those of a process in real time, by kill -9.
+Wire faults are injected in lock-step, process faults in real time, by kill -9.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ Array = NDArray[np.float64]
 
 
 class Course(NamedTuple):
-    """True motion and thrust of a trial, by the pool's clock."""
+    """True motion and thrust of a trial, on the pool's clock."""
 
     time: Array
-    """[s], (k,)"""
+    """Times [s], (k,)."""
     position: Array
     """Body origin, world frame [m], (k, 3)."""
     thrust: Array
-    """Delivered, canonical order [N], (k, n)."""
+    """Delivered thrust, canonical order [N], (k, n)."""
     enabled: Array
     """Flag [-]: 1 where the robot sent a frame that enables the motors, else 0, (k,); NaN where it was not observed."""
 
@@ -98,7 +98,7 @@ class FaultyWire:
         self._rows: list[tuple[float, Array, Array, bool]] = []
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
-        """Advance the pool by one period; `until`, a time of the robot's clock, is ignored. Times are in [s]."""
+        """Advance the pool by one period; `until`, a time on the robot's clock, is ignored. Times are in [s]."""
         self._note(sent)
         self._turns += 1
         more = self.others(self.pool.time) if self.others is not None else ()
@@ -180,7 +180,7 @@ class Fault:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Row of the table: faults of one kind, with the figures of the worst."""
+    """Row of the table: faults of one kind, of which the worst figures are shown."""
 
     title: str
     faults: Mapping[str, Fault]
@@ -196,19 +196,19 @@ class Scenario:
     plant: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the plant's firmware that differ."""
     watched: float = 0.0
-    """Least time of observation after the fault [s]; that of all trials if 0."""
+    """Least time of observation after the fault [s]; 0: that of all trials."""
     off: float = math.inf
     """Greatest true distance from the goal at the end, horizontal [m]."""
     ends: str = ""
-    """Pattern of the reason for which an autopilot's run must end; empty: it must continue."""
+    """Pattern of the reason with which an autopilot's run must end; empty: it must continue."""
     limit: float = STOP_WITHIN
-    """Time after the fault within which its thrusters must stop [s]."""
+    """Longest time from the fault until its thrusters stop [s]."""
     handed_over: bool = False
-    """True if another pilot takes over, so that only our axes, not all thrust, must end."""
+    """True if another pilot takes over, so that only our axis commands must end, not all thrust."""
 
 
 RECORDER_TURN = 0.3
-"""Time longer than the recorder's thread needs to write its queue; lock-step time runs faster than it [s]."""
+"""Time that the recorder's thread needs at most to write its queue [s]; lock-step time runs faster."""
 
 
 def pool_fault(pictures: float = 0.0, **fields: Any) -> Touch:
@@ -231,7 +231,7 @@ def autopilot_fault(**fields: Any) -> Touch:
 
 
 def _set(faults: Any, fields: Mapping[str, Any]) -> None:
-    """Set fields that are there."""
+    """Set existing fields."""
     for name, value in fields.items():
         getattr(faults, name)
         setattr(faults, name, value)
@@ -254,7 +254,7 @@ def stuck_sensors(*names: str) -> Touch:
 
 
 def stuck_pictures(bench: Bench) -> None:
-    """Let the camera repeat its last picture, each time with a new number and time."""
+    """Make the camera repeat its last picture, each time with a new number and time."""
     last: list[Picture] = []
 
     def change(pictures: Sequence[Picture]) -> Sequence[Picture]:
@@ -266,7 +266,7 @@ def stuck_pictures(bench: Bench) -> None:
 
 
 def two_publishers(bench: Bench) -> None:
-    """Let a second publisher command full thrust at every step."""
+    """Make a second publisher command full thrust at every step."""
     bridge, now = bench.runtime.bridge, bench.pool.time + bench.wire.shift
     bridge.command(now, np.full_like(bridge.force, 5.0), "intruder", stamp=now)
 
@@ -283,7 +283,7 @@ def jump_mcu_clock(step: float) -> Touch:
 
 
 def full_disk(bench: Bench) -> None:
-    """Let the system refuse more bytes for files that are as long as the record is now."""
+    """Make the system refuse to let files grow beyond the present size of the record."""
     import resource
 
     time.sleep(RECORDER_TURN)
@@ -293,7 +293,7 @@ def full_disk(bench: Bench) -> None:
 
 
 VALUES = {"quaternion": 4, "gyro": 3, "accel": 3, "depth": 0, "pressure": 0, "motor_rpm": 8}
-"""Numbers in the fields of the telemetry; 0: one, without an index."""
+"""Number of values in the fields of the telemetry; 0: one, without an index."""
 
 TIMES = ("command", "telemetry", "state")
 UNWATCHED: Mapping[str, Any] = {
@@ -384,35 +384,35 @@ def _autopilot(title: str, ends: str, limit: float, faults: Any, **more: Any) ->
 
 
 def leap(bench: Bench) -> None:
-    """Let the autopilot's filter reset its position by 0.7 m."""
+    """Make the autopilot's filter reset its position by 0.7 m."""
     autopilot: Any = bench.pool.firmware
     autopilot.leap(0.5, -0.5)
 
 
 def turning_north(bench: Bench) -> None:
-    """Turn the autopilot's north on by one step of 15° in 20 s."""
+    """Rotate the autopilot's north further, by one step of 15° in 20 s."""
     bench.pool.faults.autopilot.north += math.radians(15.0) / 20.0 / RATE
 
 
 def lagging_leap(bench: Bench) -> None:
-    """Let the autopilot's position be late, and then be reset."""
+    """Make the autopilot's position late, and then reset it."""
     bench.pool.faults.autopilot.position_lag = 0.25
     leap(bench)
 
 
 TURNED: Mapping[str, Any] = {"watched": 55.0, "off": 0.25, "settings": {"workspace_upper": (4.6, 2.6, 0.0)}}
-"""A vehicle that floats up while its thrust waits, and returns to its goal."""
+"""Settings for a vehicle that floats up while its thrust pauses, and returns to its goal."""
 TURN_SEEN = (4.0 + 0.05 * 30.0 + 1.0) / 0.75
-"""Time until the link sees a turn of 0.75 °/s [s]: 4°, 5 % of the 30° that the vehicle turns itself, and 1° by which
-the autopilot's heading follows later."""
+"""Time until the link detects a rotation of 0.75 °/s [s]: 4°, 5 % of the 30° that the vehicle turns itself,
+and 1° by which the autopilot's heading lags."""
 DECLINATION = math.radians(11.4)
-"""Magnetic declination of the place where the real autopilot was recorded [rad]."""
+"""Magnetic declination at the location where the real autopilot was recorded [rad]."""
 OWN: Mapping[str, Any] = {"firmware": "ardusub-own", "watched": 20.0, "off": 0.15}
-"""An autopilot that locates itself, and stays where it was."""
+"""Settings for an autopilot that locates itself and holds its position."""
 
 
 def low_battery(bench: Bench) -> None:
-    """Let the battery fall below the voltage at which the autopilot, as its user set it, disarms."""
+    """Make the battery voltage fall below the value at which the autopilot, with its user's settings, disarms."""
     autopilot: Any = bench.pool.firmware
     autopilot.parameters |= {"BATT_LOW_VOLT": 12.8, "BATT_FS_LOW_ACT": 2.0}
     bench.pool.faults.autopilot.battery_voltage = 9.0
@@ -532,9 +532,10 @@ KILL_WEIGHT = 5.0
 STILL = 0.05
 """Thrust below which a thruster counts as stopped [N]."""
 QUIET = 1.0
-"""Time without thrust at the end of a fault after which thrusters count as stopped [s]; less is a pause of pulses."""
+"""Time without thrust at the end of a fault after which thrusters count as stopped [s]; a shorter time is a
+gap between pulses."""
 LONGEST_LOSS = 1.0
-"""Longest time that may be missing at the end of a record [s]."""
+"""Longest duration that may be missing at the end of a record [s]."""
 INSET = np.array([0.4, 0.4, 0.2])
 """Distance by which the workspace of these trials is smaller than the vehicle file's on every side, x, y, z [m]: a
 vehicle cannot leave a workspace that ends at the pool's walls."""
@@ -546,18 +547,18 @@ def inset(lower: Any, upper: Any) -> tuple[Array, Array]:
 
 
 def measured(course: Course, began: float, ended: float, box: tuple[Array, Array] | None) -> dict[str, Any]:
-    """Measure a course.
+    """Return the measures of a trial.
 
     Args:
         course: The truth, to the end of the trial.
-        began: Begin of the fault, pool's clock [s].
+        began: Start of the fault, pool's clock [s].
         ended: End of the fault or the trial [s].
         box: Lower and upper corner of the workspace; None: the vehicle's position does not count.
 
     Returns:
-        `thrust_gone_s`, `frames_off_s`: from the fault to the last thrust, and to the last frame that enables motors;
-        None where they did not end. `margin_m`: least distance to the workspace's faces after the fault, negative
-        outside. `speed_m_s` and `thrust_n` (sum of magnitudes, mean over a second) before it.
+        `thrust_gone_s`, `frames_off_s`: from the fault to the last thrust, and to the last frame that enables
+        motors; None if they did not end. `margin_m`: least distance to the workspace's faces after the fault,
+        negative outside. `speed_m_s` and `thrust_n` (sum of magnitudes, mean over a second) before it.
     """
     t, fault = course.time, (course.time >= began) & (course.time <= ended)
     pushes = np.abs(course.thrust).max(axis=1) > STILL
@@ -585,14 +586,14 @@ def passed(result: Mapping[str, Any]) -> bool:
 
 
 def _last_activity(time: Array, active: NDArray[np.bool_], began: float) -> float | None:
-    """Return the end of the last activity, counted from `began` [s]; None if it had not ended for `QUIET`."""
+    """Return the end of the last activity, relative to `began` [s]; None if it had not ended for `QUIET`."""
     last = float(time[active][-1]) if active.any() else began
     return None if time[-1] - last < QUIET else last - began
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultJob(PoolJob):
-    """Fault in a motion and a pool whose vehicle is given; the row is the name of the scenario."""
+    """Job of one fault in a motion and a pool with a given vehicle; the row is the name of the scenario."""
 
     variant: str
     motion: str
@@ -600,7 +601,7 @@ class FaultJob(PoolJob):
     camera: str = "corners"
 
     def plan(self, seed: int) -> PoolPlan:
-        """Return the plan of its pool, with a seed for noise; an autopilot has an origin where it locates itself."""
+        """Return the plan of its pool, with a seed for noise; an autopilot has an origin if it locates itself."""
         plan, scenario = super().plan(seed), SCENARIOS[self.row]
         absent = {"origin": None} if self.firmware == "ardusub" else {}
         firmware = plan.spec.firmware.model_copy(update={**absent, **scenario.plant})
@@ -682,7 +683,7 @@ def play(job: FaultJob, path: Path) -> dict[str, Any]:
 
 
 def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
-    """Return whether an autopilot's trial ended for the reason and in the time of its scenario, or continued."""
+    """Return whether an autopilot's trial ended for the reason and within the time of its scenario, or continued."""
     ended_after = result["frames_off_s" if scenario.handed_over else "thrust_gone_s"]
     stopped = ended_after is not None and ended_after <= scenario.limit
     if not scenario.ends:
@@ -692,16 +693,16 @@ def ended_as_named(scenario: Scenario, result: Mapping[str, Any]) -> bool:
 
 
 class _Script:
-    """Run of a trial that begins and ends the fault, and stores the bridge's state before the run ends."""
+    """Controller of a trial that begins and ends the fault, and stores the bridge's state before the run ends."""
 
     def __init__(self, bench: Bench, fault: Fault, when: float, watched: float) -> None:
         self.fault = fault
         self._bench, self._when, self._watched = bench, when, watched
         self._armed, self._ended = math.nan, False
         self.began = math.nan
-        """Pool's clock [s]; NaN before."""
+        """Start of the fault on the pool's clock [s]; NaN before."""
         self.steps = 0
-        """Steps of the robot before the fault."""
+        """Number of the robot's steps before the fault."""
         self.state = self.reason = ""
 
     def _look(self, runtime: Runtime) -> None:
@@ -753,12 +754,13 @@ def _record_lost(path: Path, lacks: Callable[[Record], float]) -> dict[str, Any]
 
 
 def _record_cut(path: Path, at: float) -> dict[str, Any]:
-    """Return these for a record that was cut at a time of the robot's clock, which is this machine's [s]."""
+    """Return these for a record that was truncated at a time of the robot's clock, which is this machine's [s]."""
     return _record_lost(path, lambda record: at - max(t for t, _, _ in record.sizes()) if record.cut else 0.0)
 
 
 def _first_stop(path: Path, since: float) -> float | None:
-    """Return when the bridge first stopped enabling the motors after a time, from the record, robot's clock [s]."""
+    """Return the time at which the bridge first stopped enabling the motors after a time, from the record,
+    robot's clock [s]."""
     with open_record(path) as record:
         for entry in record.messages(("events",)):
             kind = json.loads(entry.message.data)["kind"]
@@ -773,11 +775,11 @@ def _first_stop(path: Path, since: float) -> float | None:
 STARTING = 120.0
 """Longest time that a process takes to start, or to reach an awaited state [s]."""
 POLL = 0.005
-"""Interval of polling [s]."""
+"""Polling interval [s]."""
 
 
 class ReliabilityError(ValueError):
-    """A trial could not run, since a process did not reach the state that it needs."""
+    """Trial that could not run, since a process did not reach the required state."""
 
 
 class Process:
@@ -836,12 +838,12 @@ class Process:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process with its block."""
+        """Kill the process at the end of its block if it still runs."""
         if self.running:
             self.kill()
 
     def broke(self) -> str:
-        """Return the last line of a traceback, or an empty text if the process ended in order."""
+        """Return the last line of a traceback, or an empty text if the process ended normally."""
         lines = self.complained.splitlines()
         if any(line.startswith("Traceback") for line in lines) or self._process.returncode == 1:
             return f"{self.name}: {lines[-1] if lines else 'exit status 1'}"
@@ -878,7 +880,7 @@ class Pair:
 
 @contextmanager
 def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
-    """Start both on free ports, and yield when the robot is armed and the thrusters turn.
+    """Start both processes on free ports, and yield when the robot is armed and the thrusters turn.
 
     Args:
         job: Vehicle and motion.
@@ -889,7 +891,7 @@ def pair(job: FaultJob, folder: Path) -> Iterator[Pair]:
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        # The five ports after it are used too: another attempt follows if one is in use.
+        # The five ports after it are used too: if one is in use, another attempt follows.
         port: int = free.getsockname()[1]
     start, goal, *_ = MOTIONS[job.motion]
     truth, record = folder / "truth", folder / "run.mcap"
@@ -938,7 +940,7 @@ def play_kill(job: FaultJob, path: Path) -> dict[str, Any]:
         path: Not used, as in `play`.
 
     Raises:
-        ReliabilityError: The vehicle never drove, in three attempts: a busy machine stops it before the kill.
+        ReliabilityError: The vehicle never drove in three attempts: a busy machine stops it before the kill.
     """
     for attempt in range(ATTEMPTS):
         try:
@@ -974,8 +976,8 @@ def _kill_robot(job: FaultJob, both: Pair) -> dict[str, Any]:
 def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
     """Kill the pool, so that vehicle and camera are silent: the robot has to stop commanding.
 
-    Its frames are received at the pool's port as soon as the system has freed that, and its bridge has recorded when it
-    stopped: the later of the two counts.
+    Its frames are received on the pool's port as soon as the system has freed it, and its bridge has recorded
+    the time at which it stopped: the later of the two counts.
     """
     began, killed = both.next_truth(), time.monotonic()
     both.pool.kill()
@@ -988,7 +990,7 @@ def _kill_pool(job: FaultJob, both: Pair) -> dict[str, Any]:
     course = Course(truth.time, truth.position, truth.thrust, np.ones(len(truth.time)))
     return {
         **measured(course, began, began, None),
-        # The vehicle is gone: the last frame that would turn a motor counts instead of its thrust.
+        # The vehicle is gone: instead of its thrust, the last frame that would turn a motor counts.
         "thrust_gone_s": off,
         "frames_off_s": off,
         "state": summary.get("state", "no answer"),
@@ -1019,7 +1021,7 @@ KILLS: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
     "kill-robot": ("kill -9 of the robot's process", _kill_robot),
     "kill-pool": ("kill -9 of the pool's process", _kill_pool),
 }
-"""Name -> title and the function that runs it."""
+"""Name -> title, and the function that runs it."""
 
 
 HEADS = (
@@ -1123,14 +1125,14 @@ def faults_experiment(
         out (DIR): Directory for JSON, Markdown, figures, policies and trials; an interrupted one is continued.
         seeds: Number of virtual pools, each with different vehicle, water and noise.
         seed: Seed of every random number; equal seeds give equal results.
-        scenarios (NAMES): Faults, separated by commas; all if not given.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file; finsrov, with ardusub
-            bluerov2_heavy, if not given.
+        scenarios (NAMES): Faults, separated by commas; default all.
+        severity (WORD): Deviation of the pools from the vehicle file: nominal, realistic or hard.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file; default finsrov, with ardusub
+            bluerov2_heavy.
         firmware (NAME): Firmware of the vehicle: mcu (the motor controller of finssim run) or ardusub (an
             autopilot, in the tank, with a DVL instead of the camera).
-        processes: Parallel trials; one per processor if not given.
-        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto; kills stay here.
+        processes: Parallel trials; default one per processor.
+        address (ADDRESS): Ray cluster to use instead, HOST:PORT or auto; kills run on this machine.
         progress: Receives the completed fraction and the next trial.
 
     Returns:

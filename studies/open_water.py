@@ -191,9 +191,9 @@ def open_water(
         speed: Speed [m/s].
         shape (WORD): line or square (of 10 m).
         positioning (NAME): Fixes: none, motion-capture or usbl.
-        seeds: Runs, each with different water and noise.
+        seeds: Number of runs, each with different water and noise.
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        severity (WORD): Deviation of the pools from the vehicle file: nominal, realistic or hard.
         progress: Receives the completed fraction and the next run.
     """
     ours, way = load_vehicle(vehicle), way_of(shape, 60.0 * minutes, speed)

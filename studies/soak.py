@@ -1,4 +1,4 @@
-"""Memory of the robot's software over hours of vehicle time: `python -m studies.soak --hours 20 --out soak`."""
+"""Memory use of the robot's software over hours of vehicle time: `python -m studies.soak --hours 20 --out soak`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 SAMPLED = 10.0
 """Interval of samples in vehicle time [s]."""
 WARM = 0.25
-"""Fraction at the start of a run that does not count, since caches fill [-]."""
+"""Fraction at the start of a run that is ignored, since caches fill [-]."""
 FLAT = 1.0
 """Growth per hour of vehicle time below which memory is flat [MiB/h]: 20 MiB in 20 hours."""
 GOAL = "0,0,-0.5,0"
@@ -57,7 +57,7 @@ def soak(
         out (DIR): Directory for the result and the samples.
         hours: Vehicle time to keep a station [h].
         seed: Seed of every random number; equal seeds give equal results.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        severity (WORD): Deviation of the pools from the vehicle file: nominal, realistic or hard.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         progress: Receives the completed fraction and the state.
 
@@ -113,7 +113,7 @@ def soak(
 
 
 def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
-    """Judge whether memory is flat, by its least-squares slope over all but the warm-up.
+    """Return a verdict on whether memory is flat, from its least-squares slope after the warm-up.
 
     Args:
         vehicle_s: Vehicle time of each sample [s], (k,).
@@ -131,9 +131,9 @@ def verdict(vehicle_s: Array, memory: Array) -> dict[str, Any]:
 
 
 def memory_mib() -> float:
-    """Return the memory that this process uses now [MiB], or its peak where the system does not report that."""
+    """Return the memory that this process uses now [MiB], or its peak if the system does not report it."""
     try:
-        # Not statm, which on a machine of many processors may be tens of MiB behind.
+        # statm may lag by tens of MiB on a machine with many processors.
         rollup = Path("/proc/self/smaps_rollup").read_text(encoding="ascii")
         return int(re.search(r"^Rss:\s+(\d+) kB", rollup, re.MULTILINE)[1]) / 1024.0  # type: ignore[index]
     except OSError:

@@ -1,4 +1,4 @@
-"""Any task through the deployed software, compared with the batch: `python -m studies.stack t3 --policy DIR`."""
+"""Run any task through the deployed software, compared with the batch: `python -m studies.stack t3 --policy DIR`."""
 
 from __future__ import annotations
 
@@ -56,12 +56,14 @@ def site_of(
         vehicles: One for each agent of the task.
         seed: Seed of the episode, of noise and of losses.
         plant: Seed of every vehicle's plant.
-        severity: Distance of the plants from the vehicle files.
+        severity: Deviation of the plants from the vehicle files.
         guide: Reference of a task that follows one.
         record: Directory for PLACE.mcap and PLACE.truth of every agent; None: no records.
 
     Raises:
-        PolicyError, ControlError, BaselineError: Controller, vehicles and task do not fit.
+        PolicyError: The controller does not fit the task.
+        ControlError: The task cannot be run on a robot, or the vehicles do not fit it.
+        BaselineError: The baseline does not fit the task.
     """
     fitted = fitted_task(task, vehicles)
     if isinstance(fitted, VelocityControl):
@@ -121,7 +123,7 @@ def play(
         episodes: Number of episodes.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         plant: Seed of every vehicle's plant.
-        severity (WORD): How much the pools differ from the vehicle file: nominal, realistic or hard.
+        severity (WORD): Deviation of the pools from the vehicle file: nominal, realistic or hard.
         seed: Seed of every random number; equal seeds give equal results.
         out (DIR): Directory that keeps every episode; an interrupted one is continued.
         records: Store in --out the record (.mcap) and the truth (.truth) of every agent.
@@ -151,7 +153,7 @@ def play(
         guide = list(TRAJECTORIES.values())[k % len(TRAJECTORIES)] if follows(fitted) else None
         record = out / f"episode_{k}" if out is not None and records else None
         if record is not None:
-            shutil.rmtree(record, ignore_errors=True)  # of an episode that was interrupted
+            shutil.rmtree(record, ignore_errors=True)  # of an interrupted episode
         site = site_of(
             task, policy, vehicles, seed=seed + k, plant=plant, severity=severity, guide=guide, record=record
         )
