@@ -118,7 +118,7 @@ def test_check_ends_with_3_if_no_trial_can_be_used(capsys, tmp_path):
 
 def test_check_refuses_what_is_no_trial(capsys, tmp_path):
     """A folder without trials, and a path that is not there."""
-    assert "holds no trial" in refusal(capsys, "trials", "check", tmp_path)
+    assert "contains no trial" in refusal(capsys, "trials", "check", tmp_path)
     assert "no such file" in refusal(capsys, "trials", "check", tmp_path / "nowhere")
 
 

@@ -163,7 +163,7 @@ def test_times_may_be_the_index_and_dates():
         ({"columns": {"u": "sped"}}, "no column 'sped', did you mean 'speed'"),
         ({"columns": {"uu": "speed"}}, "names 'uu', did you mean 'u'"),
         ({"units": {"speed": "m"}}, "units names 'speed'"),
-        ({"units": {"depth": "kg"}}, "wrong unit"),
+        ({"units": {"depth": "kg"}}, "invalid unit"),
         ({"units": {"t": "fortnight"}}, "is 'fortnight', expected one of s, ms"),
         ({"axes": "NWU"}, "is 'NWU', expected FLU, FRD"),
         ({"vehicl": "bluerov2"}, r"unknown key 'vehicl', did you mean 'vehicle'\? known keys: vehicle, axis"),
@@ -178,7 +178,7 @@ def test_what_a_frame_does_not_say_is_refused(change, said):
 def test_what_is_no_table_is_refused():
     with pytest.raises(CalibrationError, match="a list, expected a pandas DataFrame or a mapping"):
         fs.Trial.from_frame([1, 2])
-    with pytest.raises(CalibrationError, match="expected one-dimensional ones of one length"):
+    with pytest.raises(CalibrationError, match="expected one-dimensional ones of equal length"):
         fs.Trial.from_frame({"t": np.arange(5.0), "u": np.arange(4.0)})
 
 
@@ -204,7 +204,7 @@ def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
     result = fs.evaluate(policy)
     assert result.metrics["trials"] == 8 and "P01" in str(result.table) and result.plot().axes
     assert policy.save(tmp_path / "policy").joinpath("policy.onnx").is_file()
-    with pytest.raises(EvaluationError, match="not the catalogue's: give it with vehicle="):
+    with pytest.raises(EvaluationError, match="not in the catalogue: pass it as vehicle="):
         fs.evaluate(fs.Policy.load(tmp_path / "policy"))
     folder = policy.folder
     del policy

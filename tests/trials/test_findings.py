@@ -65,7 +65,7 @@ def test_json_has_code_values_and_sentence():
     record = finding("stuck", "u", value=np.float64(0.5), span=np.nan, start=np.float32(2.0)).as_json()
     assert record["values"] == {"value": 0.5, "span": None, "start": 2.0}
     assert (record["code"], record["severity"], record["subject"]) == ("stuck", "care", "u")
-    assert record["sentence"] == "u: stands at 0.5 for nan s from 2 s: stuck?"
+    assert record["sentence"] == "u: constant at 0.5 for nan s from 2 s: stuck?"
 
 
 def test_a_part_keeps_its_subject():

@@ -126,7 +126,7 @@ def test_the_same_trial_twice_is_refused(tmp_path):
     """Equal numbers would count as two measurements."""
     csv(tmp_path / "a", "t,u\n" + rows())
     csv(tmp_path / "b", "t,u\n" + rows(), "description: a copy")
-    with pytest.raises(CalibrationError, match=r"b: holds the same numbers as .*a: .* leave one out"):
+    with pytest.raises(CalibrationError, match=r"b: contains the same numbers as .*a: .* omit one of them"):
         load_trials([tmp_path])
 
 
@@ -261,10 +261,10 @@ def test_quaternions_get_unit_length_and_one_sign(tmp_path):
         ("time_s,u\n0,1\n1,2\n", "no column 't' .*'time: time_s'"),
         ("t,u\n0,1\n", "1 rows with a time, expected at least 2"),
         ("t,u\n1,1\n1,2\n", "all rows have the time 1 s"),
-        ("t,foo\n0,1\n1,2\n", "no usable column beside t"),
-        ("t,u\n0,\n1,\n", "no usable column beside t"),
+        ("t,foo\n0,1\n1,2\n", "no usable column besides t"),
+        ("t,u\n0,\n1,\n", "no usable column besides t"),
         ("0,1\n1,2\n", "begins with numbers"),
-        ("t,u,u\n0,1,2\n1,2,3\n", "column 'u' is there twice"),
+        ("t,u,u\n0,1,2\n1,2,3\n", "column 'u' occurs twice"),
         (
             "t,u\n0,1\n20,2\n40,3\n",
             "t has a row every 20 s, expected one every 2 s .* in ms, import it with a map",
@@ -304,7 +304,7 @@ def test_places_without_a_trial_are_refused(tmp_path):
     """Nothing there, nothing in it, two tables, and files of other kinds."""
     for path, said in [
         (tmp_path / "none", "no such file"),
-        (tmp_path, "holds no trial|neither"),
+        (tmp_path, "contains no trial|neither"),
     ]:
         with pytest.raises(CalibrationError, match=said):
             load_trials([path])

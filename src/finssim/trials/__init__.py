@@ -1,4 +1,4 @@
-"""Trials: recorded motion on disk and in memory, and what pushed the vehicle."""
+"""Trials: recorded motion on disk and in memory, and the forces that drove the vehicle."""
 
 from typing import TYPE_CHECKING
 

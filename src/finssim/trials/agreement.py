@@ -1,4 +1,4 @@
-"""Whether a trial's numbers agree with each other: units, signs, axes."""
+"""Consistency checks of a trial's columns with each other: units, signs, axes."""
 
 from __future__ import annotations
 
@@ -29,43 +29,43 @@ RATE = 25.0
 """Rate of the grid on which columns are compared [Hz]."""
 
 AGAINST = -0.5
-"""Correlation below which two columns that should agree run against each other."""
+"""Correlation below which two columns that should be equal have opposite signs."""
 
 NEGATIVE = 4.0
-"""Factor by which noise, smoothing and errors of scale change a slope of -1 at most."""
+"""Largest factor by which noise, smoothing and scale errors change a slope of -1."""
 
 WITH = 0.7
-"""Correlation above which their ratio means something."""
+"""Correlation above which the ratio of two columns is meaningful."""
 
 FEWEST = 25
-"""Points of a grid with motion that a comparison needs."""
+"""Number of grid points with motion that a comparison needs."""
 
 DEGREES = 57.3
 
 DRIFTS = 0.2
-"""Range of the heading less the integrated gyro and its constant error that is a drift [rad]."""
+"""Range of the heading minus the integrated gyro and its constant bias above which they drift apart [rad]."""
 
 WALK = 2.5
-"""Range of a random walk without its trend, in standard deviations of its end, that chance hardly exceeds."""
+"""Range of a detrended random walk, in standard deviations of its end, that is rarely exceeded by chance."""
 
 WIGGLES = 10.0
-"""Independent values that a smoother may leave of pure noise."""
+"""Number of independent values that smoothing leaves of pure noise."""
 
 LARGEST_TURN = 1.0
-"""Turn between two samples of an attitude above which its rates may be aliases [rad]."""
+"""Turn between two samples of an attitude above which the derived rates may be aliased [rad]."""
 
 STEEP = 0.6
-"""Cosine of the pitch below which the heading means nothing."""
+"""Cosine of the pitch below which the heading is undefined."""
 
 LEVEL = 0.7
-"""Cosine of the tilt below which restoring moments act on yaw and weight on surge and sway."""
+"""Cosine of the tilt below which restoring moments act on yaw, and weight acts on surge and sway."""
 
 GYRO_BIAS = 0.03
-"""Steady difference between heading and integrated gyro that no calibrated gyro has [rad/s]."""
+"""Constant difference between heading rate and gyro that no calibrated gyro has [rad/s]."""
 
 
 def unit_findings(trial: Trial) -> list[Finding]:
-    """Return findings about angles in degrees, recognised by values that radians cannot have."""
+    """Return findings about angles in degrees, recognised by values that are impossible in radians."""
     findings = []
     for name, limit in (("roll", 1.05 * np.pi), ("pitch", 0.55 * np.pi)):
         _, y = trial.series(name)
@@ -80,7 +80,7 @@ def unit_findings(trial: Trial) -> list[Finding]:
 
 
 def frame_findings(trial: Trial, vehicle: Vehicle) -> list[Finding]:
-    """Gravity against the attitude, rates against its changes, velocity against those of position and depth."""
+    """Compare gravity with the attitude, rates with its changes, and velocity with those of position and depth."""
     t = np.arange(trial.t[0], trial.t[-1], 1.0 / RATE)
     if len(t) < FEWEST:
         return []
@@ -100,7 +100,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     f, _ = on_grid(trial, ("ax", "ay", "az"), t)
     f = np.nan_to_num(f[np.isfinite(f[:, 2])])
     mean = np.linalg.norm(f.mean(axis=0))
-    usual = np.median(np.linalg.norm(f, axis=1))  # of a vehicle that turns over, too
+    usual = np.median(np.linalg.norm(f, axis=1))  # also valid for a vehicle that turns over
     for size, unit, scale in (
         (1.0, "g", 9.80665),
         (1000.0, "milli-g", 9.80665e-3),
@@ -126,7 +126,7 @@ def _gravity(trial: Trial, g: float, t: Array, attitude: AttitudeSignal) -> list
     if cosine < np.cos(np.radians(15.0)):
         against = "the attitude" if attitude.tilt else "level"
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        # Without an attitude a vehicle that is level at any time shows that its accelerometer is.
+        # Without an attitude, a vehicle that is level at any time reveals the orientation of its accelerometer.
         cosines = np.sum(f * up, axis=1) / np.linalg.norm(f, axis=1)
         if attitude.tilt or np.percentile(cosines, 98.0) < np.cos(np.radians(15.0)):
             findings.append(finding("accelerometer_turned", angle=angle, reference=against))
@@ -165,7 +165,7 @@ def _rates(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]:
 
 
 def _heading(trial: Trial) -> list[Finding]:
-    """The heading against the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
+    """Compare the heading with the integrated gyro, psi_dot = (q sin(roll) + r cos(roll)) / cos(pitch)."""
     t, r = trial.series("r")
     at, q, named = attitude_samples(trial)
     if len(t) < FEWEST or "yaw" not in named or len(at) < FEWEST or _too_slow(trial, q):
@@ -180,7 +180,7 @@ def _heading(trial: Trial) -> list[Finding]:
     if not {"roll", "pitch"} & set(named) and _tilts_unseen(trial):
         return []
     rate = (q_at * np.sin(phi) + r * np.cos(phi)) / np.maximum(np.cos(theta), STEEP)
-    # A gap of the gyro hides a turn, and a vehicle on its nose has no heading: each stretch starts again.
+    # A gap of the gyro hides a turn, and the heading is undefined at steep pitch: each segment starts again.
     step = np.diff(t)
     wide = (step > longest_step(t)) | (np.cos(theta[1:]) < STEEP) | (np.cos(theta[:-1]) < STEEP)
     turns = np.where(wide, 0.0, 0.5 * (rate[1:] + rate[:-1]) * step)
@@ -191,7 +191,7 @@ def _heading(trial: Trial) -> list[Finding]:
     bias, _ = np.polyfit(t - t[0], difference, 1) if t[-1] - t[0] > 5.0 else (0.0, 0.0)
     rest = difference - bias * (t - t[0])
     noise = 1.4826 * float(np.median(np.abs(np.diff(difference)))) * 6.0
-    # Noise of the gyro adds up to a random walk, and every second sample shows what is lost between samples.
+    # Gyro noise integrates to a random walk; every second sample estimates the error between samples.
     noise += WALK * white_noise(r) * float(np.sqrt(np.median(step) * (t[-1] - t[0])))
     coarse = np.cumsum(0.5 * (rate[2::2] + rate[:-2:2]) * (step[1::2] + step[: 2 * (len(step) // 2) : 2]))
     noise += float(np.ptp(coarse - np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)[1::2]))
@@ -231,7 +231,7 @@ def _vertical(trial: Trial, t: Array, attitude: AttitudeSignal) -> list[Finding]
 
 
 def _unit_ratio(x: Array, y: Array, of: str, over: str) -> list[Finding]:
-    """Return a finding if y surely goes with x and is another multiple of it than noise in either explains."""
+    """Return a finding if y is correlated with x at a ratio that noise in either cannot explain."""
     one = np.ones((len(x), 1))
     found, back = relation(x, y, nuisances=one), relation(y, x, nuisances=one)
     if found.correlation < WITH or not found.sure:
@@ -286,9 +286,9 @@ def _through_world(trial: Trial, t: Array, attitude: AttitudeSignal) -> Array:
 
 
 def _too_slow(trial: Trial, q: Array) -> bool:
-    """Return whether a vehicle turns so far between two samples of its attitude that their rates may be aliases.
+    """Return whether a vehicle turns so far between two attitude samples that the derived rates may be aliased.
 
-    The gyro has to say so too: an angle in degrees turns far by itself.
+    The gyro must confirm it: an angle in degrees would appear to turn far, too.
     """
     turns = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
     step = trial.duration / max(len(q) - 1, 1)
@@ -297,7 +297,7 @@ def _too_slow(trial: Trial, q: Array) -> bool:
 
 
 def _tilts_unseen(trial: Trial) -> bool:
-    """Return whether the gyro shows tilts of a vehicle that is taken as level for want of a measured tilt."""
+    """Return whether the gyro shows tilts of a vehicle that is assumed level because no tilt was measured."""
     for t, rate in (trial.series(name) for name in "pq" if trial.has(name)):
         if np.ptp(np.cumsum((rate - np.median(rate))[1:] * np.diff(t))) > LARGEST_TURN:
             return True
@@ -305,7 +305,7 @@ def _tilts_unseen(trial: Trial) -> bool:
 
 
 def _stands_out(rates: Array, samples: Array) -> bool:
-    """Return whether what changed at these rates on the grid moved by more than a smoother makes of the noise."""
+    """Return whether a signal with these rates on the grid moved by more than smoothed noise would."""
     moved = np.cumsum(np.nan_to_num(rates - np.nanmean(rates))) / RATE
     return not float(np.std(moved)) < white_noise(samples) * np.sqrt(WIGGLES / len(samples))
 

@@ -1,4 +1,4 @@
-"""`finssim trials check`: what trials can and cannot identify, and why."""
+"""Implementation of `finssim trials check`: the parameters that trials can and cannot identify, with reasons."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from finssim.trials.trial_report import (
     set_findings,
 )
 
-# Sampling of a trial's columns: rates, gaps, jitter, values that stick, hold or clip.
+# Sampling of a trial's columns: rates, gaps, jitter, values that stick, are held or clip.
 
 LONGEST_MISSING = 0.2
-"""Part of a trial without a stream above which care is needed."""
+"""Fraction of a trial without samples of a stream above which a warning is given."""
 
 SHORTEST_TRIAL = 1.0
-"""[s]"""
+"""Shortest usable trial [s]."""
 
 STUCK = 1.0
-"""Time of equal values of a moving sensor that is suspicious [s]."""
+"""Duration of equal values of a moving sensor that is suspicious [s]."""
 
 FLYING = 0.3
-"""Height above the surface that no vehicle reaches [m]: the log has another zero."""
+"""Implausible height of the vehicle above the surface, which indicates another zero of the log [m]."""
 
 COARSE = 50.0
-"""Steps of resolution that a signal must span for equal values to mean something."""
+"""Number of resolution steps that a signal must span for equal values to be meaningful."""
 
 FEW_HERTZ = 4.0
-"""Rate below which the motion between samples is not seen [Hz]."""
+"""Rate below which the motion between samples is not resolved [Hz]."""
 
 
 def stream_reports(trial: Trial) -> tuple[list[StreamReport], list[Finding]]:
-    """Columns by the times they share, and what is wrong with their sampling."""
+    """Return the columns grouped by their common times, and findings about their sampling."""
     shared: dict[bytes, list[str]] = {}
     for name in trial.channels:
         if trial.has(name):
@@ -89,7 +89,7 @@ def _report(trial: Trial, names: tuple[str, ...]) -> StreamReport:
     t, _ = trial.series(names[0])
     steps = np.diff(t)
     longest = widest_step(t)
-    within = steps[steps <= longest]  # half of them at least
+    within = steps[steps <= longest]  # at least half of them
     column = column_of(names[0])
     silent = float(steps[steps > longest].sum()) + (t[0] - trial.t[0]) + (trial.t[-1] - t[-1])
     return StreamReport(
@@ -123,7 +123,7 @@ def _sampling(report: StreamReport) -> list[Finding]:
 
 
 def _values(trial: Trial, name: str) -> list[Finding]:
-    """Stuck, held and clipped values of a measurement."""
+    """Return findings about stuck, held and clipped values of a measurement."""
     column = COLUMNS.get(name)
     if column is None or column.group == "command":
         return []
@@ -152,7 +152,7 @@ def _values(trial: Trial, name: str) -> list[Finding]:
         at = begins[longest]
         findings.append(finding("stuck", value=y[at], span=span, start=t[at]))
     for extreme, highest in ((y.max(), True), (y.min(), False)):
-        # A signal that passes through its extreme touches it once.
+        # A signal that passes through its extreme reaches it only once.
         runs = lengths[y[begins] == extreme]
         if runs.sum() >= max(10.0, 0.02 * len(y)) and runs.max() >= 4.0 * usual:
             findings.append(
@@ -162,7 +162,7 @@ def _values(trial: Trial, name: str) -> list[Finding]:
 
 
 def _coarse(y: Array) -> bool:
-    """Return whether a signal has so coarse a resolution that it repeats values."""
+    """Return whether the resolution of a signal is so coarse that it repeats values."""
     steps = np.abs(np.diff(np.unique(y)))
     return bool(np.ptp(y) < COARSE * steps.min())
 
@@ -170,12 +170,12 @@ def _coarse(y: Array) -> bool:
 # Inputs of a trial against the limits of its vehicle.
 
 OFTEN = 0.05
-"""Part of the driven time at a limit above which care is needed."""
+"""Fraction of the driven time at a limit above which a warning is given."""
 
 
 def input_findings(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[Finding]:
-    """Return findings about the inputs: assumptions, time at the limits, in the dead zones and beyond the thrusters'
-    reach."""
+    """Return findings about the inputs: assumptions, time at the limits, in the dead zones and above the
+    thrusters' capability."""
     findings = list(inputs.findings)
     if inputs.source == "passive":
         return findings
@@ -222,7 +222,7 @@ def _thrusters(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[Find
             beyond = (rpm > 0.99 * thruster.rpm_max) | (rpm < 0.99 * thruster.rpm_min)
         if beyond.mean() > OFTEN * driven.mean():
             at_limit.append(name)
-        # Of measured speeds and of pulses the thrust is known down to nothing.
+        # From measured speeds and pulses, the thrust is known even at low values.
         rpm = thruster.speed(force) * 30.0 / np.pi
         if requested and _in_dead_zone(rpm, thruster.dead_rpm_minus, thruster.dead_rpm_plus) > 0.2:
             slow.append(name)
@@ -236,7 +236,7 @@ def _thrusters(trial: Trial, vehicle: Vehicle, inputs: InputForces) -> list[Find
 
 
 def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
-    """Return the share of the driven time in which a shaft would not turn."""
+    """Return the fraction of the driven time in which a shaft would not turn."""
     driven = np.abs(rpm) > 1.0
     inside = (rpm > 0.95 * lowest) & (rpm < 0.95 * highest) & driven
     return float(inside.sum() / max(1, driven.sum()))
@@ -245,16 +245,16 @@ def _in_dead_zone(rpm: Array, lowest: float, highest: float) -> float:
 # Identifiability of each parameter of an axis in a trial, with the reasons.
 
 SEPARATE = 0.6
-"""Decades of speed that are needed to distinguish linear and quadratic damping."""
+"""Decades of speed required to distinguish linear and quadratic damping."""
 
 LEAST_TILT = np.radians(1.0)
-"""Standard deviation of an angle that its restoring moment needs [rad]."""
+"""Standard deviation of an angle that is required to identify its restoring moment [rad]."""
 
 SHORT = 0.5
-"""Time over which a change of speed is looked for [s]."""
+"""Interval over which a change of speed is evaluated [s]."""
 
 LEAST_INERTIA = 0.05
-"""Part of the strongest wrench that went into a change of speed, for the effective mass to be seen."""
+"""Fraction of the largest wrench that must accelerate the vehicle, for the effective mass to be identifiable."""
 
 
 def with_identifiability(
@@ -264,7 +264,8 @@ def with_identifiability(
     vehicle: Vehicle,
     measured: Mapping[str, tuple[Array, Array]],
 ) -> AxisReport:
-    """Return the report with the identifiability of the axis; `measured` as the trial has it, in its units."""
+    """Return the report with the identifiability of the axis; `measured` contains the trial's columns in its
+    units."""
     specific = {"k": ("roll", "pitch"), "buoyancy": ("heave",)}
     names = [name for name in PARAMETERS if report.axis in specific.get(name, AXES)]
     passive = inputs.source == "passive"
@@ -281,7 +282,7 @@ def with_identifiability(
 def _blocked(
     report: AxisReport, inputs: InputForces, motion: Motion, measured: Mapping[str, tuple[Array, Array]]
 ) -> str:
-    """Return why the axis determines nothing at all, or nothing; without thrust the fit's own reason."""
+    """Return why the axis identifies no parameter, empty if it does; without thrust the reason of the fit."""
     if not report.source:
         return f"no velocity: {NO_VELOCITY[report.axis]}"
     if inputs.source == "passive":
@@ -293,14 +294,14 @@ def _blocked(
     if not np.isfinite(report.fastest):
         return "velocity and input are never known together"
     if report.excited and report.coasts > 10.0 * report.driven and report.axis not in ("roll", "pitch"):
-        return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without: something else moves it"
+        return f"driven for {report.driven:.1f} s and moving for {report.coasts:.0f} s without input: another force"
     if report.excited:
         return ""
     if report.strongest < 1e-6:
         return "not driven"
     if report.fastest <= max(3.0 * report.noise, 0.005):
         return f"no motion above the noise: speeds up to {report.fastest:.2g}, noise {report.noise:.2g}"
-    return f"moves, but is hardly driven: wrench up to {report.strongest:.2g}"
+    return f"moves, but is hardly driven: wrench at most {report.strongest:.2g}"
 
 
 NO_VELOCITY = {
@@ -316,14 +317,14 @@ NO_VELOCITY = {
 def _damping(report: AxisReport) -> dict[str, tuple[bool, str]]:
     reason = f"{report.decades:.1f} decades of speed up to {report.fastest:.2g}"
     if report.decades < SEPARATE:
-        reason += ": only their sum at that speed; more levels or a coast would part them"
+        reason += ": only their sum at that speed; more levels or a coast would separate them"
     elif report.decades < 1.0:
         reason += ", less than one: intervals will be wide"
     return dict.fromkeys(("d1", "d2"), (report.decades >= SEPARATE, reason))
 
 
 def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
-    """Return for each parameter whether a trial without thrust determines it, and why."""
+    """Return for each parameter whether a trial without thrust identifies it, and why."""
     force = {"heave": "buoyancy excess", "roll": "restoring moment", "pitch": "restoring moment"}.get(
         report.axis
     )
@@ -338,7 +339,7 @@ def _passive_identifiability(report: AxisReport) -> dict[str, tuple[bool, str]]:
 def _driven_identifiability(
     report: AxisReport, motion: Motion, vehicle: Vehicle
 ) -> dict[str, tuple[bool, str]]:
-    """Return for each parameter whether a trial with inputs determines it, and why."""
+    """Return for each parameter whether a trial with inputs identifies it, and why."""
     i, q = AXES.index(report.axis), motion.quaternion
     n = max(1, round(SHORT * motion.rate))
     change = np.abs(motion.nu[n:, i] - motion.nu[:-n, i])
@@ -369,28 +370,28 @@ def _driven_identifiability(
 # Excitation of every axis of a trial: speeds, wrenches, levels, coasts, work.
 
 STANDS_OUT = 3.0
-"""Speeds above so many standard deviations of a sample are motion."""
+"""Number of standard deviations of the noise above which a speed counts as motion."""
 
 LEAST_SPEED = 0.005
-"""[m/s, rad/s]; slower is rest."""
+"""Speed below which the vehicle counts as at rest [m/s, rad/s]."""
 
 QUIET = 0.05
-"""Part of the strongest wrench below which an axis coasts."""
+"""Fraction of the largest wrench below which an axis coasts."""
 
 LEAST_WRENCH = 0.01
-"""Part of what the vehicle can give below which an axis is not driven."""
+"""Fraction of the vehicle's capability below which an axis is not driven."""
 
 LONG_PUSH = 3.0
-"""Time of input after which its work is significant for its sign [s]."""
+"""Duration of input after which the sign of its work is significant [s]."""
 
 HOLD = 0.5
-"""[s]"""
+"""Duration for which a level of input must be held [s]."""
 
 UNLIKELY = 0.01
-"""Probability below which a speed responds to its wrench, if the work agrees."""
+"""Probability below which a response of the speed to its wrench is significant, if the work agrees."""
 
 ANSWERS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Time constants of the speeds of vehicles [s]."""
+"""Time constants that are tried for the response of the speed [s]."""
 
 
 def axis_reports(
@@ -398,7 +399,8 @@ def axis_reports(
 ) -> list[AxisReport]:
     """Return one report per axis, without identifiability.
 
-    Weight rights roll and pitch, so that a swing excites them whatever started it, unless the header names others.
+    The restoring moment acts on roll and pitch, so that they are excited by any swing, unless the header
+    names other axes.
     """
     passive = inputs.source == "passive"
     swings = bool(np.any(inputs.force)) and not named
@@ -416,7 +418,7 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle, swings: bool)
     speed, wrench = np.abs(nu[valid]), np.abs(tau[valid])
     noise = float(np.nan_to_num(motion.noise_std[i]))
     floor = max(STANDS_OUT * noise, LEAST_SPEED)
-    # Most of a trial may be rest: percentiles are of the times that are not.
+    # A trial may consist mostly of rest: percentiles are computed over the remaining samples.
     fastest = _strong(speed, floor)
     strongest = _strong(wrench, max(QUIET * float(wrench.max()), 1e-6))
     driven = strongest > LEAST_WRENCH * max(float(vehicle.wrench_limits[i]), 1e-3)
@@ -439,7 +441,7 @@ def _axis(i: int, motion: Motion, passive: bool, vehicle: Vehicle, swings: bool)
 
 
 def _strong(values: Array, least: float) -> float:
-    """95th percentile of the values above `least`; of all where none is."""
+    """Return the 95th percentile of the values above `least`; of all values if none is above."""
     above = values[values > least]
     return float(np.percentile(above if len(above) else values, 95.0))
 
@@ -447,17 +449,17 @@ def _strong(values: Array, least: float) -> float:
 def work_findings(
     reports: list[AxisReport], motion: Motion, named: tuple[str, ...], excess: float = 0.0
 ) -> list[Finding]:
-    """Return the axes on which the inputs took energy out, where drag should have: a sign is wrong.
+    """Return findings for axes on which the inputs extracted energy although drag dissipates it: a sign is wrong.
 
-    On roll and pitch the restoring moment gives back what it took. The work of the buoyancy that the vehicle file
-    states is added to that of the inputs. What else may push (a tether, trim, a current) does not follow the inputs:
-    the speed has to answer their changes the wrong way.
+    On roll and pitch the restoring moment returns stored energy. The work of the vehicle file's buoyancy
+    excess is added to that of the inputs. Other forces (a tether, trim, a current) do not follow the inputs:
+    the speed must respond to changes of the inputs with the wrong sign.
 
     Args:
-        reports: By axis.
-        motion: Of the trial.
+        reports: Reports by axis.
+        motion: Motion of the trial.
         named: Axes that the header names.
-        excess: Buoyancy less weight [N].
+        excess: Buoyancy minus weight [N].
     """
     findings = []
     up = up_in_body(np.where(np.isfinite(motion.quaternion), motion.quaternion, [0.0, 0.0, 0.0, 1.0]))
@@ -487,9 +489,10 @@ def work_findings(
 
 
 def _answer(nu: Array, tau: Array, rate: float) -> Relation:
-    """Return how a speed follows its wrench through a first-order lag, besides a constant force and the start.
+    """Return the relation of a speed to its wrench through a first-order lag, with a constant force and
+    initial speed.
 
-    The lag is the one of `ANSWERS` that explains most; the significance allows for the choice.
+    The lag is the one of `ANSWERS` with the best fit; the significance accounts for this selection.
     """
     known = np.isfinite(nu) & np.isfinite(tau)
     relations = []
@@ -503,13 +506,14 @@ def _answer(nu: Array, tau: Array, rate: float) -> Relation:
 
 
 def check(paths: Sequence[Path], *, vehicle: str | None = None, as_json: bool = False) -> int:
-    """Report what trials can and cannot identify: rates [Hz], gaps [s], clock jumps, saturation, excitation.
+    """Report the parameters that trials can and cannot identify: rates [Hz], gaps [s], clock jumps,
+    saturation, excitation.
 
     Example: finssim trials check trials --vehicle bluerov2
 
     Args:
         paths (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables.
-        vehicle (NAME|FILE): Vehicle of the trials, if their headers name none.
+        vehicle (NAME|FILE): Vehicle of the trials, if their headers do not name one.
         as_json: Print one JSON object instead of tables.
 
     Returns:
@@ -517,7 +521,7 @@ def check(paths: Sequence[Path], *, vehicle: str | None = None, as_json: bool = 
 
     Raises:
         CalibrationError: There is no trial at a path.
-        VehicleError: No such vehicle.
+        VehicleError: There is no such vehicle.
     """
     loaded = load_vehicle(vehicle) if vehicle is not None else None
     trials: list[Trial | TrialReport] = []
@@ -544,11 +548,11 @@ def check(paths: Sequence[Path], *, vehicle: str | None = None, as_json: bool = 
 
 
 def check_trials(trials: Sequence[Trial | TrialReport], vehicle: Vehicle | None = None) -> list[TrialReport]:
-    """One report per trial; a trial that could not be read has its report already.
+    """Return one report per trial; a trial that could not be read already has its report.
 
     Args:
-        trials: In the order of the reports.
-        vehicle: That made them; without it each trial's header names its own.
+        trials: Trials, in the order of the reports.
+        vehicle: Vehicle of the trials; if None, each trial's header names it.
     """
     first_names: dict[str, str] = {}
     reports = []
@@ -585,7 +589,7 @@ def _report_of(trial: Trial, user_vehicle: Vehicle | None) -> TrialReport:
 
 
 def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
-    """The vehicle that the header names; findings say why there is none."""
+    """Return the vehicle that the header names; a finding states why there is none."""
     if trial.header.vehicle is None:
         findings.append(finding("no_vehicle"))
         return None
@@ -597,12 +601,12 @@ def _header_vehicle(trial: Trial, findings: list[Finding]) -> Vehicle | None:
 
 
 def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple[str, list[AxisReport]]:
-    """Return the kind of input and the report of every axis; findings are added."""
+    """Return the kind of input and the report of every axis; findings are appended."""
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError as error:
         findings.append(finding("unusable", reason=error.reason))
-        # The motion can be looked at without its cause.
+        # The motion can be analysed without the inputs.
         trial = replace(trial, header=trial.header.model_copy(update={"passive": True}))
         trial_motion = motion(trial, vehicle)
         unknown = [

@@ -1,4 +1,4 @@
-"""Units, clocks and axes of logs, and how they become ours."""
+"""Conversion of units, clocks and axes of logs to those of trials."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from finssim.vehicles.part import did_you_mean
 Array = NDArray[np.float64]
 
 GRAVITY = 9.80665
-"""Standard gravity, of the units g and kgf [m/s²]."""
+"""Standard gravity, for the units g and kgf [m/s²]."""
 
 POUND = 0.45359237
-"""Mass of the units lbf and ozf, which is a sixteenth of it [kg]."""
+"""Mass of a pound, for the unit lbf; an ounce (ozf) is a sixteenth [kg]."""
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-"""Seconds in one of each."""
+"""Unit of time -> seconds."""
 
 EXTRA_COLUMNS = {
     **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
     "pressure": "Pa",
     **dict.fromkeys((f"stick_{name}" for name in DEMANDS), "-"),
 }
-"""Names that a map may give beside the canonical columns -> units: they become u v w, depth and pulse widths in the
-trial."""
+"""Names that a map may use besides the canonical columns -> units: they are converted to u v w, depth and
+pulse widths in the trial."""
 
 UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3, "cdeg": math.pi / 18000.0},
@@ -65,26 +65,26 @@ UNITS: dict[str, dict[str, float]] = {
     },
     "number": {"-": 1.0},
 }  # fmt: skip
-"""Dimension -> unit -> how many of our units it is."""
+"""Dimension -> unit -> value of the unit in SI."""
 
 _DIMENSION = {unit: dimension for dimension, units in UNITS.items() for unit in units}
 
 
 def unit_of(canonical: str) -> str:
-    """The unit that a canonical or extra column is kept in."""
+    """Return the unit of a canonical or extra column."""
     if canonical in EXTRA_COLUMNS:
         return EXTRA_COLUMNS[canonical]
     column = column_of(canonical)
     if column is None:
-        raise CalibrationError(f"'{canonical}' is no column of a trial")
+        raise CalibrationError(f"'{canonical}' is not a column of a trial")
     return column.unit
 
 
 def factor(unit: str | None, canonical: str) -> float:
-    """Return the factor from a number in `unit` to the unit of the canonical column; 1 for no unit.
+    """Return the factor from `unit` to the unit of the canonical column; 1 if no unit is given.
 
     Raises:
-        CalibrationError: Unknown unit, or one of another dimension.
+        CalibrationError: The unit is unknown, or has another dimension.
     """
     if unit is None:
         return 1.0
@@ -108,22 +108,22 @@ def _like(target: str) -> str:
 
 
 SAME_ROW = 1.0e-6
-"""Samples closer than this share a row [s]."""
+"""Samples within this interval share a row [s]."""
 
 PIECE_GAP = 10.0
-"""Silence put between the pieces of a log whose clock jumped back [s]; what lay between is not known."""
+"""Gap inserted between the pieces of a log whose clock jumped back [s]; the true duration is unknown."""
 
 FEW = 3
-"""Rows that may arrive late before a step back counts as a jump of the clock."""
+"""Number of late rows above which a backward step counts as a jump of the clock."""
 
 LATE = 0.01
-"""Part of the rows that may arrive late."""
+"""Fraction of the rows that may arrive late."""
 
 REPEATED = 0.4
-"""Part of the samples that may have the time of the one before and other values."""
+"""Fraction of the samples that may repeat the previous time with other values."""
 
 DEAD_AT_ZERO = (("u", "v"), ("w",))
-"""Velocities, which may be constant without being dead."""
+"""Velocities, which may be constant although their sensor works."""
 
 DEAD = (
     (("qx", "qy", "qz", "qw"), ("roll", "pitch", "yaw"), 0.02),
@@ -134,14 +134,14 @@ DEAD = (
     (("z",), ("depth",), 0.1),
     (("depth",), ("z",), 0.1),
 )
-"""Columns of a sensor, columns of others for the same motion, and their least motion in the unit of a trial."""
+"""Columns of a sensor, other columns that measure the same motion, and their least motion in the unit of a trial."""
 
 ALIVE = 10
-"""Samples from which a column that never changes is taken for dead."""
+"""Number of samples from which a column that never changes counts as dead."""
 
 
 def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str, Array]]:
-    """Streams of different times on their union time base.
+    """Return streams with different times on their combined time base.
 
     Args:
         streams: Column -> times [s], strictly increasing, and values, (k,) each.
@@ -151,12 +151,12 @@ def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str,
         microsecond share a row.
 
     Raises:
-        CalibrationError: There is no sample at all.
+        CalibrationError: There are no samples.
     """
     every = [t for t, _ in streams.values()]
     times = np.unique(np.concatenate(every)) if every else np.empty(0)
     if not len(times):
-        raise CalibrationError("no stream holds a sample")
+        raise CalibrationError("no stream contains a sample")
     starts = np.concatenate([[True], np.diff(times) > SAME_ROW])
     row_of = np.cumsum(starts) - 1
     base = times[starts]
@@ -168,21 +168,21 @@ def merged(streams: Mapping[str, tuple[Array, Array]]) -> tuple[Array, dict[str,
 
 
 def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.intp], list[Finding]]:
-    """Times in order, and the order of the rows.
+    """Return sorted times, and the order of the rows.
 
-    A few rows that arrived late, and logs with the newest row first, are sorted. Where the clock itself jumped back (a
-    long piece of rows lies over an earlier one), the time that passed is unknown: the later piece is moved behind the
-    earlier one with a gap of `PIECE_GAP` seconds between, and nothing is interpolated across gaps.
+    Logs with a few late rows, or with the newest row first, are sorted. Where the clock jumped back (many
+    rows overlap an earlier piece), the elapsed time is unknown: the later piece is appended after the earlier
+    one with a gap of `PIECE_GAP` seconds, and nothing is interpolated across gaps.
 
     Args:
         t: Finite times [s], (n,).
-        columns: Column -> values in any unit, (n,); two pieces that fill different columns do not collide.
+        columns: Column -> values in any unit, (n,); two pieces with values in different columns may overlap.
 
     Returns:
-        Times not decreasing [s], (n,), row numbers in that order (n,), and findings.
+        Non-decreasing times [s], (n,), row numbers in that order (n,), and findings.
 
     Raises:
-        CalibrationError: The times step back in more than a few rows.
+        CalibrationError: The times step back at more than a few rows.
     """
     back = np.flatnonzero(np.diff(t) < 0.0) + 1
     rows = np.arange(len(t))
@@ -204,7 +204,7 @@ def ordered(t: Array, columns: Mapping[str, Array]) -> tuple[Array, NDArray[np.i
 
 
 def _wraps(t: Array, back: NDArray[np.intp]) -> str:
-    """Return the cause if every step back is from the end of a counter's range to its beginning, else nothing."""
+    """Return the cause if every backward step is an overflow of a counter; otherwise an empty text."""
     step = 3.0 * float(np.median(np.abs(np.diff(t))))
     ranges = [2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-6, 1e-3, 1e-2, 1.0)]
     if len(back) > 1:
@@ -212,12 +212,12 @@ def _wraps(t: Array, back: NDArray[np.intp]) -> str:
     for full in ranges:
         if full > 20.0 * step and (full - t[back - 1] <= step).all() and (np.abs(t[back]) <= step).all():
             advice = "give 'time: {column: NAME, kind: counter}' in a map"
-            return f"probably a counter that begins again after {full:.6g} s: {advice}"
+            return f"probably a counter that overflows after {full:.6g} s: {advice}"
     return ""
 
 
 def _cause(t: Array) -> str:
-    """Return the probable cause of times that step back often, and the remedy."""
+    """Return the probable cause of frequent backward steps, and the remedy."""
     trend = abs(float(np.median(t[len(t) // 2 :]) - np.median(t[: len(t) // 2])))
     if (t >= 0.0).all() and trend < 0.2 * t.max() and t.sum() > 10.0 * t.max():
         return (
@@ -228,14 +228,14 @@ def _cause(t: Array) -> str:
 
 
 def refuse_coarse(t: Array, columns: Mapping[str, Array]) -> None:
-    """Refuse a clock that is too coarse for the samples, of which all but one at a time would be left out.
+    """Refuse a clock so coarse that many samples have the same time, of which all but one would be discarded.
 
     Args:
-        t: Not decreasing [s], (n,).
+        t: Non-decreasing times [s], (n,).
         columns: Column -> values in any unit, (n,).
 
     Raises:
-        CalibrationError: Most samples have the time of the one before and other values.
+        CalibrationError: Most samples repeat the previous time with other values.
     """
     same = np.diff(t) <= SAME_ROW
     other = np.zeros(len(same), bool)
@@ -244,24 +244,25 @@ def refuse_coarse(t: Array, columns: Mapping[str, Array]) -> None:
     if len(t) >= 10 and np.sum(same & other) > REPEATED * len(t):
         step = np.median(np.diff(np.unique(t))) if t[-1] > t[0] else math.inf
         raise CalibrationError(
-            f"{np.sum(same & other)} of {len(t)} samples have the time of the one before, as the clock counts steps of "
+            f"{np.sum(same & other)} of {len(t)} samples repeat the previous time, as the clock counts steps of "
             f"{step:.3g} s: name a finer column, or spread them by 'time: {{column: NAME, kind: coarse}}' in a map"
         )
 
 
 def spread(t: Array) -> Array:
-    """Return the times [s] of a coarse clock with the samples of each step spread evenly over it.
+    """Return the times [s] of a coarse clock with the samples of each step evenly distributed over it.
 
-    The samples of the first step lie at its end, those of the last at its beginning, at the usual period.
+    The samples of the first step are placed at its end, those of the last step at its beginning, at the
+    median period.
 
     Args:
-        t: Times as read, not decreasing [s], (n,).
+        t: Times as read, non-decreasing [s], (n,).
     """
     steps, index, counts = np.unique(t, return_inverse=True, return_counts=True)
     if len(steps) < 2:
         return t
     length = np.diff(steps, append=2.0 * steps[-1] - steps[-2])
-    inner = slice(1, -1) if len(steps) > 2 else slice(None)  # a log begins and ends within a step
+    inner = slice(1, -1) if len(steps) > 2 else slice(None)  # a log starts and ends within a step
     period = float(np.median((length / counts)[inner]))
     within = np.arange(len(t)) - np.searchsorted(index, np.arange(len(steps)))[index]
     at = np.minimum(length / counts, 1.5 * period)[index] * within
@@ -277,8 +278,8 @@ def wrapped(channels: Mapping[str, Array], *, everything: bool) -> Channels:
     """Return the columns with their angles in [-pi, pi) [rad].
 
     Args:
-        channels: By canonical name, in the units of a trial.
-        everything: Whether angles beyond two turns are wrapped, too, which may be degrees without a unit.
+        channels: Columns by canonical name, in the units of a trial.
+        everything: False to leave angles beyond two turns unchanged, since they may be in degrees.
     """
     out = dict(channels)
     for name in EULER:
@@ -290,11 +291,11 @@ def wrapped(channels: Mapping[str, Array], *, everything: bool) -> Channels:
 
 
 ABSOLUTE = (7e4, 6e6)
-"""Absolute pressures that a vehicle may measure: at the surface of a lake 3000 m up, and in a depth of 600 m [Pa]."""
+"""Range of absolute pressures at a vehicle: from the surface of a lake at 3000 m altitude to 600 m depth [Pa]."""
 
 
 def pressure_unit(values: Array) -> str | None:
-    """Return the unit of absolute pressures, Pa, hPa or kPa, told from their size; None if no unit fits.
+    """Return the unit of absolute pressures, Pa, hPa or kPa, inferred from their magnitude; None if no unit fits.
 
     Args:
         values: Pressures in an unknown unit, (n,).
@@ -308,7 +309,7 @@ def pressure_unit(values: Array) -> str | None:
 
 
 def without_dead(t: Array, channels: Channels) -> list[Finding]:
-    """Remove columns that never change although another measurement of the same motion does, in place.
+    """Remove columns that never change although another measurement shows the motion, in place.
 
     Args:
         t: Times [s], (n,).
@@ -346,7 +347,7 @@ def without_dead(t: Array, channels: Channels) -> list[Finding]:
     for names, others, least in DEAD:
         present = [name for name in names if name in channels]
         moving = [name for name in others if name in channels and least < _range(channels[name]) < math.inf]
-        # A constant speed is possible while the position moves.
+        # The speed may be constant while the position changes.
         at_zero = names not in DEAD_AT_ZERO or not any(
             np.nanmax(np.abs(channels[name]), initial=0.0) for name in present
         )
@@ -358,7 +359,8 @@ def without_dead(t: Array, channels: Channels) -> list[Finding]:
 
 
 def _swing(t: Array, rate: Array) -> float:
-    """Return the range of the angle [rad] of a rate [rad/s] without its mean, for gyroscopes have a bias, (n,) each."""
+    """Return the range of the angle [rad] of a rate [rad/s] without its mean, as gyroscopes have a bias, (n,)
+    each."""
     good = np.isfinite(rate)
     steps = np.minimum(np.diff(t[good], prepend=t[good][:1]), 0.5)
     return (
@@ -373,12 +375,12 @@ def _range(values: Array) -> float:
 
 
 def constant(values: Array) -> bool:
-    """Return whether a column in any unit, (n,), has enough samples and never changes."""
+    """Return whether a column in any unit, (n,), has enough samples and is constant."""
     return _range(values) == 0.0
 
 
 def _collides(t: Array, columns: Mapping[str, Array], i: int) -> bool:
-    """Return whether the rows from `i` on repeat times of earlier rows of the same columns."""
+    """Return whether the rows from `i` on overlap in time with earlier rows of the same columns."""
     earlier = np.flatnonzero(t[:i] >= t[i])
     later = i + np.flatnonzero(t[i:] <= t[:i].max())
     if len(earlier) <= FEW or len(later) <= FEW:
@@ -408,14 +410,14 @@ def _in_pieces(t: Array, jumps: list[int]) -> tuple[Array, NDArray[np.intp], lis
 def sampled(
     t: Array, columns: Mapping[str, Array]
 ) -> tuple[Array, dict[str, Array], NDArray[np.intp], list[Finding]]:
-    """One row for each time: rows of equal times are laid over one another, the later number where both have one.
+    """Return one row for each time: rows of equal times are merged, with the later value where both have one.
 
     Args:
-        t: Not decreasing [s], (n,).
+        t: Non-decreasing times [s], (n,).
         columns: Column -> values in any unit, (n,).
 
     Returns:
-        Times [s], strictly increasing (m,), columns (m,), the row each came from (m,), and findings.
+        Times [s], strictly increasing (m,), columns (m,), the source row of each (m,), and findings.
     """
     refuse_coarse(t, columns)
     starts = np.concatenate([[True], np.diff(t) > 0.0])
@@ -427,7 +429,7 @@ def sampled(
     for name, values in columns.items():
         good = np.flatnonzero(np.isfinite(values))
         merged_columns[name] = np.full(len(selected), np.nan)
-        merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last of equal indices
+        merged_columns[name][row_of[good]] = values[good]  # NumPy keeps the last value for equal indices
         conflicts[row_of[good][values[good] != merged_columns[name][row_of[good]]]] = True
     findings = []
     if conflicts.any():
@@ -446,18 +448,18 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 WORLD = (("x", "y", "z"),)
 
 LENGTH_TOLERANCE = 1e-6
-"""Quaternions within this of unit length are left as they are, so that our own files read back bit for bit."""
+"""Quaternions within this tolerance of unit length are unchanged, so that our own files are read bitwise equal."""
 
 
 def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
-    """Columns in x forward, y left, z up of the body and a world with z up.
+    """Return columns in body axes x forward, y left, z up and a world with z up.
 
-    The units are kept.
+    The units are unchanged.
 
     Args:
-        channels: By canonical name, in the units of a trial.
-        body: FLU or FRD, of the log.
-        world: z_up or NED, of the log.
+        channels: Columns by canonical name, in the units of a trial.
+        body: Body axes of the log, FLU or FRD.
+        world: World axes of the log, z_up or NED.
     """
     turned, sunk = body == "FRD", world == "NED"
     result = dict(channels)
@@ -480,7 +482,8 @@ def in_our_frames(channels: Channels, body: str, world: str) -> Channels:
 
 
 def _half_turned_attitude(channels: Channels, body: bool) -> Channels:
-    """Attitude when only the body axes (or only the world axes) change: half a turn about x from one side."""
+    """Return the attitude when only the body axes (or only the world axes) change: half a turn about x on one
+    side."""
     half_turn = matrix_to_quat(FROM_FOSSEN.A)
 
     def turned(q: Array) -> Array:
@@ -491,7 +494,7 @@ def _half_turned_attitude(channels: Channels, body: bool) -> Channels:
         q = turned(np.stack([channels[name] for name in QUATERNION], axis=-1))
         result.update(zip(QUATERNION, np.moveaxis(q, -1, 0), strict=True))
     angles_present = [name for name in EULER if name in channels]
-    if angles_present == ["yaw"]:  # the heading of the x axis, which both conventions share
+    if angles_present == ["yaw"]:  # the heading of the x axis, which is the same in both conventions
         return result if body else result | {"yaw": FROM_FOSSEN.yaw(channels["yaw"])}
     if angles_present:
         missing = np.zeros(len(channels[angles_present[0]]))
@@ -501,7 +504,7 @@ def _half_turned_attitude(channels: Channels, body: bool) -> Channels:
 
 
 def tidy_quaternions(channels: Channels) -> list[Finding]:
-    """Give quaternions unit length and a continuous sign, in place; findings on what could not be used."""
+    """Normalise quaternions to unit length and continuous sign, in place; return findings on unusable ones."""
     present = [name for name in QUATERNION if name in channels]
     if not present:
         return []
@@ -525,7 +528,7 @@ def tidy_quaternions(channels: Channels) -> list[Finding]:
 
 
 def upside_down(channels: Mapping[str, Array]) -> bool:
-    """Return whether the vehicle is on its back most of the time, as with one axis convention left out.
+    """Return whether the vehicle is inverted most of the time, as if one axis convention had been ignored.
 
     Channels have the units of a trial.
     """

@@ -1,4 +1,4 @@
-"""Findings about data and fits, with all their wordings, and the error of this package."""
+"""Findings: coded remarks about data and fits, with their texts, and the error of this package."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Severity = Literal["refused", "care", "note"]
 """Severity: refused (the trial or fit cannot be used), care (a part may not be used), note (for information)."""
 
 SEVERITIES: tuple[Severity, ...] = ("refused", "care", "note")
-"""The worst first."""
+"""Severities, worst first."""
 
 MAX_NAMES = 8
-"""Items of a list that a sentence names."""
+"""Largest number of list items in a sentence."""
 
 MAX_SUBJECTS = 3
-"""Subjects that a sentence names where it holds for several."""
+"""Largest number of subjects in a sentence that applies to several."""
 
 
 class _Template(string.Formatter):
-    """`str.format` that writes a tuple as a list of words."""
+    """Formatter like `str.format` that writes a tuple as a list."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if not isinstance(value, (tuple, list)):
@@ -35,36 +35,36 @@ class _Template(string.Formatter):
 
 
 def listed(texts: Sequence[str], limit: int) -> str:
-    """Words after one another, and how many more than `limit` there are."""
+    """Join texts by commas, and state how many are omitted beyond `limit`."""
     return ", ".join(texts[:limit]) + (f" and {len(texts) - limit} more" if len(texts) > limit else "")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark about data or a fit."""
+    """Remark about data or a fit."""
 
     code: str
     """Key of `wordings`."""
     severity: Severity
     subject: str = ""
-    """Subject: a trial, file, thruster, axis or parameter; empty if it is obvious."""
+    """Subject: a trial, file, thruster, axis or parameter; empty if it is obvious from the context."""
     values: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """Fields of the sentence, in SI or in the unit that the sentence names."""
+    """Values of the sentence's fields, in SI or in the unit that the sentence names."""
 
     @property
     def text(self) -> str:
-        """The sentence without its subject: what, and what to do."""
+        """Sentence without its subject: the fact and the remedy."""
         return _Template().format(wordings()[self.code][1], **self.values)
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}" if self.subject else self.text
 
     def about(self, subject: str) -> Finding:
-        """Return the finding with a subject, or with a part of the subject that it has."""
+        """Return the finding with a subject, which precedes the existing one."""
         return replace(self, subject=f"{subject}: {self.subject}" if self.subject else subject)
 
     def as_json(self) -> dict[str, Any]:
-        """Code, severity, subject, values and sentence; numbers that are not finite become None."""
+        """Return code, severity, subject, values and sentence; non-finite numbers become None."""
         return {
             "code": self.code,
             "severity": self.severity,
@@ -75,19 +75,19 @@ class Finding:
 
 
 def finding(code: str, subject: str = "", /, *, severity: Severity | None = None, **values: Any) -> Finding:
-    """A finding with the severity that its code usually has.
+    """Return a finding with the default severity of its code.
 
     Args:
         code: Key of `wordings`.
-        subject: What it is about.
-        severity: Where it differs from the usual one.
+        subject: Subject of the finding.
+        severity: Severity, if it differs from the default.
         values: Fields of the sentence.
     """
     return Finding(code, severity or wordings()[code][0], subject, values)
 
 
 def sentences(findings: Iterable[Finding]) -> list[str]:
-    """Sentences in their order; what holds for several subjects is one sentence."""
+    """Return sentences in order; findings with the same text are combined in one sentence with several subjects."""
     subjects: dict[tuple[str, str], list[str]] = {}
     for item in findings:
         named = subjects.setdefault((item.code, item.text), [])
@@ -100,7 +100,7 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """Return a value in JSON's types: lists, text, and numbers of so many significant digits, None for those that are
+    """Return a value in JSON types: lists, text, and numbers with this number of significant digits, None if
     not finite."""
     if isinstance(value, Mapping):
         return {key: plain(item, digits) for key, item in value.items()}
@@ -114,20 +114,20 @@ def plain(value: Any, digits: int = 17) -> Any:
 
 @cache
 def wordings() -> dict[str, tuple[Severity, str]]:
-    """Code -> its usual severity, and its sentence with the fields that `Finding.values` fills (`findings.yaml`)."""
+    """Return code -> default severity, and sentence with the fields of `Finding.values` (`findings.yaml`)."""
     table = yaml.safe_load(Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8"))
     return {code: next(iter(wording.items())) for code, wording in table.items()}
 
 
 class CalibrationError(ValueError):
-    """A trial, table or fit that cannot be used; the message states where, what was found and what to do.
+    """Trial, table or fit that cannot be used; the message states location, problem and remedy.
 
     Attributes:
-        subject: The trial or file that cannot be used; empty where the reason names it.
-        reason: The message without it.
+        subject: The trial or file that cannot be used; empty if the reason names it.
+        reason: The message without the subject.
     """
 
     def __init__(self, reason: str, subject: str = "") -> None:
-        """Make the error with its reason, and the trial or file that it concerns."""
+        """Create the error with its reason, and the trial or file that it concerns."""
         super().__init__(f"{subject}: {reason}" if subject else reason)
         self.reason, self.subject = reason, subject

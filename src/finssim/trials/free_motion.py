@@ -1,4 +1,4 @@
-"""Free motions in trials with the thrusters off: from the release until the vehicle rests or is pushed again."""
+"""Free motions in trials with the thrusters off: from the release until the vehicle is at rest or pushed again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from finssim.vehicles import AXES
 Array = NDArray[np.float64]
 
 CHANNELS = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z", "depth")
-"""Measured columns that a simulation is compared with."""
+"""Measured columns that are compared with a simulation."""
 
 DETERMINED_BY = {
     "surge": ("u", "x", "y"),
@@ -28,32 +28,32 @@ DETERMINED_BY = {
     "pitch": ("q", "pitch"),
     "yaw": ("r", "yaw"),
 }
-"""Measured columns that determine an axis, the most direct first."""
+"""Measured columns that determine the motion of an axis, the most direct first."""
 
 FEWEST_SAMPLES, FEWEST_SPEEDS, FEWEST_COASTING = 20, 5, 3
-"""Samples of a swing, of a coast or a rise, and of a coast until something pushes."""
+"""Smallest numbers of samples of a swing, of a coast or a rise, and of a coast until the vehicle is pushed."""
 
 SLOWEST, FASTEST = 0.05, 3.0
-"""Natural frequencies that are looked for [Hz]."""
+"""Range of natural frequencies that is searched [Hz]."""
 
 FEWEST_PERIODS = 1.5
-"""Shortest decay that counts, in periods."""
+"""Shortest usable decay, in periods."""
 
 FAINT = 4.0
-"""Standard deviations of the rate's noise below which a swing shows nothing."""
+"""Number of standard deviations of the rate's noise below which a swing cannot be analysed."""
 
 LEAST_SPEED = 0.03
-"""Speed at the release below which nothing coasts [m/s, rad/s]."""
+"""Least initial speed of a coast [m/s, rad/s]."""
 
 FALLS_TO = 0.7
-"""Part of its first speed to which a coast has to fall."""
+"""Fraction of its initial speed to which a coast must decrease."""
 
 GROWS, TUGGED = 1.15, 0.1
-"""Factor above the lowest speed so far at which something pushes again, and the part of the first speed that a tether
-may add."""
+"""Factor above the lowest speed so far from which the vehicle is considered pushed again, and the fraction of
+the initial speed that a tether may add."""
 
 HELD = 0.15
-"""Part of the top speed of a rise below which a smoothed speed may still be that of a vehicle that is held."""
+"""Fraction of the top speed of a rise below which the vehicle may still be held, considering smoothing."""
 
 RISING, SHORTEST_RISE = 0.01, 3.0
 """Vertical speed that counts as a rise [m/s] (published procedure), and its shortest duration [s]."""
@@ -62,7 +62,7 @@ RISING, SHORTEST_RISE = 0.01, 3.0
 def compared_columns(trial: Trial) -> dict[str, tuple[Array, Array]]:
     """Return the columns of `CHANNELS` that a trial measures: times on its clock [s] and values in their units.
 
-    Speeds that no vehicle has are left out.
+    Implausible speeds are removed.
     """
     measured = {c: trial.series(c) for c in CHANNELS}
     t, q, given = attitude_samples(trial)
@@ -74,15 +74,15 @@ def compared_columns(trial: Trial) -> dict[str, tuple[Array, Array]]:
 
 
 def free_motion(moved: Motion, measured: Mapping[str, tuple[Array, Array]], axis: str) -> tuple[float, float]:
-    """Return begin and end of the free motion of one axis of a trial without thrust [s].
+    """Return start and end of the free motion of one axis of a trial without thrust [s].
 
     Args:
         moved: Motion of the trial.
-        measured: Column -> times [s] and values in its unit, of `compared_columns`.
-        axis: Which.
+        measured: Column -> times [s] and values in its unit, from `compared_columns`.
+        axis: Name of the axis.
 
     Raises:
-        CalibrationError: The axis does not move freely, or was hardly measured.
+        CalibrationError: The axis does not move freely, or has too few measurements.
     """
     count = max((len(measured[c][0]) for c in DETERMINED_BY[axis] if c in measured), default=0)
     swings = axis in ("roll", "pitch")
@@ -101,13 +101,13 @@ def free_motion(moved: Motion, measured: Mapping[str, tuple[Array, Array]], axis
         return _ringing(rate[0][good], rate[1][good], axis)
     if axis == "heave":
         return _rising(moved)
-    # A fast coast is over within a few samples, which smoothing would cut.
+    # A fast coast lasts only a few samples, which smoothing would truncate.
     t, speed = measured.get(DETERMINED_BY[axis][0], (moved.t, moved.nu[:, AXES.index(axis)]))
     return _coasting(t, speed, float(np.nan_to_num(moved.noise_std[AXES.index(axis)])), axis)
 
 
 def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
-    """Return the stretch from the largest rate until the swing grows again or is lost in noise [s]."""
+    """Return the segment from the largest rate until the swing grows again or falls below the noise [s]."""
     from scipy.signal import lombscargle
 
     smooth = np.convolve(np.pad(y, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
@@ -122,7 +122,7 @@ def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
     if after.sum() < FEWEST_SAMPLES or span < 1.0:
         raise refusal
     frequencies = np.linspace(max(SLOWEST, 1.0 / span), FASTEST, 400)
-    fade = np.exp(-2.0 * (t[after] - begin) / span)  # the first swings are the largest
+    fade = np.exp(-2.0 * (t[after] - begin) / span)  # the first swings have the largest amplitude
     power = lombscargle(t[after], (smooth[after] - smooth[after].mean()) * fade, 2.0 * np.pi * frequencies)
     period = 1.0 / float(frequencies[int(np.argmax(power))])
     end, swing = begin, np.inf
@@ -137,7 +137,7 @@ def _ringing(t: Array, y: Array, axis: str) -> tuple[float, float]:
 
 
 def _coasting(t: Array, nu: Array, noise: float, axis: str) -> tuple[float, float]:
-    """Return the stretch from the largest speed until something pushes again [s]."""
+    """Return the segment from the largest speed until the vehicle is pushed again [s]."""
     known = np.isfinite(nu)
     t, speed = t[known], np.abs(nu[known])
     begin = int(np.argmax(speed)) if len(speed) else 0
@@ -152,12 +152,12 @@ def _coasting(t: Array, nu: Array, noise: float, axis: str) -> tuple[float, floa
 
 
 def _rising(moved: Motion) -> tuple[float, float]:
-    """Return the longest stretch in which the height grows faster than `RISING`, without the hand's last touch [s]."""
+    """Return the longest segment with a climb rate above `RISING`, without the last contact of the hand [s]."""
     speed = np.gradient(moved.position[:, 2], moved.t)
     begin, end = max(spans_of(speed > RISING), key=lambda e: e[1] - e[0], default=(0, 1))
     begin += int(np.argmax(speed[begin:end] > HELD * speed[begin:end].max()))
     if moved.t[end - 1] - moved.t[begin] < SHORTEST_RISE:
         raise CalibrationError(
-            f"nothing rises faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water"
+            f"no rise faster than {RISING} m/s for {SHORTEST_RISE:g} s: expected a vehicle let go under water"
         )
     return float(moved.t[begin]), float(moved.t[end - 1])

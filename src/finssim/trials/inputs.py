@@ -1,4 +1,4 @@
-"""Inputs of a trial: the recorded inputs as forces, and the wrench that they applied."""
+"""Inputs of a trial: the recorded inputs as forces, and the applied wrench."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from finssim.vehicles.part import did_you_mean
 
 Array = NDArray[np.float64]
 
-# What every fit asks of the trials and axes that it is given.
+# Requirements of every fit for its trials and axes.
 
 
 FASTEST = 20.0
-"""No vehicle moves faster [m/s]."""
+"""Speed that no vehicle exceeds [m/s]."""
 FASTEST_TURN = 15.0
-"""Nor turns faster [rad/s]."""
+"""Angular rate that no vehicle exceeds [rad/s]."""
 LIMITS = dict.fromkeys("uvw", FASTEST) | dict.fromkeys("pqr", FASTEST_TURN)
 """Column -> its limit [m/s, rad/s]."""
 BEYOND = 5.0
-"""Times the speed that a vehicle file gives at full thrust, or the work of the thrust, beyond which no error of that
-file explains a log."""
+"""Factor on the vehicle file's speed at full thrust, or on the work of the thrust, above which errors of that
+file cannot explain a log."""
 FEW = 97.0
-"""Percentile of a speed that is looked at: another unit shows in all samples, wild ones are left to the fit."""
+"""Percentile of a speed that is evaluated: a wrong unit affects all samples; outliers are handled by the fit."""
 ADRIFT = 1.0
-"""Speed that water, waves and hands may give to a vehicle [m/s]."""
+"""Speed that a vehicle may have due to water, waves or handling [m/s]."""
 
 
 def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
     """Refuse trials that no fit may use.
 
     Args:
-        trials: All that were given.
-        vehicle: The one that made them.
+        trials: All trials that were given.
+        vehicle: Vehicle of the trials.
 
     Raises:
-        CalibrationError: There are none, two share a name, one is held out, or no vehicle can have moved so.
+        CalibrationError: There are no trials, two have the same name, one is held out, or a motion is impossible.
     """
     if not trials:
         raise CalibrationError("no trials were given, expected at least one to fit")
     names = [trial.name for trial in trials]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise CalibrationError(f"two trials are called '{min(twice)}', expected a name for each: rename one")
+        raise CalibrationError(f"two trials are called '{min(twice)}', expected unique names: rename one")
     for trial in trials:
         if trial.header.role == "held-out":
             raise CalibrationError(
@@ -64,11 +64,11 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
 
 
 def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return findings about the impossible: speeds, and speeds or kinetic energy beyond what the thrust can give.
+    """Return findings about impossible speeds, and about speeds or kinetic energy that the thrust cannot explain.
 
     Args:
-        trial: As it was read.
-        vehicle: The one that made it; None: only what holds for all is looked at.
+        trial: Trial as read.
+        vehicle: Vehicle of the trial; if None, only general limits are checked.
     """
     fastest = {name: _fastest(trial, name) for name in NU}
     findings = [
@@ -88,7 +88,8 @@ def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
 
 
 def within_reach(column: str, values: Array) -> NDArray[np.bool_]:
-    """Return which values, (n,), of a column some vehicle can have; all of a column that is no velocity.
+    """Return a mask of the values, (n,), that are physically plausible for a column; all if the column is no
+    velocity.
 
     Values have the unit of the column.
     """
@@ -96,19 +97,20 @@ def within_reach(column: str, values: Array) -> NDArray[np.bool_]:
 
 
 def _fastest(trial: Trial, name: str) -> float:
-    """The speed that few samples exceed, see `FEW`; 0 where there is none."""
+    """Return the speed that few samples exceed, see `FEW`; 0 if there are no samples."""
     values = np.abs(trial.series(name)[1])
     return float(np.percentile(values, FEW)) if len(values) else 0.0
 
 
 def _unearned(trial: Trial, vehicle: Vehicle) -> list[Finding]:
-    """Kinetic energy of the mass alone, E = m |v|² / 2, that the work of the inputs, ∫ |τ · v| dt, does not explain."""
+    """Return a finding if the kinetic energy of the mass alone, E = m |v|² / 2, exceeds the work of the
+    inputs, ∫ |τ · v| dt."""
     if not trial.has("u", "v", "w"):
         return []
     try:
         inputs = drive(trial, vehicle)
     except CalibrationError:
-        return []  # a function that needs the inputs reports what is missing
+        return []  # functions that need the inputs report what is missing
     v = np.column_stack([np.interp(inputs.t, *trial.series(name)) for name in "uvw"])
     tau = np.nan_to_num(applied_wrench(inputs, vehicle, inputs.t)[:, :3])
     power = np.abs(np.sum(tau * v, axis=1))
@@ -119,22 +121,22 @@ def _unearned(trial: Trial, vehicle: Vehicle) -> list[Finding]:
 
 
 def require_axes(axes: Sequence[str] | None) -> None:
-    """Refuse words that name no axis.
+    """Refuse unknown names of axes.
 
     Raises:
-        CalibrationError: It says which there are.
+        CalibrationError: An axis is unknown; the message lists the axes.
     """
     for axis in axes or ():
         if axis not in AXES:
             raise CalibrationError(f"unknown axis '{axis}'; available: {', '.join(AXES)}")
 
 
-# What the motors of a vehicle make of commanded forces: the engine's actuation in NumPy, exact in time.
+# Response of a vehicle's motors to commanded forces: the engine's actuation in NumPy, exact in time.
 
 NO_LIMIT = 1.0e9
-"""Force and slew of a motor that has no limit."""
+"""Force and slew rate of a motor without limit."""
 SHORT = 1.0e-6
-"""Time constant of an actuator that has none [s]."""
+"""Time constant of an actuator without lag [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,29 +144,29 @@ class Motors:
     """Limits, dead zone, delay, lag and slew of k channels, (k,) each."""
 
     lower: Array
-    """[N]"""
+    """Lower limit [N]."""
     upper: Array
-    """[N]"""
+    """Upper limit [N]."""
     dead_minus: Array
-    """Commands between this and `dead_plus` give nothing [N]."""
+    """Lower edge of the dead zone: commands between this and `dead_plus` produce no force [N]."""
     dead_plus: Array
-    """[N]"""
+    """Upper edge of the dead zone [N]."""
     delay: Array
-    """[s]"""
+    """Pure delay [s]."""
     time_constant: Array
-    """[s]"""
+    """Time constant of the lag [s]."""
     slew: Array
-    """[N/s], or [rad/s²] where `speed`."""
+    """Slew limit [N/s], or [rad/s²] if `speed`."""
     speed: NDArray[np.bool_]
     """True if lag and slew act on shaft speed rather than on thrust."""
     c_plus: Array
-    """T = c± ω|ω| [N s²/rad²]."""
+    """Coefficient of T = c± ω|ω| for ω > 0 [N s²/rad²]."""
     c_minus: Array
-    """[N s²/rad²]"""
+    """Coefficient of T = c± ω|ω| for ω < 0 [N s²/rad²]."""
 
 
 def channel_motors(vehicle: Vehicle) -> Motors:
-    """Motors of the vehicle's thrusters and of its other actuators, in the order of `Vehicle.channel_names`."""
+    """Return the motors of the vehicle's thrusters and other actuators, in the order of `Vehicle.channel_names`."""
     thrusters, others = list(vehicle.thrusters.values()), list(vehicle.actuators.values())
     speed = np.array([t.domain == "speed" for t in thrusters] + [False] * len(others))
 
@@ -173,7 +175,7 @@ def channel_motors(vehicle: Vehicle) -> Motors:
 
     def force_at(name: str) -> Array:
         at = [t.thrust(getattr(t, name) * 2.0 * np.pi / 60.0) for t in thrusters] + [0.0] * len(others)
-        return np.where(speed, at, 0.0)  # a motor that lags in force has no dead zone in the engine
+        return np.where(speed, at, 0.0)  # in the engine, a motor with lag in force has no dead zone
 
     one = [1.0] * len(others)
     delays = [t.delay for t in thrusters]
@@ -192,10 +194,10 @@ def channel_motors(vehicle: Vehicle) -> Motors:
 
 
 def wrench_motors(vehicle: Vehicle) -> Motors:
-    """Six equal motors for the axes of a wrench that was asked for: the mean delay and lag of the vehicle's thrusters.
+    """Return six equal motors for the axes of a commanded wrench: the mean delay and lag of the vehicle's thrusters.
 
-    Exact while all thrusters are equal, lag in force and keep away from their limits; who allocated the wrench, and
-    how, is not in the log.
+    This is exact if all thrusters are equal, lag in force and stay within their limits; the log does not
+    contain the allocation of the wrench.
     """
     thrusters = list(vehicle.thrusters.values())
     six = np.ones(6)
@@ -214,20 +216,21 @@ def wrench_motors(vehicle: Vehicle) -> Motors:
 
 
 def delivered(motors: Motors, t: Array, command: Array, at: Array) -> Array:
-    """Thrust at given times for commands that are held until the next.
+    """Return the thrust at given times for commands that are held until the next.
 
     u(t) = admissible(command(t - delay)),   x_dot = clip((u - x) / time_constant, ±slew),   T = x or c± x|x|
 
-    solved exactly between the changes of u. Before its first row a command is taken to have been held for long.
+    The equations are solved exactly between the changes of u. The first command is assumed to have been held
+    for a long time before.
 
     Args:
-        motors: Of the k channels.
+        motors: Motors of the k channels.
         t: Times of the commands, increasing [s], (n,).
-        command: [N], (n, k).
-        at: Times asked for [s], (m,).
+        command: Commanded forces [N], (n, k).
+        at: Times of the result [s], (m,).
 
     Returns:
-        [N], (m, k).
+        Thrust [N], (m, k).
     """
     f = np.clip(command, motors.lower, motors.upper)
     f = np.where((f > motors.dead_minus) & (f < motors.dead_plus), 0.0, f)
@@ -247,13 +250,14 @@ def delivered(motors: Motors, t: Array, command: Array, at: Array) -> Array:
 
 
 def _changes(t: Array, u: Array) -> tuple[Array, Array]:
-    """The rows at which a held value changes."""
+    """Return the rows at which a held value changes."""
     rows = np.concatenate([[True], np.diff(u) != 0.0])
     return t[rows], u[rows]
 
 
 def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) -> Array:
-    """x(at) of x_dot = clip((u - x) / time_constant, ±slew), at rest on u[0] before t[0]; u is held from t on."""
+    """Return x(at) of x_dot = clip((u - x) / time_constant, ±slew), steady at u[0] before t[0]; u is held
+    from t on."""
     x = np.empty(len(t))
     x[0] = now = float(u[0])
     for j, (goal, dt) in enumerate(zip(u.tolist(), np.diff(t).tolist(), strict=False)):
@@ -274,14 +278,14 @@ def _followed(t: Array, u: Array, at: Array, time_constant: float, slew: float) 
 # Columns of a trial that describe its inputs.
 
 ORDER = ("rpm_", "force_", "tau", "pwm_", "command_")
-"""Kinds of input, from the closest to what acted to the least close."""
+"""Kinds of input, from the most to the least direct measure of the applied force."""
 
 
 def _columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
-    """Return the input columns of a kind that hold numbers, in canonical order.
+    """Return the input columns of a kind that contain numbers, in canonical order.
 
     Raises:
-        CalibrationError: One names a thruster that the vehicle has not.
+        CalibrationError: A column names an unknown thruster.
     """
     if kind == "tau":
         return [name for name in TAU if trial.has(name)]
@@ -315,60 +319,61 @@ def _missing_inputs(present: dict[str, list[str]], vehicle: Vehicle) -> str:
 
 
 ACTED = ("rpm_", "force_", "tau")
-"""Inputs that are what acted, unless the header states otherwise."""
+"""Kinds of input that were applied, unless the header states otherwise."""
 
 RPM = 2.0 * np.pi / 60.0
-"""rad/s of one turn a minute."""
+"""Angular velocity of one revolution per minute [rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InputForces:
-    """The inputs of a trial as k forces."""
+    """Inputs of a trial as k forces."""
 
     t: Array
-    """Times at which all of them are known [s], (n,)."""
+    """Times at which all inputs are known [s], (n,)."""
     force: Array
-    """[N; N m for the moments of a wrench; of other actuators their unit], (n, k), k <= 8."""
+    """Inputs [N; N m for the moments of a wrench; of other actuators their unit], (n, k), k <= 8."""
     B: Array
-    """Wrench about the body origin per unit force, body frame, (6, k); zero of other actuators than thrusters."""
+    """Wrench about the body origin per unit force, body frame, (6, k); zero for actuators other than thrusters."""
     names: tuple[str, ...]
     """Channels of the vehicle, or `tau_x` ... `tau_n`."""
     commanded: bool
-    """True if these were commanded: limits, dead zone, delay, lag and slew of the motors lie before what acted."""
+    """True if the inputs are commands: limits, dead zone, delay, lag and slew of the motors determine the
+    applied force."""
     thrusters: bool
     """True if the channels are those of the vehicle: thrusters in canonical order, then its other actuators."""
     held: bool
-    """True if a value acts until the next, rather than linearly to it."""
+    """True if a value is held until the next; otherwise inputs are interpolated linearly."""
     spans: Array
-    """Beginnings and ends of the stretches in which the inputs are known [s], (s, 2)."""
+    """Starts and ends of the segments in which the inputs are known [s], (s, 2)."""
     source: str
     """`rpm`, `force`, `tau`, `pwm`, `command`, or `passive`."""
     end: float | None = None
-    """Time from which on the recording continues and the inputs are unknown [s]; None if they last as long."""
+    """Time after which the recording continues but the inputs are unknown [s]; None if they last as long."""
     findings: tuple[Finding, ...] = ()
     """Assumptions."""
 
     def at(self, t: Array) -> Array:
-        """Forces at given times [s], (m,) -> (m, k), before the motors; beyond the ends the nearest."""
+        """Return forces at given times [s], (m,) -> (m, k), before the motors; beyond the ends the nearest value."""
         if self.held:
             return self.force[np.maximum(np.searchsorted(self.t, t, side="right") - 1, 0)]
         return np.stack([np.interp(t, self.t, column) for column in self.force.T], axis=-1)
 
 
 def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
-    """The inputs of a trial: shaft speeds before forces before a wrench before pulse widths before commanded forces.
+    """Return the inputs of a trial: shaft speeds, otherwise forces, a wrench, pulse widths, or commanded forces.
 
-    A kind that is there for some thrusters only is passed over for a complete one. Axes of a wrench that have no column
-    are taken as zero, for that is how single-axis trials are logged; thrusters without a column are not.
+    A kind that is incomplete is skipped in favour of a complete one. Missing axes of a wrench are zero, since
+    single-axis trials are logged in this form; missing thrusters are not.
 
     Raises:
-        CalibrationError: No inputs, a thruster that the vehicle has not, some thrusters missing, or pulse widths
+        CalibrationError: There are no inputs, a thruster is unknown or missing, or there are pulse widths
             without a speed controller in the vehicle file.
     """
     if trial.header.passive:
         return _undriven(trial)
     present = {kind: _columns(trial, vehicle, kind) for kind in ORDER}
-    # Of a wrench any axis will do, of thrusters each has to be there.
+    # For a wrench any axis suffices, for thrusters all are required.
     complete = [k for k in ORDER if present[k] and (k == "tau" or len(present[k]) == len(vehicle.thrusters))]
     if not complete:
         raise CalibrationError(_missing_inputs(present, vehicle), trial.name)
@@ -409,17 +414,17 @@ def drive(trial: Trial, vehicle: Vehicle) -> InputForces:
 
 
 def no_input(inputs: InputForces) -> list[Finding]:
-    """Return a finding where inputs were recorded and nothing is ever pushed, for which no fit may use a trial."""
+    """Return a finding if inputs were recorded but produce no force at any time: no fit may use such a trial."""
     if inputs.source == "passive" or np.any(inputs.force):
         return []
     return [finding("pulses_dead" if inputs.source == "pwm" else "inputs_zero")]
 
 
 def _other_columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
-    """Columns of the vehicle's actuators besides thrusters, in the order of its channels.
+    """Return the columns of the vehicle's actuators other than thrusters, in the order of its channels.
 
     Raises:
-        CalibrationError: One is missing or unknown, or a wrench is given in place of the thrusters' inputs.
+        CalibrationError: A column is missing or unknown, or a wrench is given instead of the thrusters' inputs.
     """
     expected = [f"actuator_{name}" for name in vehicle.actuators]
     for column in trial.channels:
@@ -446,7 +451,7 @@ def _other_columns(trial: Trial, vehicle: Vehicle, kind: str) -> list[str]:
 
 
 def _undriven(trial: Trial) -> InputForces:
-    """No wrench at any time, as in a passive trial."""
+    """Return a zero wrench at all times, as in a passive trial."""
     return InputForces(
         t=trial.t,
         force=np.zeros((len(trial.t), 6)),
@@ -461,8 +466,8 @@ def _undriven(trial: Trial) -> InputForces:
 
 
 def _between(trial: Trial, kind: str, columns: list[str]) -> tuple[bool, bool, bool]:
-    """Return whether inputs were commanded, hold from row to row, and are observed to hold though the header does not
-    state it."""
+    """Return whether inputs were commanded, are held from row to row, and are held according to the data
+    although the header does not state it."""
     header = trial.header
     commanded = header.inputs == "commanded" or (header.inputs is None and kind not in ACTED)
     if header.inputs_between is not None:
@@ -474,7 +479,7 @@ def _between(trial: Trial, kind: str, columns: list[str]) -> tuple[bool, bool, b
 def _channels(
     trial: Trial, vehicle: Vehicle, kind: str, columns: list[str], t: Array, values: Array
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Forces (n, k), their map to the wrench about the body origin (6, k), and names."""
+    """Return forces (n, k), their map to the wrench about the body origin (6, k), and names."""
     if kind != "tau":
         force = _forces(kind, values, t, trial, vehicle)
         return force, vehicle.thruster_matrix(), vehicle.thruster_names
@@ -484,7 +489,7 @@ def _channels(
 
 
 def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Finding]:
-    """Return findings about the assumptions."""
+    """Return findings about the assumptions made."""
     source = kind.rstrip("_")
     findings = [
         finding("inputs_incomplete", kind=k, used=source) for k in ORDER[: ORDER.index(kind)] if present[k]
@@ -498,7 +503,7 @@ def _assumed(kind: str, present: dict[str, list[str]], stepped: bool) -> list[Fi
 
 
 def acting(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
-    """Return the inputs that acted at given times [s], (m,) -> (m, k); behind the motors where they were commanded."""
+    """Return the applied inputs at given times [s], (m,) -> (m, k), after the motors if the inputs are commands."""
     if drive.commanded:
         motors = channel_motors(vehicle) if drive.thrusters else wrench_motors(vehicle)
         return delivered(motors, drive.t, drive.force, t)
@@ -506,14 +511,14 @@ def acting(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
 
 
 def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
-    """Wrench that acted, about the body origin, body frame [N, N m].
+    """Return the applied wrench, about the body origin, body frame [N, N m].
 
-    Where the inputs are commands, the motors of the vehicle file lie between: limits, dead zone, delay, lag and slew,
-    exact for a command that is held until the next.
+    If the inputs are commands, the motors of the vehicle file are simulated: limits, dead zone, delay, lag
+    and slew, exactly for a command that is held until the next.
 
     Args:
-        drive: Of the trial.
-        vehicle: Whose motors they are.
+        drive: Inputs of the trial.
+        vehicle: Vehicle with the motors.
         t: Times [s], (m,).
 
     Returns:
@@ -527,25 +532,26 @@ def applied_wrench(drive: InputForces, vehicle: Vehicle, t: Array) -> Array:
 
 
 def widest_step(t: Array) -> float:
-    """Longest time between samples of a stream that is not yet a gap [s]: half a second, or four usual steps."""
+    """Return the longest interval between samples that is not a gap [s]: half a second, or four median intervals."""
     return max(0.5, 4.0 * float(np.median(np.diff(t)))) if len(t) > 1 else 0.5
 
 
 def _spans(t: Array) -> Array:
-    """Stretches without a gap, (s, 2)."""
+    """Return the segments without a gap, (s, 2)."""
     wide = np.diff(t) > widest_step(t)
     return np.stack([t[np.concatenate([[True], wide])], t[np.concatenate([wide, [True]])]], axis=-1)
 
 
 def _held_spans(t: Array, recording: Array, end: float | None) -> Array:
-    """Return where a command holds until the next, but not through a gap of the complete recording, nor beyond its
-    stream's end."""
+    """Return the segments in which a command is held until the next, but not through a gap of the complete
+    recording, nor beyond the end of its stream."""
     inside = recording[(recording >= t[0]) & (recording <= (np.inf if end is None else end))]
     return _spans(inside)
 
 
 def _end(trial: Trial, t: Array, force: Array) -> float | None:
-    """When a stream of commands ended well before the recording did, with thrust still asked for [s]; else None."""
+    """Return the time at which commands end well before the recording, with a nonzero last command [s];
+    otherwise None."""
     after = trial.header.inputs_after
     steps = np.diff(t)
     longest = max(widest_step(t), 1.5 * float(steps.max()))
@@ -556,9 +562,10 @@ def _end(trial: Trial, t: Array, force: Array) -> float | None:
 
 
 def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
-    """Return whether inputs stay exactly at levels and jump between them from row to row, as a program sets them.
+    """Return whether inputs stay exactly at levels and jump between them from row to row, as
+    program-generated ones do.
 
-    What motors delivered passes through the values between, and what a sensor measured never repeats.
+    The output of motors passes through intermediate values, and measured values never repeat exactly.
     """
     jumps = alone = 0
     for column in columns:
@@ -570,7 +577,8 @@ def _keeps_levels(trial: Trial, columns: list[str]) -> bool:
 
 
 def _common_times(trial: Trial, columns: list[str], held: bool) -> tuple[Array, Array]:
-    """Columns at the times when all of them are known: the last value if held, else in a straight line.
+    """Return columns at the times when all of them are known: the last value if held, otherwise interpolated
+    linearly.
 
     Raises:
         CalibrationError: There is no such time.
@@ -582,7 +590,7 @@ def _common_times(trial: Trial, columns: list[str], held: bool) -> tuple[Array, 
     t = t[(t >= first) & (t <= end)]
     if len(t) < 2:
         raise CalibrationError(
-            f"{', '.join(columns[:8])} are never known together: expected inputs that overlap in time",
+            f"{', '.join(columns[:8])} are never known at the same time: expected inputs that overlap in time",
             trial.name,
         )
     if held:
@@ -595,7 +603,7 @@ def _common_times(trial: Trial, columns: list[str], held: bool) -> tuple[Array, 
 
 
 def _forces(kind: str, values: Array, t: Array, trial: Trial, vehicle: Vehicle) -> Array:
-    """Thrust of each thruster [N], (n, k)."""
+    """Return the thrust of each thruster [N], (n, k)."""
     thrusters = vehicle.thrusters.items()
     if kind == "rpm_":
         return np.stack(
@@ -623,7 +631,7 @@ def _forces(kind: str, values: Array, t: Array, trial: Trial, vehicle: Vehicle) 
 
 
 def _about_origin(header: Header, vehicle: Vehicle) -> Array:
-    """Map of a wrench about `wrench_at` to the body origin: M_O = M_P + r_P × F, (6, 6)."""
+    """Return the map of a wrench about `wrench_at` to the body origin: M_O = M_P + r_P × F, (6, 6)."""
     at = header.wrench_at
     if at is None:
         point = vehicle.wrench_reference

@@ -1,7 +1,7 @@
-"""One trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
+"""Motion of a trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
 
-What is measured is smoothed (`finssim.trials.motion`) and moved to the body origin; what is not is
-derived where the other columns allow it, and NaN where they do not. Nothing is interpolated across a gap.
+Measured quantities are smoothed (`smooth`) and transferred to the body origin; others are
+derived if the remaining columns determine them, and NaN otherwise. Nothing is interpolated across a gap.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class AttitudeSignal:
     rates_std: Array
     """Standard deviation of `rates` [rad/s], (3,)."""
     turn: Array
-    """Rotation to use for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
+    """Rotation for vectors: `quaternion`, or level with the measured heading, (m, 4); NaN where unknown."""
     heading: bool
     """True if the heading is measured; otherwise `quaternion` has heading 0 and only its tilt is meaningful."""
     tilt: bool
@@ -56,10 +56,11 @@ class AttitudeSignal:
 
 
 def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
-    """Attitude as sampled.
+    """Return the attitude as sampled.
 
     Returns:
-        Times (n,) [s], quaternions (n, 4) with 0 for angles that are not measured, and which of roll, pitch, yaw are.
+        Times (n,) [s], quaternions (n, 4) with 0 for unmeasured angles, and the names of the measured ones of
+        roll, pitch, yaw.
     """
     if trial.has(*QUATERNION):
         q = np.stack([trial.channels[name] for name in QUATERNION], axis=-1)
@@ -67,7 +68,9 @@ def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
         return trial.t[good], q[good], EULER
     given = tuple(name for name in EULER if trial.has(name))
     if "roll" in given and "pitch" not in given or "pitch" in given and "roll" not in given:
-        given = tuple(name for name in given if name == "yaw")  # half a tilt is no attitude
+        given = tuple(
+            name for name in given if name == "yaw"
+        )  # roll or pitch alone does not determine the tilt
     if not given:
         return np.empty(0), np.empty((0, 4)), ()
     t = max((trial.series(name)[0] for name in given), key=len)
@@ -83,7 +86,7 @@ def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
-    """The attitude of a trial, smoothed, at given times (m,)."""
+    """Return the smoothed attitude of a trial at given times (m,)."""
     t, q, given = attitude_samples(trial)
     nothing = np.full((len(at), 4), np.nan)
     if len(t) < 2:
@@ -98,7 +101,7 @@ def attitude_signal(trial: Trial, at: Array) -> AttitudeSignal:
     s = smooth(t, q, at, order=3, together=True)
     length = np.linalg.norm(s.value, axis=1, keepdims=True)
     quaternion = s.value / length
-    # q_dot = q omega / 2, with omega in body axes; the length of q drops out of the vector part.
+    # q_dot = q omega / 2, with omega in body axes; the norm of q does not affect the vector part.
     rates = 2.0 * quat_multiply(quat_conjugate(quaternion), s.slope / length)[:, :3]
     tilt, heading = "roll" in given, "yaw" in given
     measured = np.array([tilt, tilt, heading])
@@ -118,7 +121,7 @@ def up_in_body(quaternion: Array) -> Array:
     return quat_rotate(quat_conjugate(quaternion), np.array([0.0, 0.0, 1.0]))
 
 
-# Velocity and position of the body origin on a grid, measured or derived from what is.
+# Velocity and position of the body origin on a grid, measured or derived.
 
 STEEPEST = 0.3
 """Cosine of the tilt below which a vertical velocity does not determine heave."""
@@ -126,7 +129,7 @@ STEEPEST = 0.3
 
 @dataclass
 class _Column:
-    """One column on the grid; all NaN if the trial does not have it."""
+    """Column on the grid; all NaN if the trial lacks it."""
 
     value: Array
     slope: Array
@@ -136,13 +139,13 @@ class _Column:
 
 
 def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal) -> dict[str, Any]:
-    """Velocity and position of the body origin: the fields of `Motion` that follow from the measured columns.
+    """Return velocity and position of the body origin: the fields of `Motion` that follow from the measured columns.
 
     Args:
         trial: The trial.
-        vehicle: Gives the place of the pressure sensor where the header does not.
+        vehicle: Vehicle with the position of the pressure sensor, if the header lacks it.
         at: Times [s], (m,).
-        attitude: At these times.
+        attitude: Attitude at these times.
     """
     header, findings = trial.header, list[Finding]()
     measured = [_column(trial, name, at, 2) for name in NU]
@@ -181,7 +184,7 @@ def velocities(trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSign
 
 
 def arm_velocity(omega: Array, arm: Array) -> Array:
-    """omega × r, with unknown rates taken as 0, body frame [m/s], (m, 3).
+    """Return omega × r, with unknown rates set to 0, body frame [m/s], (m, 3).
 
     Args:
         omega: Angular velocity, body frame [rad/s], (m, 3).
@@ -191,7 +194,7 @@ def arm_velocity(omega: Array, arm: Array) -> Array:
 
 
 def _lacks(omega: Array, arm: Array) -> bool:
-    """Return whether a rate that would move a point at `arm` is unknown throughout."""
+    """Return whether a rate that affects the velocity of a point at `arm` is unknown throughout."""
     unknown = ~np.asarray(np.isfinite(omega).any(axis=0))
     return any(unknown[i] and np.delete(arm, i).any() for i in range(3))
 
@@ -212,8 +215,8 @@ def _column(trial: Trial, name: str, at: Array, order: int) -> _Column:
 def _origin(
     trial: Trial, vehicle: Vehicle, at: Array, attitude: AttitudeSignal, omega: Array
 ) -> tuple[Array, Array, Array]:
-    """Position and velocity of the body origin in the world, (m, 3) each, and the standard deviations of the latter and
-    of its slope by axis, (3, 2)."""
+    """Return position and velocity of the body origin in the world, (m, 3) each, and the standard deviations
+    of the velocity and of its slope by axis, (3, 2)."""
     header = trial.header
     x, y, z = (_column(trial, name, at, 3) for name in "xyz")
     arms = [np.asarray(header.position_at, float)] * 3
@@ -235,7 +238,7 @@ def _origin(
 
 
 def depth_place(trial: Trial, vehicle: Vehicle) -> Array:
-    """Body point of the pressure sensor [m], (3,): the header's, the vehicle's, or the origin."""
+    """Return the body point of the pressure sensor [m], (3,): from the header, the vehicle, or the origin."""
     if trial.header.depth_at is not None:
         return np.asarray(trial.header.depth_at, float)
     return np.zeros(3) if vehicle.sensors.depth is None else np.asarray(vehicle.sensors.depth.position, float)
@@ -244,8 +247,8 @@ def depth_place(trial: Trial, vehicle: Vehicle) -> Array:
 def _derived(
     nu: Array, source: list[str], flow: Array, attitude: AttitudeSignal, trial: Trial, findings: list[Finding]
 ) -> list[tuple[Array, str]]:
-    """Return u, v, w from the world velocity of the origin, and the names of their sources; no name if it is not
-    determined."""
+    """Return u, v, w from the world velocity of the origin, and the names of their sources; an empty name if
+    a velocity is not determined."""
     known = np.asarray(np.isfinite(attitude.turn).all(axis=1))
     turn = np.where(known[:, None], attitude.turn, [0.0, 0.0, 0.0, 1.0])
     horizontal = trial.has("x", "y") and attitude.heading
@@ -258,7 +261,7 @@ def _derived(
         body = quat_inverse_rotate(turn, world)
         body[~known] = np.nan
     else:
-        # Vertical velocity alone: z_dot = up · v, solved for heave with surge and sway as far as they are known.
+        # Vertical velocity alone: z_dot = up · v, solved for heave with surge and sway where they are known.
         up = quat_inverse_rotate(turn, np.array([0.0, 0.0, 1.0]))
         if attitude.tilt:
             up[~known] = np.nan
@@ -273,14 +276,14 @@ ACCELERATION = ("ax", "ay", "az")
 
 
 def holds_gravity(trial: Trial, gravity: float) -> bool:
-    """Return whether the accelerations are specific force, from the header or from their size.
+    """Return whether the accelerations are specific force, from the header or from their magnitude.
 
-    Vehicles under water accelerate far less than gravity: what is about as large as gravity holds it. With only ax or
-    ay there is nothing to tell it by, and an accelerometer is assumed.
+    Submerged vehicles accelerate far less than gravity: values of about its magnitude include it. If only ax
+    or ay exists, they are assumed to come from an accelerometer.
 
     Args:
-        trial: Its header and its columns ax, ay, az.
-        gravity: [m/s²]
+        trial: Trial with its header and its columns ax, ay, az.
+        gravity: Gravity [m/s²].
     """
     if trial.header.acceleration != "auto":
         return trial.header.acceleration == "specific_force"
@@ -292,56 +295,57 @@ def holds_gravity(trial: Trial, gravity: float) -> bool:
 
 
 FASTEST = 100.0
-"""Rate of the grid that is not exceeded unless asked for [Hz]; bodies in water do not need more."""
+"""Largest default rate of the grid [Hz]; motions in water do not need more."""
 
 MOST = 0.5
-"""An axis that is known for less than this part of a trial does not decide which rows are valid."""
+"""Fraction of a trial for which an axis must be known to decide which rows are valid."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A trial on a uniform grid of n times. Body frame, about the body origin, unless stated otherwise."""
+    """Trial on a uniform grid of n times. Body frame, about the body origin, unless stated otherwise."""
 
     t: Array
     """Times on the trial's clock [s], (n,)."""
     rate: float
     """Rate of the grid [Hz]."""
     nu: Array
-    """u, v, w, p, q, r, smoothed [m/s, rad/s], (n, 6); NaN where unknown. Relative to the ground, or to the water where
-    the header says so and gives no current."""
+    """Smoothed velocities u, v, w, p, q, r [m/s, rad/s], (n, 6); NaN where unknown. Relative to the ground,
+    or to the water if the header states so and gives no current."""
     raw: Array
-    """Velocities of measured axes [m/s, rad/s], not smoothed, linear between samples, (n, 6); NaN if not measured."""
+    """Unsmoothed velocities of measured axes, interpolated linearly [m/s, rad/s], (n, 6); NaN if not measured."""
     quaternion: Array
     """Rotation from body to world, (n, 4); NaN without roll and pitch. The heading is 0 if it was not measured."""
     position: Array
-    """World frame [m], (n, 3); NaN where unknown."""
+    """Position in the world frame [m], (n, 3); NaN where unknown."""
     tau: Array
-    """Wrench that acted [N, N m], (n, 6); commands have passed the motors of the vehicle file. NaN where unknown."""
+    """Applied wrench [N, N m], (n, 6), with commands passed through the motors of the vehicle file. NaN where
+    unknown."""
     phase: NDArray[np.str_]
-    """(n,); empty words where the trial names none."""
+    """Phase of each row, (n,); empty if the trial names none."""
     valid: NDArray[np.bool_]
-    """True if the wrench and every axis that is known for most of the trial are known, (n,)."""
+    """True if the wrench and all axes that are known for most of the trial are known, (n,)."""
     nu_source: tuple[str, ...]
-    """Source of each axis: `measured`, `derived from position`, `derived from depth`, `derived from attitude`, or
-    nothing."""
+    """Source of each axis: `measured`, `derived from position`, `derived from depth`, `derived from
+    attitude`, or empty."""
     noise_std: Array
-    """Standard deviation by axis of one sample of a measured velocity, or of the value of a derived one [m/s, rad/s],
+    """Standard deviation by axis of one sample of a measured velocity, or of a derived velocity [m/s, rad/s],
     (6,)."""
     findings: tuple[Finding, ...] = ()
-    """Assumptions."""
+    """Assumptions made."""
 
 
 def motion(trial: Trial, vehicle: Vehicle) -> Motion:
-    """A trial on a uniform grid, of the rate of its fastest stream up to 100 Hz.
+    """Return a trial on a uniform grid, at the rate of its fastest stream up to 100 Hz.
 
-    Times between samples of a stream of up to 0.2 s, or four usual steps, are bridged.
+    Intervals between samples of a stream are bridged up to 0.2 s or four median intervals.
 
     Args:
         trial: The trial.
-        vehicle: Gives the places of sensors that the header leaves out, the motors and gravity.
+        vehicle: Vehicle with the sensor positions that the header lacks, the motors and gravity.
 
     Raises:
-        CalibrationError: The inputs are missing or not of this vehicle.
+        CalibrationError: The inputs are missing or do not belong to this vehicle.
     """
     inputs = drive(trial, vehicle)
     rate = grid_rate(trial, inputs)
@@ -365,14 +369,14 @@ def motion(trial: Trial, vehicle: Vehicle) -> Motion:
 
 
 BLOCK, BLOCKS, CLEAR = 1.0, 10, 3.0
-"""Stretch over which a rate and that of the attitude are compared [s], least number of stretches, and standard errors
-from which on their mean difference counts."""
+"""Length of the segments over which a rate is compared with that of the attitude [s], least number of
+segments, and significance of their mean difference in standard errors."""
 
 
 def gyroscope_bias(motion: Motion) -> Array:
-    """Mean difference between the angular velocity and that of the measured attitude [rad/s], (3,).
+    """Return the mean difference between the angular velocity and that of the measured attitude [rad/s], (3,).
 
-    It is 0 where too little attitude is known, or where noise explains the difference.
+    It is 0 if too little of the attitude is known, or if noise explains the difference.
     """
     q, rates = motion.quaternion, motion.nu[:, 3:]
     turn = quat_multiply(quat_conjugate(q[:-1]), q[1:])
@@ -390,7 +394,7 @@ def gyroscope_bias(motion: Motion) -> Array:
 
 
 def grid_rate(trial: Trial, inputs: InputForces) -> float:
-    """Rate of the fastest stream of inputs or motion, up to `FASTEST` [Hz]."""
+    """Return the rate of the fastest stream of inputs or motion, up to `FASTEST` [Hz]."""
     steps = [float(np.median(np.diff(inputs.t)))] if inputs.source != "passive" else []
     for column in trial.channels:
         if column in COLUMNS and COLUMNS[column].group != "command" and trial.has(column):
@@ -401,7 +405,8 @@ def grid_rate(trial: Trial, inputs: InputForces) -> float:
 
 
 def phase_at(trial: Trial, t: Array) -> NDArray[np.str_]:
-    """The phase that the log names at some times on the trial's clock [s], (n,); empty words where it names none."""
+    """Return the phase in the log at given times on the trial's clock [s], (n,); empty words if the log has
+    no phases."""
     if trial.phase is None:
         return np.full(len(t), "", dtype="<U10")
     return trial.phase[np.maximum(np.searchsorted(trial.t, t + 1e-9, side="right") - 1, 0)]
@@ -417,19 +422,19 @@ def _valid(tau: Array, nu: Array) -> NDArray[np.bool_]:
 
 
 RATE = 100.0
-"""Rate of the grid on which streams are compared [Hz]; the peak is found between its points."""
+"""Rate of the grid on which streams are compared [Hz]; the peak is interpolated between its points."""
 
 LONGEST = 1.0
-"""Offsets up to this are looked for [s]."""
+"""Largest offset that is searched [s]."""
 
 NEAR = 0.15
-"""Distance from the most shared motion within which the peak is refined [s]."""
+"""Distance from the offset with the most common motion within which the peak is refined [s]."""
 
 PARTS = 10
-"""Parts of a recording, each left out in turn to see how far the offset rests on it."""
+"""Number of parts of a recording for the jackknife estimate of the offset's uncertainty."""
 
 LEAST = 0.6
-"""Correlation below which two streams do not agree on any motion, so that their offset is unknown."""
+"""Correlation below which two streams do not show a common motion, so that their offset is unknown."""
 
 
 class Offset(NamedTuple):
@@ -444,9 +449,9 @@ class Offset(NamedTuple):
 
 
 def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) -> tuple[Array, Array]:
-    """Columns of a trial, smoothed, and their slopes at times t (m,), (m, c) each; NaN where there are none.
+    """Return smoothed columns of a trial and their slopes at times t (m,), (m, c) each; NaN if there are no data.
 
-    Times are in [s]; columns have the units of a trial, slopes these per second.
+    Times are in [s]; columns have the units of a trial, slopes these units per second.
     """
     value, slope = np.full((len(t), len(columns)), np.nan), np.full((len(t), len(columns)), np.nan)
     for i, name in enumerate(columns):
@@ -458,14 +463,14 @@ def on_grid(trial: Trial, columns: tuple[str, ...], t: Array, order: int = 2) ->
 
 
 def offset(fixed: Array, moved: Array) -> Offset | None:
-    """The offset of a signal to another of the same motion, from the peak of their correlation.
+    """Return the time offset of a signal relative to another of the same motion, from the peak of their correlation.
 
     Args:
         fixed: Signals in any unit at `RATE`, NaN where unknown, (m, c).
-        moved: The same signals in the same unit, whose times are in question, (m, c).
+        moved: The same signals in the same unit, with the unknown time offset, (m, c).
 
     Returns:
-        None if they do not agree on any motion.
+        None if the signals show no common motion.
     """
     both = np.isfinite(fixed).any(axis=0) & np.isfinite(moved).any(axis=0)
     if not both.any():
@@ -478,20 +483,23 @@ def offset(fixed: Array, moved: Array) -> Offset | None:
     energy = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
     if not energy > 0.0:
         return None
-    # The most shared motion finds the peak; the correlation of what overlaps, which the ends do not pull, refines it.
+    # The most common motion locates the peak; the correlation over the overlap, unbiased at the ends, refines it.
     near = np.abs(lags - lags[int(np.argmax(sums[..., 2].sum(axis=1)))]) <= NEAR * RATE
     place, height = _peak(_correlation(sums.sum(axis=1)), near)
     if not height >= LEAST:
         return None
     parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(PARTS)]
-    spread = float(np.sqrt((PARTS - 1) * np.var(parts)))  # jackknife: one short event must not look certain
-    if not np.isfinite(spread):  # without one part there is no peak
+    spread = float(
+        np.sqrt((PARTS - 1) * np.var(parts))
+    )  # jackknife: a single short event must not appear certain
+    if not np.isfinite(spread):  # without one of the parts there is no peak
         return None
     return Offset(-float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)
 
 
 def _peak(correlation: Array, near: NDArray[np.bool_]) -> tuple[float, float]:
-    """Place, between the samples, and height of the highest peak of the part that is near; NaN if on its edge."""
+    """Return the interpolated position and the height of the highest peak within the mask; NaN if it is on
+    its edge."""
     best = int(np.argmax(np.where(near, correlation, -2.0)))
     if best in (0, len(near) - 1) or not (near[best - 1] and near[best + 1]):
         return np.nan, np.nan
@@ -505,7 +513,7 @@ def _centred(x: Array) -> Array:
 
 
 def _sums(x: Array, y: Array, lag: int, edges: NDArray[np.int64]) -> Array:
-    """Sums of x², y² and x y of x(t) and y(t + lag) where both are known, by block of t, (blocks, 3)."""
+    """Return the sums of x², y² and x y of x(t) and y(t + lag) where both are known, by block of t, (blocks, 3)."""
     n = len(x)
     products = np.zeros((n, 3))
     rows = slice(max(0, -lag), n - max(0, lag))
@@ -521,47 +529,49 @@ def _correlation(sums: Array) -> Array:
     return np.asarray(sums[:, 2] / np.maximum(np.sqrt(sums[:, 0] * sums[:, 1]), 1e-300))
 
 
-# Zero-phase smoothing of unevenly sampled signals, its strength chosen from the data.
+# Zero-phase smoothing of unevenly sampled signals, with a strength estimated from the data.
 #
-# A penalised cubic B-spline (Eilers and Marx 1996), with up to a knot per sample, fitted to every stretch without a
+# A penalised cubic B-spline (Eilers and Marx 1996), with up to one knot per sample, fitted to every segment without a
 # gap:
 #
 #     min Σ (y_i - f(t_i))² + λ Σ (Δᵐ c)²
 #
-# λ is the one under which the data are most likely (restricted maximum likelihood; Wahba 1985), with the spectrum of
-# the smoother on a uniform grid, where sines diagonalise it. It is found for windows of some seconds and goes from
-# one to the next, so that a push is followed closely and the calm after it is not. Of the noise only whiteness is
-# assumed.
+# λ maximises the likelihood of the data (restricted maximum likelihood; Wahba 1985), using the spectrum of the
+# smoother on a uniform grid, where sines diagonalise it. It is estimated for windows of some seconds and interpolated
+# between them, so that a push is followed closely and the calm motion after it is smoothed. The noise is only assumed
+# to be white.
 
 FEWEST = 5
-"""Samples that a stretch needs; shorter ones are left out."""
+"""Least number of samples of a segment; shorter ones are discarded."""
 
 CANDIDATES = 48
-"""Values of λ that are tried."""
+"""Number of values of λ that are evaluated."""
 
 WINDOW = 200
-"""Samples of a window, half shared with the next, at least; shorter stretches have one λ."""
+"""Least number of samples of a window, half of which overlaps the next; shorter segments have one λ."""
 
 WINDOW_TIME = 4.0
-"""Length of a window, at least [s]."""
+"""Least length of a window [s]."""
 
 SHARE = 0.3
-"""Weight, for a sample of a window, of the mean likelihood over all windows: what a window leaves open they decide."""
+"""Weight, for each sample of a window, of the mean likelihood over all windows, which decides where a window
+does not."""
 
 STIFFEST = 1e9
-"""Largest λ where it varies: beside closely followed parts the equations would lose digits far above it."""
+"""Largest λ if it varies: next to closely followed parts, much larger values would make the equations
+ill-conditioned."""
 
 KNOT_PHASE = 0.2
-"""Most that the frequency of half loss turns from one knot to the next [rad]."""
+"""Largest phase of the half-loss frequency from one knot to the next [rad]."""
 
 MIN_INTERVALS = 4
 
 SPIKE = 8.0
-"""Robust standard deviations beyond which a sample is a spike."""
+"""Number of robust standard deviations beyond which a sample is a spike."""
 
 
 class Smooth(NamedTuple):
-    """Signals on a grid; NaN where no stretch of samples reaches."""
+    """Signals on a grid; NaN outside the segments of samples."""
 
     value: Array
     """Values in the unit of the signal, (m, c)."""
@@ -570,34 +580,35 @@ class Smooth(NamedTuple):
     noise: Array
     """Standard deviation of one sample, in the unit of the signal, (c,)."""
     slope_std: Array
-    """Standard deviation of `slope`, in its unit, of what noise remains and what signal was lost (Wahba 1983), (c,)."""
+    """Standard deviation of `slope`, in its unit, due to remaining noise and lost signal (Wahba 1983), (c,)."""
 
 
 def longest_step(t: Array) -> float:
-    """Longest time between samples that is still bridged [s]: 0.2 s, or four usual steps."""
+    """Return the longest interval between samples that is bridged [s]: 0.2 s, or four median intervals."""
     return max(0.2, 4.0 * float(np.median(np.diff(t)))) if len(t) > 1 else 0.2
 
 
 def stretches(t: Array, max_gap: float) -> list[slice]:
-    """Runs of samples with no step longer than `max_gap`. Times are in [s]."""
+    """Return the runs of samples without a step longer than `max_gap`. Times are in [s]."""
     edges = [0, *(np.flatnonzero(np.diff(t) > max_gap) + 1), len(t)]
     return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
 
 
 def spans_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Runs of samples that are true, [begin, end) each."""
+    """Return the runs of true samples as (begin, end) pairs, end exclusive."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(b), int(e)) for b, e in edges.reshape(-1, 2)]
 
 
 def white_noise(values: Array) -> float:
-    """Standard deviation of white noise on a signal that is smooth from sample to sample, from its second differences.
+    """Return the standard deviation of white noise on a signal that is smooth from sample to sample, from
+    second differences.
 
     Args:
-        values: Evenly sampled, finite, in any unit, (n,).
+        values: Evenly sampled finite values, in any unit, (n,).
 
     Returns:
-        In the unit of the values; NaN for fewer than ten samples.
+        Standard deviation in the unit of the values; NaN for fewer than ten samples.
     """
     if len(values) < 10:
         return math.nan
@@ -605,14 +616,14 @@ def white_noise(values: Array) -> float:
 
 
 def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
-    """Return which samples are not spikes: far from the median of their five nearest, by the spread of all such
-    distances.
+    """Return a mask of the samples that are not spikes: spikes are far from the median of their five nearest
+    samples, relative to the spread of these distances.
 
     Args:
         t: Times [s], (n,).
         y: Values in any unit, (n, c).
 
-    Returns:
+    Mask, (n,); at most a twentieth of the samples is rejected, since spikes are rare.
         (n,); at most a twentieth is refused, for what happens more often is no spike.
     """
     n = len(t)
@@ -634,13 +645,13 @@ def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = Fa
     Args:
         t: Times of the samples, increasing [s], (n,).
         y: Finite values in any unit, (n, c).
-        at: Times asked for [s], (m,).
-        order: m, the difference that is penalised: 2 for signals whose slope may jump, as velocities under a step of
-            force; 3 for their integrals.
-        together: One λ for all columns, for parts of one quantity such as a quaternion.
+        at: Times of the result [s], (m,).
+        order: Order m of the penalised difference: 2 for signals with jumps in slope, such as velocities
+            under a step of force; 3 for their integrals.
+        together: True for one λ for all columns, such as the components of a quaternion.
 
     Returns:
-        On `at`.
+        Smoothed signals at `at`.
     """
     good = without_spikes(t, y)
     gap = longest_step(t)
@@ -666,7 +677,7 @@ def smooth(t: Array, y: Array, at: Array, *, order: int = 2, together: bool = Fa
 
 
 def _windows(t: Array, run: slice) -> list[slice]:
-    """Windows of equal length that overlap by half."""
+    """Return windows of equal length that overlap by half."""
     n = run.stop - run.start
     whole = int(min(n / WINDOW, (t[run][-1] - t[run][0]) / WINDOW_TIME))
     count = max(1, 2 * whole - 1)
@@ -676,7 +687,8 @@ def _windows(t: Array, run: slice) -> list[slice]:
 
 
 def _spectrum(t: Array, y: Array, order: int) -> tuple[Array, Array, Array]:
-    """Penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of the sines of a window."""
+    """Return penalty eigenvalue (k,), angular frequency (k,) [rad/s] and power by column (k, c) of the sines
+    of a window."""
     n = len(t)
     grid = np.linspace(t[0], t[-1], n)
     even = np.stack([np.interp(grid, t, column) for column in y.T], axis=-1)
@@ -690,9 +702,9 @@ def _spectrum(t: Array, y: Array, order: int) -> tuple[Array, Array, Array]:
 
 
 def _first(y: Array) -> Array:
-    """The first value without its noise, (n, c) -> (c,): of the longest line that the first samples follow.
+    """Return the first value without noise, (n, c) -> (c,), from the longest line that fits the first samples.
 
-    A line through two noisy ends would be a signal of its own.
+    A line through two noisy ends would add a spurious signal.
     """
     noise = np.median(np.abs(np.diff(y, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6.0))
     value, following = y[0].copy(), np.ones(y.shape[1], bool)
@@ -703,13 +715,13 @@ def _first(y: Array) -> Array:
         rest = y[:k] - mean - x[:, None] * slope
         fits = following & (np.sqrt(np.sum(rest**2, axis=0) / (k - 2)) <= (1.1 + np.sqrt(2.0 / k)) * noise)
         value = np.where(fits, mean + x[0] * slope, value)
-        following = fits if k >= 16 else following  # four samples may misfit by chance
+        following = fits if k >= 16 else following  # four samples may deviate by chance
         k *= 4
     return value
 
 
 def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
-    """λ of every window (w,), and noise and slope_std by column (2, c)."""
+    """Return λ of every window (w,), and noise and slope_std by column (2, c)."""
     smallest, largest = min(p.min() for p, _, _ in spectra), max(p.max() for p, _, _ in spectra)
     candidates = np.geomspace(1e-4 / largest, 1e1 / smallest, CANDIDATES)
     unlikely, sizes = np.empty((len(spectra), CANDIDATES)), np.array([len(p) for p, _, _ in spectra])
@@ -730,12 +742,13 @@ def _choose(spectra: list[tuple[Array, Array, Array]]) -> tuple[Array, Array]:
 
 
 def _fit(t: Array, y: Array, middle: Array, strength: Array, order: int, at: Array) -> tuple[Array, Array]:
-    """Value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each; λ at `middle` (w,)."""
-    # What is smoothed strongly needs few knots; many would only make the equations ill-conditioned.
+    """Return value and slope at given times inside [t[0], t[-1]] of the penalised spline, (m, c) each; λ at
+    `middle` (w,)."""
+    # Strong smoothing needs few knots; many would make the equations ill-conditioned.
     usual = len(t) - 1
     intervals = max(MIN_INTERVALS, math.ceil(usual * min(1.0, strength.min() ** (-0.5 / order) / KNOT_PHASE)))
     h = (t[-1] - t[0]) / intervals
-    trend = (y[-1] - y[0]) / (t[-1] - t[0])  # taken off, for what is small has small rounding
+    trend = (y[-1] - y[0]) / (t[-1] - t[0])  # subtracted, since small values have small rounding errors
     line, y = y[0] + (at - t[0])[:, None] * trend, y - y[0] - (t - t[0])[:, None] * trend
     count = intervals + 3
     if len(strength) > 1:
@@ -763,7 +776,7 @@ def _fit(t: Array, y: Array, middle: Array, strength: Array, order: int, at: Arr
 
 
 def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
-    """Cell, and values and slopes of the four uniform cubic B-splines that are not zero there, (4, m) each."""
+    """Return the cell, and values and slopes of the four nonzero uniform cubic B-splines there, (4, m) each."""
     cell = np.clip(np.floor(x).astype(np.intp), 0, intervals - 1)
     s = x - cell
     r = 1.0 - s
@@ -773,7 +786,7 @@ def _basis(x: Array, intervals: int) -> tuple[NDArray[np.intp], Array, Array]:
 
 
 ANSWER = (0.02, 0.02, 0.02, 0.04, 0.04, 0.04)
-"""Range of a velocity below which an axis does not answer [m/s, rad/s]."""
+"""Range of a velocity below which an axis does not respond [m/s, rad/s]."""
 
 
 def answers(moved: Motion, i: int) -> bool:
@@ -783,6 +796,7 @@ def answers(moved: Motion, i: int) -> bool:
 
 
 def usual_range(values: Array) -> float:
-    """Return the range from the 2nd to the 98th percentile of the finite values, in their unit; 0 without any."""
+    """Return the range from the 2nd to the 98th percentile of the finite values, in their unit; 0 if there
+    are none."""
     finite = values[np.isfinite(values)]
     return float(np.ptp(np.percentile(finite, [2.0, 98.0]))) if len(finite) else 0.0

@@ -11,37 +11,38 @@ from scipy.special import stdtr
 Array = NDArray[np.float64]
 
 CHANCE = 1e-4
-"""Probability below which a relation is not chance."""
+"""Probability below which a relation is significant."""
 
 
 class Relation(NamedTuple):
-    """Slope of y over x through zero, and how sure it is."""
+    """Slope of y over x through zero, and its significance."""
 
     slope: float
     """Slope in the unit of y over that of x."""
     correlation: float
     """Cosine of the two signals, -1 to 1."""
     chance: float
-    """Probability that signals without a relation give a slope of this sign and size."""
+    """Probability that unrelated signals yield a slope of this sign and size."""
 
     @property
     def sure(self) -> bool:
-        """Return whether the slope is not chance."""
+        """Return whether the slope is significant."""
         return self.chance < CHANCE
 
 
 def relation(x: ArrayLike, y: ArrayLike, *, nuisances: ArrayLike | None = None) -> Relation:
-    """Return how a signal depends on another, with a significance that allows for errors correlated in time.
+    """Return the dependence of a signal on another, with a significance that accounts for errors correlated in time.
 
-    y = b x + e has the standard error σ_e / |x| times the root of 1 + 2 Σ ρ_x(k) ρ_e(k), the sum over all lags of the
-    products of both autocorrelations (Bartlett 1935): as many samples count as are independent of one another. A single
-    push counts if what it leaves unexplained is short or small; noise of a strong smoother counts as the few values
-    that it consists of.
+    y = b x + e has the standard error σ_e / |x| times the root of 1 + 2 Σ ρ_x(k) ρ_e(k), the sum over all
+    lags of the products of both autocorrelations (Bartlett 1935): the number of independent samples counts. A
+    single push is significant if its residual is short or small; the output of a strong smoother counts as
+    the few independent values that it consists of.
 
     Args:
-        x: Evenly sampled, in any unit; NaN where it must not count, (n,).
-        y: The same of the other signal, in any unit, (n,).
-        nuisances: Signals of any unit whose part in x and y is removed first, for instance ones for a constant, (n, k).
+        x: Evenly sampled values, in any unit; NaN to exclude a sample, (n,).
+        y: The other signal at the same times, in any unit, (n,).
+        nuisances: Signals of any unit whose contribution to x and y is removed first, for instance ones for a
+            constant, (n, k).
     """
     x, y = np.array(x, float), np.array(y, float)
     known = np.isfinite(x) & np.isfinite(y)
@@ -69,7 +70,7 @@ def relation(x: ArrayLike, y: ArrayLike, *, nuisances: ArrayLike | None = None) 
 
 
 def _autocorrelation(x: Array) -> Array:
-    """Return the autocorrelation at the lags from 0 on, (n,)."""
+    """Return the autocorrelation at non-negative lags, (n,)."""
     n = len(x)
     spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
     return np.asarray(np.fft.irfft(spectrum, 2 * n)[:n] / (x @ x))

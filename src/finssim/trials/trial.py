@@ -1,4 +1,4 @@
-"""One trial: what was commanded and measured while a vehicle moved, in canonical columns."""
+"""Trial: commands and measurements of a moving vehicle, in canonical columns."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class _Section(Part):
 
 
 class TrialWater(_Section):
-    """The water of the trial, where it differs from the vehicle file's."""
+    """Water of the trial, if it differs from that of the vehicle file."""
 
     density: float | None = Field(default=None, gt=0.0)
-    """[kg/m³]"""
+    """Density [kg/m³]."""
     depth: float | None = Field(default=None, gt=0.0)
     """Depth of the pool [m]."""
     current: Point | None = None
-    """World frame [m/s]."""
+    """Current in the world frame [m/s]."""
 
 
 class Header(_Section):
@@ -63,40 +63,40 @@ class Header(_Section):
     vehicle: str | None = None
     """Name or file of the vehicle."""
     axis: tuple[Axis, ...] = ()
-    """Axes that the trial excites; found from the data where empty."""
+    """Axes that the trial excites; detected from the data if empty."""
     role: Literal["fit", "held-out"] | None = None
     """Role of the trial in a fit; a fit refuses held-out trials."""
     description: str = ""
     inputs: Literal["applied", "commanded"] | None = None
-    """Kind of the input columns: what acted (measured, reconstructed) or what was commanded, before delay and lag.
-    `None`: `rpm_*`, `force_*` and `tau_*` acted, `pwm_*` and `command_*` were commanded."""
+    """Kind of the input columns: applied (measured, reconstructed) or commanded, before delay and lag. If
+    `None`, `rpm_*`, `force_*` and `tau_*` were applied, `pwm_*` and `command_*` were commanded."""
     inputs_between: Literal["held", "linear"] | None = None
-    """Inputs between two samples. `None`: commands are held, and so are inputs that keep exact levels and jump from row
-    to row; anything else that acted is linear."""
+    """Inputs between two samples. If `None`, commands are held, and so are inputs that keep exact levels and
+    jump from row to row; other applied inputs are linear."""
     inputs_after: Literal["held", "zero", "unknown"] | None = None
-    """Inputs after the end of an input stream within the recording. `None`: a last command of no thrust is held, any
-    other is unknown from one sample later on."""
+    """Inputs after the end of an input stream within the recording. If `None`, a zero last command is held,
+    any other is unknown from one sample interval later on."""
     passive: bool = False
-    """Thrusters off: no input columns are needed."""
+    """True if the thrusters were off: no input columns are needed."""
     wrench_at: Annotated[
         tuple[float, float, float] | Literal["center_of_gravity", "origin"] | None,
         BeforeValidator(_moment_point),
     ] = None
-    """Body point about which tau_k, tau_m, tau_n are moments [m]; the vehicle's `wrench_reference` where not given."""
+    """Body point that is the reference of tau_k, tau_m, tau_n [m]; the vehicle's `wrench_reference` if None."""
     velocity_at: Point = (0.0, 0.0, 0.0)
-    """Body point whose velocity u, v, w are [m]."""
+    """Body point to which the velocity u, v, w refers [m]."""
     position_at: Point = (0.0, 0.0, 0.0)
-    """Body point whose position x, y, z are [m]."""
+    """Body point to which the position x, y, z refers [m]."""
     acceleration_at: Point | None = None
-    """Body point of the accelerometer [m], for the record: no check or fit needs it."""
+    """Body point of the accelerometer [m], for documentation only: no check or fit uses it."""
     depth_at: Point | None = None
-    """Body point of the pressure sensor [m]; the vehicle's depth sensor where not given."""
+    """Body point of the pressure sensor [m]; the vehicle's depth sensor if None."""
     acceleration: Literal["specific_force", "kinematic", "auto"] = "auto"
-    """Kind of ax, ay, az: with gravity (an accelerometer: +9.81 up at rest) or without; `auto` finds it."""
+    """Kind of ax, ay, az: with gravity (an accelerometer: +9.81 up at rest) or without; `auto` detects it."""
     velocity: Literal["ground", "water"] = "ground"
-    """Reference of u, v, w."""
+    """Reference of u, v, w: ground or water."""
     voltage: float | None = Field(default=None, gt=0.0)
-    """Voltage of the battery [V], for pulse widths; a column `voltage` has priority."""
+    """Battery voltage [V], for pulse widths; a column `voltage` has priority."""
     water: TrialWater = Field(default_factory=TrialWater)
 
     @model_validator(mode="before")
@@ -108,7 +108,8 @@ class Header(_Section):
         return data
 
     def meaning(self) -> dict[str, Any]:
-        """The parts that change what the numbers mean, as plain values: all but description, role and vehicle."""
+        """Return the fields that affect the meaning of the numbers, as plain values: all but description,
+        role and vehicle."""
         return self.model_dump(mode="json", exclude={"description", "role", "vehicle", "axis"})
 
 
@@ -116,7 +117,7 @@ class Header(_Section):
 
 
 class Column(NamedTuple):
-    """One canonical column; the page on trials gives its meaning."""
+    """Canonical column; the page on trials defines its meaning."""
 
     group: str
     """Columns of one group come from one sensor: command velocity rates acceleration attitude position depth."""
@@ -127,7 +128,7 @@ TAU = ("tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n")
 """Wrench, body frame; moments about the header's `wrench_at`."""
 
 NU = ("u", "v", "w", "p", "q", "r")
-"""nu, body frame."""
+"""Velocity nu, body frame."""
 
 COLUMNS = {
     name: Column(group, unit)
@@ -157,11 +158,11 @@ INPUT_PREFIXES = {
         ("actuator_", "-"),
     )
 }
-"""Columns named PREFIX + name of the thruster, or of another actuator."""
+"""Prefixes of columns named PREFIX + name of a thruster or another actuator."""
 
 
 def column_of(name: str) -> Column | None:
-    """The canonical column of that name, or None."""
+    """Return the canonical column of that name, or None."""
     if name in COLUMNS:
         return COLUMNS[name]
     for prefix, column in INPUT_PREFIXES.items():
@@ -171,33 +172,33 @@ def column_of(name: str) -> Column | None:
 
 
 PHASES = ("baseline", "excitation", "coast", "rest")
-"""Words of the `phase` column; an empty word is none of them."""
+"""Words of the `phase` column; an empty word means no phase."""
 
 SLOWEST = 2.0
-"""Between the rows of a trial, usually: no motion can be learnt of what is seldomer [s]."""
+"""Largest median interval between the rows of a trial: slower data do not resolve the motion [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Measurements over one time base; streams of other rates leave NaN where they have no sample.
+    """Measurements on one time base; streams with other rates have NaN where they have no sample.
 
-    Frames and units are those of `finssim.trials.trial`.
+    Frames and units are defined in `finssim.trials.trial`.
     """
 
     name: str
-    """Unique among the trials used together; the folder's name."""
+    """Name, unique among the trials that are used together; the folder's name."""
     t: Array
     """Times [s], strictly increasing, (n,)."""
     channels: dict[str, Array] = field(default_factory=dict)
     """Canonical column -> values in the unit of `COLUMNS`, NaN where there is no sample, (n,) each."""
     phase: NDArray[np.str_] | None = None
-    """A word of `PHASES` or "" for every row, (n,); None where the log names no phases."""
+    """Word of `PHASES` or "" for every row, (n,); None if the log has no phases."""
     header: Header = field(default_factory=Header)
     """Content of `trial.yaml`."""
     findings: tuple[Finding, ...] = ()
-    """Repairs, and data that was left out while reading."""
+    """Repairs, and data that was omitted on reading."""
     path: Path | None = None
-    """Folder or file it was read from."""
+    """Folder or file that the trial was read from."""
 
     def __post_init__(self) -> None:
         t = self.t
@@ -217,7 +218,7 @@ class Trial:
                 )
         if self.phase is not None and (self.phase.shape != t.shape or not set(self.phase) <= {*PHASES, ""}):
             raise CalibrationError(
-                f"{self.name}: phase must hold {len(t)} words of {', '.join(PHASES)}, or empty ones"
+                f"{self.name}: phase must contain {len(t)} words of {', '.join(PHASES)}, or empty ones"
             )
 
     @classmethod
@@ -233,36 +234,36 @@ class Trial:
         surface_pressure: float | None = None,
         **header: Any,
     ) -> Trial:
-        """Return the trial that a table in memory holds; columns that are not used are named in its findings.
+        """Return the trial in a table in memory; unused columns are listed in its findings.
 
         Args:
-            frame: A pandas DataFrame, or a mapping of names to columns of one length. A DataFrame whose index holds the
-                times needs no time column.
-            columns: Column of a trial -> name of the column in `frame`; the columns that have the names of a trial's
-                columns if None.
-            units: Column of a trial, or `t` for the times -> its unit in `frame`, where that is not the trial's own
-                unit; `date` for written dates and for pandas timestamps.
+            frame: A pandas DataFrame, or a mapping of names to columns of equal length. A DataFrame with a
+                time index needs no time column.
+            columns: Column of a trial -> name of the column in `frame`; if None, the columns with names of a
+                trial's columns.
+            units: Column of a trial, or `t` for the times -> its unit in `frame`, if it differs from that of
+                the trial; `date` for written dates and for pandas timestamps.
             time: Name of the column of times.
             axes: Axes of the table: FLU (x forward, y left, z up) or FRD (x forward, y right, z down, and a world with
                 z down).
             name: Name of the trial.
-            surface_pressure: What the sensor of a column `pressure` reads at the surface [Pa], 0 for a gauge; a
-                standard atmosphere if None, which is noted in the findings.
-            header: Further keys of `trial.yaml`, such as `vehicle`, `voltage` or `role`.
+            surface_pressure: Reading of the sensor of a column `pressure` at the surface [Pa], 0 for a gauge
+                sensor; a standard atmosphere if None, which is noted in the findings.
+            header: Additional keys of `trial.yaml`, such as `vehicle`, `voltage` or `role`.
 
         Raises:
-            CalibrationError: A column, unit or key that is not known, no times, or no usable column.
+            CalibrationError: A column, unit or key is unknown, or there are no times or no usable columns.
         """
         from finssim.trials.importers.frame import trial_from_frame
 
         return trial_from_frame(frame, columns, units, time, axes, name, surface_pressure, header)
 
     def has(self, *columns: str) -> bool:
-        """Return whether every one of these columns holds at least two finite samples."""
+        """Return whether all of these columns contain at least two finite samples."""
         return all(c in self.channels and np.isfinite(self.channels[c]).sum() >= 2 for c in columns)
 
     def series(self, column: str) -> tuple[Array, Array]:
-        """Times [s] and values of the finite samples of a column, (k,) each; empty where there are none."""
+        """Return times [s] and values of the finite samples of a column, (k,) each; empty if there are none."""
         values = self.channels.get(column)
         if values is None:
             return np.empty(0), np.empty(0)
@@ -289,9 +290,9 @@ class Trial:
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of the numbers, the phases and the parts of the header that change their meaning.
+        """Digest of the numbers, the phases and the header fields that affect their meaning.
 
-        It does not depend on the trial's name, its place, its file format or its role.
+        It does not depend on the trial's name, location, file format or role.
         """
         digest = hashlib.sha256(np.ascontiguousarray(self.t).tobytes())
         for column in sorted(self.channels):

@@ -37,19 +37,19 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MAX_RAGGED = 0.1
-"""Part of the rows that may have a wrong number of cells; a file with more of them is no table."""
+"""Fraction of the rows that may have a wrong number of cells; a file with more of them is not a table."""
 
 
 @dataclass
 class ColumnTable:
-    """Columns of one file, all of one length."""
+    """Columns of one file, all of equal length."""
 
     numbers: dict[str, Array] = field(default_factory=dict)
-    """Column -> values in any unit, NaN for empty cells and cells that hold no number."""
+    """Column -> values in any unit, NaN for empty cells and cells without a number."""
     words: dict[str, list[str]] = field(default_factory=dict)
     """Column -> text, for columns in which no cell is a number (and for `phase`)."""
     findings: list[Finding] = field(default_factory=list)
-    """Repairs, and data that was left out."""
+    """Repairs, and data that was omitted."""
 
     @property
     def columns(self) -> list[str]:
@@ -60,19 +60,19 @@ class ColumnTable:
 def read_table(
     path: Path, *, skip: int = 0, names: Sequence[str] | None = None, spaces: bool = False
 ) -> ColumnTable:
-    """The columns of a `.csv` (`.txt`, `.tsv`) or `.parquet` file.
+    """Return the columns of a `.csv` (`.txt`, `.tsv`) or `.parquet` file.
 
-    A CSV file needs a line of column names; cells may be separated by commas, semicolons or tabs, lines that begin
-    with # are comments. A file that a crash cut short opens up to the cut.
+    A CSV file needs a header line; cells may be separated by commas, semicolons or tabs, and lines that begin
+    with # are comments. A file truncated by a crash is read up to its end.
 
     Args:
         path: The file.
-        skip: Lines of a text before its table.
-        names: Of the columns of a text that has no line of names.
-        spaces: Whether blanks separate the cells of a text.
+        skip: Number of lines before the table in a text file.
+        names: Names of the columns of a text file without a header line.
+        spaces: True if blanks separate the cells of a text file.
 
     Raises:
-        CalibrationError: Unreadable, empty, without column names, or no table.
+        CalibrationError: The file is unreadable, empty, without column names, or not a table.
     """
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path)
@@ -80,12 +80,13 @@ def read_table(
 
 
 def write_table(path: Path, numbers: dict[str, Array], phase: NDArray[np.str_] | None = None) -> None:
-    """Write columns as CSV or Parquet, by the path's suffix; every number reads back bit for bit, NaN as an empty cell.
+    """Write columns as CSV or Parquet, by the path's suffix; numbers are read back bitwise equal, NaN is an
+    empty cell.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         numbers: Column -> values in any unit, (n,) each.
-        phase: A word for each row, (n,); no such column if None.
+        phase: Phase of each row, (n,); the column is omitted if None.
     """
     if path.suffix == ".parquet":
         import pyarrow.parquet
@@ -136,7 +137,7 @@ def _check_names(names: list[str], path: Path) -> None:
         raise CalibrationError(f"{path}: no line of column names: expected a CSV file that begins with t,...")
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise CalibrationError(f"{path}: column '{twice[0]}' is there twice: rename or remove one")
+        raise CalibrationError(f"{path}: column '{twice[0]}' occurs twice: rename or remove one")
     try:
         [float(name) for name in names]
     except ValueError:
@@ -152,14 +153,14 @@ def _report_ragged(
     elif len(ragged) > max(1.0, MAX_RAGGED * count):
         raise CalibrationError(
             f"{path}: {len(ragged)} of {count} rows do not have {width} cells, one for each column name "
-            f"(first: row {ragged[0]}): is one table in it, with one separator?"
+            f"(first: row {ragged[0]}): does it contain exactly one table, with one separator?"
         )
     elif ragged:
         table.findings.append(finding("ragged_rows", rows=len(ragged), expected=width, first=ragged[0]))
 
 
 def _keep(table: ColumnTable, name: str, column: list[Any]) -> None:
-    """File a column under numbers or words."""
+    """Store a column under numbers or words."""
     if not name:
         return
     text_rows = [i for i, cell in enumerate(column) if isinstance(cell, str)]
@@ -212,25 +213,26 @@ def _read_parquet(path: Path) -> ColumnTable:
     return table
 
 
-# From the columns of a table to a trial.
+# Conversion of a table's columns to a trial.
 
-# Samples that a log repeats: a stream of 10 Hz written into every row of a table of 50 Hz is still one of 10 Hz.
+# Repeated samples in a log: a 10 Hz stream written to every row of a 50 Hz table is still a 10 Hz stream.
 
 FEWEST = 10
-"""Runs of equal rows that it takes to call a stream repeated."""
+"""Least number of runs of equal rows of a repeated stream."""
 
 LEAST = 0.2
-"""Part of the rows that are repeats; fewer do no harm."""
+"""Least fraction of repeated rows; fewer are harmless."""
 
 REGULAR = 0.9
-"""Part of the runs that may not be much longer than the usual one: clocks repeat regularly, resting sensors do not."""
+"""Fraction of the runs that may not be much longer than the median: clocks repeat regularly, resting sensors
+do not."""
 
 
 def without_repeats(channels: dict[str, Array]) -> list[Finding]:
-    """Turn the repeated samples of measured streams into empty ones, in place; findings on what was found.
+    """Clear the repeated samples of measured streams, in place; return findings.
 
-    Left in, they would count as measurements of their own, and their steps as motion. Inputs are left alone: a command
-    that stays is a command.
+    Otherwise they would count as independent measurements, and their steps as motion. Inputs are not changed:
+    a constant command is a command.
     """
     groups: dict[str, list[str]] = {}
     for name in channels:
@@ -250,9 +252,9 @@ def without_repeats(channels: dict[str, Array]) -> list[Finding]:
 
 
 def new_samples(values: Array) -> NDArray[np.bool_]:
-    """Return which rows are new, (n, c) -> (n,); all if the rows do not repeat in a regular way.
+    """Return a mask of the new rows, (n, c) -> (n,); all rows if they do not repeat regularly.
 
-    Long runs are taken for rest: in them a row counts as new every usual run.
+    Long runs are assumed to be rest: within them, one row per median run counts as new.
     """
     n = len(values)
     everything = np.ones(n, bool)
@@ -272,27 +274,28 @@ def new_samples(values: Array) -> NDArray[np.bool_]:
 
 
 def _coarse(changes: Array) -> bool:
-    """Return whether most changes are of one size: the last digit of a sensor, which repeats for another reason."""
+    """Return whether most changes have the same size: the resolution of a sensor, which repeats values for
+    another reason."""
     steps = np.abs(np.diff(changes))
     steps = steps[steps > 0.0]
     return len(steps) > 0 and float(np.mean(steps < 1.001 * steps.min())) > 0.5
 
 
 EPOCH = 1.0e8
-"""Times later than this count from 1970 [s]; no vehicle has been on for three years."""
+"""Time above which times count from 1970 [s]; it exceeds three years of operation."""
 
 
 def trial_from_table(name: str, table: ColumnTable, header: Header, path: Path | None = None) -> Trial:
-    """A trial from the columns of a table, in order of time, each repair a finding.
+    """Return a trial from the columns of a table, sorted by time; each repair is a finding.
 
     Args:
-        name: Of the trial.
-        table: Columns as written, in SI and our frames.
-        header: What they mean.
-        path: Where the table was read.
+        name: Name of the trial.
+        table: Columns as written, in SI and FinsSim's frames.
+        header: Content of `trial.yaml`.
+        path: File or folder of the table.
 
     Raises:
-        CalibrationError: No time, fewer than two rows, or no usable column.
+        CalibrationError: There is no time column, fewer than two rows, or no usable column.
     """
     findings, numbers, texts = list(table.findings), dict(table.numbers), dict(table.words)
     if "t" not in table.columns:
@@ -313,7 +316,7 @@ def trial_from_table(name: str, table: ColumnTable, header: Header, path: Path |
         findings.append(finding("upside_down"))
     if not any(np.isfinite(values).sum() >= 2 for values in channels.values()):
         raise CalibrationError(
-            f"no usable column beside t: expected some of {', '.join(COLUMNS)}, "
+            f"no usable column besides t: expected some of {', '.join(COLUMNS)}, "
             f"{', '.join(f'{p}NAME' for p in INPUT_PREFIXES)} with numbers in them; "
             f"found {', '.join(table.columns[:12])}"
         )
@@ -331,13 +334,13 @@ def _no_time(columns: list[str]) -> str:
 
 
 def _seconds(numbers: Array | None, texts: list[str] | None, findings: list[Finding]) -> Array:
-    """Times in s from numbers or dates; those that count from 1970 begin at 0."""
+    """Return times in s from numbers or dates; those that count from 1970 are shifted to start at 0."""
     if numbers is None:
         try:
             dates = np.array([w.removesuffix("Z") or "NaT" for w in texts or []], dtype="datetime64[ns]")
         except ValueError:
             raise CalibrationError(
-                f"t holds '{(texts or [''])[0]}', expected seconds or dates like 2024-05-01T12:00:00.25"
+                f"t contains '{(texts or [''])[0]}', expected seconds or dates like 2024-05-01T12:00:00.25"
             ) from None
         valid = dates[~np.isnat(dates)]
         start = valid[0] if len(valid) else np.datetime64("NaT", "ns")
@@ -362,7 +365,7 @@ def _phases(texts: list[str] | None, findings: list[Finding]) -> NDArray[np.str_
 
 
 def _canonical(numbers: dict[str, Array], texts: list[str], findings: list[Finding]) -> dict[str, Array]:
-    """The columns of a trial among those of the log."""
+    """Return the columns of the log that are columns of a trial."""
     channels = {column: values for column, values in numbers.items() if column_of(column)}
     for column in texts:
         if column_of(column):
@@ -379,7 +382,7 @@ def _canonical(numbers: dict[str, Array], texts: list[str], findings: list[Findi
 def _in_order(
     t: Array, channels: dict[str, Array], phase: NDArray[np.str_] | None, findings: list[Finding]
 ) -> tuple[Array, dict[str, Array], NDArray[np.str_] | None]:
-    """Rows with strictly increasing times."""
+    """Return the rows with strictly increasing times."""
     timed = np.isfinite(t)
     if not timed.all():
         findings.append(finding("rows_untimed", rows=(~timed).sum()))
@@ -401,10 +404,10 @@ def _in_order(
 
 
 def read_header(path: Path) -> Header:
-    """The header in a `trial.yaml`; an empty file is an empty header.
+    """Return the header in a `trial.yaml`; an empty file is an empty header.
 
     Raises:
-        CalibrationError: Unreadable, or a key or value that is refused; one sentence per key.
+        CalibrationError: The file is unreadable, or a key or value is invalid; one sentence per key.
     """
     if path.is_file() and path.stat().st_size < 65536 and not _content(path):
         return Header()
@@ -432,11 +435,11 @@ def load_trial(path: str | os.PathLike[str]) -> Trial:
     """Read one trial.
 
     Args:
-        path: A folder with `data.csv` or `data.parquet` and, if it has one, `trial.yaml`; or a table alone.
+        path: A folder with `data.csv` or `data.parquet` and optionally `trial.yaml`; or a single table.
 
     Raises:
-        CalibrationError: There is no trial, or one that cannot be used; the message says where and why. What could be
-            repaired is told in the trial's `findings` instead.
+        CalibrationError: There is no trial, or it cannot be used; the message states location and reason.
+            Repairs are reported in the trial's `findings` instead.
     """
     path = Path(path)
     name, data, header_path = _locate(path)
@@ -452,10 +455,10 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
     """Read several trials under unique names, in the order given.
 
     Args:
-        paths: Each a trial, or a folder that holds trials.
+        paths: Paths of trials, or of folders that contain trials.
 
     Raises:
-        CalibrationError: One cannot be used, there are none, or one is there twice.
+        CalibrationError: A trial cannot be used, there are no trials, or one is given twice.
     """
     locations = [trial for path in paths for trial in trials_at(Path(path))]
     trials = [load_trial(path) for path in locations]
@@ -464,12 +467,12 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
         first = first_paths.setdefault(trial.sha256, path)
         if first is not path:
             raise CalibrationError(
-                f"{path}: holds the same numbers as {first}: a trial given twice would count as two measurements; "
-                "leave one out"
+                f"{path}: contains the same numbers as {first}: a trial given twice would count as two measurements; "
+                "omit one of them"
             )
     if not trials:
         raise CalibrationError(
-            "no trial given: give folders that hold data.csv or data.parquet, or such files"
+            "no trial given: give folders that contain data.csv or data.parquet, or such files"
         )
     names = _unique_names(trials, locations)
     return [
@@ -479,11 +482,11 @@ def load_trials(paths: Iterable[str | os.PathLike[str]]) -> list[Trial]:
 
 
 ABOVE = 3
-"""Folders, from the trial's own upwards, in which a vehicle file is looked for that is not where it was."""
+"""Number of folders, from the trial's own upwards, in which a missing vehicle file is searched."""
 
 
 def vehicle_reference(name: str) -> str:
-    """Return how a trial names a vehicle: a name of the catalogue, or the absolute path of a file that exists."""
+    """Return the vehicle reference of a trial: a name of the catalogue, or the absolute path of an existing file."""
     path = Path(name)
     is_file = (path.suffix != "" or path.name != name) and path.is_file()
     return str(path.resolve()) if is_file else name
@@ -492,11 +495,12 @@ def vehicle_reference(name: str) -> str:
 def vehicle_of(trial: Trial) -> Vehicle:
     """Return the vehicle that the header of a trial names.
 
-    A relative path counts from the trial's folder, or else from the working directory. A file that is not there is
-    looked for by its name in the trial's folder and the two above, so that trials and vehicle can be moved together.
+    A relative path is relative to the trial's folder, or otherwise to the working directory. If the file does
+    not exist there, its name is searched in the trial's folder and the two above, so that trials and vehicle
+    can be moved together.
 
     Raises:
-        VehicleError: There is no such vehicle, or its file is refused.
+        VehicleError: There is no such vehicle, or its file is invalid.
     """
     named = str(trial.header.vehicle)
     beside = Path(trial.path or ".") / named
@@ -514,16 +518,16 @@ def vehicle_of(trial: Trial) -> Vehicle:
 def write_trial(
     trial: Trial, folder: str | os.PathLike[str], *, format: Literal["csv", "parquet"] = "csv"
 ) -> None:
-    """Write a trial as a folder of `trial.yaml` and data that reads back with the same `sha256`.
+    """Write a trial as a folder of `trial.yaml` and data, which has the same `sha256` when read.
 
     Args:
-        trial: In canonical columns.
-        folder: New or empty, or an earlier trial of ours, which is replaced.
-        format: Of the data.
+        trial: Trial in canonical columns.
+        folder: New or empty folder, or one with an earlier FinsSim trial, which is replaced.
+        format: Format of the data.
 
     Raises:
-        CalibrationError: An unknown format.
-        OutputError: The folder holds other files, or cannot be written.
+        CalibrationError: The format is unknown.
+        OutputError: The folder contains other files, or cannot be written.
     """
     if format not in ("csv", "parquet"):
         raise CalibrationError(f"format is '{format}', expected csv or parquet")
@@ -532,7 +536,7 @@ def write_trial(
         other = sorted({file.name for file in target.iterdir()} - {HEADER, *DATA})
         if other:
             raise OutputError(
-                f"cannot write {folder}: the directory holds other files ({other[0]}): give a new one"
+                f"cannot write {folder}: the directory contains other files ({other[0]}): give a new one"
             )
     with atomic_directory(target, replaces=HEADER) as temporary:
         header = trial.header.model_dump(mode="json", exclude_defaults=True)
@@ -541,14 +545,14 @@ def write_trial(
 
 
 def _locate(path: Path) -> tuple[str, Path, Path | None]:
-    """Name, data file and header file of the trial at a path."""
+    """Return name, data file and header file of the trial at a path."""
     if path.name in (HEADER, *DATA) and path.is_file():
         path = path.parent
     if path.is_dir():
         data = [path / file for file in DATA if (path / file).is_file()]
         if len(data) != 1:
             holding = "both data.csv and data.parquet" if data else "neither data.csv nor data.parquet"
-            raise CalibrationError(f"{path}: holds {holding}, expected one of them")
+            raise CalibrationError(f"{path}: contains {holding}, expected one of them")
         header = path / HEADER
         return path.resolve().name, data[0], header if header.exists() else None
     if not path.exists():
@@ -557,14 +561,14 @@ def _locate(path: Path) -> tuple[str, Path, Path | None]:
         )
     if path.suffix.lower() not in SUFFIXES:
         raise CalibrationError(
-            f"{path}: is no trial: expected a folder with data.csv or data.parquet, or such a file; "
+            f"{path}: is not a trial: expected a folder with data.csv or data.parquet, or such a file; "
             "other logs are converted by 'finssim trials import'"
         )
     return path.stem, path, None
 
 
 def trials_at(path: Path) -> list[Path]:
-    """The trial at a path, or those in the folder there, in natural order of their names."""
+    """Return the trial at a path, or those in the folder there, in natural order of their names."""
     if not path.is_dir() or any((path / file).is_file() for file in DATA):
         return [path]
     inside = [item for item in path.iterdir() if not item.name.startswith(".")]
@@ -576,7 +580,7 @@ def trials_at(path: Path) -> list[Path]:
     ]
     if not trials:
         raise CalibrationError(
-            f"{path}: holds no trial: expected data.csv or data.parquet in it or in folders of it"
+            f"{path}: contains no trial: expected data.csv or data.parquet in it or in its subfolders"
         )
     return sorted(
         trials, key=lambda item: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", item.name)]
@@ -584,7 +588,7 @@ def trials_at(path: Path) -> list[Path]:
 
 
 def _unique_names(trials: list[Trial], paths: list[Path]) -> list[str]:
-    """Return the names of the trials; equal ones get as many of their parent folders as distinguish them."""
+    """Return the names of the trials; equal names are extended by as many parent folders as needed."""
     names = [trial.name for trial in trials]
     parents = [list(path.resolve().parts[-2::-1]) for path in paths]
     depth = 0

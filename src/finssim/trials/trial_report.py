@@ -1,4 +1,4 @@
-"""Reports of checked trials: as data, between the trials of a set, and as tables for people."""
+"""Reports of trial checks: as data, across the trials of a set, and as printed tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Verdict = Literal["usable", "usable with care", "refused"]
 
 PARAMETERS = ("m_eff", "d1", "d2", "k", "buoyancy")
-"""Parameters that a trial may determine of an axis; k of roll and pitch, buoyancy of heave."""
+"""Parameters of an axis that a trial may identify; k of roll and pitch, buoyancy of heave."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,19 +31,19 @@ class StreamReport:
     group: str
     samples: int
     rate: float
-    """Samples per second while there are any [Hz]."""
+    """Sampling rate outside gaps [Hz]."""
     jitter: float
-    """Standard deviation of the time between samples, gaps aside, as a share of its mean."""
+    """Standard deviation of the interval between samples, without gaps, as a fraction of its mean."""
     gaps: int
     longest_gap: float
-    """[s]"""
+    """Longest gap [s]."""
     missing: float
-    """Part of the trial's time without this stream."""
+    """Fraction of the trial's duration without this stream."""
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Result for one parameter: whether a trial determines it, and why."""
+    """Identifiability of one parameter in a trial, with the reason."""
 
     can: bool
     why: str
@@ -51,11 +51,11 @@ class Identifiability:
 
 @dataclass(frozen=True, kw_only=True)
 class AxisReport:
-    """Excitation of one axis and what follows from it."""
+    """Excitation of one axis and the identifiability that results."""
 
     axis: str
     source: str
-    """Source of the velocity: measured, derived from ..., or nothing."""
+    """Source of the velocity: measured, derived from ..., or empty."""
     fastest: float = np.nan
     """95th percentile of the speed [m/s, rad/s]."""
     noise: float = np.nan
@@ -65,14 +65,14 @@ class AxisReport:
     strongest: float = 0.0
     """95th percentile of the wrench [N, N m]."""
     work: float = 0.0
-    """Done by the inputs along this axis [J]; of a passive trial 0."""
+    """Work of the inputs along this axis [J]; 0 for a passive trial."""
     both_directions: bool = False
     driven: float = 0.0
-    """Time of input [s]."""
+    """Duration of input [s]."""
     coasts: float = 0.0
-    """Time of motion without input [s]."""
+    """Duration of motion without input [s]."""
     rests: float = 0.0
-    """Time without input and motion [s]."""
+    """Duration without input and motion [s]."""
     excited: bool = False
     tells: dict[str, Identifiability] = field(default_factory=dict)
     """Identifiability by parameter."""
@@ -80,16 +80,16 @@ class AxisReport:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialReport:
-    """One trial."""
+    """Report of one trial."""
 
     name: str
     vehicle: str | None = None
     role: str | None = None
     duration: float = 0.0
-    """[s]"""
+    """Duration [s]."""
     rows: int = 0
     inputs: str = ""
-    """Kind of input: rpm, force, tau, pwm, command, passive, or nothing."""
+    """Kind of input: rpm, force, tau, pwm, command, passive, or empty."""
     streams: tuple[StreamReport, ...] = ()
     axes: tuple[AxisReport, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -102,18 +102,18 @@ class TrialReport:
         return "refused" if "refused" in levels else "usable with care" if "care" in levels else "usable"
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; numbers that are not finite become None."""
+        """Return plain values; non-finite numbers become None."""
         record = {key: value for key, value in asdict(self).items() if key != "axes"}
         record |= {"verdict": self.verdict, "findings": [entry.as_json() for entry in self.findings]}
         axes = {axis.axis: {k: v for k, v in asdict(axis).items() if k != "axis"} for axis in self.axes}
         return {**plain(record), "axes": plain(axes)}
 
 
-# Checks between the trials of a set: vehicles, roles, names, and what they determine together.
+# Checks across the trials of a set: vehicles, roles, names, and joint identifiability.
 
 
 def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> list[str]:
-    """Return the names of the trials that determine a parameter of an axis; held-out and refused ones do not count."""
+    """Return the names of the trials that identify a parameter of an axis, without held-out and refused trials."""
     return [
         report.name
         for report in reports
@@ -124,7 +124,7 @@ def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> 
 
 
 def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
-    """Findings about the set."""
+    """Return findings about the set."""
     findings = []
     vehicles = {report.vehicle for report in reports if report.vehicle}
     if len(vehicles) > 1:
@@ -151,26 +151,26 @@ def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
     return findings
 
 
-# Reports of checked trials as tables for people, readable at a hundred columns.
+# Printed reports of trial checks, for a terminal of 100 columns.
 
 COLOURS = {"usable": "green", "usable with care": "yellow", "refused": "red"}
 MARKS = {"refused": "[red]✗[/red]", "care": "[yellow]![/yellow]", "note": "[dim]·[/dim]"}
 MANY = 4
-"""More trials than this are printed without the tables of each."""
+"""Largest number of trials for which the tables of each trial are printed."""
 
 
 def print_reports(reports: Sequence[TrialReport], console: Console, common: Sequence[Finding] = ()) -> None:
-    """Print what was found.
+    """Print the reports of checked trials.
 
     Args:
-        reports: By trial.
-        console: Where to.
-        common: Findings about all of them together.
+        reports: Reports by trial.
+        console: Console to print on.
+        common: Findings about all trials together.
     """
     for report in reports:
         _print_trial(report, console, brief=len(reports) > MANY)
     if len(reports) > 1:
-        table = _table(("axis", *PARAMETERS), ("axis",), "trials that determine a parameter")
+        table = _table(("axis", *PARAMETERS), ("axis",), "trials that identify a parameter")
         for axis in AXES:
             counts = [len(identified_by(reports, axis, parameter)) for parameter in PARAMETERS]
             table.add_row(axis, *(str(count) if count else "[dim]-[/dim]" for count in counts))
@@ -215,7 +215,7 @@ def _print_trial(report: TrialReport, console: Console, *, brief: bool) -> None:
 
 
 def _table(heads: Sequence[str], left_aligned: Sequence[str], title: str | None = None) -> Table:
-    """An empty table of columns, some of them to the left."""
+    """Return an empty table with columns, some of them left-aligned."""
     table = Table(
         box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title=title, title_justify="left"
     )
@@ -241,8 +241,8 @@ def _axes(axes: Sequence[AxisReport]) -> Table:
 
 
 def _identifiability_table(axes: Sequence[AxisReport]) -> Table:
-    """Return a table of what each axis determines, and the reasons for the rest; reasons that several share are listed
-    once."""
+    """Return a table of the parameters that each axis identifies, and the reasons for the others; shared
+    reasons are listed once."""
     grid = Table.grid(padding=(0, 1))
     for a in axes:
         by_reason: dict[tuple[bool, str], list[str]] = {}

@@ -369,7 +369,7 @@ def test_rotors_of_px4_are_compared_with_the_vehicle_or_offered(tmp_path):
     pytest.importorskip("pyulog")
     path = ulog(tmp_path / "a.ulg", parameters=rotors(move=0.1))
     found = {item.code: str(item) for item in one(path, vehicle="bluerov2_heavy").findings}
-    assert "place T1 0.1 m from where bluerov2_heavy has it" in found["rotors_apart"]
+    assert "place T1 0.1 m from its position in bluerov2_heavy" in found["rotors_apart"]
     stated = {item.code: str(item) for item in one(path, vehicle=None).findings}["rotors_stated"]
     lines = yaml.safe_load("{" + stated.partition("gravity: ")[2].partition("; these")[0] + "}")
     vehicle = load_vehicle("bluerov2_heavy")
@@ -411,7 +411,7 @@ def test_a_px4_log_without_motion_is_refused(tmp_path):
     (tmp_path / "endless.ulg").write_bytes(
         b"ULog\x01\x12\x35\x01" + bytes(8) + about + b"\x2c\x01\0" + bytes(97)
     )
-    with pytest.raises(CalibrationError, match="is damaged, and no part of it can be read"):
+    with pytest.raises(CalibrationError, match="is damaged and cannot be read"):
         read_trials([tmp_path / "endless.ulg"])
 
 
@@ -423,7 +423,9 @@ def test_formats_are_recognised_by_content(tmp_path):
     (tmp_path / "b.txt").write_text(json.dumps(report(0, "1")))
     assert importer_of(tmp_path / "b.txt") == "waterlinked"
     (tmp_path / "c.xyz").write_text("?")
-    with pytest.raises(CalibrationError, match=r"unknown kind of log, expected one of .*PX4.*give --format"):
+    with pytest.raises(
+        CalibrationError, match=r"unknown format of the log, expected one of .*PX4.*give --format"
+    ):
         read_trials([tmp_path / "c.xyz"])
     with pytest.raises(CalibrationError, match="format is 'ulg', expected one of auto, "):
         read_trials([tmp_path / "c.xyz"], format="ulg")

@@ -159,11 +159,11 @@ def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, mode):
     "text, sentence",
     [
         ("/odometry: {}", "no topic '/odometry', did you mean '/odom'?"),
-        ("/array: {}", "no columns are usual"),
+        ("/array: {}", "has no default columns"),
         ("/odom: {columns: {u: twist.linear.x}}", "no field 'linear' of 'twist.linear.x'"),
-        ("/odom: {columns: {u: twist.twist.linear}}", "expected a number: it holds x, y, z"),
+        ("/odom: {columns: {u: twist.twist.linear}}", "expected a number: it contains x, y, z"),
         ("/array: {columns: {rpm_T1: 'data[7]'}}", "has no element 7"),
-        ("/motors: {columns: {rpm_T9: 'speed[T9]'}}", "the message names T1, T2"),
+        ("/motors: {columns: {rpm_T9: 'speed[T9]'}}", "the message contains T1, T2"),
         ("/array: {columns: {x: 'data[0]'}, phase: 'data'}", "field 'data' is a ndarray"),
     ],
 )

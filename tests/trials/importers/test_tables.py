@@ -252,7 +252,7 @@ def test_roles_of_single_trials(folder, tmp_path):
             "time: t\ncolumns: {u: vel_y}",
             "no column 'vel_y', did you mean 'vel_x'? its columns are t, vel_x, name",
         ),
-        ("time: t\ncolumns: {u: name}", "column 'name' holds no numbers, for instance 'x'"),
+        ("time: t\ncolumns: {u: name}", "column 'name' contains no numbers, for instance 'x'"),
         ("time: when\ncolumns: {u: vel_x}", "no column 'when'"),
         ("columns: {u: vel_x}", "no time: give 'time: COLUMN'"),
         ("time: t\ncolums: {u: vel_x}", "unknown key 'colums', did you mean 'columns'?"),

@@ -1,4 +1,4 @@
-"""Foreign logs to trial folders: one file for each format."""
+"""Importers of logs from other programs to trial folders: one file per format."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,5 @@
-"""ArduSub logs as streams: pulses or axes, attitude, inertial measurements, depth, velocity, battery, arming."""
+"""Importer of ArduSub logs as streams: pulses or axes, attitude, inertial measurements, depth, velocity,
+battery, arming."""
 
 from __future__ import annotations
 
@@ -40,10 +41,10 @@ AUTOPILOT = 1
 """MAVLink component of the autopilot."""
 
 NO_AUTOPILOT = 8
-"""MAV_AUTOPILOT_INVALID, in the heartbeats of ground stations and cameras."""
+"""MAV_AUTOPILOT_INVALID, sent in the heartbeats of ground stations and cameras."""
 
 WRONG_CLOCK = 5.0
-"""A stamp farther than this from the time of receipt is of another clock [s]."""
+"""Difference between a stamp and its time of receipt above which the stamp belongs to another clock [s]."""
 
 
 @dataclass(frozen=True)
@@ -52,31 +53,31 @@ class ArduPilotLog:
 
     shown: str
     telemetry: bool
-    """True for a `.tlog` or a recording of BlueOS, which the autopilot did not write."""
+    """True for a `.tlog` or a recording of BlueOS, which was not written by the autopilot."""
     times: dict[str, Array] = field(default_factory=dict)
     """Kind -> times [s], (n,)."""
     messages: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    """Kind -> fields of each message, n of them."""
+    """Kind -> fields of each message, (n,)."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """Parameters of the autopilot in its units, with their latest values."""
+    """Parameters of the autopilot in its units, with their last values."""
     counts: Counter[str] = field(default_factory=Counter)
     """Kind -> number of messages in the log, read or not."""
 
     def has(self, kind: str) -> bool:
-        """Return whether there are at least two such messages."""
+        """Return whether there are at least two messages of a kind."""
         return len(self.messages.get(kind, ())) >= 2
 
     def numbers(self, kind: str, name: str) -> Array:
-        """A field of every message of a kind, NaN where it has none, (n,). It has the unit of the log."""
+        """Return a field of every message of a kind, NaN where it is missing, (n,). It has the unit of the log."""
         return np.array([_number(message.get(name)) for message in self.messages[kind]], dtype=float)
 
     def stream(self, kind: str, channels: dict[str, Array], *findings: Finding) -> Stream:
-        """Columns at the times of a kind of message. Channels have the units of a trial."""
+        """Return columns at the times of a kind of message. Channels have the units of a trial."""
         source = f"{self.shown} {kind}"
         return Stream(source=source, t=self.times[kind], channels=channels, findings=findings)
 
     def some(self, kind: str, name: str, value: int | str) -> ArduPilotLog:
-        """The log with only those messages of a kind whose field has that value; all where none has the field."""
+        """Return the log with only the messages of a kind whose field has a value; with all if none has the field."""
         if not any(name in message for message in self.messages.get(kind, ())):
             return self
         keep = [i for i, message in enumerate(self.messages[kind]) if message.get(name) == value]
@@ -88,15 +89,15 @@ class ArduPilotLog:
 
 
 def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> ArduPilotLog:
-    """The messages of some kinds; a log that was cut short is read up to the cut.
+    """Return the messages of some kinds; a truncated log is read up to its end.
 
     Args:
         path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
-        kinds: Names of messages.
-        received: Whether telemetry is timed by its receipt, not by the stamps of the autopilot.
+        kinds: Names of the kinds of message.
+        received: True to time telemetry by its receipt instead of the autopilot's stamps.
 
     Raises:
-        CalibrationError: No such messages: it is no log, or an empty one.
+        CalibrationError: There are no such messages: the file is not a log, or is empty.
         ModuleNotFoundError: pymavlink is not installed.
     """
     try:
@@ -119,14 +120,14 @@ def read_log(path: Path, kinds: frozenset[str], *, received: bool = False) -> Ar
     log.times.update(clock.times() if log.telemetry else clock.boot_times())
     if not log.messages:
         raise CalibrationError(
-            f"{path}: holds no messages that a trial could use: expected an ArduSub log, .BIN or .tlog, or a .mcap of "
+            f"{path}: contains no usable messages: expected an ArduSub log, .BIN or .tlog, or a .mcap of "
             "BlueOS' recorder or of ROS 2"
         )
     return log
 
 
 class _Clock:
-    """Times of messages: the autopilot's stamps, laid on the times of receipt."""
+    """Clock that aligns the autopilot's stamps with the times of receipt."""
 
     def __init__(self, received: bool) -> None:
         self.received = received
@@ -139,17 +140,17 @@ class _Clock:
     def add(self, kind: str, message: dict[str, Any], receipt: float) -> None:
         stamp = _stamp(message)
         if math.isfinite(stamp) and "VISION" not in kind:
-            if stamp < self.last - 1.0:  # the autopilot started again
+            if stamp < self.last - 1.0:  # the autopilot restarted
                 self.offsets.append(math.inf)
             self.last = stamp
-            # The message with the shortest delay gives the difference of the clocks.
+            # The message with the shortest delay determines the difference between the clocks.
             self.offsets[-1] = min(self.offsets[-1], receipt - stamp)
         self.receipts.setdefault(kind, []).append(receipt)
         self.stamps.setdefault(kind, []).append(stamp)
         self.boots.setdefault(kind, []).append(len(self.offsets) - 1)
 
     def boot_times(self) -> dict[str, Array]:
-        """Stamps as they are, of a log that the autopilot wrote itself."""
+        """Return the unchanged stamps, for a log that the autopilot wrote itself."""
         return {kind: np.array(stamps) for kind, stamps in self.stamps.items()}
 
     def times(self) -> dict[str, Array]:
@@ -163,7 +164,7 @@ class _Clock:
 
 
 def _stamp(message: dict[str, Any]) -> float:
-    """Seconds since the autopilot started; NaN where the message does not say."""
+    """Return the seconds since the autopilot started; NaN if the message contains no stamp."""
     for name, unit in (("TimeUS", 1e-6), ("time_boot_ms", 1e-3), ("time_usec", 1e-6), ("usec", 1e-6)):
         if message.get(name):
             return float(message[name]) * unit
@@ -179,21 +180,21 @@ def _messages(
         return
     from pymavlink import DFReader, mavutil
 
-    complaints = io.StringIO()  # pymavlink prints what it skips at a cut
+    complaints = io.StringIO()  # pymavlink prints the bytes that it skips at a truncation
     with contextlib.redirect_stderr(complaints), contextlib.redirect_stdout(complaints):
         try:
             if dataflash:
                 log = DFReader.DFReader_binary(str(path))
             else:
                 log = mavutil.mavlogfile(str(path), robust_parsing=True)
-        except Exception as error:  # pymavlink raises whatever it stumbles over
+        except Exception as error:  # pymavlink raises any kind of error
             raise CalibrationError(f"{path}: not an ArduPilot log: {error}") from None
         systems: set[int] = set()
         try:
             while True:
                 try:
                     message = log.recv_match(type=sorted(kinds)) if dataflash else log.recv_msg()
-                except Exception:  # the same, at the cut of a log
+                except Exception:  # the same, at the end of a truncated log
                     break
                 if message is None:
                     break
@@ -219,13 +220,13 @@ def _messages(
 
 
 MAVLINK_TOPIC = re.compile(r"mavlink/(\d+)/(\d+)/([A-Z0-9_]+)")
-"""Topic of a recording of BlueOS: system, component and kind of a message."""
+"""Topic in a recording of BlueOS: system, component and kind of a message."""
 
 
 def _recorded(
     path: Path, kinds: frozenset[str], counts: Counter[str]
 ) -> Iterator[tuple[str, dict[str, Any], float]]:
-    """Yield the messages of an MCAP of BlueOS' recorder, which keeps messages of its MAVLink server as JSON."""
+    """Yield the messages of an MCAP file of BlueOS' recorder, which stores messages of its MAVLink server as JSON."""
     from mcap.reader import NonSeekingReader
 
     systems: set[int] = set()
@@ -234,7 +235,7 @@ def _recorded(
         while True:
             try:
                 _, channel, message = next(messages)
-            except Exception:  # at the end, or at the cut of a log in whatever layer reads it
+            except Exception:  # at the end, or at the truncation of a log, raised by any layer of the reader
                 return
             topic = MAVLINK_TOPIC.fullmatch(channel.topic)
             counts[topic[3] if topic else channel.topic] += 1
@@ -249,7 +250,7 @@ def _recorded(
 
 
 def _plain(value: Any) -> Any:
-    """A field as pymavlink has it: numbers for names and sets of flags, text for lists of letters."""
+    """Return a field in pymavlink's form: numbers for names and sets of flags, text for lists of characters."""
     from pymavlink.dialects.v20 import ardupilotmega
 
     if isinstance(value, dict):
@@ -263,13 +264,13 @@ def _plain(value: Any) -> Any:
 
 
 def _of_autopilot(sender: tuple[int, int], kind: str, fields: dict[str, Any], systems: set[int]) -> bool:
-    """Return whether the vehicle's autopilot sent it; position sensors and pilots use the same link.
+    """Return whether the vehicle's autopilot sent a message; position sensors and pilots use the same link.
 
     Args:
         sender: System and component.
-        kind: Of the message.
-        fields: Of the message.
-        systems: Those that an autopilot speaks for; a heartbeat of one is added.
+        kind: Kind of the message.
+        fields: Fields of the message.
+        systems: Systems with an autopilot; the sender of an autopilot's heartbeat is added.
     """
     if kind == "HEARTBEAT":
         if fields.get("autopilot") == NO_AUTOPILOT:
@@ -291,24 +292,26 @@ VELOCITY_KINDS = frozenset(
 )
 
 HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, STANDING_STILL = 2, 8, 16, 128
-"""Flags of the filter's state; the last means that it assumes a constant position, without a measurement of one."""
+"""Flags of the filter's state; the last one means that it assumes a constant position without measuring it."""
 
 ESTIMATES = {
     "XKF1": ("XKF4", "SS", ("VN", "VE", "VD", "PN", "PE", "PD")),
     "NKF1": ("NKF4", "SS", ("VN", "VE", "VD", "PN", "PE", "PD")),
     "LOCAL_POSITION_NED": ("EKF_STATUS_REPORT", "flags", ("vx", "vy", "vz", "x", "y", "z")),
 }
-"""Kind of message -> the one of its filter's state, the field of that, and the fields of velocity and position."""
+"""Kind of message -> kind with the state of its filter, field of that state, and the fields of velocity and
+position."""
 
 LEAST_USABLE = 0.2
-"""Part of the estimates that must rest on a measurement of position or velocity."""
+"""Fraction of the estimates that must be based on a measurement of position or velocity."""
 
 
 def velocity_stream(log: ArduPilotLog, source: Literal["auto", "ekf", "vision", "none"]) -> Stream | None:
-    """Velocity from position deltas if there are any, else velocity and position from the autopilot's estimate.
+    """Return velocity from position deltas if there are any, otherwise velocity and position estimated by the
+    autopilot.
 
-    The estimate is left out where the filter had no measurement of horizontal position or velocity: what it says then
-    is that the vehicle stands still.
+    The estimate is omitted where the filter had no measurement of horizontal position or velocity: it then
+    assumes that the vehicle is stationary.
     """
     if source == "none":
         return None
@@ -320,7 +323,7 @@ def velocity_stream(log: ArduPilotLog, source: Literal["auto", "ekf", "vision", 
 
 
 def _position_deltas(log: ArduPilotLog) -> Stream | None:
-    """Position deltas over the time they took, body frame."""
+    """Return velocity from position deltas over their time intervals, body frame."""
     if log.has("VISO"):
         kind, dt = "VISO", log.numbers("VISO", "dt")
         delta = np.stack([log.numbers(kind, f"PosD{axis}") for axis in "XYZ"], axis=-1)
@@ -332,7 +335,7 @@ def _position_deltas(log: ArduPilotLog) -> Stream | None:
         return None
     good = dt > 1e-3
     velocity = np.where(good[:, None], delta / np.where(good, dt, 1.0)[:, None], np.nan)
-    # A delta is the mean over the time before its stamp.
+    # A delta is the mean over the interval before its stamp.
     channels = dict(zip("uvw", velocity.T, strict=True))
     stream = log.stream(kind, channels, finding("velocity_at_sensor", kind=kind))
     return in_our_axes(replace(stream, t=stream.t - 0.5 * np.where(good, dt, 0.0)), FRD)
@@ -359,7 +362,7 @@ def _estimate(log: ArduPilotLog) -> Stream | None:
 
 
 def _held(log: ArduPilotLog, kind: str, name: str, t: Array, otherwise: float) -> Array:
-    """A field at other times, each value held until the next; the same everywhere where the log has none."""
+    """Return a field at other times, each value held until the next; a constant if the log has no such message."""
     if not log.messages.get(kind):
         return np.full(len(t), otherwise)
     held = np.searchsorted(log.times[kind], t, side="right") - 1
@@ -378,7 +381,7 @@ KINDS = VELOCITY_KINDS | frozenset(
 
 ARMED_EVENT, DISARMED_EVENT = 10, 11
 ARMED_FLAG = 128
-"""MAV_MODE_FLAG_SAFETY_ARMED"""
+"""MAV_MODE_FLAG_SAFETY_ARMED."""
 
 
 def read(path: Path, request: Request) -> TrialStreams:
@@ -386,11 +389,11 @@ def read(path: Path, request: Request) -> TrialStreams:
 
     Args:
         path: `.BIN`, `.tlog`, or `.mcap` of BlueOS.
-        request: Map, and the vehicle whose thrusters the outputs drive; without it the pulses keep the numbers of the
-            outputs. A passive trial has none.
+        request: Map, and the vehicle whose thrusters the outputs drive; without a vehicle, pulses are named
+            by output number. A passive trial has no pulses.
 
     Raises:
-        CalibrationError: Not a log, or outputs that cannot be told apart.
+        CalibrationError: The file is not a log, or its outputs cannot be assigned.
         ModuleNotFoundError: pymavlink is not installed.
     """
     requested = request.mapped.ardusub
@@ -405,7 +408,7 @@ def read(path: Path, request: Request) -> TrialStreams:
     ]
     usable = with_inputs(log, request, [s for s in streams if s is not None and len(s.t) >= 2])
     if not any(stream.channels for stream in usable):
-        raise CalibrationError(f"{path.name}: holds no attitude, rates, depth, velocity or outputs")
+        raise CalibrationError(f"{path.name}: contains no attitude, rates, depth, velocity or outputs")
     used = {stream.source.removeprefix(f"{path.name} ") for stream in usable}
     used |= {"PARM", "PARAM_VALUE", "HEARTBEAT", "MODE", "FMT", "EV", "XKF4", "NKF4", "EKF_STATUS_REPORT"}
     rest = [f"{kind} ({count})" for kind, count in sorted(log.counts.items()) if kind not in used]
@@ -415,10 +418,11 @@ def read(path: Path, request: Request) -> TrialStreams:
 
 
 def with_inputs(log: ArduPilotLog, request: Request, streams: list[Stream]) -> list[Stream]:
-    """Return streams of a log with the pulses of its outputs, or those that the mixer makes of the pilot's axes.
+    """Return the streams of a log with the pulses of its outputs, or those computed by the mixer from the
+    pilot's axes.
 
     Raises:
-        CalibrationError: The outputs do not fit the vehicle's thrusters.
+        CalibrationError: The outputs do not match the vehicle's thrusters.
     """
     if request.passive:
         return streams
@@ -429,7 +433,7 @@ def with_inputs(log: ArduPilotLog, request: Request, streams: list[Stream]) -> l
 
 
 def _attitude(log: ArduPilotLog) -> Stream | None:
-    """Roll, pitch, yaw; in telemetry the rates too, which come without the bias that the autopilot found."""
+    """Return roll, pitch, yaw; in telemetry also the rates, which the autopilot has corrected for bias."""
     if log.has("ATT"):
         angles = [np.radians(log.numbers("ATT", name)) for name in ("Roll", "Pitch", "Yaw")]
         channels, kind = {}, "ATT"
@@ -447,19 +451,21 @@ def _attitude(log: ArduPilotLog) -> Stream | None:
 
 
 def _instance(log: ArduPilotLog, first: str, others: str, number: int) -> tuple[str, ArduPilotLog]:
-    """Return the kind of message of a sensor, from 0, and the log with only its messages of that kind."""
+    """Return the kind of message of sensor `number`, from 0, and the log with only its messages of that kind."""
     kind = f"{others}{number + 1}" if number and log.has(f"{others}{number + 1}") else first
     return kind, log.some(kind, "I", number)
 
 
 def _inertial(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
-    """Specific force, and in DataFlash logs the rates."""
+    """Return the specific force, and in DataFlash logs the rates."""
     if not log.telemetry:
         kind, instance = _instance(log, "IMU", "IMU", requested.imu)
         if not log.has(kind):
             return None
         if not instance.has(kind):
-            raise CalibrationError(f"{log.shown}: holds no IMU {requested.imu}: give 'ardusub: {{imu: 0}}'")
+            raise CalibrationError(
+                f"{log.shown}: contains no IMU {requested.imu}: give 'ardusub: {{imu: 0}}'"
+            )
         channels = {f"a{axis.lower()}": instance.numbers(kind, f"Acc{axis}") for axis in "XYZ"}
         channels |= {
             name: instance.numbers(kind, f"Gyr{axis}") for name, axis in zip("pqr", "XYZ", strict=True)
@@ -467,14 +473,14 @@ def _inertial(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
         return in_our_axes(instance.stream(kind, channels), FRD)
     for kind in INERTIAL:
         if log.has(kind) and np.any(log.numbers(kind, "zacc")):
-            # [milli-g], and zero in every field of a chip that has no such sensor
+            # [milli-g], and zero in every field that the sensor lacks
             channels = {f"a{axis}": 1e-3 * GRAVITY * log.numbers(kind, f"{axis}acc") for axis in "xyz"}
             return in_our_axes(log.stream(kind, channels), FRD)
     return None
 
 
 def _depth(log: ArduPilotLog, requested: ArduSubMap) -> Stream | None:
-    """Depth of the pressure sensor that the autopilot takes for outside."""
+    """Return the depth from the pressure sensor that the autopilot treats as external."""
     primary = int(log.parameters.get("BARO_PRIMARY", log.parameters.get("GND_PRIMARY", 1)))
     chosen = primary if requested.barometer is None else requested.barometer
     if log.telemetry:
@@ -493,9 +499,9 @@ def _depth_from_pressure(log: ArduPilotLog, chosen: int) -> Stream | None:
     pressure = 100.0 * log.numbers(kind, "press_abs")  # [hPa]
     ground = log.parameters.get(f"BARO{chosen + 1}_GND_PRESS", 0.0)
     if ground <= 0.0:
-        # The trial's maker knows the surface pressure and the density.
+        # `trial_of` knows the surface pressure and the density.
         return log.stream(kind, {"pressure": pressure})
-    # 9800 Pa for a metre of fresh water, as the autopilot reckons.
+    # 9800 Pa for a metre of fresh water, as in the autopilot.
     depth = (pressure - ground) / (9800.0 * log.parameters.get("BARO_SPEC_GRAV", 1.0))
     return log.stream(kind, {"depth": depth}, finding("depth_of_message", kind=kind, ground=ground))
 
@@ -517,7 +523,7 @@ def _voltage(log: ArduPilotLog) -> Stream | None:
 
 
 def _arming(log: ArduPilotLog) -> Stream | None:
-    """Words `armed` and `disarmed`; what was before the first event is its opposite."""
+    """Return the words `armed` and `disarmed`; the state before the first event is its opposite."""
     if log.has("HEARTBEAT"):
         armed = [bool(int(mode) & ARMED_FLAG) for mode in log.numbers("HEARTBEAT", "base_mode")]
         return _arming_stream(log, "HEARTBEAT", list(log.times["HEARTBEAT"]), armed)
@@ -541,7 +547,8 @@ def _arming_stream(log: ArduPilotLog, kind: str, times: list[float], armed: list
 
 
 def _pulses(log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle | None) -> list[Stream]:
-    """pwm_NAME of each thruster, turned about the neutral pulse where needed: longer pulses push along its axis."""
+    """Return pwm_NAME of each thruster, mirrored about neutral where needed so that longer pulses push along
+    its axis."""
     kind, field = ("SERVO_OUTPUT_RAW", "servo{}_raw") if log.telemetry else ("RCOU", "C{}")
     port = log.some(kind, "port", 0)
     if not port.has(kind):
@@ -562,18 +569,19 @@ def _pulses(log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle | None) -
 
 
 MANUAL = 19
-"""The mode in which the pilot's axes pass the mixer as they are."""
+"""Number of the mode in which the pilot's axes reach the mixer unchanged."""
 USUAL_YAW = 3.375
-"""ACRO_YAW_P at which the yaw axis is passed on as it is."""
+"""ACRO_YAW_P at which the yaw axis is unchanged."""
 
 
 def _driven_by_sticks(
     log: ArduPilotLog, requested: ArduSubMap, vehicle: Vehicle, streams: list[Stream]
 ) -> list[Stream]:
-    """The streams with pwm_NAME from the pilot's axes, where the log has no outputs, and without what other modes did.
+    """Return the streams with pwm_NAME from the pilot's axes, if the log has no outputs, without samples of
+    other modes.
 
     Raises:
-        CalibrationError: The frame's motors do not fit the vehicle's thrusters.
+        CalibrationError: The frame's motors do not match the vehicle's thrusters.
     """
     axes = _axes(log, requested)
     named = [number for number, (name, _) in FRAMES.items() if name == _frame_name(requested, vehicle)]
@@ -592,7 +600,7 @@ def _driven_by_sticks(
         raise CalibrationError(f"{log.shown}: {error}") from None
     note = finding("sticks_mixed", frame=FRAMES[config][0], gain=1.0)
     pulses = log.stream(kind, channels, note, mapped)
-    # A held command has no gap other than one of the complete recording.
+    # The only gaps of a held command are those of the complete recording.
     manual_streams, other = [], 0
     for stream in (*streams, pulses):
         manual = (_mode(log, stream.t) == MANUAL) | ~_armed(log, stream.t)
@@ -609,7 +617,8 @@ def _frame_name(requested: ArduSubMap, vehicle: Vehicle) -> Any:
 
 
 def _axes(log: ArduPilotLog, requested: ArduSubMap) -> tuple[str, Array, Array] | None:
-    """Kind of message, times and demands in the order of `DEMANDS`, (n, 6), from channels or from the joystick."""
+    """Return kind of message, times and demands in the order of `DEMANDS`, (n, 6), from channels or from the
+    joystick."""
     kind, name = ("RC_CHANNELS", "chan{}_raw") if log.telemetry else ("RCIN", "C{}")
     if log.has(kind):
         pulses = np.stack([log.numbers(kind, name.format(n)) for n in range(1, 7)])
@@ -628,7 +637,7 @@ def _axes(log: ArduPilotLog, requested: ArduSubMap) -> tuple[str, Array, Array] 
 
 
 def _gains(log: ArduPilotLog) -> ArduPilotLog:
-    """The log with PilotGain alone of the values that go by names."""
+    """Return the log with PilotGain as its only named value."""
     kind = "NAMED_VALUE_FLOAT"
     if all(message.get("name") != "PilotGain" for message in log.messages.get(kind, ())):
         return replace(log, messages={**log.messages, kind: []})
@@ -636,13 +645,13 @@ def _gains(log: ArduPilotLog) -> ArduPilotLog:
 
 
 def _mode(log: ArduPilotLog, t: Array) -> Array:
-    """Return the number of the autopilot's mode at times; MANUAL if the log has none."""
+    """Return the number of the autopilot's mode at given times; MANUAL if the log has none."""
     kind, name = ("HEARTBEAT", "custom_mode") if log.telemetry else ("MODE", "ModeNum")
     return _held(log, kind, name, t, MANUAL)
 
 
 def _armed(log: ArduPilotLog, t: Array) -> NDArray[np.bool_]:
-    """Return whether it was armed at times; always if the log does not contain it."""
+    """Return whether the vehicle was armed at given times; always true if the log does not contain it."""
     arming = _arming(log)
     if arming is None:
         return np.ones(len(t), dtype=bool)
@@ -651,7 +660,8 @@ def _armed(log: ArduPilotLog, t: Array) -> NDArray[np.bool_]:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    """Return whether a file is a DataFlash log, telemetry, or an MCAP file without a profile, of BlueOS' recorder."""
+    """Return whether a file is a DataFlash log, telemetry, or an MCAP file of BlueOS' recorder, which has no
+    profile."""
     return head.startswith(DATAFLASH) or path.suffix.lower() in (".bin", ".tlog") or without_profile(head)
 
 

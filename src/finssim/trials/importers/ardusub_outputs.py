@@ -1,4 +1,4 @@
-"""Assignment of the outputs of an ArduSub autopilot to thrusters, with their direction."""
+"""Assignment of ArduSub's outputs to thrusters, with their directions."""
 
 from __future__ import annotations
 
@@ -17,34 +17,35 @@ from finssim.vehicles.part import did_you_mean
 __all__ = ["STICKS", "mixed_pulses", "outputs_of", "thrusters_of"]
 
 STICKS = tuple(f"stick_{name}" for name in DEMANDS)
-"""Demands in the order of the mixer's factors."""
+"""Stick columns, in the order of the mixer's factors."""
 
 STICK_CHANNELS = ("pitch", "roll", "throttle", "yaw", "forward", "lateral")
-"""Demands of channels 1 to 6 of an ArduSub."""
+"""Demands of channels 1 to 6 of ArduSub."""
 
 MOTOR_1 = 33
 """SERVOn_FUNCTION of the first motor."""
 
 LEAST_LIKENESS = 1.4
-"""Least likeness of a motor's factors to a thruster: at most 1 from the direction of the force and 1 from the signs of
-its moments."""
+"""Least similarity between a motor's factors and a thruster: at most 1 from the direction of the force and 1
+from the signs of its moments."""
 
 
 def outputs_of(
     vehicle: Vehicle, parameters: Mapping[str, float], requested: Mapping[str, str]
 ) -> tuple[dict[int, tuple[str, int]], Finding]:
-    """Output (from 1) -> thruster, and -1 where its pulses have to be turned about neutral; and what that rests on.
+    """Return output (from 1) -> thruster, and -1 where its pulses must be mirrored about neutral; and a
+    finding about the source.
 
-    Turned pulses are as the vehicle file has the thruster wired: longer ones push along its axis, or against it where
-    its motor_sign is -1.
+    Mirrored pulses agree with the wiring in the vehicle file: longer pulses push along the thruster's axis,
+    or against it if its motor_sign is -1.
 
-    From `requested` (`C1: T1`, `C2: -T2`), else from the vehicle's motor_index, else from the frame and the motor
-    directions that the autopilot's parameters name, matched with where the vehicle's thrusters sit.
+    The assignment follows `requested` (`C1: T1`, `C2: -T2`), otherwise the vehicle's motor_index, otherwise the frame
+    and the motor directions in the autopilot's parameters, matched with the poses of the vehicle's thrusters.
 
     Parameters have the autopilot's units.
 
     Raises:
-        CalibrationError: Outputs or thrusters that do not exist, or nothing to go by.
+        CalibrationError: Outputs or thrusters do not exist, or there is no information on the assignment.
     """
     if requested:
         outputs = _stated_outputs(vehicle, requested)
@@ -53,7 +54,7 @@ def outputs_of(
         outputs = {
             _output_of(int(thruster.motor_index or 0) + 1, parameters): (name, thruster.motor_sign or 1)
             for name, thruster in vehicle.thrusters.items()
-        }  # the motor_sign is the vehicle file's, so that no pulse is turned below
+        }  # the motor_sign is that of the vehicle file, so that no pulse is mirrored below
         basis = "by the motor_index of the vehicle file"
     else:
         outputs, frame = _by_frame(vehicle, parameters)
@@ -75,17 +76,17 @@ def mixed_pulses(
     directions: Sequence[int],
     requested: Mapping[str, str],
 ) -> tuple[dict[str, Array], Finding]:
-    """pwm_NAME of each thruster [µs] from demands, by ArduSub's mixer, and which output drives which thruster.
+    """Return pwm_NAME of each thruster [µs] from demands, by ArduSub's mixer, and a finding about the assignment.
 
     Args:
-        vehicle: Whose thrusters the motors are.
-        demands: In the order of `STICKS` [-1, 1], (n, 6); rows that are not all known give NaN.
-        parameters: FRAME_CONFIG, one of `FRAMES`, and MOT_n_DIRECTION as `outputs_of` takes it.
-        directions: MOT_n_DIRECTION as the mixer takes it; 1 where not given.
-        requested: As of `outputs_of`.
+        vehicle: Vehicle with the thrusters.
+        demands: Demands in the order of `STICKS` [-1, 1], (n, 6); incomplete rows give NaN.
+        parameters: FRAME_CONFIG, one of `FRAMES`, and MOT_n_DIRECTION for `outputs_of`, in the autopilot's units.
+        directions: MOT_n_DIRECTION for the mixer; 1 where not given.
+        requested: As in `outputs_of`.
 
     Raises:
-        CalibrationError: The motors do not fit the thrusters.
+        CalibrationError: The motors do not match the thrusters.
     """
     outputs, mapped = outputs_of(vehicle, parameters, requested)
     valid = np.isfinite(demands).all(axis=-1)
@@ -117,7 +118,7 @@ def _stated_outputs(vehicle: Vehicle, requested: Mapping[str, str]) -> dict[int,
 
 
 def _output_of(motor: int, parameters: Mapping[str, float]) -> int:
-    """The output that carries a motor, both from 1."""
+    """Return the output of a motor, both from 1."""
     for output in range(1, 33):
         if parameters.get(f"SERVO{output}_FUNCTION") == MOTOR_1 + motor - 1:
             return output
@@ -125,12 +126,12 @@ def _output_of(motor: int, parameters: Mapping[str, float]) -> int:
 
 
 def _motor(output: int, parameters: Mapping[str, float]) -> int:
-    """The motor, from 0, that an output, from 1, carries."""
+    """Return the motor, from 0, of an output, from 1."""
     return int(parameters.get(f"SERVO{output}_FUNCTION", MOTOR_1 + output - 1)) - MOTOR_1
 
 
 def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[int, tuple[str, int]], str]:
-    way_out = "say it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
+    way_out = "give it in a map: 'ardusub: {outputs: {C1: THRUSTER, C2: -THRUSTER, ...}}'"
     config = parameters.get("FRAME_CONFIG")
     if config is None or int(config) not in FRAMES:
         lack = "does not name its frame"
@@ -146,7 +147,7 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
             f"{vehicle.name} has {len(vehicle.thrusters)} thrusters: {way_out}"
         )
     roll, pitch, yaw, up, forward, right = np.array(factors, dtype=float).T
-    # ArduSub's "up" is positive against the z axis of its forward-right-down body.
+    # ArduSub's "up" is positive against the z axis of its forward-right-down body frame.
     motors = FROM_FOSSEN.twist(np.stack([forward, right, -up, roll, pitch, yaw], axis=-1))
     matched = thrusters_of(vehicle, motors)
     if matched is None:
@@ -157,16 +158,17 @@ def _by_frame(vehicle: Vehicle, parameters: Mapping[str, float]) -> tuple[dict[i
     for motor, (name, sign) in enumerate(matched, start=1):
         direction = parameters.get(f"MOT_{motor}_DIRECTION")
         if direction not in (1.0, -1.0):
-            raise CalibrationError(f"the log does not say MOT_{motor}_DIRECTION: {way_out}")
+            raise CalibrationError(f"the log does not contain MOT_{motor}_DIRECTION: {way_out}")
         outputs[_output_of(motor, parameters)] = (name, int(sign * direction))
     return outputs, frame
 
 
 def thrusters_of(vehicle: Vehicle, motors: Array) -> list[tuple[str, int]] | None:
-    """Return the thruster of each motor, and -1 where the motor pushes against its axis; None if the motors do not fit.
+    """Return the thruster of each motor, and -1 if the motor pushes against its axis; None if the motors do
+    not match.
 
     Args:
-        vehicle: Whose thrusters they are; as many as the motors.
+        vehicle: Vehicle with as many thrusters as motors.
         motors: Direction of the wrench of each motor about the centre of gravity, body frame [-, m], (n, 6).
     """
     from scipy.optimize import linear_sum_assignment
@@ -182,7 +184,7 @@ def thrusters_of(vehicle: Vehicle, motors: Array) -> list[tuple[str, int]] | Non
 
 
 def _likeness(motor: np.ndarray, column: np.ndarray) -> float:
-    """Cosine between the forces, plus the mean agreement of the signs of the moments that the motor is used for."""
+    """Return the cosine between the forces, plus the mean agreement of the signs of the motor's nonzero moments."""
     force = motor[:3] @ column[:3] / np.linalg.norm(motor[:3])
     used = motor[3:] != 0.0
     if not used.any():

@@ -1,4 +1,4 @@
-"""Trials from mapped columns: axes, velocities of the world, pressure."""
+"""Assembly of trials from mapped columns: axes, world velocities, pressure."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from finssim.vehicles import load_vehicle
 from finssim.vehicles.autopilot import FRAMES
 from finssim.vehicles.part import did_you_mean
 
-# One table of a long log into several, one for each trial.
+# Splitting of a long log into several tables, one per trial.
 
 Rows = NDArray[np.bool_]
 
 
 def split_table(name: str, table: Stream, rule: SplitRule | None) -> dict[str, Stream]:
-    """Name of a trial -> its part of the table, with times from 0; one part of that name without a rule.
+    """Return name of a trial -> its part of the table, with times from 0; without a rule, the complete table.
 
     Raises:
-        CalibrationError: The log has not what the rule goes by, or nothing is left.
+        CalibrationError: The log lacks the column that the rule needs, or no piece remains.
     """
     if rule is None:
         return {name: table}
@@ -73,13 +73,13 @@ WORDED = {
     "arming": ("arming", "the log has no arming messages"),
     "column": ("split", "no source of the map names a split column"),
 }
-"""Rule -> the words that it uses, and the message if there are none."""
+"""Rule -> the word column that it uses, and the message if it is missing."""
 
 
 def _labels(name: str, table: Stream, rule: SplitRule) -> NDArray[np.int64]:
-    """Number of the piece that each row belongs to, -1 for none, (n,).
+    """Return the number of the piece of each row, -1 for none, (n,).
 
-    A trial of `phase` begins with each baseline; without baselines, with each excitation after something else.
+    A trial of `phase` starts with each baseline; without baselines, with each excitation that follows another phase.
     """
     if rule.by == "gaps":
         return np.cumsum(np.diff(table.t, prepend=table.t[0]) > rule.longest_gap)
@@ -124,14 +124,15 @@ class Stream:
     channels: dict[str, Array] = field(default_factory=dict)
     """Canonical or extra column -> values in the units of a trial, (n,) each."""
     words: dict[str, Texts] = field(default_factory=dict)
-    """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word holds until the next."""
+    """`phase`, `split` or `arming` -> a word for every sample, (n,) each; a word is valid until the next."""
     findings: tuple[Finding, ...] = ()
-    """Repairs, and data that was left out."""
+    """Repairs, and omitted data."""
     rank: int = -1
-    """Place in the order of sources: of two that have a column the lower is used; -1 if the user chose it."""
+    """Priority of the source: of two sources of a column, the one with the lower rank is used; -1 if chosen
+    by the user."""
 
     def selected(self, rows: NDArray[np.intp] | NDArray[np.bool_], t: Array | None = None) -> Stream:
-        """Some of the samples, in that order; at times `t` where given. Times are in [s]."""
+        """Return selected samples, in the given order; at times `t` if given. Times are in [s]."""
         return replace(
             self,
             t=self.t[rows] if t is None else t,
@@ -140,19 +141,20 @@ class Stream:
         )
 
     def noting(self, *findings: Finding) -> Stream:
-        """Return the stream with more findings."""
+        """Return the stream with additional findings."""
         return replace(self, findings=(*self.findings, *findings))
 
 
 def in_order(stream: Stream, *, alone: bool) -> Stream:
-    """The stream with strictly increasing times.
+    """Return the stream with strictly increasing times.
 
-    Samples without a time are left out, late ones are sorted in, of samples with one time the first is kept. Where the
-    clock was set back, the rest follows after a gap if the stream is `alone`
+    Samples without a time are removed, late ones are sorted, and the first of several samples at one time is
+    kept. Where the clock was set back, the remainder follows after a gap if the stream is `alone`
     (`finssim.trials.conversion.ordered`).
 
     Raises:
-        CalibrationError: No samples, or a clock set back in one of several streams, which cannot be aligned again.
+        CalibrationError: There are no samples, or the clock was set back in one of several streams, which
+            cannot be aligned.
     """
     timed = np.isfinite(stream.t)
     untimed = [] if timed.all() else [finding("samples_untimed", samples=(~timed).sum())]
@@ -179,20 +181,20 @@ def in_order(stream: Stream, *, alone: bool) -> Stream:
         stream = stream.selected(first)
     if len(stream.t) < 2:
         raise CalibrationError(
-            f"{stream.source}: the time never increases: name the column that holds the time"
+            f"{stream.source}: the time never increases: name the column that contains the time"
         )
     return stream.noting(*(item.about(stream.source) for item in (*untimed, *repaired)))
 
 
 def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> list[Stream]:
-    """The streams with columns, or groups of them, moved in time; their words stay.
+    """Return the streams with columns, or groups of columns, shifted in time; words are not shifted.
 
     Args:
-        streams: Of a trial.
-        offsets: Column or group -> what is added to its times [s].
+        streams: Streams of a trial.
+        offsets: Column or group -> offset added to its times [s].
 
     Raises:
-        CalibrationError: A key that is neither a group nor a column of these streams.
+        CalibrationError: A key is neither a group nor a column of these streams.
     """
     movable = [*GROUPS, *(name for stream in streams for name in stream.channels)]
     for key in offsets:
@@ -215,15 +217,15 @@ def moved_in_time(streams: Sequence[Stream], offsets: Mapping[str, float]) -> li
 
 
 def merge(streams: Sequence[Stream]) -> Stream:
-    """All streams on the union of their times, which start at 0.
+    """Return all streams on their combined times, which start at 0.
 
     Raises:
-        CalibrationError: A column in two streams, or streams that lie apart in time.
+        CalibrationError: Two streams contain the same column, or streams do not overlap in time.
     """
     each = [in_order(stream, alone=len(streams) == 1) for stream in without_doubles(streams)]
     _refuse_disjoint(each)
     start = min(float(stream.t[0]) for stream in each)
-    # In integer microseconds, so that a written and read trial has the same times.
+    # In integer microseconds, so that a trial has the same times after writing and reading.
     each = [replace(stream, t=np.round(stream.t - start, 6)) for stream in each]
     columns = {name: (stream.t, values) for stream in each for name, values in stream.channels.items()}
     spoken = {name: (stream.t, texts) for stream in each for name, texts in stream.words.items()}
@@ -240,10 +242,10 @@ def merge(streams: Sequence[Stream]) -> Stream:
 
 
 def without_doubles(streams: Sequence[Stream]) -> list[Stream]:
-    """Return the streams with one source for each column: one that moves, then that of the lowest rank.
+    """Return the streams with one source for each column: one that changes, then the one with the lowest rank.
 
     Raises:
-        CalibrationError: Two sources of one rank for a column, or of words.
+        CalibrationError: Two sources of equal rank contain the same column or words.
     """
     out = list(streams)
     names_of = [name for stream in out for name in (*stream.channels, *stream.words)]
@@ -269,7 +271,7 @@ def _dead(stream: Stream, names: tuple[str, ...]) -> bool:
 
 
 def _without(stream: Stream, names: tuple[str, ...], better: str, *, dead: bool) -> Stream:
-    """Return the stream without some columns, with one finding for all that were left out for one other stream."""
+    """Return the stream without some columns, with one finding for all columns replaced by another stream."""
     gone, findings = tuple(name for name in names if name in stream.channels), []
     for item in stream.findings:
         if item.code in ("stream_dead", "columns_left_out") and item.values["better"] == better:
@@ -298,16 +300,16 @@ def _refuse_disjoint(streams: Sequence[Stream]) -> None:
 WORLD_VELOCITY = ("vx", "vy", "vz")
 STANDARD_ATMOSPHERE = 101325.0
 LONGEST_BRIDGE = 0.5
-"""Between two attitudes that a velocity of the world is turned with [s]."""
+"""Longest interval between two attitudes that are interpolated to rotate a world velocity [s]."""
 
 
 def in_our_axes(stream: Stream, frame: LogFrame, *, radians: bool = True) -> Stream:
-    """Return the stream in x forward, y left, z up and a world with z up, with angles in [-pi, pi).
+    """Return the stream in axes x forward, y left, z up and a world with z up, with angles in [-pi, pi).
 
     Args:
-        stream: Of the log's axes.
+        stream: Stream in the log's axes.
         frame: Axes of the log.
-        radians: False if the angles may be degrees without a unit; they are wrapped within one turn only.
+        radians: False if the angles may be in degrees; they are then wrapped only within two turns.
     """
     channels = wrapped(in_our_frames(stream.channels, frame.body, frame.world), everything=radians)
     if frame.world == "NED":
@@ -318,15 +320,15 @@ def in_our_axes(stream: Stream, frame: LogFrame, *, radians: bool = True) -> Str
 
 
 def trial_of(name: str, table: Stream, header: Header, column_map: ColumnMap) -> Trial:
-    """The trial that a table makes, with u v w and depth in place of world velocities and pressure.
+    """Return the trial of a table, with u v w and depth computed from world velocities and pressure.
 
     Raises:
-        CalibrationError: World velocities without an attitude, or beside body velocities.
+        CalibrationError: There are world velocities without an attitude, or in addition to body velocities.
     """
     channels, findings = dict(table.channels), list(table.findings)
     findings += _without_empty(channels)
     world = [c for c in WORLD_VELOCITY if c in channels]
-    if 0 < len(world) < len([c for c in WORLD_VELOCITY if c in table.channels]):  # others of them are empty
+    if 0 < len(world) < len([c for c in WORLD_VELOCITY if c in table.channels]):  # the others are empty
         findings.append(finding("world_velocity_incomplete", columns=tuple(world)))
         channels = {c: v for c, v in channels.items() if c not in WORLD_VELOCITY}
     elif world:
@@ -353,15 +355,15 @@ def trial_of(name: str, table: Stream, header: Header, column_map: ColumnMap) ->
     if upside_down(channels):
         findings.append(finding("upside_down"))
     if not channels:
-        raise CalibrationError(f"{name}: no column of a trial holds a number")
-    findings.sort(key=lambda item: item.code == "not_read")  # the last of an import
+        raise CalibrationError(f"{name}: no column of a trial contains a number")
+    findings.sort(key=lambda item: item.code == "not_read")  # shown last in an import
     return Trial(
         name=name, t=table.t, channels=channels, phase=_phase(table), header=header, findings=tuple(findings)
     )
 
 
 def _without_empty(channels: dict[str, Array]) -> list[Finding]:
-    """Remove columns without a number, in place."""
+    """Remove columns without any number, in place."""
     empty = [column for column, values in channels.items() if not np.isfinite(values).any()]
     for column in empty:
         del channels[column]
@@ -376,7 +378,7 @@ def _phase(table: Stream) -> np.ndarray | None:
 
 
 def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str, Array]:
-    """u v w from world velocities and the attitude interpolated to their times."""
+    """Return u v w from world velocities and the attitude interpolated to their times."""
     from scipy.spatial.transform import Rotation, Slerp
 
     missing = [c for c in WORLD_VELOCITY if c not in channels]
@@ -391,13 +393,13 @@ def _body_velocity(name: str, t: Array, channels: dict[str, Array]) -> dict[str,
         q = quat_from_euler(*(channels[c] for c in EULER))
     else:
         raise CalibrationError(
-            f"{name}: vx, vy, vz are velocities in the world, and without an attitude they cannot become u, v, w: "
+            f"{name}: vx, vy, vz are world velocities, which cannot be converted to u, v, w without an attitude: "
             "map roll pitch yaw or qx qy qz qw"
         )
     valid = np.isfinite(q).all(axis=-1) & (np.linalg.norm(np.nan_to_num(q), axis=-1) > 0.5)
     velocity = np.stack([channels[c] for c in WORLD_VELOCITY], axis=-1)
     if valid.sum() < 2:
-        raise CalibrationError(f"{name}: the attitude that turns vx, vy, vz holds fewer than two samples")
+        raise CalibrationError(f"{name}: the attitude for vx, vy, vz has fewer than two samples")
     times = t[valid]
     after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
     near = (t >= times[0]) & (t <= times[-1]) & (times[after] - times[after - 1] <= LONGEST_BRIDGE)
@@ -444,7 +446,7 @@ def _pulses(
 
 
 def _depth(name: str, pressure: Array, header: Header, column_map: ColumnMap) -> tuple[Array, list[Finding]]:
-    """Depth of the pressure sensor [m]: (p - p_surface) / (rho g)."""
+    """Return the depth of the pressure sensor [m]: (p - p_surface) / (rho g)."""
     vehicle = load_vehicle(header.vehicle) if header.vehicle is not None else None
     density = header.water.density or (vehicle.water.density if vehicle else 1000.0)
     gravity = vehicle.water.gravity if vehicle else GRAVITY
@@ -455,7 +457,7 @@ def _depth(name: str, pressure: Array, header: Header, column_map: ColumnMap) ->
         low, high = float(finite.min()), float(finite.max())
         if unit is None:
             raise CalibrationError(
-                f"{name}: pressures of {low:.6g} to {high:.6g} are no absolute pressures in water in Pa, hPa or kPa: "
+                f"{name}: pressures of {low:.6g} to {high:.6g} are not absolute pressures in water in Pa, hPa or kPa: "
                 "give 'unit:' of the column in a map, and 'surface_pressure: 0' for a gauge"
             )
         if unit != "Pa":

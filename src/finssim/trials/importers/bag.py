@@ -1,4 +1,5 @@
-"""ROS bags as streams, without ROS: ROS 2 (sqlite3, MCAP) and ROS 1, with the topics of MAVROS and of Doppler logs."""
+"""ROS bags as streams, without a ROS installation: ROS 2 (sqlite3, MCAP) and ROS 1, with the topics of MAVROS
+and of Doppler logs."""
 
 from __future__ import annotations
 
@@ -32,20 +33,21 @@ BAGS = (".mcap", ".db3", ".bag")
 TEXT = "std_msgs/msg/String"
 
 KNOWN = shipped_maps("rosbag.yaml")
-"""Topics and types that need no map, and definitions of messages."""
+"""Topics and types that are read without a map, and definitions of messages."""
 
 INPUTS = {
     "mavros_msgs/msg/RCOut": ("SERVO_OUTPUT_RAW", "servo{}_raw"),
     "mavros_msgs/msg/RCIn": ("RC_CHANNELS", "chan{}_raw"),
     "mavros_msgs/msg/OverrideRCIn": ("RC_CHANNELS", "chan{}_raw"),
 }
-"""Types whose channels are those of a message of the autopilot, and its fields; the first of one message is used."""
+"""Types with the channels of a message of the autopilot, and its fields; of several types for a message, the
+first is used."""
 
 PARAMETERS = {
     "mavros_msgs/msg/Param": ("value.integer", "value.real"),
     "mavros_msgs/msg/ParamEvent": ("value.integer_value", "value.double_value"),
 }
-"""Types of a parameter of the autopilot, and the fields of its number, of which the other one is 0."""
+"""Types of a parameter of the autopilot, and the fields of its value, of which the unused one is 0."""
 
 FIX = "sensor_msgs/msg/NavSatFix"
 EQUATOR = 6378137.0
@@ -54,16 +56,17 @@ FLATTENED = 6.69437999014e-3
 """Square of the eccentricity of the ellipsoid of WGS 84 [-]."""
 
 COMMANDS = re.compile(r"cmd|command|setpoint|goal|target|desired|reference")
-"""Parts of the names of topics whose poses and velocities are no measurements."""
+"""Parts of the names of topics whose poses and velocities are not measurements."""
 
 _PART = re.compile(r"([^.\[\]]+)|\[([^\]]*)\]")
 
 
 def number_at(message: Any, path: str, topic: str) -> float:
-    """The number at a dotted path: `twist.twist.linear.x`, `data[3]`, `velocity[T1]` (by the list `name` or `names`).
+    """Return the number at a dotted path: `twist.twist.linear.x`, `data[3]`, `velocity[T1]` (indexed by the
+    list `name` or `names`).
 
     Raises:
-        CalibrationError: No such field, or no number there.
+        CalibrationError: There is no such field, or it is not a number.
     """
     value = _value_at(message, path, topic)
     if isinstance(value, (bool, int, float)) or (hasattr(value, "item") and getattr(value, "ndim", 1) == 0):
@@ -76,7 +79,7 @@ def number_at(message: Any, path: str, topic: str) -> float:
 
 
 def stamp_of(message: Any) -> int | None:
-    """The header's stamp [ns], or None where there is none or it was left at zero."""
+    """Return the header's stamp [ns], or None if it is missing or zero."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:
         return None
@@ -101,13 +104,13 @@ def _value_at(message: Any, path: str, topic: str) -> Any:
         position = int(key) if key.lstrip("-").isdigit() else names.index(key) if key in names else None
         if position is None:
             raise CalibrationError(
-                f"{topic}: '{path}' asks for '{key}', and the message names {', '.join(names) or 'none'}"
+                f"{topic}: '{path}' needs '{key}', but the message contains {', '.join(names) or 'no names'}"
             )
         try:
             value = value[position]
         except (IndexError, TypeError):
             if hasattr(value, "__len__") and len(value) == 0:
-                return math.nan  # an array left empty holds no sample
+                return math.nan  # an empty array contains no sample
             raise CalibrationError(f"{topic}: '{path}' has no element {key}") from None
     return value
 
@@ -118,7 +121,7 @@ def _field_names(value: Any) -> list[str]:
 
 def _inside(value: Any) -> str:
     inside = _field_names(value)
-    return f": it holds {', '.join(inside)}" if inside else ""
+    return f": it contains {', '.join(inside)}" if inside else ""
 
 
 def read(path: Path, request: Request) -> TrialStreams:
@@ -126,10 +129,10 @@ def read(path: Path, request: Request) -> TrialStreams:
 
     Args:
         path: Folder of a ROS 2 bag, `.mcap`, `.db3`, or a ROS 1 `.bag`.
-        request: Map of topics; without one, each topic of a usual type or of MAVROS is read.
+        request: Map of topics; without one, every topic of a known type or of MAVROS is read.
 
     Raises:
-        CalibrationError: Not a bag, or topics, types or fields that it lacks.
+        CalibrationError: The path is not a bag, or topics, types or fields are missing.
         ModuleNotFoundError: rosbags is not installed.
     """
     recorded, remarks = finssim_record.recorded_header(path)
@@ -149,7 +152,7 @@ def read(path: Path, request: Request) -> TrialStreams:
             sources = _known(reader, types)
         if not sources:
             raise CalibrationError(
-                f"{path.name}: no topic of a usual type: write a map; its topics are {_listed(types)}"
+                f"{path.name}: no topic of a known type: write a map; its topics are {_listed(types)}"
             )
         _collect(reader, sources, findings)
         _localise(sources, findings)
@@ -179,7 +182,7 @@ def read(path: Path, request: Request) -> TrialStreams:
 
 
 def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> LogTopic:
-    """Return a topic of a map, with the usual columns of its type where the map names none."""
+    """Return a topic of a map, with the default columns of its type if the map names none."""
     if source.columns or source.phase is not None or source.split is not None:
         return LogTopic(source, -1, kind)
     usual = KNOWN["usual"] | KNOWN["dvl"]
@@ -188,7 +191,7 @@ def _mapped(reader: Any, topic: str, kind: str, source: SourceMap) -> LogTopic:
         usual = {kind: SourceMap(columns=_thruster_columns(reader, topic, kind))}
     if name not in usual:
         raise CalibrationError(
-            f"{topic} is of type {kind}, for which no columns are usual: give 'columns: {{u: FIELD, ...}}'"
+            f"{topic} is of type {kind}, which has no default columns: give 'columns: {{u: FIELD, ...}}'"
         )
     rank = [*KNOWN["dvl"], *KNOWN["mavros"], *finssim_record.THRUSTERS, *KNOWN["usual"]].index(name)
     keys = {name: getattr(source, name) for name in source.model_fields_set - {"columns"}}
@@ -220,7 +223,7 @@ def _known(reader: Any, types: Mapping[str, str]) -> dict[str, LogTopic]:
 
 
 def _is_dvl(reader: Any, kind: str) -> bool:
-    """Return whether a type is a report of a Water Linked log, by its fields."""
+    """Return whether a type is a report of a Water Linked DVL, by its fields."""
     fields = dict(reader.typestore.fielddefs.get(kind, ((), ()))[1])
     return {"velocity", "velocity_valid", "fom"} <= set(fields)
 
@@ -237,7 +240,7 @@ def _inputs(
     The topics of outputs and channels are removed from the sources.
 
     Raises:
-        CalibrationError: The outputs do not fit the vehicle.
+        CalibrationError: The outputs do not match the vehicle.
     """
     log, vehicle, named = ArduPilotLog(label, telemetry=True), request.vehicle, {}
     for topic, source in sorted(sources.items(), key=lambda item: item[1].rank):
@@ -269,7 +272,7 @@ def _inputs(
 
 
 def _parameters(sources: dict[str, LogTopic]) -> dict[str, float]:
-    """Return the parameters of the autopilot in its units, the last value of each; their topics are removed."""
+    """Return the last value of each parameter of the autopilot, in its units; their topics are removed."""
     found: dict[str, float] = {}
     for topic in [
         topic for topic, source in sources.items() if source.kind in PARAMETERS and source.rank >= 0
@@ -280,7 +283,7 @@ def _parameters(sources: dict[str, LogTopic]) -> dict[str, float]:
 
 
 def _localise(sources: Mapping[str, LogTopic], findings: list[Finding]) -> None:
-    """Turn degrees of fixes into metres east and north of the first valid one, on the ellipsoid of WGS 84."""
+    """Convert degrees of fixes to metres east and north of the first valid fix, on the WGS 84 ellipsoid."""
     for topic, source in sources.items():
         cells = source.cells
         if source.kind != FIX or not {"latitude", "longitude"} <= set(cells):
@@ -301,7 +304,7 @@ def _localise(sources: Mapping[str, LogTopic], findings: list[Finding]) -> None:
 
 
 def _collect(reader: Any, sources: dict[str, LogTopic], findings: list[Finding]) -> None:
-    """Read the messages of the topics; a message that cannot be read is counted."""
+    """Read the messages of the topics; messages that cannot be read are counted."""
     needed = {topic: used_columns(source.map) for topic, source in sources.items()}
     for topic, names in needed.items():
         if sources[topic].rank >= 0:
@@ -322,9 +325,9 @@ def _collect(reader: Any, sources: dict[str, LogTopic], findings: list[Finding])
                 cells = {name: _cell(message, name, connection.topic) for name in source.cells}
             except (MemoryError, KeyboardInterrupt):
                 raise
-            except Exception as error:  # whatever rosbags meets in a damaged or unknown message
+            except Exception as error:  # any error of rosbags at a damaged or unknown message
                 if isinstance(error, CalibrationError) and source.rank < 0:
-                    raise  # the user's field
+                    raise  # an error in a field chosen by the user
                 source.broken[" ".join(str(error).split())[:120] or type(error).__name__] += 1
                 continue
             stamp = stamp_of(message) if source.map.stamps == "header" else None
@@ -334,9 +337,9 @@ def _collect(reader: Any, sources: dict[str, LogTopic], findings: list[Finding])
                 source.cells[name].append(cell)
     except CalibrationError:
         raise
-    except Exception as error:  # a damaged bag breaks in whatever layer reads it
+    except Exception as error:  # depending on the damage, any layer of the reader may raise
         if not any(len(source.received) >= 2 for source in sources.values()):
-            raise CalibrationError(f"the bag breaks at its first messages: {error}") from None
+            raise CalibrationError(f"the bag is damaged at its first messages: {error}") from None
         findings.append(
             finding("bag_damaged", reason=str(error).partition("\n")[0][:120] or type(error).__name__)
         )
@@ -348,7 +351,7 @@ def _cell(message: Any, path: str, topic: str) -> Any:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """A bag itself, or the storage files of a folder that lost its metadata; none if it is no bag."""
+    """Return a bag itself, or the storage files of a folder without metadata; none if it is not a bag."""
     if not path.is_dir():
         return [path] if path.suffix.lower() in BAGS else []
     if (path / "metadata.yaml").is_file():
@@ -368,13 +371,13 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
             findings.append(finding("no_metadata", bag=path.name, files=len(parts)))
         if path.is_dir():
             packed = [file for file in sorted(path.iterdir()) if file.is_file() and packed_with_zstd(file)]
-            remedy = "unpack its files with 'zstd -d' and give these, each by itself"
+            remedy = "unpack its files with 'zstd -d' and give these one by one"
             check_unpacked(packed, CalibrationError, str(path), remedy)
-        stack.enter_context(limited_memory())  # whatever a small bag may unpack to
+        stack.enter_context(limited_memory())  # in case a small bag decompresses to a large size
         try:
             reader = AnyReader(parts, default_typestore=_typestore())
             reader.open()
-        except Exception as error:  # what is damaged shows in whatever layer of rosbags meets it
+        except Exception as error:  # depending on the damage, any layer of rosbags may raise
             raise CalibrationError(
                 f"{path}: cannot be opened as a bag: {error or 'damaged'}: for a damaged .db3 try sqlite3's .recover"
             ) from None
@@ -385,7 +388,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[Finding]]]:
 
 
 def _typestore() -> Any:
-    """Return the types of ROS 2, with some of MAVROS and of a Doppler log."""
+    """Return the types of ROS 2, with some types of MAVROS and of a Doppler log."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
@@ -395,7 +398,7 @@ def _typestore() -> Any:
 
 
 def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSource]:
-    """Columns that the first message of a topic names."""
+    """Return the columns named by the first message of a topic."""
     connections = [c for c in reader.connections if c.topic == topic]
     for _, message in _messages(reader, connections):
         return finssim_record.thruster_columns(topic, kind, message)
@@ -403,7 +406,7 @@ def _thruster_columns(reader: Any, topic: str, kind: str) -> dict[str, ColumnSou
 
 
 def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    """When messages were received [ns], and what they hold; a damaged bag breaks in whatever layer reads it."""
+    """Yield times of receipt [ns] and contents of messages; damage in a bag is reported as one error."""
     raws = iter(reader.messages(connections=connections))
     while True:
         try:
@@ -417,7 +420,7 @@ def _messages(reader: Any, connections: Sequence[Any]) -> Iterator[tuple[int, An
 
 
 def _events(reader: Any) -> list[Stream]:
-    """Return the streams of the events of our own records."""
+    """Return the streams of the events in our own records."""
     connections = [c for c in reader.connections if c.topic.endswith("/events") and c.msgtype == TEXT]
     texts = ((time * 1e-9, message.data) for time, message in _messages(reader, connections))
     stream = finssim_record.spoken_events("events", texts, reader.start_time * 1e-9) if connections else None
@@ -429,7 +432,7 @@ def _listed(types: Mapping[str, str]) -> str:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    """Return whether a path is a bag; an MCAP file without a profile is of BlueOS' recorder."""
+    """Return whether a path is a bag; an MCAP file without a profile is from BlueOS' recorder instead."""
     return bool(bag_files(path)) and not without_profile(head)
 
 

@@ -1,4 +1,4 @@
-"""Maps of logs: which columns, units, axes, clocks and pieces make trials."""
+"""Maps of logs: the columns, units, axes, clocks and segments that form trials."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FALSE = ("0", "false", "no", "n", "f", "invalid", "")
 
 
 def _token(cell: Any) -> str:
-    """Return a cell as a word in lower case: 1 and 0 for the words of truth, numbers without trailing zeros."""
+    """Return a cell as a lower-case token: 1 or 0 for Boolean words, numbers without trailing zeros."""
     if isinstance(cell, (bool, int, float, np.floating)):
         return "" if cell != cell else f"{float(cell):g}"
     word = str(cell).strip().lower()
@@ -31,11 +31,11 @@ def _token(cell: Any) -> str:
 
 
 class Validity(Part):
-    """Column that marks invalid samples: a flag, certain values, or limits."""
+    """Column that marks invalid samples, by a flag, certain values, or limits."""
 
     column: str
     value: tuple[str | float, ...] | None = None
-    """Values of valid samples in the unit of the column; true, yes, valid, ok or 1 without `value` and limits."""
+    """Values of valid samples in the unit of the column; without `value` and limits: true, yes, valid, ok or 1."""
     above: float | None = None
     """Valid samples are above this number, in the unit of the column."""
     below: float | None = None
@@ -54,14 +54,14 @@ class Validity(Part):
         return data if given is None else {**data, "value": [_token(value) for value in values]}
 
     def valid(self, cells: Sequence[Any] | Array, label: str) -> NDArray[np.bool_]:
-        """Return which samples are valid, (n,).
+        """Return a mask of the valid samples, (n,).
 
         Args:
-            cells: Cells of the column, words or numbers in its unit, (n,).
+            cells: Cells of the column, text or numbers in its unit, (n,).
             label: Name of the source in messages.
 
         Raises:
-            CalibrationError: The cells are no flag and no numbers, whichever is needed.
+            CalibrationError: The cells are not flags or not numbers, as required.
         """
         if self.above is not None or self.below is not None:
             try:
@@ -72,7 +72,7 @@ class Validity(Part):
                 ) from None
             high = math.inf if self.below is None else self.below
             low = -math.inf if self.above is None else self.above
-            return ~((numbers >= high) | (numbers <= low))  # what has no number has no limit
+            return ~((numbers >= high) | (numbers <= low))  # a missing number violates no limit
         tokens = np.array([_token(cell) for cell in cells], dtype=np.str_)
         if self.value is not None:
             return np.isin(tokens, [_token(value) for value in self.value])
@@ -91,7 +91,7 @@ class ColumnSource(Part):
     column: str | None = None
     """Name of a column, or dotted path of a field such as `twist.twist.linear.x` or `data[3]`."""
     value: float | None = None
-    """A constant in `unit`, in place of a column."""
+    """Constant in `unit`, instead of a column."""
     scale: float = 1.0
     offset: float = 0.0
     """Offset in `unit`, added after scaling."""
@@ -122,7 +122,7 @@ class ColumnSource(Part):
 
 
 class NamedColumn(Part):
-    """A section that may be the name of a column alone."""
+    """Section that may be abbreviated to the name of a column."""
 
     column: str
 
@@ -133,14 +133,14 @@ class NamedColumn(Part):
 
 
 class TimeColumn(NamedColumn):
-    """The column that holds the time."""
+    """Column that contains the time."""
 
     unit: str = "s"
     kind: Literal["stamp", "period", "counter", "coarse"] = "stamp"
-    """A clock; the time since the row before; a counter that begins again after `wrap`; or a clock of few steps, over
-    each of which its samples are spread."""
+    """Type of the time: a clock (stamp); the time since the previous row (period); a counter that overflows
+    at `wrap`; or a clock with coarse steps, over which its samples are distributed."""
     scale: float = Field(default=1.0, gt=0.0)
-    """Factor from the column to `unit`, such as 0.02 for a counter of samples of 50 Hz."""
+    """Factor from the column to `unit`, such as 0.02 for a 50 Hz sample counter."""
     wrap: float | None = Field(default=None, gt=0.0)
     """Range of a counter, in counts of the column; the next of 2^8, 2^16, 2^24 and 2^32 if None."""
 
@@ -158,7 +158,7 @@ class TimeColumn(NamedColumn):
         dates = self.unit == "date" and self.kind in ("period", "counter")
         if dates or (self.wrap is not None and self.kind != "counter"):
             raise refuse_section(
-                f"kind is {self.kind}: wrap is for a counter, unit: date for no period or counter"
+                f"kind is {self.kind}: wrap is for counters only, and unit: date not for periods or counters"
             )
         return self
 
@@ -182,10 +182,10 @@ class TimeColumn(NamedColumn):
 
 
 class PhaseColumn(NamedColumn):
-    """The column that names the phases of an experiment."""
+    """Column that names the phases of an experiment."""
 
     words: dict[str, str] = Field(default_factory=dict)
-    """Word of the log -> baseline, excitation, coast or rest; other words become none."""
+    """Word of the log -> baseline, excitation, coast or rest; other words mean no phase."""
 
     @field_validator("words")
     @classmethod
@@ -193,7 +193,7 @@ class PhaseColumn(NamedColumn):
         for word in labels.values():
             if word not in PHASES:
                 raise refuse_value(
-                    f"holds '{word}'{did_you_mean(word, list(PHASES))} expected {', '.join(PHASES)}"
+                    f"contains '{word}'{did_you_mean(word, list(PHASES))} expected {', '.join(PHASES)}"
                 )
         return labels
 
@@ -202,7 +202,7 @@ class LogFrame(Part):
     """Axes that the log uses."""
 
     body: Literal["FLU", "FRD"] = "FLU"
-    """Forward-left-up or forward-right-down."""
+    """Body axes: forward-left-up or forward-right-down."""
     world: Literal["z_up", "NED"] = "z_up"
 
     @model_validator(mode="before")
@@ -223,23 +223,23 @@ class SourceMap(Part):
     """Map of one file or topic."""
 
     time: TimeColumn | None = None
-    """Needed for files; topics have stamps."""
+    """Time column, required for files; topics have stamps."""
     columns: dict[str, ColumnSource] = Field(default_factory=dict)
-    """Canonical column -> its source; for topics of known types the usual ones where nothing is given."""
+    """Canonical column -> its source; the default columns for topics of known types if empty."""
     frame: LogFrame = Field(default_factory=LogFrame)
     time_offset: float = 0.0
-    """Added to the times [s]."""
+    """Offset added to the times [s]."""
     phase: PhaseColumn | None = None
     split: str | None = None
-    """Column whose changes of value begin a new trial."""
+    """Column whose changes of value start a new trial."""
     spaces: bool = False
     """True if blanks separate the columns of a text table; commas, semicolons and tabs are detected."""
     skip_rows: int = Field(default=0, ge=0)
-    """Lines before the line of names."""
+    """Number of lines before the header line."""
     names: tuple[str, ...] | None = None
-    """Names of the columns of a file that has no line of names."""
+    """Names of the columns of a file without a header line."""
     valid: tuple[Validity, ...] | None = None
-    """Columns that mark invalid samples, which are left out; an evident one if None, none if `false`."""
+    """Columns that mark invalid samples, which are removed; detected automatically if None, none if `false`."""
     arming: Validity | None = None
     """Column that is valid while the vehicle is armed, for `split: arming`."""
     stamps: Literal["header", "received"] = "header"
@@ -258,7 +258,7 @@ class SourceMap(Part):
     @field_validator("columns", mode="before")
     @classmethod
     def _same_names(cls, columns: Any) -> Any:
-        """A list is of columns that the log calls as we do."""
+        """Accept a list of columns whose names in the log are canonical."""
         if isinstance(columns, (list, tuple)) and all(isinstance(name, str) for name in columns):
             return {name: name for name in columns}
         if not isinstance(columns, dict):
@@ -278,7 +278,7 @@ class SourceMap(Part):
             try:
                 factor(source.unit, name)
             except CalibrationError as error:
-                raise refuse_value(f"holds a wrong unit: {error}") from None
+                raise refuse_value(f"has an invalid unit: {error}") from None
         return columns
 
 
@@ -291,19 +291,19 @@ class ArduSubMap(Part):
     """Map of an ArduSub log, and settings of the mixer from sticks to pulses."""
 
     outputs: dict[str, str] = Field(default_factory=dict)
-    """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus where longer pulses push backwards."""
+    """Output of the autopilot -> thruster, `{C1: T1, C2: -T2}`; a minus if longer pulses push backwards."""
     velocity: Literal["auto", "ekf", "vision", "none"] = "auto"
     """Source of u v w: the state estimate, or the position deltas of a DVL or visual odometry."""
     imu: int = Field(default=0, ge=0)
     barometer: int | None = Field(default=None, ge=0)
-    """The pressure sensor in the water; the primary one where not given."""
+    """Index of the pressure sensor in the water; the primary one if None."""
     stamps: Literal["header", "received"] = "header"
     """Times of a .tlog: the autopilot's own clock if a message has it, or the times at which messages were received."""
     frame: Literal["VECTORED", "VECTORED_6DOF"] | None = None
-    """Frame of the mixer that `stick_*` columns went through."""
+    """Frame of the mixer for `stick_*` columns."""
     gain: float = Field(default=1.0, gt=0.0, le=1.0)
-    """Pilot gain, a factor (PilotGain, JS_GAIN_DEFAULT), of `stick_*` columns, where they are the joystick's, not
-    scaled yet."""
+    """Pilot gain, a factor (PilotGain, JS_GAIN_DEFAULT), to be applied to `stick_*` columns if they are
+    unscaled joystick values."""
     motor_directions: tuple[Literal[1, -1], ...] = ()
     """MOT_n_DIRECTION of motors 1, 2, ..., for `stick_*` columns; 1 where not given."""
 
@@ -317,7 +317,7 @@ class SplitRule(Part):
     windows: dict[str, tuple[float, float]] = Field(default_factory=dict)
     """Trial -> start and end [s] after the start of the log, for `windows`."""
     shortest: float = Field(default=1.0, ge=0.0)
-    """Shorter pieces are left out [s]."""
+    """Shortest duration of a piece; shorter ones are discarded [s]."""
 
     @model_validator(mode="before")
     @classmethod
@@ -345,21 +345,21 @@ class SplitRule(Part):
 
 
 class ColumnMap(Part):
-    """One map file."""
+    """Map file."""
 
     files: dict[str, SourceMap] = Field(default_factory=dict)
-    """Name or pattern of a file (`imu.csv`, `*_imu.csv`, `{trial}_imu.csv`) -> how it is read."""
+    """Name or pattern of a file (`imu.csv`, `*_imu.csv`, `{trial}_imu.csv`) -> its map."""
     topics: dict[str, SourceMap] = Field(default_factory=dict)
     ardusub: ArduSubMap = Field(default_factory=ArduSubMap)
     split: SplitRule | None = None
     time_offsets: dict[str, float] = Field(default_factory=dict)
     """Column, or group (command velocity rates acceleration attitude position depth) -> seconds added to its times."""
     surface_pressure: float | None = Field(default=None, ge=0.0)
-    """Pressure of the surface as the sensor reads it, for `pressure` columns [Pa]; 0 for a gauge."""
+    """Pressure at the surface as measured by the sensor, for `pressure` columns [Pa]; 0 for a gauge sensor."""
     header: dict[str, Any] = Field(default_factory=dict)
     """Keys of `trial.yaml` of every trial."""
     trials: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Trial -> further keys of its `trial.yaml`, which replace those of every trial."""
+    """Trial -> additional keys of its `trial.yaml`, which override those of every trial."""
 
     @model_validator(mode="before")
     @classmethod
@@ -383,10 +383,11 @@ class ColumnMap(Part):
         return {**data, "header": {**data.get("header", {}), **header}}
 
     def header_of(self, trial: str, vehicle: str | None, recorded: Mapping[str, Any] | None = None) -> Header:
-        """Return the header of a trial; a vehicle given on the command line has priority, the log's own header is last.
+        """Return the header of a trial; a vehicle given on the command line has priority, the log's own
+        header the lowest.
 
         Raises:
-            CalibrationError: A key or value that `trial.yaml` does not take.
+            CalibrationError: A key or value is not valid in `trial.yaml`.
         """
         keys = {**(recorded or {}), **self.header, **self.trials.get(trial, {})}
         if vehicle is not None:
@@ -410,7 +411,7 @@ def read_map(path: Path) -> ColumnMap:
     """Read and check a map file.
 
     Raises:
-        CalibrationError: Unreadable, malformed, or a key or value that is refused.
+        CalibrationError: The file is unreadable or malformed, or a key or value is invalid.
     """
     tree = read_mapping(path, CalibrationError, such_as="files: {log.csv: {time: t, columns: {u: vel_x}}}")
     try:
@@ -425,10 +426,10 @@ def read_map(path: Path) -> ColumnMap:
 
 
 def shipped_maps(file: str) -> dict[str, dict[str, Any]]:
-    """Return the sections of a shipped file: name -> map of a topic, report or table that needs no map of the user's.
+    """Return the sections of a shipped file: name -> map of a topic, report or table that is read without a user map.
 
     Args:
-        file: Name of the YAML file beside this module; sections of texts are returned as they are.
+        file: Name of the YAML file beside this module; sections with text are returned unchanged.
     """
     tree = read_mapping(Path(__file__).with_name(file), CalibrationError, such_as="topics: {}")
     return {
@@ -441,10 +442,10 @@ def shipped_maps(file: str) -> dict[str, dict[str, Any]]:
 
 
 def present(source: SourceMap, names: Sequence[str]) -> SourceMap:
-    """Return a map of those of its columns that a log has; velocities in the world only if it has all three.
+    """Return a map restricted to the columns that a log contains; world velocities only if all three exist.
 
     Args:
-        source: Map of all columns that the format may have.
+        source: Map of all columns that the format may contain.
         names: Columns or fields of the log.
     """
     there = {name: spec for name, spec in source.columns.items() if spec.column in names}
@@ -454,10 +455,10 @@ def present(source: SourceMap, names: Sequence[str]) -> SourceMap:
 
 
 def split_rule(text: str) -> SplitRule:
-    """The rule that a word of the command line names: phase, gaps, gaps=SECONDS, arming or column.
+    """Return the rule for a word of the command line: phase, gaps, gaps=SECONDS, arming or column.
 
     Raises:
-        CalibrationError: Another word.
+        CalibrationError: The word is unknown.
     """
     word, _, seconds = text.partition("=")
     try:

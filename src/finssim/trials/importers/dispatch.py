@@ -1,4 +1,4 @@
-"""The importer: which reader a file needs, which files make one trial, and the folders that are written."""
+"""Import of logs: selection of readers, grouping of files to trials, and writing of folders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from finssim.vehicles import load_vehicle
 
 
 def print_folders(folders: Sequence[Path], as_json: bool) -> None:
-    """Print where trials were written, a line each or as one JSON object."""
+    """Print the folders of the trials, one per line or as one JSON object."""
     names = [str(folder) for folder in folders]
     print(json.dumps({"trials": names}) if as_json else "\n".join(names))
 
@@ -42,8 +42,8 @@ def import_trials(
     Example: finssim trials import dive.BIN --vehicle bluerov2 --split arming --out trials
 
     Args:
-        logs (LOG): Logs of any format that `finssim doctor` lists as an importer of trials: tables, bags, logs of
-            autopilots, ground stations and Doppler logs. Tables that a map puts together form one trial.
+        logs (LOG): Logs of any format that `finssim doctor` lists as an importer of trials: tables, bags,
+            logs of autopilots, ground stations and Doppler logs. Tables that a map combines form one trial.
         out (DIR): Folder for the trial folders.
         column_map (FILE): Map of the log's columns or topics, with units and frames (.yaml).
         format (FORMAT): auto (by content), or the name of an importer: csv, ardupilot, rosbag, ulog, ...
@@ -52,11 +52,11 @@ def import_trials(
         as_json: Print one JSON object instead of one line per trial.
 
     Returns:
-        The folders, in the order of their trials; what was repaired or left out is told on standard error.
+        The folders, in the order of their trials; repairs and omissions are reported on standard error.
 
     Raises:
-        CalibrationError: A log or map that cannot be used; nothing is written then.
-        OutputError: A folder that holds other files, or cannot be written.
+        CalibrationError: A log or map cannot be used; nothing is written.
+        OutputError: A folder contains other files, or cannot be written.
     """
     folders = []
     for trial in read_trials(logs, column_map=column_map, format=format, vehicle=vehicle, split=split):
@@ -76,14 +76,14 @@ def read_trials(
     vehicle: str | None = None,
     split: str | SplitRule | None = None,
 ) -> list[Trial]:
-    """The trials that logs hold; see `import_trials`."""
+    """Return the trials in logs; see `import_trials`."""
     mapped = read_map(Path(column_map)) if column_map is not None else ColumnMap.model_validate({})
     for name in (
         vehicle or mapped.header.get("vehicle"),
         *(keys.get("vehicle") for keys in mapped.trials.values()),
     ):
         if name is not None:
-            load_vehicle(name)  # an unknown one is refused before any log is read
+            load_vehicle(name)  # refuse an unknown vehicle before any log is read
     rule = split_rule(split) if isinstance(split, str) else split or mapped.split
     trials: list[Trial] = []
     named = vehicle or mapped.header.get("vehicle")
@@ -97,7 +97,7 @@ def read_trials(
     unknown = [name for name in mapped.trials if name not in {trial.name for trial in trials}]
     if unknown and not any(trial.name.startswith(tuple(unknown)) for trial in trials):
         names = ", ".join(trial.name for trial in trials)
-        raise CalibrationError(f"{column_map}: trials.{unknown[0]}: no such trial; the logs make {names}")
+        raise CalibrationError(f"{column_map}: trials.{unknown[0]}: no such trial; the logs contain {names}")
     _check_names(trials)
     return trials
 
@@ -134,7 +134,7 @@ def _table_logs(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[tup
             unread.append(path.name)
         elif len(hits) > 1:
             raise CalibrationError(
-                f"{path.name} fits {hits[0][0]} and {hits[1][0]} of the map: make them differ"
+                f"{path.name} fits {hits[0][0]} and {hits[1][0]} of the map: make the patterns distinct"
             )
         else:
             pattern, trial = hits[0] if hits else ("", path.stem)
@@ -162,8 +162,8 @@ def _table_logs(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[tup
 
 
 def _trial_name(pattern: str, path: Path) -> str | None:
-    """The trial that a file belongs to, or None where the pattern does not fit."""
-    # Without {trial} the first * gives the trial's name; without either, the folder does.
+    """Return the trial that a file belongs to, or None if the pattern does not match."""
+    # Without {trial} the first * is the trial's name; without either, the folder is.
     before, mark, after = pattern.partition("{trial}" if "{trial}" in pattern else "*")
     hit = re.fullmatch(
         _expression(before) + ("(?P<trial>.+?)" if mark else "") + _expression(after), path.name
@@ -174,17 +174,17 @@ def _trial_name(pattern: str, path: Path) -> str | None:
 
 
 def _expression(pattern: str) -> str:
-    """A pattern with * and ? as a regular expression."""
+    """Convert a pattern with * and ? to a regular expression."""
     return "".join(".*" if c == "*" else "." if c == "?" else re.escape(c) for c in pattern)
 
 
 def _check_names(trials: list[Trial]) -> None:
-    """Each name is a folder's, and no other trial's: maps and patterns make them as well as names of logs."""
+    """Refuse names that are not valid folder names or occur twice; they may come from maps, patterns or log names."""
     names = set()
     for trial in trials:
         plain_name(trial.name, "trial", CalibrationError)
         if trial.name in names:
             raise CalibrationError(
-                f"two logs make a trial '{trial.name}': import them one by one, or rename a file"
+                f"two logs result in a trial '{trial.name}': import them one by one, or rename a file"
             )
         names.add(trial.name)

@@ -1,4 +1,4 @@
-"""Records of FinsSim within bags: thrusters by name, phases and arming from events, and the vehicle."""
+"""FinsSim records within bags: thrusters by name, phases and arming from events, and the vehicle."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from finssim.trials.importers.column_map import ColumnSource, SourceMap
 from finssim.vehicles import VehicleError, catalogue_vehicle
 
 NATIVE = "finssim_msgs/msg/"
-"""Prefix of the types in our own bags."""
+"""Prefix of the message types in our own bags."""
 
 ACTUATORS = "actuator_states"
-"""Last part of the topic with the values of actuators besides thrusters, as positions of joints."""
+"""Last component of the topic with the values of non-thruster actuators, as joint positions."""
 
 TRIAL_TOPICS = (
     "odom",
@@ -32,27 +32,27 @@ TRIAL_TOPICS = (
     "telemetry",
     "pressure",
 )
-"""Last parts of the topics of a trial; the wanted wrench and the goal do not describe what happened."""
+"""Last components of the topics of a trial; the requested wrench and the goal do not describe the actual motion."""
 
 COMPASS = "/compass/imu"
-"""Topic of an Imu that gives a heading alone, without rates and specific force."""
+"""Topic of an Imu message that contains only a heading, without rates and specific force."""
 
 ARMING = {"armed": "armed", "disarmed": "disarmed", "fault": "disarmed"}
-"""Kind of an event -> whether thrusters may turn from then on; while it holds, an armed bridge stays armed."""
+"""Kind of an event -> arming state from then on, until the next such event."""
 
 THRUSTERS: dict[str, dict[str, tuple[str, str]]] = {
     "sensor_msgs/msg/JointState": {"rpm_": ("velocity", "rad/s")},
     "finssim_msgs/msg/ThrusterState": {"rpm_": ("shaft_speed", "rad/s"), "command_": ("force", "N")},
     "finssim_msgs/msg/ThrusterCommand": {"command_": ("force", "N")},
 }
-"""Type -> prefix of a trial's columns -> list of the message and its unit, one number a thruster."""
+"""Type -> prefix of a trial's columns -> list in the message and its unit, one number per thruster."""
 
 
 def native_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
-    """Topics of ours that make a trial; none of a bag without a type of ours.
+    """Return FinsSim's own topics that form a trial; none for a bag without message types of FinsSim.
 
     Args:
-        types: LogTopic -> type, all that the bag has.
+        types: Topic -> type, for all topics of the bag.
     """
     if not any(kind.startswith(NATIVE) for kind in types.values()):
         return {}
@@ -64,8 +64,7 @@ def native_topics(types: Mapping[str, str]) -> dict[str, SourceMap]:
 
 
 def thruster_columns(topic: str, kind: str, message: Any) -> dict[str, ColumnSource]:
-    """Columns that a message holds by the names of thrusters or other actuators; lists that it leaves empty hold
-    none."""
+    """Return the columns of a message, named by thrusters or other actuators; empty lists yield none."""
     names = names_of(message)
     lists = THRUSTERS.get(kind, {})
     if topic.rsplit("/", 1)[-1] == ACTUATORS:
@@ -86,9 +85,9 @@ def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float)
     """Return phases and arming from the events of a record; None if they contain neither.
 
     Args:
-        topic: Of the events.
-        events: Time [s] and JSON of each, in order.
-        start: Of the record [s]; before the first event there is no phase, and the vehicle is disarmed.
+        topic: Topic of the events.
+        events: Time [s] and JSON of each event, in order.
+        start: Start of the record [s]; before the first event there is no phase, and the vehicle is disarmed.
     """
     times, phase, arming = [start], [""], ["disarmed"]
     for time, text in events:
@@ -96,7 +95,7 @@ def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float)
             event = json_value(text, CalibrationError, topic)
             kind, word = str(event["kind"]), str(event.get("text", ""))
         except (ValueError, KeyError, TypeError, AttributeError):
-            continue  # words of other programs
+            continue  # text of other programs
         if kind != "phase" and kind not in ARMING:
             continue
         times.append(time)
@@ -108,10 +107,10 @@ def spoken_events(topic: str, events: Iterable[tuple[float, str]], start: float)
 
 
 def recorded_header(path: Path) -> tuple[dict[str, Any], list[Finding]]:
-    """Return the keys of a record for `trial.yaml`, and findings about it; nothing of a foreign file.
+    """Return the keys of a record for `trial.yaml`, and findings about it; nothing for a foreign file.
 
     Raises:
-        CalibrationError: The record's own words for the header are broken.
+        CalibrationError: The header in the record is invalid.
     """
     about = mcap_metadata(path, "finssim")
     try:

@@ -37,8 +37,8 @@ def trial_from_frame(
         time: Name of the column of times.
         axes: FLU or FRD.
         name: Name of the trial.
-        surface_pressure: What the pressure sensor reads at the surface [Pa].
-        header: Further keys of `trial.yaml`.
+        surface_pressure: Reading of the pressure sensor at the surface [Pa].
+        header: Additional keys of `trial.yaml`.
     """
     plain_name(name, "name of the trial", CalibrationError)
     table = _table(frame, time, name)
@@ -75,7 +75,7 @@ def trial_from_frame(
 
 
 def _table(frame: Any, time: str, name: str) -> ColumnTable:
-    """Return the columns of a DataFrame, its index of times included, or of a mapping."""
+    """Return the columns of a DataFrame, including a time index, or of a mapping."""
     if hasattr(frame, "columns") and hasattr(frame, "index"):
         index = frame.index
         held = index.name == time or np.issubdtype(np.asarray(index).dtype, np.datetime64)
@@ -83,7 +83,7 @@ def _table(frame: Any, time: str, name: str) -> ColumnTable:
             frame = frame.assign(**{time: np.asarray(index)})
         columns = {str(column): frame[column] for column in frame.columns}
         if len(columns) < len(frame.columns):
-            raise CalibrationError(f"{name}: two columns have one name: rename one")
+            raise CalibrationError(f"{name}: two columns have the same name: rename one")
     elif isinstance(frame, Mapping):
         columns = {str(column): values for column, values in frame.items()}
     else:
@@ -95,6 +95,6 @@ def _table(frame: Any, time: str, name: str) -> ColumnTable:
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         listed = ", ".join(f"{column} {array.shape}" for column, array in arrays.items())
         raise CalibrationError(
-            f"{name}: columns {listed or 'none'}, expected one-dimensional ones of one length"
+            f"{name}: columns {listed or 'none'}, expected one-dimensional ones of equal length"
         )
     return memory_table(arrays)

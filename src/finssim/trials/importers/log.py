@@ -1,4 +1,4 @@
-"""What importers of logs receive and return, and the choice of one by name or content."""
+"""Arguments and results of importers of logs, and the selection of an importer by name or content."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class Request:
 
     @property
     def passive(self) -> bool:
-        """Whether the thrusters were off, so that no commands are read."""
+        """True if the thrusters were off, so that no commands are read."""
         return bool(self.mapped.header.get("passive", False))
 
 
 @dataclass(frozen=True)
 class TrialStreams:
-    """Content of a log that makes one trial."""
+    """Content of a log that forms one trial."""
 
     streams: list[Stream]
-    """Streams in canonical columns; their findings name everything that was not read."""
+    """Streams in canonical columns; their findings list all contents that were not read."""
     header: dict[str, Any] = field(default_factory=dict)
     """Keys of `trial.yaml` that the log contains."""
 
@@ -44,7 +44,7 @@ def importer_of(path: Path, format: str = "auto") -> str:
     """Return the name of the importer of a log: the given one, or the first that recognises its content.
 
     Raises:
-        CalibrationError: No importer of that name, or none recognises it.
+        CalibrationError: There is no importer of that name, or none recognises the log.
     """
     known = importers("trial")
     if format not in ("auto", *known):
@@ -54,5 +54,7 @@ def importer_of(path: Path, format: str = "auto") -> str:
     name = format if format in known else recognised("trial", path)
     if name is None:
         titles = ", ".join(importer.title for importer in known.values())
-        raise CalibrationError(f"{path}: unknown kind of log, expected one of {titles}; or give --format")
+        raise CalibrationError(
+            f"{path}: unknown format of the log, expected one of {titles}; or give --format"
+        )
     return name

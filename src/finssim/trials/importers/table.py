@@ -1,4 +1,4 @@
-"""Tables as streams: text, Parquet, NumPy archives and tables in memory, by a map or by the names of their columns."""
+"""Tables as streams: text, Parquet, NumPy archives and tables in memory, read by a map or by their column names."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from finssim.vehicles.part import did_you_mean
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
 TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
-"""Names of the time column without a map; seconds."""
+"""Names of the time column without a map; times are in seconds."""
 
 WORST_FOM = 0.4
-"""Figure of merit of a Doppler log at which BlueOS' extension for it gives a velocity no weight [m/s]."""
+"""Figure of merit of a Doppler log from which BlueOS' extension for it ignores a velocity [m/s]."""
 
 EVIDENT: dict[str, tuple[str, dict[str, float]]] = {
     "valid": ("", {}),
@@ -43,7 +43,7 @@ EVIDENT: dict[str, tuple[str, dict[str, float]]] = {
     "fix_valid": ("position", {}),
     "fix_type": ("position", {"above": 1.0}),  # MAVLink: 0 and 1 are no fix
 }
-"""Column that marks invalid samples -> group of columns, all if empty, and limits; used without `valid` in a map."""
+"""Column that marks invalid samples -> group of columns (all if empty), and limits; used if a map has no `valid`."""
 
 
 def read_stream(path: Path, source: SourceMap | None) -> Stream:
@@ -51,10 +51,10 @@ def read_stream(path: Path, source: SourceMap | None) -> Stream:
 
     Args:
         path: Text, Parquet or NumPy file.
-        source: Map of its columns; without it the columns with canonical names are taken.
+        source: Map of its columns; without it, columns with canonical names are read.
 
     Raises:
-        CalibrationError: Unreadable, or a column that it lacks.
+        CalibrationError: The file is unreadable, or lacks a column.
     """
     mapping = source or SourceMap()
     if path.suffix.lower() == ".npz":
@@ -69,10 +69,10 @@ def read_npz(path: Path, time: str | None) -> ColumnTable:
 
     Args:
         path: The archive; Python objects in it are refused.
-        time: Name of the array of times; the first usual name if None. Arrays of another length are left out.
+        time: Name of the time array; the first known name if None. Arrays of another length are ignored.
 
     Raises:
-        CalibrationError: No archive, or no array of times.
+        CalibrationError: The file is not an archive, or contains no time array.
     """
     columns: dict[str, Any] = {}
     others: list[str] = []
@@ -92,7 +92,7 @@ def read_npz(path: Path, time: str | None) -> ColumnTable:
                     columns[name] = array
     except CalibrationError:
         raise
-    except Exception as error:  # what is damaged shows in whatever layer of zipfile and NumPy meets it
+    except Exception as error:  # depending on the damage, any layer of zipfile and NumPy may raise
         reason = " ".join(str(error).split())[:120]
         raise CalibrationError(f"{path}: cannot be read as a NumPy archive of numbers: {reason}") from None
     time = time or next((name for name in TIME_NAMES if name in columns), None)
@@ -110,10 +110,10 @@ def read_npz(path: Path, time: str | None) -> ColumnTable:
 
 
 def memory_table(columns: Mapping[str, Any]) -> ColumnTable:
-    """Return columns in memory as a table, times of NumPy and pandas as written dates.
+    """Return columns in memory as a table, with times of NumPy and pandas as written dates.
 
     Args:
-        columns: Name -> array of numbers, dates or words, (n,) each.
+        columns: Name -> array of numbers, dates or text, (n,) each.
     """
     table = ColumnTable()
     for column, array in columns.items():
@@ -130,8 +130,8 @@ def table_stream(table: ColumnTable, source: SourceMap | None, label: str) -> St
     """Return the columns of a table as a stream.
 
     Args:
-        table: As read.
-        source: Map of its columns; without it the columns with canonical names are taken.
+        table: Table as read.
+        source: Map of its columns; without it, columns with canonical names are read.
         label: Name of the table in messages.
 
     Raises:
@@ -152,7 +152,7 @@ def table_stream(table: ColumnTable, source: SourceMap | None, label: str) -> St
 
 
 def used_columns(source: SourceMap) -> list[str]:
-    """Return the columns or fields that a map names, without that of the time."""
+    """Return the columns or fields that a map uses, except that of the time."""
     specs = source.columns.values()
     flags = [*(spec.valid for spec in specs), source.arming, *(source.valid or ())]
     names = [
@@ -164,7 +164,7 @@ def used_columns(source: SourceMap) -> list[str]:
 
 
 def worded(source: SourceMap) -> dict[str, str]:
-    """Return `phase` and `split` -> the column or field with their words, where the map names one."""
+    """Return `phase` and `split` -> the column or field with their words, if the map defines them."""
     phase = {"phase": source.phase.column} if source.phase is not None else {}
     return phase | ({"split": source.split} if source.split is not None else {})
 
@@ -179,7 +179,7 @@ def stream_of(table: ColumnTable, source: SourceMap, t: Array, label: str) -> St
         label: Name of the table in messages.
 
     Raises:
-        CalibrationError: The table lacks a column, or has no valid sample.
+        CalibrationError: The table lacks a column, or contains no valid sample.
     """
     flags = _flags(table, source)
     channels: dict[str, Array] = {}
@@ -219,7 +219,7 @@ def stream_of(table: ColumnTable, source: SourceMap, t: Array, label: str) -> St
 
 
 def _flags(table: ColumnTable, source: SourceMap) -> list[tuple[Validity, list[str]]]:
-    """Return the marks of invalid samples with their columns: those of the map, or the evident ones of the table."""
+    """Return the validity marks with their columns: those of the map, or those detected in the table."""
     columns = list(source.columns)
     if source.valid is not None:
         return [(flag, columns) for flag in source.valid]
@@ -274,7 +274,7 @@ def _numbers(table: ColumnTable, name: str, label: str) -> Array:
     _require_column(table, name, label)
     if name not in table.numbers:
         example = next((word for word in table.words[name] if word), "")
-        raise CalibrationError(f"{label}: column '{name}' holds no numbers, for instance '{example}'")
+        raise CalibrationError(f"{label}: column '{name}' contains no numbers, for instance '{example}'")
     return table.numbers[name]
 
 
@@ -291,19 +291,19 @@ def _time(table: ColumnTable, time: TimeColumn, label: str) -> Array:
     words = [_date(word) for word in _text(table, time.column, label)]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an offset from universal time, which is applied
+            warnings.simplefilter("ignore", UserWarning)  # a UTC offset, which is applied
             dates = np.array(words, dtype="datetime64[us]")
     except ValueError:
         raise CalibrationError(
-            f"{label}: column '{time.column}' holds neither numbers nor dates such as 2026-05-31 12:30:00.25: "
-            "give a column that does"
+            f"{label}: column '{time.column}' contains neither numbers nor dates such as 2026-05-31 12:30:00.25: "
+            "give a column with the time"
         ) from None
     seconds = np.where(np.isnat(dates), np.nan, dates.astype(np.int64) * 1e-6)
     return time.model_copy(update={"unit": "date"}).seconds(seconds)
 
 
 def _date(word: str) -> str:
-    """Return a date as NumPy reads it: universal time without saying so, and a day for a time without one."""
+    """Return a date in NumPy's form: UTC without a suffix, and with a day if only a time is given."""
     word = re.sub(r"(Z|[+-]00:?00)$", "", word.strip()).replace(",", ".")
     return f"1970-01-01T{word}" if re.match(r"\d\d:\d", word) else word or "NaT"
 
@@ -313,14 +313,14 @@ def _column_list(table: ColumnTable) -> str:
 
 
 def _names(path: Path, head: bytes) -> list[str]:
-    """Return the names of the columns of a text table, from its first bytes; none of other files."""
+    """Return the column names of a text table, from its first bytes; empty for other files."""
     if path.suffix.lower() not in TEXTS:
         return []
     return text_table(decoded(head)[0]).names
 
 
 def known_table(file: str) -> Importer:
-    """Return the importer of tables that a shipped file describes: its title, the columns it needs, and its map.
+    """Return the importer of a table format that a shipped file defines by its title, required columns and map.
 
     Args:
         file: Name of the YAML file beside this module.

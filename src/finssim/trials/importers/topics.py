@@ -1,4 +1,4 @@
-"""Topics of a log, each with its own times and fields, as the streams of a trial."""
+"""Conversion of a log's topics, each with its own times and fields, to the streams of a trial."""
 
 from __future__ import annotations
 
@@ -17,34 +17,35 @@ from finssim.trials.importers.table import memory_table, stream_of
 from finssim.trials.trial import Array
 
 OTHER_CLOCK = 5.0
-"""Stamps that are farther from the times of receipt than those of other topics are of another clock [s]."""
+"""Difference of stamps from the times of receipt, relative to other topics, above which they belong to
+another clock [s]."""
 
 
 @dataclass
 class LogTopic:
-    """A topic that is read."""
+    """Topic that is read."""
 
     map: SourceMap
     rank: int = 0
-    """Place in the order of sources of a column; -1 if a map names its columns."""
+    """Priority among the sources of a column; -1 if a map names its columns."""
     kind: str = ""
     """Type of its messages."""
     received: Any = field(default_factory=list)
     """Times of receipt [s], (n,)."""
     stamps: Any = field(default_factory=list)
-    """Stamps of the headers [s], NaN for messages without one, (n,); empty if no message has one."""
+    """Stamps of the headers [s], NaN for messages without one, (n,); empty if no message has a stamp."""
     cells: dict[str, Any] = field(default_factory=dict)
-    """Field -> numbers or words, (n,)."""
+    """Field -> numbers or text, (n,)."""
     broken: Counter[str] = field(default_factory=Counter)
-    """Reasons for which messages cannot be read -> their number."""
+    """Reason why messages cannot be read -> their number."""
 
 
 def times_of(topics: Mapping[str, LogTopic], findings: list[Finding]) -> dict[str, Array]:
-    """Return the times [s] of each topic's messages on one clock: stamps where they are of that of the others.
+    """Return the times [s] of each topic's messages on one clock: the stamps if they belong to the common clock.
 
     Args:
         topics: Topics by name.
-        findings: List to which topics with another clock are added.
+        findings: List to which topics with another clock are appended.
     """
     delays = {
         name: float(np.nanmedian(np.subtract(topic.received, topic.stamps)))
@@ -72,19 +73,19 @@ def log_of(
     others: Sequence[Stream] = (),
     header: Mapping[str, Any] | None = None,
 ) -> TrialStreams:
-    """Return the topics that can be used as streams, with findings about the others.
+    """Return the usable topics as streams, with findings about the others.
 
     Args:
         label: Name of the log in messages.
         topics: Topics by name.
-        times: LogTopic -> times of its messages [s].
+        times: Topic -> times of its messages [s].
         findings: Findings about the log.
-        unread: What the log contains beside the topics.
+        unread: Contents of the log besides the topics.
         others: Further streams of the log.
         header: Keys of `trial.yaml`.
 
     Raises:
-        CalibrationError: No topic can be used, or one of which a map names the columns.
+        CalibrationError: No topic can be used, or a topic whose columns a map names cannot.
     """
     streams = []
     for name, topic in topics.items():
@@ -108,6 +109,6 @@ def log_of(
         usable = []
     if not usable:
         reasons = "".join(f"; {item}" for item in findings if item.code == "topic_unusable")
-        raise CalibrationError(f"{label}: {', '.join(topics)} hold fewer than two messages each{reasons}")
+        raise CalibrationError(f"{label}: {', '.join(topics)} have fewer than two messages each{reasons}")
     findings += [finding("not_read", items=", ".join(unread))] if unread else []
     return TrialStreams([usable[0].noting(*findings), *usable[1:]], dict(header or {}))

@@ -23,7 +23,8 @@ from finssim.trials.importers.topics import LogTopic, log_of, times_of
 from finssim.trials.trial import Array
 
 APART = 0.05
-"""Distance between a rotor in the parameters and the thruster in the vehicle file from which a finding is made [m]."""
+"""Distance between a rotor in the parameters and the thruster in the vehicle file above which a finding is
+reported [m]."""
 MAGIC = b"ULog\x01\x12\x35"
 
 TOPICS = shipped_maps("ulog.yaml")["topics"]
@@ -31,12 +32,12 @@ TOPICS = shipped_maps("ulog.yaml")["topics"]
 
 
 class _BoundedFile(io.BytesIO):
-    """Content of a file that is read a bounded number of times, for pyulog does not leave some damaged files."""
+    """File content with a limited number of reads, since pyulog loops forever on some damaged files."""
 
     def read(self, size: int | None = -1) -> bytes:
         self.reads = getattr(self, "reads", 0) + 1
         if self.reads > 10_000 + len(self.getbuffer()) // 2:
-            raise CalibrationError("it is damaged, and no part of it can be read")
+            raise CalibrationError("it is damaged and cannot be read")
         return super().read(size)
 
 
@@ -48,7 +49,7 @@ def read(path: Path, request: Request) -> TrialStreams:
         request: Map and vehicle; a passive trial has no outputs.
 
     Raises:
-        CalibrationError: No such log, or without a usual topic.
+        CalibrationError: The file is not a PX4 log, or contains no known topic.
         ModuleNotFoundError: pyulog is not installed.
     """
     from pyulog import ULog
@@ -57,7 +58,7 @@ def read(path: Path, request: Request) -> TrialStreams:
     try:
         with limited_memory(), contextlib.redirect_stdout(io.StringIO()):  # pyulog prints what it skips
             log = ULog(_BoundedFile(data))
-    except Exception as error:  # what is damaged shows in whatever layer of pyulog meets it
+    except Exception as error:  # depending on the damage, any layer of pyulog may raise
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise CalibrationError(f"{path}: cannot be read as a PX4 log: {reason}") from None
     topics: dict[str, LogTopic] = {}
@@ -67,7 +68,7 @@ def read(path: Path, request: Request) -> TrialStreams:
     for data in sorted(log.data_list, key=lambda data: (data.name, data.multi_id)):
         name, t = data.name + (f" {data.multi_id}" if data.multi_id else ""), 1e-6 * data.data["timestamp"]
         if name in TOPICS:
-            source = present(TOPICS[name], list(data.data))  # versions of PX4 differ
+            source = present(TOPICS[name], list(data.data))  # depends on the version of PX4
             topics[name] = LogTopic(source, list(TOPICS).index(name), received=t, cells=data.data)
         elif name == "actuator_outputs" and not request.passive and len(t) >= 2:
             outputs.append(_outputs(data.data, t, request, log.initial_parameters))
@@ -80,8 +81,8 @@ def read(path: Path, request: Request) -> TrialStreams:
 
 
 def _outputs(data: dict[str, Any], t: Array, request: Request, parameters: Mapping[str, float]) -> Stream:
-    """Return the pulses of the outputs [µs], assigned to thrusters by a map, by the vehicle's motor_index, or by the
-    geometry of the rotors in the log's parameters (in the autopilot's units)."""
+    """Return the pulses of the outputs [µs], assigned to thrusters by a map, by the vehicle's motor_index, or
+    by the geometry of the rotors in the log's parameters (in the autopilot's units)."""
     pulses = {i + 1: np.asarray(data[f"output[{i}]"], float) for i in range(16) if f"output[{i}]" in data}
     pulses = {
         i: np.where((values > 800.0) & (values < 2200.0), values, np.nan) for i, values in pulses.items()
@@ -107,9 +108,9 @@ def _outputs(data: dict[str, Any], t: Array, request: Request, parameters: Mappi
 def _by_rotors(
     outputs: dict[int, tuple[str, int]], note: Finding, parameters: Mapping[str, float], request: Request
 ) -> tuple[dict[int, tuple[str, int]], list[Finding]]:
-    """Return outputs with their thrusters, by the places and axes of the rotors (CA_ROTOR*), and what is found.
+    """Return outputs with their thrusters, by the positions and axes of the rotors (CA_ROTOR*), and findings.
 
-    Without a vehicle, or where they do not fit its thrusters, the outputs and the note stay.
+    Without a vehicle, or if the rotors do not match its thrusters, the outputs and the note are returned unchanged.
     """
     count = int(parameters.get("CA_ROTOR_COUNT", 0))
     if count == 0:
@@ -162,7 +163,7 @@ def _by_rotors(
 
 
 def _list(vector: Array) -> str:
-    """Return a vector as a list of a vehicle file, in its unit."""
+    """Return a vector formatted as a list of a vehicle file, in its unit."""
     return f"[{', '.join(f'{x + 0.0:.4g}' for x in vector)}]"
 
 

@@ -1,4 +1,4 @@
-"""JSON lines of Water Linked's Doppler logs, of all versions of their protocol."""
+"""Importer of JSON lines of Water Linked's Doppler logs, for all versions of their protocol."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ REPORTS = shipped_maps("water_linked.yaml")["reports"]
 """Type of a report -> map of its fields."""
 
 LABELS = {"type", "format", "ts", "status", "time", "time_of_transmission", "time_of_validity"}
-"""Fields that tell what a report is."""
+"""Fields that identify a report."""
 
 
 def read(path: Path, request: Request) -> TrialStreams:
-    """Return the velocities over the floor, and dead reckoning if it has the same clock, as streams.
+    """Return the velocities over ground, and dead reckoning if it uses the same clock, as streams.
 
     Args:
-        path: One JSON object a line. Until version 2 of the protocol a report has no clock: its `time` is the period
-            since the last report, which is summed up.
+        path: File with one JSON object per line. Up to version 2 of the protocol a report has no clock: its
+            `time` is the period since the last report, which is summed.
         request: Not used.
 
     Raises:
-        CalibrationError: Unreadable, or without a valid velocity.
+        CalibrationError: The file is unreadable, or contains no valid velocity.
     """
     text, _ = read_text(path, CalibrationError)
     reports: dict[str, list[dict[str, Any]]] = {kind: [] for kind in REPORTS}
@@ -57,7 +57,7 @@ def read(path: Path, request: Request) -> TrialStreams:
     velocity, position = reports["velocity"], reports["position_local"]
     if not velocity:
         raise CalibrationError(
-            f"{path}: no velocity of a Water Linked log in it, expected one JSON object a line"
+            f"{path}: contains no velocity of a Water Linked log, expected one JSON object per line"
         )
     stamped = all(_number(report.get("time_of_validity")) > 0.0 for report in velocity)
     time = TimeColumn(column="time", unit="ms", kind="period")
@@ -84,7 +84,7 @@ def read(path: Path, request: Request) -> TrialStreams:
 
 
 def _topic(kind: str, reports: list[dict[str, Any]]) -> LogTopic:
-    """Return reports as a topic; a number that a report lacks is NaN."""
+    """Return reports as a topic; a number that is missing in a report is NaN."""
     names = [name for name in used_columns(REPORTS[kind]) if any(name in report for report in reports)]
     return LogTopic(
         REPORTS[kind], cells={name: [_number(report.get(name)) for report in reports] for name in names}
