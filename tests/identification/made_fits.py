@@ -26,7 +26,7 @@ def made_fit(vehicle: Vehicle | None = None, **changes: Any) -> Fit:
             (0.0, 9.0),
             "N m s²/rad²",
             False,
-            "rests on its bound",
+            "is at its bound",
             f"{SET}.quadratic_damping.5.5",
         ),
         ("heave.d1", 81.0, (-np.inf, np.nan), "N s/m", False, "no speed", f"{SET}.linear_damping.2.2"),

@@ -112,7 +112,7 @@ def test_an_interrupted_fit_says_so(tmp_path):
 
 def test_estimates_that_no_vehicle_can_have_are_refused():
     """A mass matrix that is not positive definite is a sentence, not a vehicle."""
-    with pytest.raises(CalibrationError, match="make no vehicle: .*not positive definite"):
+    with pytest.raises(CalibrationError, match="do not form a valid vehicle: .*not positive definite"):
         calibrated(made_fit(changes={f"{SET}.added_mass.0.0": -400.0}))
 
 
@@ -193,5 +193,5 @@ def test_a_part_of_the_drag_is_written_as_unsure():
     after = calibrated(fit)
     assert after.hydrodynamic_set("calibrated").quadratic_damping[5, 5] == 0.1
     assert state_text(fit.estimates["yaw.d2"], fit, after) == "unsure"
-    assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; rests on its bound"
+    assert after.origin_of(f"{SET}.quadratic_damping.5").note == "95 % interval 0 to 9; is at its bound"
     assert "yaw.d2" not in retained_values(fit, after)

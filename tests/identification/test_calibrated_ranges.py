@@ -17,15 +17,15 @@ from identification.made_fits import SET, made_fit
 
 
 def test_the_rule():
-    """Told: the interval over the estimate; not told or guessed: half to double; not asked for: a tenth."""
+    """Determined: the interval over the estimate; undetermined or guessed: half to double; not fitted: a tenth."""
     fit = made_fit()
     factors = range_factors(fit, calibrated(fit))
     assert factors["linear_damping.surge"][:2] == pytest.approx((37.9 / 39.1, 40.2 / 39.1))
     assert factors["added_mass.surge"][:2] == pytest.approx((16.9 / 17.9, 19.0 / 17.9))
-    assert factors["quadratic_damping.yaw"] == (0.5, 2.0, "not told")
-    assert factors["linear_damping.heave"] == (0.5, 2.0, "not told")
+    assert factors["quadratic_damping.yaw"] == (0.5, 2.0, "undetermined")
+    assert factors["linear_damping.heave"] == (0.5, 2.0, "undetermined")
     assert factors["linear_damping.roll"] == (0.5, 2.0, "guessed")
-    assert factors["linear_damping.sway"] == (0.9, 1.1, "not asked for")
+    assert factors["linear_damping.sway"] == (0.9, 1.1, "not fitted")
     assert factors["time_constant"][:2] == pytest.approx((0.1 / 0.15, 0.2 / 0.15))
     assert factors["thrust.all"][:2] == pytest.approx((0.95 / 0.97, 0.99 / 0.97), abs=0.001)
     assert "quadratic_damping.surge" not in factors  # it is zero: a factor on it is nothing
@@ -86,7 +86,7 @@ def test_the_file_says_why(tmp_path):
     fit = made_fit()
     write_ranges(fit, tmp_path / "r.yaml")
     text = (tmp_path / "r.yaml").read_text(encoding="utf-8")
-    assert "surge: [0.9693, 1.028]  # told" in text and "# guessed" in text and "# not asked for" in text
+    assert "surge: [0.9693, 1.028]  # determined" in text and "# guessed" in text and "# not fitted" in text
     assert calibrated(fit).sha256[:16] in load_ranges(tmp_path / "r.yaml").source
 
 

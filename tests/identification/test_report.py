@@ -46,7 +46,7 @@ def test_a_reader_finds_what_they_need(folder):
         "37.9 to 40.2",
         "4 of 6 parameters",
         "yaw.d2 0.4776",
-        "rests on its bound",
+        "is at its bound",
         "11" * 32,
         COMMAND,
         vehicle.sha256,

@@ -458,7 +458,7 @@ def test_what_cannot_be_fitted_is_refused():
         (trials, {"axes": ["up"]}, "unknown axis 'up'"),
         (trials, {"estimate": ["colour"]}, "cannot estimate 'colour'"),
         (trials, {"damping": "cubic"}, "unknown damping"),
-        ([trials[0], trials[0]], {}, "expected a name for each"),
+        ([trials[0], trials[0]], {}, "expected unique names"),
     ):
         with pytest.raises(CalibrationError, match=words):
             fit_by_simulation(given, vehicle, **options)

@@ -1,4 +1,4 @@
-"""Real to sim: from logs of trials to a calibrated vehicle, with uncertainty."""
+"""Real-to-sim: calibration of a vehicle from logs of trials, with uncertainty."""
 
 from typing import TYPE_CHECKING
 

@@ -1,13 +1,13 @@
-"""Changes of a vehicle that is driven: payload, drag and thrusters, estimated from one window of driving to the next.
+"""Online estimation of changes of a vehicle in operation (payload, drag, thrusters), window by window.
 
-The estimator is that of `simulation_error`. Each window of some seconds is fitted for itself, with the vehicle file as
-a weak prior, and gives information J and a solution x̂. The state of the filter is a mean m and a covariance P:
+The estimator is that of `simulation_error`. Each window of some seconds is fitted separately, with the vehicle file
+as a weak prior, and yields information J and a solution x̂. The state of the filter is a mean m and a covariance P:
 
-    P⁻¹ ← λ P⁻¹ + (1 - λ) P₀⁻¹,   λ = exp(-T / τ)     what is old is forgotten, down to the vehicle file's own prior
-    J ← (J⁻¹ + Q)⁻¹                                    no window is better than the model
+    P⁻¹ ← λ P⁻¹ + (1 - λ) P₀⁻¹,   λ = exp(-T / τ)     forgets old windows, down to the prior of the vehicle file
+    J ← (J⁻¹ + Q)⁻¹                                    limits the information of a window by the model error
     P⁻¹ ← P⁻¹ + J,   m ← m + P J (x̂ - m)
 
-A window whose x̂ - m is far outside P + J⁻¹ is of a vehicle that has just changed: its P before is then P₀.
+A window whose x̂ - m is far outside P + J⁻¹ indicates that the vehicle has just changed: P is then reset to P₀.
 """
 
 from __future__ import annotations
@@ -47,54 +47,56 @@ __all__ = ["Adaptation", "Follower", "calibrate_changes", "windows_of"]
 Array = NDArray[np.float64]
 
 WINDOW, SEGMENT = 10.0, 5.0
-"""Length of a window, and of a simulation without a restart [s]."""
+"""Length of a window, and longest simulation without a restart [s]."""
 
 STEP = 0.05
-"""Step of the simulation [s]."""
+"""Time step of the simulation [s]."""
 
 APART = 0.1
 """Least time between compared samples of a channel [s]."""
 
 CORRELATED = 1.5
-"""Correlation time of the errors of a robot's estimate [s]: samples within it count as one."""
+"""Correlation time of the errors of a robot's state estimate [s]: samples within it count as one."""
 
 MEMORY = 20.0
 """Time constant τ with which windows are forgotten [s]."""
 
 UNLIKE = 25.0
-"""Square of the largest normalised innovation above which a window belongs to a vehicle that has changed [-]."""
+"""Square of the largest normalised innovation above which a window indicates a changed vehicle [-]."""
 
 BLIND = 1e-6
-"""Information along a direction, in the prior's units, below which the data say nothing and rounding decides."""
+"""Information along a direction, in the prior's units, below which the data are not informative and rounding
+dominates."""
 
 GAP = 0.5
 """Gap between states that ends a window [s]."""
 
 ITERATIONS = 6
-"""Most iterations of a window."""
+"""Largest number of iterations per window."""
 
 FAR = 1e3
 """Bound of each y, in standard deviations."""
 
 COARSE_STEP = 50.0
-"""Size of a coordinate y; its finite difference is a third of a standard deviation."""
+"""Scale of a coordinate y; its finite difference is a third of a standard deviation."""
 
 RELEVANT = {"drag": 0.1, "thruster": 0.1}
-"""Least change that counts, of factors [-]; of the weight it is `RELEVANT_WEIGHT`."""
+"""Least relevant change of factors [-]; for the weight it is `RELEVANT_WEIGHT`."""
 
 RELEVANT_WEIGHT = 0.005
-"""Least additional weight that counts, over the vehicle's own weight [-]."""
+"""Least relevant additional weight, relative to the vehicle's own weight [-]."""
 
 DIFFERENT = 1.5
-"""Least change over the half width of its 95 % interval: among a dozen numbers, an error above 1 is usual."""
+"""Least ratio of a change to the half width of its 95 % interval: among a dozen estimates, some exceed 1 by
+chance."""
 
 
 class _Coordinates:
-    """The unknowns in standard deviations of the prior, in the form of `parameters.Parameters`."""
+    """Unknowns in standard deviations of the prior, with the interface of `parameters.Parameters`."""
 
     nuisances = 0
     axes = biases = ()
-    """None: a push along x and y is among the unknowns."""
+    """Empty: a push along x and y is one of the unknowns."""
 
     def __init__(self, of: Adaptation, mean: Array, std: Array) -> None:
         self.vehicle, self._of, self._mean, self._std = of.vehicle, of, mean, std
@@ -106,29 +108,30 @@ class _Coordinates:
         self.coordinates = [Coordinate(name, "-", 0.0, -FAR, FAR, COARSE_STEP, 1.0) for name in of.names]
 
     def prior_rows(self) -> tuple[Array, Array]:
-        """Return no rows (0, P) and no targets (0,): nothing else is known of the vehicle."""
+        """Return no rows (0, P) and no targets (0,): there is no other prior information."""
         return np.zeros((0, len(self.names))), np.zeros(0)
 
     def plants(self, y: Array) -> Plants:
-        """Return the simulator's parameters of vectors (W, P)."""
+        """Return the simulator's parameters for vectors (W, P)."""
         return self._of.plants(self._mean + np.atleast_2d(y) * self._std)
 
 
 @dataclass
 class Adaptation:
-    """Recursive estimate of what has changed on a vehicle: drag, an additional weight in water, and thrusters.
+    """Recursive estimate of changes of a vehicle: drag, an additional weight in water, and thrusters.
 
-    Mass and added mass are the vehicle file's; the thrusts that they need show the factors.
+    Mass and added mass are those of the vehicle file; the thrust factors are inferred from the thrust that
+    they require.
 
     Attributes:
-        vehicle: The vehicle, as it was identified.
+        vehicle: The vehicle as identified.
         names: `drag` [-], `weight` [N] in water and its first moments about the body origin `weight_x`, `weight_y`,
             `weight_z` [N m], a factor `thruster.NAME` for each thruster [-], and `push_x` and `push_y` [N], a force
-            along body x and y that lasts for one window, such as a current's.
+            along body x and y that is constant in one window, such as that of a current.
         mean: Estimates, in the units of `names`, (P,).
         covariance: Covariance of the estimates, in products of their units, (P, P).
         windows: Number of windows so far.
-        renewed: Numbers of the windows that contradicted those before, from 1.
+        renewed: Numbers of the windows, from 1, that contradicted the previous ones.
     """
 
     vehicle: Vehicle
@@ -145,8 +148,8 @@ class Adaptation:
                 f"{v.name}: no calibrated hydrodynamics, expected added mass and damping: identify it first"
             )
         w, (length, width, height) = v.weight, v.body.size
-        # Value at the start, standard deviation, and by how much what the model leaves out (thrust that differs by
-        # direction, eddies) moves the estimate of a window.
+        # Initial value, standard deviation, and effect of model errors (thrust that differs by direction, eddies) on
+        # the estimate of a window.
         prior = {
             "drag": (1.0, 0.5, 0.05),
             "weight": (0.0, 0.05 * w, 0.001 * w),
@@ -193,10 +196,10 @@ class Adaptation:
         )  # fmt: skip
 
     def update(self, window: Sequence[Segment]) -> None:
-        """Learn from one window of driving.
+        """Update the estimates with one window.
 
         Args:
-            window: Segments of some seconds, in order; none of them is used twice.
+            window: Segments of some seconds, in order; no segment may be used twice.
         """
         if not window:
             return
@@ -219,7 +222,7 @@ class Adaptation:
         self.windows += 1
 
     def _learned(self, window: Sequence[Segment]) -> tuple[Array, Array]:
-        """Return the information J of a window, and J x for the solution x that the window gives by itself."""
+        """Return the information J of a window, and J x for the solution x of the window alone."""
         n, std = len(self.names), np.sqrt(np.diag(self._prior))
         unknowns: Any = _Coordinates(self, self._start, std)
         problem = Shooting([_thinned(s) for s in window], unknowns, CHANNELS, correlated=False)
@@ -233,15 +236,16 @@ class Adaptation:
         J = (own - np.eye(n)) / alike
         right = own @ y / alike  # (1 + J) y = J y of the data alone
         J, right = J / np.outer(std, std), right / std + J @ (self._start / std) / std
-        # No window is better than the model: (J⁻¹ + Q)⁻¹.
+        # The information of a window is limited by the model error: (J⁻¹ + Q)⁻¹.
         discrepancy = self._discrepancy + self._standing(window)
         worse = np.linalg.inv(np.eye(n) + J @ np.diag(discrepancy**2))
         return worse @ J, worse @ right
 
     def _standing(self, window: Sequence[Segment]) -> Array:
-        """Return the part of each thruster's commands in a window that its motor may not follow, (P,); 0 elsewhere.
+        """Return the fraction of each thruster's commands in a window that its motor may not follow, (P,); 0
+        elsewhere.
 
-        A motor stands still below its slowest speed, whether or not the simulated one does [-].
+        A motor may not rotate below its slowest speed, whether or not the simulated one does [-].
         """
         out = np.zeros(len(self.names))
         for i, (name, thruster) in enumerate(self.vehicle.thrusters.items()):
@@ -277,7 +281,7 @@ class Adaptation:
         return {"windows": self.windows, "renewed": list(self.renewed), "changes": estimates}
 
     def print(self, console: Console) -> None:
-        """Print the estimates as a table, those that differ from the vehicle file with a mark."""
+        """Print the estimates as a table in which those that differ from the vehicle file are marked."""
         table = Table("change", "estimate", "95 % interval", "unit", "", box=None)
         for name, e in self.estimates.items():
             low, high = e.ci95
@@ -288,9 +292,9 @@ class Adaptation:
 
     @property
     def adapted(self) -> Vehicle:
-        """Return the vehicle with the numbers that differ; its mass and inertia are the file's.
+        """Return the vehicle with the changed numbers; its mass and inertia are those of the file.
 
-        An additional weight becomes a smaller displaced volume and another centre of buoyancy.
+        An additional weight is represented by a smaller displaced volume and a shifted centre of buoyancy.
         """
         x = self._start.copy()
         for i, estimate in enumerate(self.estimates.values()):
@@ -322,12 +326,12 @@ def _root(covariance: Array) -> Array:
 
 
 def _whitened(root: Array, J: Array, right: Array) -> tuple[Array, Array, Array]:
-    """Return information, principal directions and solution of data in coordinates y with covariance 1.
+    """Return information, principal directions and solution of data in coordinates y with unit covariance.
 
     Args:
-        root: Of the prior's covariance, L Lᵀ.
+        root: Cholesky factor L of the prior's covariance L Lᵀ.
         J: Information of the data.
-        right: J times the solution of the data, from the prior's mean on.
+        right: J times the solution of the data, relative to the prior's mean.
     """
     size, along = np.linalg.eigh(root.T @ J @ root)
     seen = size > BLIND
@@ -336,7 +340,7 @@ def _whitened(root: Array, J: Array, right: Array) -> tuple[Array, Array, Array]
 
 
 def _thinned(segment: Segment) -> Segment:
-    """Return a segment whose samples of each channel are at least `APART` from each other."""
+    """Return a segment in which successive samples of each channel are at least `APART` apart."""
     measured: Mapping[str, tuple[Array, Array]] = {
         name: (t[rows], values[rows])
         for name, (t, values) in segment.measured.items()
@@ -346,11 +350,11 @@ def _thinned(segment: Segment) -> Segment:
 
 
 def windows_of(trial: Trial, vehicle: Vehicle) -> Iterator[list[Segment]]:
-    """Cut a trial into windows; a rest shorter than half a segment is left out.
+    """Cut a trial into windows; a remainder shorter than half a segment is omitted.
 
     Args:
-        trial: Inputs and motion.
-        vehicle: The vehicle that moved.
+        trial: Trial with inputs and motion.
+        vehicle: Vehicle of the trial.
 
     Yields:
         Segments of each window, in order.
@@ -363,10 +367,10 @@ def windows_of(trial: Trial, vehicle: Vehicle) -> Iterator[list[Segment]]:
 
 
 class Follower:
-    """Estimates changes while a robot runs: windows are fitted in a thread of their own, in order."""
+    """Estimator of changes while a robot runs: windows are fitted in order in a separate thread."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """Fit an empty window first, so that nothing is compiled while the vehicle is driven."""
+        """Fit an empty window first, so that nothing is compiled during operation."""
         self.adaptation = Adaptation(vehicle)
         self._columns = [*NU, *EULER, "x", "y", "z", *(f"command_{name}" for name in vehicle.thruster_names)]
         self._rows: list[list[float]] = []
@@ -377,14 +381,14 @@ class Follower:
         Adaptation(vehicle).update(next(windows_of(self._trial(rest), vehicle)))
 
     def add(self, time: float, nu: Array, quaternion: Array, position: Array, force: Array) -> None:
-        """Take the state of a vehicle that is driven; a gap of more than 0.5 s begins a new window.
+        """Add a state of the vehicle in operation; a gap of more than 0.5 s starts a new window.
 
         Args:
-            time: [s]
+            time: Time [s].
             nu: Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (6,).
             quaternion: Body to world, xyzw, (4,).
-            position: World frame [m], (3,).
-            force: Commands of the thrusters [N], (n,).
+            position: Position in the world frame [m], (3,).
+            force: Commanded forces of the thrusters [N], (n,).
         """
         if self._rows and not 0.0 < time - self._rows[-1][0] < GAP:
             self._rows.clear()
@@ -404,7 +408,7 @@ class Follower:
         return Trial.from_frame(columns, name="driving")
 
     def finish(self) -> Adaptation:
-        """Wait until all windows are fitted, and return what has changed.
+        """Wait until all windows are fitted, and return the estimates.
 
         Raises:
             CalibrationError: A window could not be simulated.
@@ -418,24 +422,24 @@ class Follower:
 def calibrate_changes(
     trials: Sequence[Path], *, vehicle: str, out: Path | None = None, as_json: bool = False
 ) -> Adaptation:
-    """Estimate what has changed on an identified vehicle from trials of it at work: payload, drag, thrusters.
+    """Estimate changes of an identified vehicle from trials in operation: payload, drag, thrusters.
 
-    Weak thrusters, an additional weight and its place, and a factor on the drag are followed through the trials, in
-    windows of 10 s. Estimates that differ from the vehicle file are marked.
+    Weak thrusters, an additional weight with its position, and a factor on the drag are tracked through the
+    trials in windows of 10 s. Estimates that differ from the vehicle file are marked.
 
     Example: finssim calibrate changes trials --vehicle mine.yaml --out now.yaml
 
     Args:
-        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables, in the order of time.
-        vehicle (NAME|FILE): The vehicle as it was identified: in the catalogue, or path of a vehicle file.
-        out (FILE): Vehicle file to write with what has changed (.yaml).
+        trials (TRIAL): Trial folders, folders of them, or bare .csv or .parquet tables, in chronological order.
+        vehicle (NAME|FILE): The identified vehicle: in the catalogue, or path of a vehicle file.
+        out (FILE): Vehicle file to write with the changed numbers (.yaml).
         as_json: Print one JSON object instead of a table.
 
     Returns:
         The estimates after the last window.
 
     Raises:
-        CalibrationError, VehicleError, OutputError: What cannot be used.
+        CalibrationError, VehicleError, OutputError: An input or output cannot be used.
     """
     if out is not None:
         refuse_places(out, None, "vehicle")
@@ -446,7 +450,7 @@ def calibrate_changes(
             adaptation.update(window)
     if not adaptation.windows:
         raise CalibrationError(
-            f"{trials[0]}: no {0.5 * SEGMENT:g} s with commands and motion, nothing to follow"
+            f"{trials[0]}: no {0.5 * SEGMENT:g} s with commands and motion, so there is nothing to estimate"
         )
     if out is not None:
         write_vehicle(adaptation.adapted, out)

@@ -1,4 +1,4 @@
-"""Evidence of trials on the numbers of a fit, and the intervals that follow."""
+"""Evidence of trials for the numbers of a fit, and the resulting intervals."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 
 
 FEWEST_TRIALS = 4
-"""Trials below which they are cut into blocks to estimate the spread."""
+"""Number of trials below which they are cut into blocks to estimate the spread."""
 
 BLOCKS = 24
-"""Number of blocks of all trials together."""
+"""Total number of blocks of all trials."""
 
 
 class Confidence(NamedTuple):
@@ -34,18 +34,18 @@ class Confidence(NamedTuple):
     evidence: Evidence
     covariance: Covariance
     free: Array
-    """Result of the last step without bounds, in the units of theta, (P,)."""
+    """Result of one unbounded step from the solution, in the units of theta, (P,)."""
     interval: Array
     """95 % interval in the units of theta, around `free` and containing theta, (P, 2)."""
 
     def variance(self, slope: Array, at: Sequence[int]) -> float:
-        """Return the variance of a sum of some parameters.
+        """Return the variance of a linear combination of some parameters.
 
-        It has the unit of the sum squared.
+        The unit is the square of that of the combination.
 
         Args:
-            slope: Factor of each, (n,).
-            at: Their places in theta, (n,).
+            slope: Factor of each parameter, (n,).
+            at: Indices of the parameters in theta, (n,).
         """
         C = self.covariance
         matrix = (C.local if C.alone[at].any() else C.trials)[np.ix_(at, at)]
@@ -54,7 +54,8 @@ class Confidence(NamedTuple):
 
 
 def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
-    """Evidence of theta, after initial states and offsets are eliminated, and what follows from it."""
+    """Return the evidence on theta, after elimination of initial states and offsets, and its covariance and
+    intervals."""
     evidence = evidence_of(problem, solution)
     pooled = problem.coasts and evidence.unit == "trials"
     covariance = pooled_covariance(evidence) if pooled else trial_covariance(evidence)
@@ -68,7 +69,7 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
     ends = intervals(free, covariance)
     ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], theta), np.maximum(ends[:, 1], theta)
     ends = np.clip(ends, low[:, None], high[:, None])
-    if np.isfinite(solution.step).all():  # the truth may be where one step more would go
+    if np.isfinite(solution.step).all():  # without convergence, the true value may be as far as one more step
         goes = np.clip(theta + solution.step, low, high)
         ends[:, 0], ends[:, 1] = np.minimum(ends[:, 0], goes), np.maximum(ends[:, 1], goes)
     unknown = ~np.isfinite(np.diagonal(covariance.local))
@@ -77,9 +78,9 @@ def confidence(problem: Shooting, solution: FitSolution) -> Confidence:
 
 
 def shared_slopes(problem: Shooting, solution: FitSolution) -> Array:
-    """Return the derivatives of every sample without what the unknowns of its own segment take up, (N, P).
+    """Return the derivatives of every sample, without the part explained by the unknowns of its own segment, (N, P).
 
-    They have the units of sample and theta.
+    The units are those of the sample over those of theta.
     """
     linear, weight = solution.linear, curvatures_of(solution.linear.residual, solution.std)
     slopes = linear.shared.copy()
@@ -91,12 +92,12 @@ def shared_slopes(problem: Shooting, solution: FitSolution) -> Array:
 
 
 def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int64] | None = None) -> Evidence:
-    """Normal matrices and scores by groups of rows.
+    """Return normal matrices and scores by groups of rows.
 
     Args:
-        problem: What was fitted.
-        solution: Where the fit ended.
-        group: Of every row, (N,); trials if None, or blocks where fewer than `FEWEST_TRIALS` excite an axis.
+        problem: Problem that was fitted.
+        solution: Solution of the fit.
+        group: Group of every row, (N,); trials if None, or blocks if fewer than `FEWEST_TRIALS` excite an axis.
     """
     linear = solution.linear
     curved = curvatures_of(linear.residual, solution.std)
@@ -120,7 +121,8 @@ def evidence_of(problem: Shooting, solution: FitSolution, group: NDArray[np.int6
 
 
 def time_blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Block of every sample: each trial in equal spans of time, the longer the trial the more of them."""
+    """Return the block of every sample: each trial is cut into equal time spans, whose number depends on its
+    length."""
     t = problem.measured.clock
     present = np.unique(trial)
     span = {g: (float(t[trial == g].min()), float(np.ptp(t[trial == g]))) for g in present}
@@ -137,7 +139,7 @@ def time_blocks(problem: Shooting, trial: NDArray[np.int64]) -> NDArray[np.int64
 
 @dataclass
 class Stage:
-    """One fit of one set of parameters."""
+    """Fit of one set of parameters."""
 
     problem: Shooting
     solution: FitSolution
@@ -145,5 +147,5 @@ class Stage:
 
     @property
     def x(self) -> Array:
-        """Return the final parameters, (P,). They have the units of the coordinates."""
+        """Return the final parameters, (P,), in the units of the coordinates."""
         return self.solution.point.theta[: len(self.problem.parameters.names)]

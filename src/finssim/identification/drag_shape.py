@@ -1,4 +1,4 @@
-"""Drag as the average over its shapes (linear, quadratic, both) by their evidence."""
+"""Drag as the average over its models (linear, quadratic, both), weighted by their evidence."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ Array = NDArray[np.float64]
 
 
 SHAPES = {"linear": 0.1, "quadratic": 0.45, "both": 0.45}
-"""Prior probability of the shapes of drag: at the Reynolds numbers of vehicles, above 10⁴, it is hardly ever linear."""
+"""Prior probability of the drag models: at the Reynolds numbers of vehicles, above 10⁴, drag is rarely linear."""
 
 SIZE_STD = 1.5
-"""Standard deviation of quadratic drag, as a part of that of a box of the vehicle's size (drag coefficient 1)."""
+"""Standard deviation of quadratic drag, relative to that of a box of the vehicle's size (drag coefficient 1)."""
 
 NARROW = 2.0
-"""Ratio of the speeds of stretches below which they show one drag, but not its shape."""
+"""Ratio of the speeds of segments below which they determine the drag at one speed, but not its model."""
 
 WIDER = 2.5
-"""Factor on the standard deviations for the intervals then."""
+"""Factor on the standard deviations of the intervals in that case."""
 
 WHITE = np.linspace(-5.0, 5.0, 61)
 """Grid of the densities, in standard deviations."""
 
 
 class DragShape(NamedTuple):
-    """Drag of an axis as the average over its shapes."""
+    """Drag of an axis, averaged over its models."""
 
     value: Array
     """d1 and d2 in their units, (2,)."""
     ends: list[tuple[float, float]]
-    """Their 95 % intervals in the same units."""
+    """95 % intervals of d1 and d2 in their units."""
     weights: dict[str, float]
-    """Probability of each shape [-]."""
+    """Probability of each model [-]."""
     spread: float = np.inf
-    """Standard deviation of the drag at the top speed, for the thrust that was found [N, N m]."""
+    """Standard deviation of the drag at the top speed, at the estimated thrust [N, N m]."""
 
 
 def drag_of_size(vehicle: Vehicle, axis: str) -> float:
@@ -57,7 +57,7 @@ def drag_of_size(vehicle: Vehicle, axis: str) -> float:
 
 
 def levels_of(problem: Shooting, axis: str) -> list[float]:
-    """Return the speeds that stretches of the trials reach on an axis, of those that move it [m/s, rad/s]."""
+    """Return the speeds that segments of the trials reach on an axis, for segments that excite it [m/s, rad/s]."""
     i, tops = AXES.index(axis), []
     for s in problem.segments:
         own = s.measured.get(DETERMINED_BY[axis][0])
@@ -69,13 +69,13 @@ def levels_of(problem: Shooting, axis: str) -> list[float]:
 
 
 def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) -> DragShape:
-    """Return the average over linear and quadratic drag and both, by their evidence, for the thrust that was found.
+    """Return the average over linear and quadratic drag and both, weighted by evidence, at the estimated thrust.
 
     Args:
-        stage: The fit of both.
-        axis: Which.
-        size: Quadratic drag that the size of the vehicle lets expect, in the unit of d2.
-        levels: Speeds of the stretches [m/s, rad/s]; their range widens the intervals if it is below `NARROW`.
+        stage: Fit with both terms.
+        axis: Name of the axis.
+        size: Quadratic drag expected from the size of the vehicle, in the unit of d2.
+        levels: Speeds of the segments [m/s, rad/s]; if their range is below `NARROW`, the intervals are widened.
     """
     from scipy.stats import norm, t
 
@@ -89,21 +89,21 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
     factor = float(t.ppf(0.975, min(float(np.min(C.dof[at])), 1e6)) / norm.ppf(0.975))
     x, mean = stage.x[at], stage.x[at].copy()
     for j in np.flatnonzero(x <= stage.problem.low[at]):
-        # Without the bound the term would be lower, and the other one with it as they are correlated.
+        # Without the bound the term would be lower, and the other one would change with it by their correlation.
         lower = np.clip(stage.found.free[at][j] - x[j], -4.0 * np.sqrt(S[j, j]), 0.0)
         mean += S[:, j] / S[j, j] * lower
     top = max(levels, default=1.0)
     value, _, weights, spread = _average(mean, S * factor**2, size, top)
     known = float(np.sqrt(S[1, 1])) < DETERMINED * SIZE_STD * size
     file = float(stage.problem.parameters.expected[at[1]])
-    # What slow trials leave open stays as the file has it, with the d1 that goes with it.
+    # If slow trials do not determine d2, it is kept from the file, with the corresponding d1.
     if not (known or stage.problem.parameters.likely) and file > 0.0:
         value = np.array([max(mean[0] + S[0, 1] / S[1, 1] * (file - mean[1]), 0.0), file])
     if known and x[0] <= stage.problem.low[at[0]]:
-        value = x  # the trials show a quadratic drag alone; the intervals allow for a linear one
+        value = x  # the trials indicate purely quadratic drag; the intervals include linear drag
     wide = factor * (WIDER if top < NARROW * min(levels, default=top) else 1.0)
     ends = _average(mean, S * wide**2, size, top)[1]
-    # What the thrust and its lever add to the spread of both together.
+    # Contribution of the thrust and its lever arm to the joint spread of both terms.
     more = 1.96 * factor * np.sqrt(np.maximum(np.diagonal(whole - S), 0.0))
     pairs = [
         (max(v - np.hypot(v - a, m), 0.0), v + np.hypot(b - v, m))
@@ -113,11 +113,11 @@ def drag_shape(stage: Stage, axis: str, size: float, levels: Sequence[float]) ->
 
 
 COMMON = ("thrust_scale", *PLACES)
-"""Coordinates that scale all drag together."""
+"""Coordinates that scale all drag terms."""
 
 
 def _given(C: Covariance, at: Sequence[int], known: Sequence[int]) -> Array:
-    """Return the covariance (P, P) given some coordinates, in the units of theta."""
+    """Return the covariance (P, P) conditional on some coordinates, in the units of theta."""
     local, trials = (float(np.linalg.det(matrix[np.ix_(at, at)])) for matrix in (C.local, C.trials))
     matrix = C.trials if trials > local and not C.alone[at].any() else C.local
     if not known or not np.isfinite(matrix[np.ix_(known, known)]).all():
@@ -131,19 +131,19 @@ def _given(C: Covariance, at: Sequence[int], known: Sequence[int]) -> Array:
 def _average(
     mean: Array, S: Array, size: float, top: float
 ) -> tuple[Array, list[tuple[float, float]], dict[str, float], float]:
-    """Return mean and 95 % intervals of d1 and d2 over the shapes, the probability of each shape, and the standard
-    deviation of the drag at the top speed.
+    """Return mean and 95 % intervals of d1 and d2 over the models, the probability of each model, and the
+    standard deviation of the drag at the top speed.
 
     Args:
-        mean: Of the likelihood of d1 and d2, in their units, (2,).
-        S: Its covariance, (2, 2).
-        size: Quadratic drag that the size of the vehicle lets expect, in the unit of d2.
-        top: Speed at which linear drag is expected to be no larger [m/s, rad/s].
+        mean: Mean of the likelihood of d1 and d2, in their units, (2,).
+        S: Covariance of the likelihood, (2, 2).
+        size: Quadratic drag expected from the size of the vehicle, in the unit of d2.
+        top: Speed up to which linear drag is not expected to exceed quadratic drag [m/s, rad/s].
     """
     from scipy.stats import norm
 
     prior = norm(0.0, size * max(top, 2.0 * USUAL_SPEED)), norm(size, SIZE_STD * size)
-    share = 2.0, 1.0 / norm.cdf(1.0 / SIZE_STD)  # of densities that are not negative
+    share = 2.0, 1.0 / norm.cdf(1.0 / SIZE_STD)  # of densities truncated to non-negative values
     root = np.linalg.cholesky(S)
     white = np.stack(np.meshgrid(WHITE, WHITE, indexing="ij"), axis=-1).reshape(-1, 2)
     parts = {"both": (mean + white @ root.T, np.abs(np.linalg.det(root)) * (WHITE[1] - WHITE[0]) ** 2)}
@@ -170,7 +170,7 @@ def _average(
     grid = np.concatenate([g for g, _ in parts.values()])
     density_of = np.concatenate([density[n] for n in parts]) / total
     ends = []
-    for j in range(2):  # no one knows that a term is absent: the intervals of both terms are in them too
+    for j in range(2):  # a term is never known to be absent: the intervals include those of both terms
         some = [_quantiles(grid[:, j], density_of)]
         if weights["both"] > 0.0:
             some.append(_quantiles(parts["both"][0][:, j], density["both"] / weights["both"]))
@@ -181,7 +181,7 @@ def _average(
 
 
 def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
-    """Return the 2.5 % and 97.5 % points of weighted values in their unit; weights add up to 1."""
+    """Return the 2.5 % and 97.5 % quantiles of weighted values in their unit; weights sum to 1."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weight[order])
     low, high = np.searchsorted(total, (0.025, 0.975 - 1e-12))
@@ -189,9 +189,9 @@ def _quantiles(values: Array, weight: Array) -> tuple[float, float]:
 
 
 def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
-    """Return a fit with its drag at the average over shapes, and the other numbers where they then are best.
+    """Return a fit with the drag averaged over models, and the other numbers re-optimised for it.
 
-    Their intervals reach over both: what a shape of drag moves is uncertain by that.
+    Their intervals cover both solutions: the effect of the drag model is part of their uncertainty.
     """
     if not shapes:
         return stage
@@ -218,19 +218,21 @@ def averaged(stage: Stage, shapes: Mapping[str, DragShape]) -> Stage:
 
 
 POLISH, RELEASED_POLISH = 1, 3
-"""Iterations with which the other numbers follow the drag, with thrust and without: there they trade off closely."""
+"""Iterations in which the other numbers are re-optimised, with thrust and without: without, they are strongly
+correlated."""
 
 
 USEFUL_DRAG = 0.5
-"""Half width of the interval of a damping force, as a part of it, up to which it is written: better than a guess."""
+"""Relative half width of the interval of a damping force up to which it is written: still better than a guess."""
 
 
 def is_drag_known(
     p: Parameters, x: Array, found: Confidence, axis: str, speed: float, shape: DragShape | None
 ) -> bool:
-    """Return whether the drag at one speed [m/s, rad/s] is known to `USEFUL_DRAG`, or excludes the vehicle file's.
+    """Return whether the drag at one speed [m/s, rad/s] is known to `USEFUL_DRAG`, or excludes the vehicle
+    file's value.
 
-    The fit ended at x, in the units of the coordinates, (P,).
+    x is the solution of the fit, in the units of the coordinates, (P,).
     """
     i, names = AXES.index(axis), [f"{axis}.{name}" for name in ("d1", "d2")]
     at = [p.names.index(name) for name in names if name in p.names]
@@ -238,7 +240,7 @@ def is_drag_known(
     slope = powers[np.isin(names, p.names)]
     before = np.array([p.set.linear_damping[i][i], p.set.quadratic_damping[i][i]], float)
     force = float(slope @ x[at])
-    if p.likely:  # in terms of the thrust, whose scale goes to the file too
+    if p.likely:  # relative to the thrust, whose scale is also written to the file
         scale = p.names.index("thrust_scale")
         at, slope = [*at, scale], np.append(slope, -force / x[scale])
     half = 2.0 * (np.sqrt(np.maximum(found.variance(slope, at), 0.0)) if shape is None else shape.spread)

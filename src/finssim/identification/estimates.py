@@ -29,10 +29,10 @@ from finssim.vehicles import AXES, Vehicle
 Array = NDArray[np.float64]
 
 CERTAIN = 0.2
-"""Half width of an interval, as a part of the estimate, up to which a parameter counts as identifiable."""
+"""Relative half width of an interval up to which a parameter counts as identifiable."""
 
 USEFUL = 0.5
-"""Half width, as a part of the estimate, up to which an inertia is written to the vehicle file: better than a guess."""
+"""Relative half width up to which an inertia is written to the vehicle file: still better than a guess."""
 
 DECADE = 10.0
 
@@ -43,13 +43,13 @@ BIAS_NOTE = (
 
 
 class Number(NamedTuple):
-    """A number of an axis as it was fitted."""
+    """Fitted number of an axis."""
 
     value: float
     ends: tuple[float, float]
-    """95 % interval in the unit of the number; not finite where the trials do not determine it."""
+    """95 % interval in the unit of the number; not finite if the trials do not determine it."""
     free: float | None = None
-    """Estimate without the bound that it rests on, in the unit of the number; None where it rests on none."""
+    """Estimate without the active bound, in the unit of the number; None if no bound is active."""
 
 
 @dataclass
@@ -58,13 +58,13 @@ class AxisResult:
 
     axis: str
     speeds: tuple[float, float]
-    """Lowest and highest that the damping rests on [m/s, rad/s]."""
+    """Lowest and highest speed on which the damping is based [m/s, rad/s]."""
     estimates: dict[str, Estimate] = field(default_factory=dict)
     changes: dict[str, Any] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
     def believe_nothing(self, reason: str) -> None:
-        """Leave the numbers as they are, call none of them identifiable and write none."""
+        """Mark all estimates as not identifiable and discard all changes, for a reason."""
         self.estimates = {
             name: replace(e, identifiable=False, note=reason) for name, e in self.estimates.items()
         }
@@ -84,17 +84,17 @@ def axis_result(
 ) -> AxisResult:
     """Return the result of one axis.
 
-    What the data know well is written, and so is what they know badly where the vehicle file's number lies outside the
-    interval: a wide interval is a better answer than a number that it excludes.
+    Numbers that the data determine well are written, and so are uncertain ones if the vehicle file's number
+    lies outside the interval: a wide interval is better than a number that it excludes.
 
     Args:
-        p: What was free.
-        x: Where the fit ended, in the units of the coordinates, (P,).
-        numbers: Of `numbers_of`.
-        axis: Which.
-        speeds: Lowest and highest that the damping rests on [m/s, rad/s].
-        drag_known: Whether the damping is known well enough to be written; both of its terms are written, or neither.
-        given: Effective inertia where it is known [kg, kg m²].
+        p: Free parameters of the fit.
+        x: Solution of the fit, in the units of the coordinates, (P,).
+        numbers: Result of `numbers_of`.
+        axis: Name of the axis.
+        speeds: Lowest and highest speed on which the damping is based [m/s, rad/s].
+        drag_known: Whether the damping is known well enough to be written; both terms are written, or neither.
+        given: Known effective inertia [kg, kg m²].
     """
     out, i, file = AxisResult(axis, speeds), AXES.index(axis), matrices(p.moved(x))
     rigid, (low, high), unit = float(file.M_RB[i, i]), speeds, "m/s" if i < 3 else "rad/s"
@@ -102,7 +102,7 @@ def axis_result(
     def take(
         name: str, value: float, ends: tuple[float, float], sure: bool, note: str, path: str | None = None
     ) -> Estimate:
-        """Take an estimate."""
+        """Add an estimate."""
         own = UNITS["m_eff" if name == "added_mass" else name][i > 2]
         ends = (float(ends[0]), float(ends[1]))
         one = Estimate(f"{axis}.{name}", float(value), ends, own, sure, note, path)
@@ -110,12 +110,12 @@ def axis_result(
         return one
 
     def add(name: str, number: Number, path: str | None = None) -> Estimate:
-        """Take the estimate of a number, and a finding where it rests on its bound."""
+        """Add the estimate of a number, and a finding if a bound is active."""
         value, (least, most), free = number
         own, note = UNITS[name][i > 2], ""
         if free is not None:
             note = "held at its bound" + (
-                f"; free, it would be {free:.3g} {own}" if np.isfinite(free) else ""
+                f"; without the bound it would be {free:.3g} {own}" if np.isfinite(free) else ""
             )
             out.findings.append(finding("at_bound", f"{axis}.{name}", free=free, unit=own))
         elif not np.isfinite([least, most]).all():
@@ -147,7 +147,7 @@ def axis_result(
         out.findings.append(finding("damping_unknown", axis, low=low, high=high, unit=unit))
     if "k" in numbers and axis in ("roll", "pitch"):
         add("k", numbers["k"], "body.center_of_buoyancy.2")
-    if f"{axis}.bias" in numbers:  # identifiable wherever it has an interval, for it may well be zero
+    if f"{axis}.bias" in numbers:  # identifiable if it has an interval, since it may well be zero
         bias = add("bias", numbers[f"{axis}.bias"])
         take("bias", bias.estimate, bias.ci95, bool(np.isfinite(bias.ci95).all()), BIAS_NOTE)
     if 0.0 < low and high < DECADE * low:
@@ -156,13 +156,13 @@ def axis_result(
 
 
 def _added_mass(out: AxisResult, whole: Estimate, file: Matrices, take: Callable[..., Estimate]) -> None:
-    """Take the added mass of an axis: its effective inertia less the file's rigid part."""
+    """Add the added mass of an axis: its effective inertia minus the rigid-body inertia of the file."""
     i = AXES.index(out.axis)
     rigid, before = float(file.M_RB[i, i]), float(file.M_A[i, i])
     value, ends = whole.estimate - rigid, (whole.ci95[0] - rigid, whole.ci95[1] - rigid)
-    sure, note = whole.identifiable, f"with the file's rigid {rigid:.4g} {whole.unit} as exact"
+    sure, note = whole.identifiable, f"assuming the file's rigid-body {rigid:.4g} {whole.unit}"
     if value <= 0.0:
-        sure, note = False, f"m_eff is below the file's rigid {rigid:.4g} {whole.unit}"
+        sure, note = False, f"m_eff is below the file's rigid-body {rigid:.4g} {whole.unit}"
         fields = {"effective": whole.estimate, "rigid": rigid, "unit": whole.unit}
         out.findings.append(finding("inertia_too_small", out.axis, **fields))
     elif ends[0] <= 0.0:
@@ -174,14 +174,15 @@ def _added_mass(out: AxisResult, whole: Estimate, file: Matrices, take: Callable
 
 
 def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]) -> dict[str, float]:
-    """Return the centre of buoyancy that gives the constant moments of roll and pitch of a vehicle that lies tilted.
+    """Return the centre of buoyancy that explains the constant roll and pitch moments of a vehicle with a
+    static tilt.
 
-    B r_b - W r_g = (b_pitch, -b_roll, k), of which the centre of gravity stays.
+    B r_b - W r_g = (b_pitch, -b_roll, k), with the centre of gravity unchanged.
 
-    Places are in [m].
+    Positions are in [m].
 
     Args:
-        found: Estimates, `roll.bias` and `pitch.bias` among them.
+        found: Estimates, including `roll.bias` and `pitch.bias`.
         buoyancy: B [N].
         centre: r_b of the vehicle file [m].
     """
@@ -194,14 +195,15 @@ def trim(found: Mapping[str, Estimate], buoyancy: float, centre: Sequence[float]
 
 
 def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[str, float], list[Finding]]:
-    """Buoyancy excess, stiffness and constant moments as volume and centre of buoyancy; weight and its centre stay.
+    """Return buoyancy excess, stiffness and constant moments as volume and centre of buoyancy; weight and
+    centre of gravity are unchanged.
 
     Args:
         found: Estimates by name.
-        vehicle: As its file has it.
+        vehicle: Vehicle as defined by its file.
 
     Returns:
-        Changes of the vehicle file in its units, and a finding where roll and pitch disagree.
+        Changes of the vehicle file in its units, and a finding if roll and pitch disagree.
     """
     body, water, findings = vehicle.body, vehicle.water, list[Finding]()
     changes: dict[str, float] = {}
@@ -229,12 +231,12 @@ def hydrostatics(found: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[dict[
 
 
 def useful(e: Estimate) -> bool:
-    """Return whether an estimate is known to `USEFUL`."""
+    """Return whether an estimate is known to within `USEFUL`."""
     return 0.5 * (e.ci95[1] - e.ci95[0]) < USEFUL * e.estimate
 
 
 def outside(value: float, ends: Array | tuple[float, float]) -> bool:
-    """Return whether a number lies outside an interval of the same unit that has two ends."""
+    """Return whether a number lies outside a finite interval of the same unit."""
     return bool(np.isfinite(ends).all() and not ends[0] <= value <= ends[1])
 
 
@@ -242,7 +244,7 @@ LAG_CERTAIN = 0.05
 """Half width of the interval of a delay up to which it counts as identifiable [s]."""
 
 EXCESS_CERTAIN = 0.02
-"""Half width of the interval of buoyancy less weight, as a part of the weight, up to which it is identifiable."""
+"""Half width of the interval of buoyancy minus weight, relative to the weight, up to which it is identifiable."""
 
 PATHS = {
     "buoyancy_excess": "body.displaced_volume",
@@ -250,25 +252,25 @@ PATHS = {
     "thrust_lag": "thrusters.*.time_constant",
     "thrust_delay": "thrusters.*.delay",
 }
-"""Reported coordinates besides those of the axes, and their places in the vehicle file."""
+"""Reported coordinates besides those of the axes, and their paths in the vehicle file."""
 
 
 LEVER = 1.0
-"""Size that the simulation's own error counts against in a place [m]: a lever of some centimetres shows in the small
-difference of large accelerations."""
+"""Length to which the simulation's own error is related for positions [m]: a lever arm of some centimetres
+results from a small difference of large accelerations."""
 
 
-NO_BETTER = "the trials determine it no better than the vehicle file"
+NO_BETTER = "the trials do not determine it better than the vehicle file"
 
 
 def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> dict[str, Number]:
-    """Every coordinate with its 95 % interval, by name.
+    """Return every coordinate with its 95 % interval, by name.
 
     Args:
-        p: What was free.
-        x: Where the fit ended, in the units of the coordinates, (P,).
-        found: Evidence there.
-        own_error: Of the simulation itself, as a part of an estimate; intervals hold it too.
+        p: Free parameters of the fit.
+        x: Solution of the fit, in the units of the coordinates, (P,).
+        found: Evidence at the solution.
+        own_error: Relative error of the simulation itself [-], which the intervals include.
     """
     local, out, M_RB = np.diagonal(found.covariance.local), {}, matrices(p.moved(x)).M_RB
     half = intervals(np.zeros(len(local)), found.covariance)[:, 1]
@@ -282,7 +284,7 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
             width = float(np.hypot(half[c], own_error * size))
             low = max(min(free - width, value), p.low[c])
             high = free + width if free + width > value else value + width
-            # Where a fit ended early, the truth may be where one step more would go.
+            # If the fit was terminated early, the true value may be as far as one more step.
             low, high = min(low, float(found.interval[c, 0])), max(high, float(found.interval[c, 1]))
         out[name] = Number(value, (low, high), float(found.free[c]) if value <= p.low[c] else None)
     return out
@@ -291,7 +293,7 @@ def numbers_of(p: Parameters, x: Array, found: Confidence, own_error: float) -> 
 def other_estimates(
     p: Parameters, numbers: Mapping[str, Number]
 ) -> tuple[dict[str, Estimate], list[Finding]]:
-    """Return the estimates that belong to no axis, and findings on those that rest on a bound."""
+    """Return the estimates that belong to no axis, and findings about active bounds."""
     out, bounds = dict[str, Estimate](), list[Finding]()
     reported = {*PATHS, *PLACES, *p.terms, *p.actuators, *p.gains}
     paths = PATHS | places(p.vehicle)
@@ -299,11 +301,11 @@ def other_estimates(
     for name, unit in units.items():
         value, (low, high), free = numbers[name]
         half, note = 0.5 * (high - low), ""
-        # Delay and excess may well be zero, so that their uncertainty is not judged as a part of them.
+        # Delay and excess may well be zero, so their uncertainty is not judged relative to their value.
         limits = {"thrust_delay": LAG_CERTAIN, "buoyancy_excess": EXCESS_CERTAIN * p.vehicle.weight}
         limit = limits.get(name, CERTAIN * abs(value))
         if free is not None:
-            note = f"held at its bound; free, it would be {free:.3g} {unit}"
+            note = f"held at its bound; without the bound it would be {free:.3g} {unit}"
             bounds.append(finding("at_bound", name, free=free, unit=unit))
         elif not np.isfinite(half):
             note = "the trials do not determine it"
@@ -314,7 +316,7 @@ def other_estimates(
             known, std = half / 1.96, float(coordinate.std or np.inf)
             if known > DETERMINED * std:
                 note = NO_BETTER
-            else:  # what the trials alone say, without the file
+            else:  # estimate from the trials alone, without the file
                 variance = 1.0 / (known**-2.0 - std**-2.0)
                 alone = variance * (value / known**2.0 - coordinate.start / std**2.0)
                 span = 1.96 * float(np.sqrt(variance))
@@ -340,15 +342,16 @@ def changes(
     unmeasured: Sequence[str],
     scaled: bool,
 ) -> dict[str, Any]:
-    """Changes of the vehicle file.
+    """Return the changes of the vehicle file.
 
     Args:
-        p: What was free.
-        x: Where the fit ended, in the units of the coordinates, (P,).
+        p: Free parameters of the fit.
+        x: Solution of the fit, in the units of the coordinates, (P,).
         found: All estimates.
         axes: Changes of the axes' own numbers.
-        unmeasured: Axes that were simulated because no trial measured them: the others hold with their numbers.
-        scaled: Whether a thrust scale belongs to the thrusters' curves.
+        unmeasured: Axes that were simulated because no trial measured them: the other estimates are valid
+            with their numbers.
+        scaled: True if a thrust scale is applied to the thrusters' curves.
     """
     out, written = dict(axes), x.copy()
     for c, name in enumerate(p.names):
@@ -361,7 +364,7 @@ def changes(
         old = np.asarray(getattr(p.set, path.rpartition(".")[2]), float)
         new = [f"{path}.{i}.{i}" in axes or axis in unmeasured for i, axis in enumerate(AXES)]
         for i, j in np.ndindex(6, 6):
-            # A coupling changes with either of its axes, or is zero where the damping that was chosen has none.
+            # A coupling changes with both of its axes, or is zero if the selected damping model has none.
             if new[i] and i == j or (new[i] or new[j]) and matrix[i, j] != old[i, j]:
                 out[f"{path}.{i}.{j}"] = float(matrix[i, j])
     moved = p.moved(written)
@@ -395,7 +398,7 @@ def terminal_speed(d1: float, d2: float, excess: float) -> float:
     Args:
         d1: Linear damping of heave [N s/m].
         d2: Quadratic damping of heave [N s²/m²].
-        excess: Buoyancy less weight [N].
+        excess: Buoyancy minus weight [N].
     """
     e = max(excess, 0.0)
     return 2.0 * e / max(d1 + float(np.sqrt(d1**2 + 4.0 * d2 * e)), 1e-12)
@@ -406,12 +409,12 @@ def derived(
 ) -> tuple[float, tuple[float, float]]:
     """Return a positive function of the parameters and its 95 % interval, to first order in its logarithm.
 
-    It has the unit of the function.
+    The result has the unit of the function.
 
     Args:
-        stage: A finished fit.
-        of: Vector of parameters (P,) -> the number.
-        own_error: Of the simulation itself, as a part of the number.
+        stage: Finished fit.
+        of: Function from the vector of parameters (P,) to the number.
+        own_error: Relative error of the simulation itself [-].
     """
     from scipy.stats import t
 
@@ -433,7 +436,7 @@ KINDS = {"added_mass": "added_mass", "d1": "linear_damping", "d2": "quadratic_da
 
 
 def matrix_changes(p: Parameters, x: Array) -> dict[str, Any]:
-    """Return the changes of the vehicle file to the matrices of a vector in the units of the coordinates, (P,)."""
+    """Return the changes of the vehicle file for the matrices of a vector in the units of the coordinates, (P,)."""
     return {f"{SET}.{name}": m[0] for name, m in zip(KINDS.values(), p.matrices(x), strict=True)}
 
 

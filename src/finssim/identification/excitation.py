@@ -18,26 +18,26 @@ Array = NDArray[np.float64]
 
 
 SWINGING = ("roll", "pitch")
-"""Axes that the weight rights."""
+"""Axes with a hydrostatic restoring moment."""
 
 DRIFTING = {"x": "u", "y": "v", "z": "w", "depth": "w", "yaw": "r"}
-"""Integrals without a restoring force: where the rate is measured they add drift, not knowledge."""
+"""Integrals without a restoring force: if the rate is measured, they add drift but no information."""
 
 SEEN = 0.9
-"""Part of a segment for which a velocity has to be known to be imposed."""
+"""Fraction of a segment for which a velocity must be known to be imposed."""
 
 PUSH = 0.03
-"""Range of a wrench, as part of the vehicle's limit, below which an axis is not driven."""
+"""Range of a wrench, relative to the vehicle's limit, below which an axis is not driven."""
 
 
 def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: bool = False) -> Segment:
-    """The segment as a fit of some axes uses it.
+    """Return the segment as a fit of some axes uses it.
 
-    Axes that are not fitted move as they were seen to, where they were seen: their numbers in the vehicle file may be
-    wrong, and couplings would carry that into the others. They are not compared, nor are integrals that add drift. An
-    axis whose motion does not stand out of its noise is simulated instead, for the noise would shake the others; but
-    not in a free motion, where nothing drives it. The bias of the gyroscope is taken off the rates: what they add up to
-    is an attitude.
+    Axes that are not fitted follow their measured motion where it is known: their numbers in the vehicle file
+    may be wrong, and couplings would transfer the error to the others. They are not compared, nor are
+    integrals that add drift. An axis whose motion is within its noise is simulated instead, since the noise
+    would excite the others; but not in a free motion, where it is not driven. The bias of the gyroscope is
+    subtracted from the rates, since they are integrated to an attitude.
     """
     held = np.full((segment.steps + 1, 6), np.nan)
     t = segment.t0 + segment.step * np.arange(segment.steps + 1)
@@ -58,13 +58,13 @@ def compared(segment: Segment, motion: Motion, axes: Sequence[str], *, free: boo
 
 
 def observable(trials: Sequence[Streams]) -> tuple[str, ...]:
-    """Axes that some trial measures anything of."""
+    """Return the axes for which some trial contains a measurement."""
     columns = {c for s in trials for c in s.measured}
     return tuple(a for a in AXES if columns & set(DETERMINED_BY[a]))
 
 
 def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
-    """Return the axes that the trials excite, of those that some trial measures."""
+    """Return the axes that the trials excite, among those that some trial measures."""
     found = set[str]().union(*excitations(trials, vehicle))
     return tuple(a for a in AXES if a in found and a in observable(trials))
 
@@ -72,8 +72,8 @@ def excited(trials: Sequence[Streams], vehicle: Vehicle) -> tuple[str, ...]:
 def excitations(trials: Sequence[Streams], vehicle: Vehicle) -> list[set[str]]:
     """Return the axes that each trial excites.
 
-    Pushes along the body of a tilted vehicle move it up and down. If no trial drives heave, those count that tilt:
-    imposed as it was seen, heave would bias the drag of surge and sway.
+    Pushes along the body of a tilted vehicle have a vertical component. If no trial drives heave, trials with tilt
+    count as exciting it: with heave imposed from its measurement, the drag of surge and sway would be biased.
     """
     out = [excites(s, vehicle) for s in trials]
     if any("heave" in moved for moved in out):
@@ -86,16 +86,17 @@ def excitations(trials: Sequence[Streams], vehicle: Vehicle) -> list[set[str]]:
 
 
 def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
-    """Trials that excite one of some axes; all of them where none does.
+    """Return the trials that excite at least one of some axes; all of them if none does.
 
-    In the others the vehicle moves on axes that are not fitted, maybe not even measured, and couplings carry that over.
+    In the other trials the vehicle moves on axes that are not fitted and possibly not measured, which affects
+    the fitted ones through couplings.
     """
     return [s for s in trials if set(excites(s, vehicle)) & set(axes)] or list(trials)
 
 
 def excites(s: Streams, vehicle: Vehicle) -> set[str]:
-    """Return the axes that one trial excites: without thrust those that move freely, else those its header names, else
-    those that were driven, or swing."""
+    """Return the axes that one trial excites: without thrust those that move freely, otherwise those that its
+    header names, otherwise those that were driven or swing."""
     if s.drive.source == "passive":
         return set(s.released)
     if s.trial.header.axis:
@@ -108,8 +109,8 @@ def excites(s: Streams, vehicle: Vehicle) -> set[str]:
     out: set[str] = set()
     for i, axis in enumerate(AXES):
         pushed = limits[i] > 0.0 and usual_range(tau[:, i]) > PUSH * limits[i]
-        # Weight rights roll and pitch: a small swing determines them, whatever started it. If they were not
-        # fitted, the file's stiffness, which may be a guess, would determine the later course of surge and sway.
+        # Roll and pitch have a restoring moment: a small swing determines them, whatever its cause. If they were not
+        # fitted, the file's stiffness, which may be a guess, would affect the later course of surge and sway.
         swings = i in (3, 4)
         if answers(s.motion, i) and (pushed or swings):
             out.add(axis)
@@ -117,7 +118,8 @@ def excites(s: Streams, vehicle: Vehicle) -> set[str]:
 
 
 def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
-    """Range of speeds at which an axis was seen moving, from the 20th to the 99th percentile [m/s or rad/s]."""
+    """Return the range of measured speeds of an axis in motion [m/s, rad/s], from the 20th to the
+    99th percentile."""
     i = AXES.index(axis)
     values = np.concatenate([np.abs(m.nu[:, i]) for m in motions] or [np.empty(0)])
     values = values[np.isfinite(values)]
@@ -127,8 +129,8 @@ def speeds(motions: Sequence[Motion], axis: str) -> tuple[float, float]:
 
 
 def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) -> float:
-    """Length of segments that shows steady motion and yet forgets what no model knows [s]: five of the slowest time
-    constant, at least forty samples, between 5 and 12 s."""
+    """Return a segment length that includes steady motion and limits the growth of model errors [s]: five
+    times the slowest time constant, at least forty samples, between 5 and 12 s."""
     chosen = vehicle.hydrodynamic_set("calibrated")
     M = np.diag(vehicle.mass_matrix("calibrated"))
     slowest = 0.5
@@ -142,6 +144,6 @@ def horizon(vehicle: Vehicle, trials: Sequence[Streams], axes: Sequence[str]) ->
 
 
 def sampling(trials: Sequence[Streams]) -> float:
-    """Usual time between the samples of a channel [s]."""
+    """Return the median interval between the samples of a channel [s]."""
     steps = [float(np.median(np.diff(t))) for s in trials for t, _ in s.measured.values() if len(t) > 2]
     return float(np.median(steps or [0.02]))

@@ -1,4 +1,4 @@
-"""Results of a calibration: estimates with intervals, their basis, and what could not be determined."""
+"""Results of a calibration: estimates with intervals, their basis, and parameters that are not identifiable."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter."""
+    """Estimate of one parameter."""
 
     name: str
     """`surge.m_eff`, `surge.added_mass`, `surge.d1`, `surge.d2`, `surge.bias`, `roll.k`, `buoyancy_excess`,
@@ -36,18 +36,18 @@ class Estimate:
     estimate: float
     """Value in `unit`."""
     ci95: tuple[float, float]
-    """95 % interval in `unit`; infinite or NaN ends where the data say nothing."""
+    """95 % interval in `unit`; infinite or NaN ends if the data are not informative."""
     unit: str
     identifiable: bool
-    """True if the data determine it; False also if it rests on a bound."""
+    """True if the data determine the parameter; False also if a bound is active."""
     note: str = ""
     """Reason why it is not identifiable, or basis of the number."""
     path: str | None = None
-    """Dotted path of the number in the vehicle file, where it has one."""
+    """Dotted path of the number in the vehicle file, if it is in the file."""
 
     @classmethod
     def within(cls, name: str, value: float, half: float, unit: str, sure: bool, note: str = "") -> Estimate:
-        """An estimate with an interval of `half` to each side, and a note where it is not `sure`.
+        """Return an estimate with an interval of ± `half`, and a note if it is not `sure`.
 
         Numbers are in `unit`.
         """
@@ -56,28 +56,28 @@ class Estimate:
         return cls(name, float(value), ci95, unit, bool(sure), note)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; a number that is not finite becomes None."""
+        """Return plain values; non-finite numbers become None."""
         values = {key: getattr(self, key) for key in ("estimate", "ci95", "unit", "identifiable", "note")}
         return dict(plain(values))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dive:
-    """The next dive that a fit recommends."""
+    """Recommended next dive."""
 
     legs: tuple[Leg, ...]
     widest: str
     """Name of the estimate with the widest interval, relative to its value."""
     factor: float
-    """Width of that interval after the dive, relative to the one now [-]."""
+    """Width of that interval after the dive, relative to its present width [-]."""
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return sum(leg.times * leg.duration for leg in self.legs)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return {"legs": [asdict(leg) for leg in self.legs], "widest": self.widest, "factor": self.factor}
 
     def __str__(self) -> str:
@@ -101,13 +101,13 @@ class Correlation:
     """Correlations, (n, n)."""
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return {"names": list(self.names), "matrix": plain(self.matrix)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """Measured and fitted values along one abscissa, for the report's figures."""
+    """Measured and fitted values over one abscissa, for the report's figures."""
 
     title: str
     x_label: str
@@ -125,8 +125,8 @@ class Curve:
 
     @classmethod
     def joined(cls, title: str, y_label: str, parts: Sequence[tuple[Array, ...]]) -> Curve:
-        """Stretches of time [s], measured and fitted values, and bands if there are any, (k,) each, one after the other
-        with a second between; lines break there and at gaps."""
+        """Return a curve that concatenates segments of time [s], measured and fitted values, and optional
+        bands, (k,) each, one second apart; lines break between segments and at gaps."""
         x, columns, start = list[Array](), list[list[Array]](), 0.0
         for t, *values in parts:
             gaps = [*(1 + np.flatnonzero(np.diff(t) > longest_step(t))), len(t)]
@@ -146,34 +146,35 @@ class Fit:
     """A finished calibration."""
 
     kind: str
-    """thruster, motor or hydrodynamics"""
+    """Kind of calibration: thruster, motor or hydrodynamics."""
     method: str
     before: Vehicle
-    """The vehicle that the fit started from."""
+    """Vehicle from which the fit started."""
     estimates: dict[str, Estimate]
     """Estimates by name, in the order of a report."""
     changes: dict[str, Any]
-    """For `Vehicle.replace`: dotted path -> value, only of what the data determine."""
+    """Changes for `Vehicle.replace`: dotted path -> value, only for parameters that the data determine."""
     quality: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Axis or thruster -> figures of the fit: r2 and nrmse [-], rmse in the unit of the axis, samples, rejected, ..."""
+    """Axis or thruster -> quality of the fit: r2 and nrmse [-], rmse in the unit of the axis, samples,
+    rejected, ..."""
     correlation: Correlation | None = None
     findings: tuple[Finding, ...] = ()
-    """Bounds, degeneracies, speeds of less than a decade, trials left out."""
+    """Findings about bounds, degeneracies, speeds of less than a decade, omitted trials."""
     curves: tuple[Curve, ...] = ()
     trials: dict[str, str] = field(default_factory=dict)
     """Name of a trial or table -> SHA-256 of its numbers."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Method options, seed."""
+    """Options of the method, and seed."""
     next_dive: Dive | None = None
-    """What to record next; None where it was not asked for."""
+    """Recommended next dive; None if it was not requested."""
     interrupted: bool = False
-    """True if Ctrl-C ended it before it converged; the estimates are the best until then."""
+    """True if Ctrl-C stopped the fit before it converged; the estimates are the best so far."""
 
     @cached_property
     def vehicle(self) -> Vehicle:
-        """The calibrated vehicle: everything that the fit did not determine keeps its number and its origin.
+        """Calibrated vehicle: all numbers that the fit did not determine keep their values and origins.
 
-        Raises:
+        CalibrationError: The estimates do not form a vehicle that can be simulated.
             CalibrationError: The estimates make no vehicle that can be simulated.
         """
         from finssim.identification.vehicle_file import calibrated
@@ -182,20 +183,20 @@ class Fit:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % interval of each estimate by its name, in the estimate's unit; infinite ends where it is unknown."""
+        """95 % interval of each estimate by its name, in the estimate's unit; infinite ends if it is unknown."""
         return {name: estimate.ci95 for name, estimate in self.estimates.items()}
 
     def plot(self) -> Figure:
         """Return a Matplotlib figure of measured and fitted values and their differences, of up to six curves.
 
         Raises:
-            CalibrationError: The fit holds no curves.
+            CalibrationError: The fit contains no curves.
         """
         from finssim.identification.report import draw_curves
 
         figure = next(draw_curves(self.curves), None)
         if figure is None:
-            raise CalibrationError("the fit holds no curves to draw")
+            raise CalibrationError("the fit contains no curves to draw")
         return figure
 
     def __repr__(self) -> str:

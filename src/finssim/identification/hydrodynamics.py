@@ -1,4 +1,5 @@
-"""The hydrodynamics of a vehicle from its trials: the scale of thrust, the fit, and whether it replays better."""
+"""Identification of a vehicle's hydrodynamics from trials: the scale of thrust, the fit, and its validation
+by replay."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from finssim.identification.prediction import Replay
 
 UNKNOWN_VOLTAGE = (
-    "no battery voltage: from what batteries have and the file's inertia; it is in every interval"
+    "no battery voltage: estimated from usual batteries and the file's inertia; included in every interval"
 )
 
 Progress = Callable[[float, str], None]
@@ -48,23 +49,23 @@ def fit_hydrodynamics(
 ) -> Fit:
     """Fit added mass, damping, buoyancy and stiffness.
 
-    Where every driven trial is of pulse widths without a battery voltage, the thrust is unknown: its scale is then
-    estimated from the voltages that batteries have and the added mass that the vehicle file expects, goes to the file
-    with the rest, and its uncertainty is in every interval.
+    If every driven trial contains only pulse widths without a battery voltage, the thrust is unknown: its
+    scale is then estimated from usual battery voltages and the added mass that the vehicle file implies, is
+    written to the file with the other numbers, and its uncertainty is part of every interval.
 
     Args:
-        trials: None of them held out.
-        vehicle: Gives the rigid body, the motors and what is not fitted.
+        trials: Trials, none of which is held out.
+        vehicle: Vehicle with the rigid body, the motors and all parameters that are not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        estimate: Further parameters, of `EXTRAS`, of the vehicle's terms and of its actuators.
+        estimate: Further parameters, from `EXTRAS`, the vehicle's terms and its actuators.
         damping: `auto`, `linear`, `quadratic` or `both`.
-        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
-        horizon: Longest stretch that is simulated without a restart [s].
-        held_out: Further trials that judge the fit. Without any, it is judged by trials, or stretches of them, left out
-            in turn. The vehicle file keeps its numbers of each axis that it predicts better.
-        published: `top_speed` [m/s] and `bollard_pull` [N] of the vehicle, both ahead, as data.
-        design: Whether the next dive is designed.
-        progress: Called with the part done and a few words.
+        known: Known effective inertias M_RB + M_A, by axis [kg, kg m²].
+        horizon: Longest segment that is simulated without a restart [s].
+        held_out: Further trials that validate the fit. Without them, it is validated by trials, or segments of them,
+            left out in turn. The vehicle file keeps its numbers of each axis that it predicts better.
+        published: `top_speed` [m/s] and `bollard_pull` [N] of the vehicle, both ahead, as additional data.
+        design: True to design the next dive.
+        progress: Function that is called with the completed fraction and a short text.
 
     Raises:
         CalibrationError: No trial can be used, or an option is unknown.
@@ -87,12 +88,12 @@ def fit_hydrodynamics(
         )
     if fit.interrupted or not fit.changes:
         return fit
-    show(0.95, "judging by what was not fitted")
+    show(0.95, "validating with data that was not fitted")
     return judged(fit, held_out)
 
 
 def _replay(pairs: Sequence[Pair], trials: Sequence[Trial], fit: Fit) -> Replay:
-    """Return the replay of some pairs' trials by the calibrated vehicle, on the axes of the pairs."""
+    """Return the replay of the pairs' trials by the calibrated vehicle, on the axes of the pairs."""
     from finssim.identification.prediction import replay
 
     axes = {pair.name: pair.axes for pair in pairs}
@@ -102,8 +103,8 @@ def _replay(pairs: Sequence[Pair], trials: Sequence[Trial], fit: Fit) -> Replay:
 
 
 def _by_replay(fit: Fit, trials: Sequence[Trial]) -> tuple[dict[str, tuple[float, float]], Replay | None]:
-    """Return the NRMSE by axis of the calibrated vehicle and of the file, medians over the trials [-], and the replay
-    of the former; None if no trial can be replayed.
+    """Return the NRMSE by axis of the calibrated vehicle and of the file, medians over the trials [-], and
+    the replay by the calibrated vehicle; None if no trial can be replayed.
 
     Both are scored on the axes that the file's thrusters excite.
     """
@@ -124,7 +125,8 @@ def _by_replay(fit: Fit, trials: Sequence[Trial]) -> tuple[dict[str, tuple[float
 
 
 def _held_out_curves(after: Replay, fit: Fit) -> tuple[Curve, ...]:
-    """Return the curves of a fit, with the replays of held-out trials in place of an axis' own where there are any."""
+    """Return the curves of a fit, in which the replays of held-out trials replace those of an axis if there
+    are any."""
     own = {curve.title.partition(":")[0]: curve for curve in fit.curves}
     for axis in own:
         name = NU[AXES.index(axis)]
@@ -144,19 +146,20 @@ def _held_out_curves(after: Replay, fit: Fit) -> tuple[Curve, ...]:
 
 
 WORSE = 1.02
-"""Factor on the vehicle file's NRMSE up to which a fit is not worse: two equal vehicles differ by so much by chance."""
+"""Factor on the vehicle file's NRMSE up to which a fit is not worse: equal vehicles differ by this much by chance."""
 
 JUDGED_TOGETHER = ("roll", "pitch")
-"""Axes of one stiffness and one height of the thrusters: the file's numbers stay for both, or for neither."""
+"""Axes that share the stiffness and the height of the thrusters: the file's numbers are kept for both or for
+neither."""
 
 
 def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
-    """Return a fit that keeps the vehicle file's numbers of each axis that it predicts worse than the file does, with
-    curves of the trials that judge it.
+    """Return a fit that keeps the vehicle file's numbers of each axis that it predicts worse than the file
+    does, with curves of the validation trials.
 
     Args:
-        fit: The fit, whose quality holds the NRMSE over what was left out of it in turn, and that of the file.
-        held_out: Trials that judge instead, as far as they show an axis.
+        fit: The fit, whose quality contains the NRMSE of left-out data, and that of the file.
+        held_out: Trials that validate instead, for the axes that they contain.
     """
     quality = {axis: dict(figures) for axis, figures in fit.quality.items()}
     scores, after = _by_replay(fit, held_out) if held_out else ({}, None)
@@ -180,7 +183,7 @@ def judged(fit: Fit, held_out: Sequence[Trial] = ()) -> Fit:
 
 
 def _file_kept(fit: Fit, axis: str) -> Fit:
-    """Return the fit with the vehicle file's numbers of an axis, times the scale of the thrust that goes with them."""
+    """Return the fit with the vehicle file's numbers of an axis, multiplied by the estimated scale of thrust."""
     i, plant, figures = AXES.index(axis), matrices(fit.before), fit.quality[axis]
     own = {"added_mass": plant.M_A, "linear_damping": plant.D1, "quadratic_damping": plant.D2}
     changes = {
@@ -211,14 +214,14 @@ def _file_kept(fit: Fit, axis: str) -> Fit:
     return replace(fit, changes=changes, estimates=found, findings=(*fit.findings, worse))
 
 
-FILE_BETTER = "the vehicle file predicts what was not fitted better"
+FILE_BETTER = "the vehicle file predicts data that was not fitted better"
 
 
 # -- the scale of thrust --------------------------------------------------------------------------------------------
 
 
 def _unknown_voltage(trials: Sequence[Trial], vehicle: Vehicle) -> bool:
-    """Return whether only pulse widths are known of the thrust, without the battery's voltage."""
+    """Return whether the thrust is known only as pulse widths, without the battery's voltage."""
     driven = [trial for trial in trials if not trial.header.passive]
     try:
         sources = {drive(trial, vehicle).source for trial in driven}
@@ -253,7 +256,7 @@ def calibrate_hydrodynamics(
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (FILE): Vehicle file to write (.yaml).
         axes (AXES): Axes to fit, of surge,sway,heave,roll,pitch,yaw; the excited ones if not given.
-        estimate (NAMES): Further parameters to fit, of thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or the
+        estimate (NAMES): Further parameters to fit: thrust_scale,thrust_lag,thrust_delay,buoyancy_excess,k or
             parameters of the vehicle's terms, such as lift.coefficient.
         damping (KIND): Drag: linear, quadratic, both, or auto to choose.
         fix (AXIS.m=N): Known inertias, including added mass [kg, kg m²]: yaw.m=0.6,surge.m=24.
@@ -268,8 +271,8 @@ def calibrate_hydrodynamics(
         The calibrated vehicle.
 
     Raises:
-        CalibrationError, VehicleError, OutputError: As they say; nothing is written then.
-        KeyboardInterrupt: After Ctrl-C, when the best until then, if there is any, has been written.
+        CalibrationError, VehicleError, OutputError: See these classes; nothing is written.
+        KeyboardInterrupt: After Ctrl-C; the best result so far, if there is any, has been written.
     """
     options = dict(locals())
     further = tuple(name for name in (word.strip() for word in estimate.split(",")) if name)
@@ -303,7 +306,7 @@ def _axes(words: str | None) -> tuple[str, ...] | None:
 
 
 def _known(words: str) -> dict[str, float]:
-    """Axis -> effective inertia, of `yaw.m=0.6,surge.m=24`."""
+    """Return axis -> effective inertia, from text such as `yaw.m=0.6,surge.m=24`."""
     found = {}
     for word in filter(None, (part.strip() for part in words.split(","))):
         name, _, value = word.partition("=")

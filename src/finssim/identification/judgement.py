@@ -1,4 +1,4 @@
-"""Figures of a fit besides its estimates: quality by axis, prediction of what was left out, curves, findings."""
+"""Quality of a fit: figures by axis, prediction of left-out data, curves, findings."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ Array = NDArray[np.float64]
 
 
 LATE = 0.03
-"""Lag of a stream that leads to a warning [s]."""
+"""Lag of a stream above which a warning is given [s]."""
 
 SHOWN = 4
-"""Trials in the curve of an axis."""
+"""Number of trials in the curve of an axis."""
 
 
 def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
-    """Return which samples count in figures of quality, (N,).
+    """Return a mask of the samples that count in figures of quality, (N,).
 
-    Others are those that the fit rejects and that stand alone among the residuals of their channel and trial, at most a
-    twentieth of these: the errors of a wrong model last, or are many, and count.
+    Excluded are samples that the fit rejects and that are isolated among the residuals of their channel and
+    trial, at most a twentieth of these: the errors of a wrong model are persistent or numerous, and count.
     """
     m, clock = problem.measured, problem.measured.clock
     residual = solution.linear.residual
@@ -48,9 +48,10 @@ def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
 
 
 def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
-    """Return the measured channel that shows each axis: the most direct one; empty where there is none.
+    """Return the measured channel that determines each axis: the most direct one; empty if there is none.
 
-    Of x and y, where no velocity is measured, surge and sway have one each: that which their own numbers move more.
+    If no velocity is measured, surge and sway are assigned one of x and y each: the one that their own
+    numbers affect more.
     """
     m, p = problem.measured, problem.parameters
     out = {axis: next((c for c in DETERMINED_BY[axis] if c in m.names), "") for axis in p.axes}
@@ -59,7 +60,7 @@ def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
         return out
 
     def moved(axis: str, column: str) -> float:
-        """Return how much the numbers of an axis move a column."""
+        """Return the effect of the numbers of an axis on a column."""
         own = [c for c, name in enumerate(p.names) if name.startswith(f"{axis}.")]
         rows = m.channel == m.names.index(column)
         slopes = solution.linear.shared[np.ix_(rows, own)] * p.scale[own] / solution.std[rows, None]
@@ -73,8 +74,8 @@ def channels(problem: Shooting, solution: FitSolution) -> dict[str, str]:
 def _shown_by(
     problem: Shooting, name: str, good: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, float]]:
-    """Return the good samples (n,), of (N,), of a channel, their trials (n,), and the range of the channel in each
-    trial, from the 5th to the 95th percentile."""
+    """Return the good samples (n,), of (N,), of a channel, their trials (n,), and the range of the channel in
+    each trial, from the 5th to the 95th percentile."""
     m = problem.measured
     rows = np.flatnonzero(good & (m.channel == m.names.index(name))) if name else np.empty(0, int)
     trial = problem.groups[m.segment][rows]
@@ -87,9 +88,9 @@ def _shown_by(
 def quality(
     problem: Shooting, solution: FitSolution, axes: Sequence[str], used: Sequence[Streams]
 ) -> dict[str, dict[str, float]]:
-    """Figures of each axis over the trials that move it: the simulated against the measured channel.
+    """Return figures of each axis over the trials that excite it: the simulated compared with the measured channel.
 
-    Units are those of the channel; R² and NRMSE have none.
+    Units are those of the channel; R² and NRMSE are dimensionless.
     """
     out, good, names = {}, believed(problem, solution), channels(problem, solution)
     for axis in axes:
@@ -122,23 +123,23 @@ def quality(
 
 
 AXES_BIAS = ("surge.bias", "sway.bias", "yaw.bias")
-"""Biases that no vehicle file has a place for."""
+"""Biases that a vehicle file cannot represent."""
 
 
 def held_out(
     stage: Stage, file: Shooting, axes: Sequence[str], by_trial: bool
 ) -> tuple[dict[str, tuple[float, float]], Array]:
-    """Return the NRMSE of each axis over stretches that the numbers do not rest on, and that of the vehicle file [-],
-    and the errors of the former, (N,), in the units of the samples.
+    """Return the NRMSE of each axis over segments on which the estimates are not based, that of the vehicle
+    file [-], and the errors of the former, (N,), in the units of the samples.
 
-    Each trial, or stretch of one, is predicted by the numbers that one Gauss-Newton step from the end of the fit gives
-    without it, each from the initial state and the offsets of its sensors that suit it best.
+    Each trial, or segment, is predicted with the estimates after one Gauss-Newton step without it from the
+    solution of the fit, from the initial state and the sensor offsets that fit it best.
 
     Args:
-        stage: The finished fit.
+        stage: Finished fit.
         file: The same problem with every number of the vehicle file free.
         axes: Fitted axes.
-        by_trial: Whether whole trials are left out.
+        by_trial: True to leave out complete trials.
     """
     problem, point = stage.problem, stage.solution.point
     good, names = believed(problem, stage.solution), channels(problem, stage.solution)
@@ -182,8 +183,8 @@ def held_out(
 def _predicted_error(
     problem: Shooting, theta: Array, solution: FitSolution, good: NDArray[np.bool_]
 ) -> Array:
-    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to the good
-    samples (N,), (N, C).
+    """Return the errors of vectors (C, P) after the initial state and offsets of each segment are fitted to
+    the good samples (N,), (N, C).
 
     The unit is that of the channel.
     """
@@ -201,9 +202,9 @@ def _predicted_error(
 def unexplained(
     problem: Shooting, solution: FitSolution, axis: str, used: Sequence[Streams]
 ) -> tuple[str, float]:
-    """Return the trial of a free motion that the fit explains least, and its R²; infinite without any.
+    """Return the trial of a free motion that the fit explains least, and its R²; infinite if there is none.
 
-    R² has no unit.
+    R² is dimensionless.
     """
     rows, trial, _ = _shown_by(problem, channels(problem, solution)[axis], believed(problem, solution))
     worst, least = "", np.inf
@@ -217,12 +218,12 @@ def unexplained(
 
 
 def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> tuple[Curve, ...]:
-    """Return the measured and simulated channel of each axis with a 95 % band, over the trials that move it most.
+    """Return the measured and simulated channel of each axis with a 95 % band, over the trials that excite it most.
 
     Args:
-        stage: The finished fit.
+        stage: Finished fit.
         axes: Fitted axes.
-        error: Of predictions of stretches without what they show, (N,), in the units of the samples; the fit's own
+        error: Errors of predictions of left-out segments, (N,), in the units of the samples; the fit's
             residuals if None.
     """
     problem, solution, C = stage.problem, stage.solution, stage.found.covariance
@@ -230,7 +231,7 @@ def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> t
     variance = np.where(np.outer(known, known), np.where(C.alone[:, None] | C.alone, C.local, C.trials), 0.0)
     slopes = shared_slopes(problem, solution)
     band = 1.96 * np.sqrt(solution.std**2 + np.einsum("ni,ij,nj->n", slopes, variance, slopes))
-    how = "simulated from the inputs alone" if error is None else "each stretch predicted without it"
+    how = "simulated from the inputs alone" if error is None else "each segment predicted without it"
     error = solution.linear.residual if error is None else error
     m, out, good = problem.measured, [], believed(problem, solution)
     names, clock = channels(problem, solution), m.clock
@@ -255,12 +256,12 @@ def fit_findings(
     used: Sequence[Streams],
     trials: Mapping[str, int],
 ) -> list[Finding]:
-    """Return findings that a reader needs before using the numbers.
+    """Return findings that are relevant for the use of the numbers.
 
     Args:
-        problem: What was fitted.
-        solution: Where the fit ended.
-        found: What is known there.
+        problem: Problem that was fitted.
+        solution: Solution of the fit.
+        found: Uncertainty at the solution.
         used: The trials.
         trials: Axis -> number of trials that excite it.
     """
@@ -288,10 +289,10 @@ def fit_findings(
 
 
 def _close(solution: FitSolution, found: Confidence, judged: int) -> bool:
-    """Return whether one step more would keep every parameter within its 95 % interval.
+    """Return whether one more step would keep every parameter within its 95 % interval.
 
-    Trials differ by more than independent noise, so that a step far above the error that such noise leaves may still be
-    far below what can be known.
+    Trials differ by more than independent noise, so that a step far above the error due to such noise may
+    still be far below the actual uncertainty.
     """
     low, high = intervals(solution.point.theta, found.covariance).T
     return bool(np.all(np.abs(solution.step[:judged]) <= 0.5 * (high - low)[:judged]))

@@ -1,7 +1,7 @@
-"""Manoeuvres of vehicles that must move to steer: orders to their autopilot whose motion identifies them.
+"""Manoeuvres of vehicles that must move to steer: references for their autopilot, whose motion identifies them.
 
-Speed runs determine the drag ahead; zig-zags and turning circles (Nomoto 1957; ITTC 7.5-02-06-01) sway and yaw, and
-the lift of the fins that turn the vehicle; depth steps heave, pitch, and the fins that dive it. Any autopilot of speed,
+Speed runs determine the drag ahead; zig-zags and turning circles (Nomoto 1957; ITTC 7.5-02-06-01) determine sway and
+yaw, and the lift of the rudders; depth steps determine heave, pitch, and the diving planes. Any autopilot of speed,
 course and depth can run them; a log needs speeds, rates, attitude, shaft speeds and `actuator_NAME` of every fin.
 """
 
@@ -34,36 +34,37 @@ __all__ = ["Manoeuvre", "Order", "manoeuvres", "simulate_manoeuvres", "write_man
 Array = NDArray[np.float64]
 
 SETTLE = 10.0
-"""Straight way at the start of each manoeuvre [s]."""
+"""Duration of the straight run at the start of each manoeuvre [s]."""
 PERIOD = 0.1
 """Time between two commands of the autopilot [s]."""
 DIVE = 0.75
 """Step of depth, in lengths of the vehicle."""
 HARD, STOP, FAR = 3.0, 15.0, 4.0
-"""Time of the last, hard order of a manoeuvre, of the stop after it [s], and change of depth of a hard dive [m]."""
+"""Duration of the last, hard reference of a manoeuvre, of the stop after it [s], and change of depth of a
+hard dive [m]."""
 LOST = math.radians(60.0)
-"""Pitch at which the autopilot has lost the vehicle: it turns over [rad]."""
+"""Pitch at which control of the vehicle is lost: it turns over [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """Reference of the autopilot until the next order."""
+    """Reference of the autopilot until the next one."""
 
     duration: float
-    """[s]"""
+    """Duration [s]."""
     speed: float
-    """Surge [m/s]; 0: the propellers stop, and the fins stay where they are."""
+    """Surge velocity [m/s]; if 0, the propellers stop and the fins keep their angles."""
     course: float = 0.0
-    """Course from that of the start, counter-clockwise from above [rad]."""
+    """Course relative to that of the start, counter-clockwise from above [rad]."""
     depth: float = 0.0
-    """Depth below that of the start [m]."""
+    """Depth relative to that of the start [m]."""
     turn: float = 0.0
-    """Constant difference of the commanded course from the present one, for a turning circle; 0 for none [rad]."""
+    """Constant difference between commanded and present course, for a turning circle; 0 for none [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Manoeuvre:
-    """One trial."""
+    """Manoeuvre of one trial."""
 
     name: str
     axes: tuple[Axis, ...]
@@ -72,11 +73,11 @@ class Manoeuvre:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return sum(order.duration for order in self.orders)
 
     def at(self, t: float) -> Order:
-        """Return the order of a time since the start [s]."""
+        """Return the reference at a time since the start [s]."""
         for order in self.orders:
             if t < order.duration:
                 return order
@@ -85,15 +86,15 @@ class Manoeuvre:
 
 
 def manoeuvres(vehicle: Vehicle) -> list[Manoeuvre]:
-    """Return speed runs, zig-zags at two speeds, turning circles, depth steps, and both together.
+    """Return speed runs, zig-zags at two speeds, turning circles, depth steps, and both combined.
 
-    Each step lasts as long as the vehicle takes for ten of its lengths, at least 5 s. The speeds and the steps of depth
-    leave the fins a reserve for a hull that is less stable than the file says; such a hull slips little. Each manoeuvre
-    but the speed runs therefore ends with a stop out of a hard turn or dive: the hull turns broadside to its way, and
-    shows its drag in sway, heave, pitch and yaw.
+    Each step lasts as long as the vehicle takes for ten of its lengths, at least 5 s. The speeds and the
+    steps of depth leave the fins a reserve for a hull that is less stable than the file states; such motions
+    have little side slip. Each manoeuvre except the speed runs therefore ends with a stop out of a hard turn
+    or dive: the hull turns broadside to its motion, which reveals its drag in sway, heave, pitch and yaw.
 
     Args:
-        vehicle: With an autopilot of course (`finssim.control.course`).
+        vehicle: Vehicle with a course autopilot (`finssim.control.course`).
     """
     slow, middle, fast = np.quantile(course_speeds(vehicle), (0.4, 0.6, 1.0)).tolist()
     dive = DIVE * float(vehicle.body.size[0])
@@ -102,7 +103,7 @@ def manoeuvres(vehicle: Vehicle) -> list[Manoeuvre]:
         return max(5.0, 10.0 * float(vehicle.body.size[0]) / speed)
 
     def trial(name: str, axes: tuple[Axis, ...], speed: float, *orders: Order, **last: float) -> Manoeuvre:
-        """Return straight way, the orders, a last one as hard as the autopilot acts, and the stop after it."""
+        """Return a straight run, the references, a last one at the limit of the autopilot, and the stop after it."""
         hard = Order(duration=HARD, speed=speed, **last)
         straight, stop = Order(duration=SETTLE, speed=speed), Order(duration=STOP, speed=0.0)
         return Manoeuvre(name=name, axes=axes, orders=(straight, *orders, hard, stop))
@@ -140,15 +141,15 @@ def manoeuvres(vehicle: Vehicle) -> list[Manoeuvre]:
 
 
 def write_manoeuvre(manoeuvre: Manoeuvre, folder: Path) -> None:
-    """Write the orders of a manoeuvre as `programme.csv`: each holds from its time until the next.
+    """Write the references of a manoeuvre as `programme.csv`: each is held until the time of the next.
 
-    The table has `t` [s], `speed` [m/s], `course` [deg] from that of the start, counter-clockwise from above, `depth`
-    [m] below that of the start, and `turn` [deg]: where it is not 0, the course is always that much from the present
-    one.
+    The table has `t` [s], `speed` [m/s], `course` [deg] relative to that of the start, counter-clockwise from
+    above, `depth` [m] relative to that of the start, and `turn` [deg]: if it is not 0, the commanded course
+    differs from the present one by this angle.
 
     Args:
-        manoeuvre: Which.
-        folder: To write into; made if missing.
+        manoeuvre: Manoeuvre to write.
+        folder: Folder to write to; created if missing.
 
     Raises:
         OutputError: The system refused to write.
@@ -173,7 +174,7 @@ class _Helm:
         self.start: tuple[Array, Array] | None = None
         self.steps, self.propellers = 0, len(vehicle.thrusters)
         self.pitch = np.zeros(len(chosen))
-        """Greatest pitch of each manoeuvre so far, up or down [rad]."""
+        """Largest pitch of each manoeuvre so far, up or down [rad]."""
 
     def __call__(self, simulator: Simulator) -> None:
         if self.steps % round(PERIOD / STEP) == 0:
@@ -218,18 +219,18 @@ def simulate_manoeuvres(
 ) -> list[Trial]:
     """Return a trial of each manoeuvre, run by the vehicle's autopilot in the simulator and measured with noise.
 
-    It starts with the speed of the first order: at rest, no fin would hold an unstable hull, or one that floats.
+    It starts at the speed of the first reference: at rest, no fin would hold an unstable or buoyant hull.
 
     Args:
-        chosen: What to run.
-        vehicle: The vehicle file: the autopilot is tuned to it, and the trials name it.
-        truth: What moves in its place, such as the file with other numbers; the same if None.
-        seed: Of initial conditions and noise.
+        chosen: Manoeuvres to run.
+        vehicle: Vehicle of the file: the autopilot is tuned to it, and the trials name it.
+        truth: Vehicle that is simulated instead, such as the file with other numbers; the same if None.
+        seed: Seed of initial conditions and noise.
         options: Further arguments of `finssim.identification.synthetic.simulate_programme`.
 
     Raises:
-        CalibrationError: A motion does not stay finite, the autopilot does not hold the vehicle, or an option cannot
-            be.
+        CalibrationError: A motion does not stay finite, the autopilot loses control of the vehicle, or an
+            option is invalid.
         ControlError: The vehicle cannot be steered by course.
     """
     programmes = []
@@ -250,7 +251,7 @@ def simulate_manoeuvres(
     lost = [one.name for one, pitch in zip(chosen, helm.pitch, strict=True) if pitch > LOST]
     if lost:
         raise CalibrationError(
-            f"{', '.join(lost)}: the vehicle turned over, for the autopilot, tuned to the file, does not hold it: "
-            "give a vehicle nearer to the file, or orders of less depth and more speed"
+            f"{', '.join(lost)}: the vehicle turned over, as the autopilot, tuned to the file, cannot control it: "
+            "give a vehicle closer to the file, or references with less depth and more speed"
         )
     return trials

@@ -1,4 +1,5 @@
-"""The next dive: the steps that narrow the intervals of a fit most for their length, from its information matrix."""
+"""Design of the next dive: the steps that reduce the intervals of a fit most per duration, from its
+information matrix."""
 
 from __future__ import annotations
 
@@ -26,38 +27,40 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 LEVELS = (0.15, 0.4, 0.9)
-"""Levels that are compared, as parts of the vehicle's wrench limit."""
+"""Levels that are compared, relative to the vehicle's wrench limit."""
 
 HOLDS = (3.0, 8.0)
-"""Lengths of the first step that are compared [s]."""
+"""Durations of the first step that are compared [s]."""
 
 UPRIGHT = 0.8
 """Cosine of the tilt below which a step counts as too strong."""
 
 SHORTEST, LONGEST = 30.0, 600.0
-"""Length of a dive [s]."""
+"""Shortest and longest duration of a dive [s]."""
 
 WRITTEN = ("added_mass", "d1", "d2", "k")
-"""Coordinates whose intervals a dive is to narrow."""
+"""Coordinates whose intervals a dive is designed to reduce."""
 
 
 def next_dive(
     stages: Stages, stage: Stage, vehicle: Vehicle, estimates: Mapping[str, Estimate]
 ) -> Dive | None:
-    """Return a dive as long as the fitted trials whose steps narrow the intervals of inertia, drag and stiffness most.
+    """Return a dive as long as the fitted trials whose steps reduce the intervals of inertia, drag and
+    stiffness most.
 
-    Every step is simulated with the calibrated vehicle and measured as the fitted trials were, with the noise that the
-    fit found. It adds J^T W J to the fit's information N, without what its initial state and offsets take up. Steps are
-    chosen one by one, each time the one that lowers the sum of the logarithms of the variances most for its length.
+    Every step is simulated with the calibrated vehicle and measured like the fitted trials, with the noise
+    estimated by the fit. It adds J^T W J to the fit's information N, after elimination of its initial state
+    and offsets. Steps are selected one by one, each time the one that reduces the sum of the logarithms of
+    the variances most per duration.
 
     Args:
-        stages: The fit's trials and settings.
-        stage: The finished fit.
-        vehicle: The calibrated vehicle.
-        estimates: Of the fit, whose widest interval the dive's summary is about.
+        stages: Trials and settings of the fit.
+        stage: Finished fit.
+        vehicle: Calibrated vehicle.
+        estimates: Estimates of the fit; the dive's summary refers to the widest interval.
 
     Returns:
-        None where no step keeps the vehicle upright, or nothing was driven.
+        The dive; None if no step keeps the vehicle upright, or no axis was driven.
     """
     driven = [one for one in stages.used if one.drive.source != "passive"]
     legs = [
@@ -88,7 +91,7 @@ def next_dive(
         count[best] += 1
         total = total + normal[best]
         spent += legs[best].duration
-    # The summary: the widest interval of the fit, relative to its number.
+    # The summary: the widest interval of the fit, relative to its value.
     factors = dict(
         zip((names[i] for i in at), np.exp(0.5 * (np.log(_variances(total, at)) - first)), strict=True)
     )
@@ -112,7 +115,7 @@ def _variances(information: Array, at: Sequence[int]) -> Array:
 def _information(
     stages: Stages, stage: Stage, vehicle: Vehicle, legs: Sequence[Leg]
 ) -> tuple[list[Leg], Array]:
-    """Return the steps that can be driven, and the information that each adds, per product of the units of theta."""
+    """Return the feasible steps, and the information that each adds, per product of the units of theta."""
     old, solution = stage.problem, stage.solution
     rate = 1.0 / (STEP * max(round(sampling(stages.used) / STEP), 1))
     try:
@@ -143,7 +146,7 @@ def _information(
         return [], np.empty(0)
     problem = stages.problem(dict(old.parameters.damping), {}, cut)
     std = dict(zip(old.measured.names, _std_by_channel(stage), strict=True))
-    # Without a stream that only some fitted trials have, such as positions beside velocities, its lag has no place.
+    # The lag of a stream that only some fitted trials have, such as positions beside velocities, does not occur here.
     own = [old.names.index(name) for name in problem.names]
     point = Point(solution.point.theta[own], np.zeros(problem.prior_std.shape))
     linear = problem.linearise(point)
@@ -162,7 +165,7 @@ def _information(
 
 
 def _std_by_channel(stage: Stage) -> list[float]:
-    """Return the noise of each channel of a fit, of trials that drive its axis where there are any, in its unit."""
+    """Return the noise of each channel of a fit, from trials that drive its axis if there are any, in its unit."""
     m, std = stage.problem.measured, stage.solution.std
     driven = [std[m.kind == j] if (m.kind == j).any() else std[m.channel == j] for j in range(len(m.names))]
     return [float(one[0]) for one in driven]

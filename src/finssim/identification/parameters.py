@@ -1,4 +1,4 @@
-"""Free numbers of a fit by simulation error: their starts, bounds and priors, and the plants that they give."""
+"""Free parameters of a fit by simulation error: initial values, bounds and priors, and the resulting plants."""
 
 from __future__ import annotations
 
@@ -25,36 +25,38 @@ EXTRAS = ("thrust_scale", "thrust_lag", "thrust_delay", "buoyancy_excess", "k")
 """Parameters that can be estimated besides the axes' own numbers and the parameters of the vehicle's terms."""
 
 MARGIN = 0.95
-"""Part of the rigid-body inertia that a negative added mass may take away."""
+"""Fraction of the rigid-body inertia that a negative added mass may cancel."""
 
 FELT, USUAL_SPEED = 0.02, 0.5
-"""Part of the weight, and speed on each axis [m/s, rad/s]."""
+"""Fraction of the weight that a large change of a term's parameter amounts to, and speed on each axis [m/s,
+rad/s]."""
 
 LONGEST_DELAY = 1.0
-"""[s]"""
+"""Upper bound of a delay [s]."""
 
 SHORTEST_LAG = 0.005
-"""Time constant below which a step of the simulation shows no lag [s]."""
+"""Time constant below which a time step of the simulation cannot resolve the lag [s]."""
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number that a fit moves."""
+    """Number that is adjusted in a fit."""
 
     name: str
     unit: str
     start: float
-    """First value, in the unit of the coordinate."""
+    """Initial value, in the unit of the coordinate."""
     low: float
     """Lower bound, in the unit of the coordinate."""
     high: float
     """Upper bound, in the unit of the coordinate."""
     scale: float
-    """Size of a large change; finite differences take a small share of it as step."""
+    """Size of a large change; the step of finite differences is a small fraction of it."""
     std: float | None = None
-    """Prior standard deviation about `start`; `VAGUE` times the scale if None, infinite where nothing is known."""
+    """Standard deviation of the prior about `start`; `VAGUE` times the scale if None, infinite without prior."""
     rigid: float | None = None
-    """Rigid inertia of the axis; if given, the prior is that of ln(rigid + coordinate), and `std` has no unit."""
+    """Rigid-body inertia of the axis; if given, the prior is that of ln(rigid + coordinate), and `std` is
+    dimensionless."""
 
 
 @dataclass(frozen=True)
@@ -64,19 +66,20 @@ class Plants:
     fields: dict[str, Array]
     """Fields of `VehicleParameters` in their units, (W, 1, ...)."""
     bias: Array
-    """Constant wrench that acts, about the body origin, body frame [N, N m], (W, 1, 6)."""
+    """Constant wrench, about the body origin, body frame [N, N m], (W, 1, 6)."""
     lag: Array | None
     """Time constant of the motors [s], (W,)."""
     delay: Array | None
-    """[s], (W,)"""
+    """Delay of the motors [s], (W,)."""
     lower: Array | None = None
-    """Heights of the horizontal thrusters above those of the file [m], (W,)."""
+    """Heights of the horizontal thrusters relative to those of the file [m], (W,)."""
     gains: Array | None = None
-    """Thrust of each thruster over the vehicle file's, times the scale of all [-], (W, MAX_THRUSTERS)."""
+    """Thrust of each thruster relative to the vehicle file's, times the common scale [-], (W, MAX_THRUSTERS)."""
 
 
 def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coordinate:
-    """A parameter of a term; a large change of it makes a force of `FELT` of the weight at `USUAL_SPEED`."""
+    """Return a coordinate for a parameter of a term; a large change causes a force of `FELT` of the weight at
+    `USUAL_SPEED`."""
     terms = tuple(TERMS[name] for name in sorted(chosen.terms))
     numbers = chosen.term_parameters
     start = float(numbers[path])
@@ -89,9 +92,10 @@ def term_coordinate(chosen: HydrodynamicSet, vehicle: Vehicle, path: str) -> Coo
 
 
 def actuator_fields(vehicle: Vehicle) -> dict[str, dict[str, float]]:
-    """Parameter of a kind of actuator, `fin.lift_slope` -> field of the plant and number of each actuator of that kind.
+    """Return parameter of a kind of actuator, `fin.lift_slope` -> field of the plant and number of each
+    actuator of that kind.
 
-    A fit moves one factor on all of them. Each number has the unit of its kind.
+    A fit adjusts one factor for all of them. Each number has the unit of its kind.
     """
     out: dict[str, dict[str, float]] = {}
     for item, section in installed(vehicle).items():
@@ -103,7 +107,7 @@ def actuator_fields(vehicle: Vehicle) -> dict[str, dict[str, float]]:
 
 
 def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, float]:
-    """Changes of the vehicle file that multiply a parameter of all actuators of a kind, `fin.lift_slope`.
+    """Return the changes of the vehicle file that multiply a parameter of all actuators of a kind, `fin.lift_slope`.
 
     Args:
         vehicle: The vehicle.
@@ -128,35 +132,35 @@ def scaled_actuators(vehicle: Vehicle, name: str, factor: float) -> dict[str, fl
 
 
 LIKELY_SCALE, SCALE_STD = 0.88, 0.17
-"""Thrust of a battery on its way from full to empty, over that at the voltage of the thruster's table, and the standard
-deviation of its logarithm: thrust goes with the square of a voltage of 3.3 to 4.2 V a cell, 0.68 to 1.10 of the
-table's at 16 V (0.14), and propellers of one make differ by a tenth."""
+"""Thrust of a battery between full and empty, relative to that at the voltage of the thruster's table, and
+the standard deviation of its logarithm: thrust is proportional to the square of a voltage of 3.3 to 4.2 V per
+cell, 0.68 to 1.10 of that in the table at 16 V (0.14), and propellers of one model differ by a tenth."""
 
 ADDED_MASS_STD, RIGID_STD, INERTIA_STD = 0.7, 0.35, 0.5
-"""Standard deviation of an added mass, as parts of the vehicle file's and of its rigid mass, whichever is more, and of
-the logarithm of an effective moment of inertia: published sets of one vehicle differ by as much."""
+"""Standard deviation of an added mass, relative to the larger of the vehicle file's value and its rigid-body mass,
+and of the logarithm of an effective moment of inertia: published sets of one vehicle differ by this much."""
 
 PLACE_STD = {"measured": 0.005, "derived": 0.03, "published": 0.03, "guessed": 0.05}
-"""Standard deviation of a height or centre of the vehicle file by its origin [m]."""
+"""Standard deviation of a height or centre in the vehicle file by its origin [m]."""
 
 GAINS, GAIN_STD, COMMON_STD = "thruster_gains", 0.05, 1e-3
-"""Word for the thrusts of single thrusters over the file's, each a coordinate `gain.NAME`; their standard deviation;
-and that of their mean, for what they have in common is the scale of thrust."""
+"""Name of the option for individual thruster gains relative to the file, each a coordinate `gain.NAME`; their
+standard deviation; and that of their mean, since their common factor is the scale of thrust."""
 
 DETERMINED = 0.8
-"""Standard deviation of a place, as a part of that of its prior, up to which it goes to the vehicle file."""
+"""Standard deviation of a position, relative to that of its prior, up to which it is written to the vehicle file."""
 
 PUBLISHED_STD = 0.1
-"""Standard deviation of a published top speed or bollard pull, as a part of the largest thrust."""
+"""Standard deviation of a published top speed or bollard pull, relative to the largest thrust."""
 
 CENTRES = ("gravity_x", "gravity_y", "gravity_z")
 PLACES = ("thruster_height", *CENTRES)
-"""Places that are free where roll or pitch is fitted: the common height of the thrusters that push sideways, and the
-centre of gravity. The centre of buoyancy follows from it, the stiffness and the constant moments."""
+"""Positions that are free if roll or pitch is fitted: the common height of the horizontal thrusters, and the
+centre of gravity. The centre of buoyancy follows from the latter, the stiffness and the constant moments."""
 
 
 def places(vehicle: Vehicle) -> dict[str, str]:
-    """Return the paths of `PLACES` in the file, that of the height of the first of the thrusters that share it."""
+    """Return the paths of `PLACES` in the file; for the common height, that of the first of the thrusters."""
     paths = [f"thrusters.{name}.position.2" for name in horizontal(vehicle)[:1]]
     return dict(zip(PLACES, paths, strict=False)) | {
         n: f"body.center_of_gravity.{j}" for j, n in enumerate(CENTRES)
@@ -164,7 +168,7 @@ def places(vehicle: Vehicle) -> dict[str, str]:
 
 
 def origin(vehicle: Vehicle, path: str) -> str:
-    """Return the origin of a number of the file; `guessed` where it states none."""
+    """Return the origin of a number in the file; `guessed` if the file states none."""
     try:
         return str(vehicle.origin_of(path).origin)
     except VehicleError:
@@ -172,25 +176,25 @@ def origin(vehicle: Vehicle, path: str) -> str:
 
 
 def horizontal(vehicle: Vehicle) -> list[str]:
-    """Return the names of the thrusters that push sideways."""
+    """Return the names of the thrusters that push horizontally."""
     return [name for name, t in vehicle.thrusters.items() if abs(t.axis[2]) < SIDEWAYS]
 
 
 SIDEWAYS = 0.5
-"""Vertical part of the axis of a thruster below which it pushes sideways [-]."""
+"""Magnitude of the vertical component of a thruster's axis below which it pushes horizontally [-]."""
 
 
 class Parameters:
-    """The free numbers of a fit.
+    """Free parameters of a fit.
 
-    Every coordinate lies in a box, and every vector of the box gives a plant with positive definite M_RB + M_A and
-    damping that takes energy out: the bounds of a diagonal fit are d1, d2 >= 0 and an added mass that leaves M_RB
-    positive definite even if all axes are at their bounds. A box, because damping
-    may well be exactly zero: a logarithm never reaches it and would make its interval look like an estimate's.
+    Every coordinate is bounded, and every vector within the bounds yields a plant with positive definite M_RB
+    + M_A and dissipative damping: the bounds of a diagonal fit are d1, d2 >= 0 and an added mass that keeps
+    M_RB + M_A positive definite even if all axes are at their bounds. Bounds are used because damping may be
+    exactly zero: a logarithm never reaches zero and would yield a misleading interval.
 
     Attributes:
-        coordinates: In the order of a vector.
-        expected: The vehicle file's numbers, (P,).
+        coordinates: Coordinates in the order of a vector.
+        expected: Numbers of the vehicle file, (P,).
     """
 
     def __init__(
@@ -208,26 +212,26 @@ class Parameters:
         likely: bool = False,
         published: Mapping[str, float] | None = None,
     ) -> None:
-        """Choose what is free.
+        """Select the free parameters.
 
         Args:
-            vehicle: Gives the start and everything that is not free.
-            axes: Whose added mass and damping are free.
-            damping: `linear`, `quadratic` or `both` by axis; what is left out is zero.
-            extras: Of `EXTRAS`, `GAINS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its
-                actuators.
-            biases: Axes with a constant wrench b, about the set's reference point and on the side of the damping:
-                M nu_dot + D nu + b = tau.
-            start: Coordinate -> where it starts, in its unit, in place of the vehicle file's number.
-            imposed: Axes that are not fitted: their added mass alone is free, for its momentum turns and pushes the
-                others. Their coordinates come last.
-            unseen: Those of `imposed` that no trial shows moving, and that therefore are simulated: their drag is free.
+            vehicle: Vehicle with the initial values and everything that is not free.
+            axes: Axes whose added mass and damping are free.
+            damping: `linear`, `quadratic` or `both` by axis; the omitted term is zero.
+            extras: Names from `EXTRAS`, `GAINS`, the parameters of the vehicle's terms, such as
+                `lift.coefficient`, and of its actuators.
+            biases: Axes with a constant wrench b, about the set's reference point and on the side of the
+                damping: M nu_dot + D nu + b = tau.
+            start: Coordinate -> initial value, in its unit, instead of the vehicle file's number.
+            imposed: Axes that are not fitted: only their added mass is free, since its momentum rotates and
+                pushes the other axes. Their coordinates come last.
+            unseen: Axes of `imposed` without measurements, which are therefore simulated: their drag is free.
             held: Effective inertias M_RB + M_A that are not free, by axis [kg, kg m²].
-            likely: Whether the scale of thrust is what batteries give.
-            published: `top_speed` [m/s] and `bollard_pull` [N], both ahead, as far as they are known.
+            likely: True if the scale of thrust has the prior of usual batteries.
+            published: Known values of `top_speed` [m/s] and `bollard_pull` [N], both ahead.
 
         Raises:
-            CalibrationError: The calibrated set holds no coefficients.
+            CalibrationError: The calibrated set contains no coefficients.
         """
         plant, chosen = matrices(vehicle), vehicle.hydrodynamics["calibrated"]
         assert isinstance(chosen, HydrodynamicSet)
@@ -305,7 +309,7 @@ class Parameters:
         return out + [self._of_axis(axis, kind) for axis in self.unseen for kind in ("d1", "d2")]
 
     def _of_axis(self, axis: str, kind: str, low: float = 0.0) -> Coordinate:
-        """An axis' own added mass, d1, d2 or bias, from the vehicle file's number on."""
+        """Return an axis' own added mass, d1, d2 or bias, initialised with the vehicle file's number."""
         i = AXES.index(axis)
         m, bias = float((self.M_RB + self.M_A)[i, i]), np.zeros((6, 6))
         own, size = {
@@ -322,10 +326,11 @@ class Parameters:
         return Coordinate(f"{axis}.{kind}", unit, float(own[i, i]), low, np.inf, size, std, rigid)
 
     def prior_rows(self) -> tuple[Array, Array]:
-        """Return rows (R, P) and targets (R,) of what is known of sums of coordinates, over the standard deviations.
+        """Return rows (R, P) and targets (R,) of the priors of linear combinations of coordinates, over their
+        standard deviations.
 
-        Drag at the top speed equals the largest thrust, and so does a bollard pull; scale 1 where it is not free. The
-        mean of the gains of single thrusters is 1.
+        Drag at the top speed equals the largest thrust, and so does a bollard pull; the scale is 1 if it is
+        not free. The mean of the gains of individual thrusters is 1.
         """
         largest = float(self.vehicle.wrench_limits[0]) if self.published else 1.0
         rows, target = np.zeros((len(self.published), len(self.names))), np.zeros(len(self.published))
@@ -346,15 +351,16 @@ class Parameters:
 
     @property
     def nuisances(self) -> int:
-        """Return the number of nuisance coordinates, which are the last ones."""
+        """Return the number of nuisance coordinates, which come last."""
         return len(self.imposed) + 2 * len(self.unseen)
 
     def mass_floor(self) -> Array:
-        """Lowest added mass of each free axis, (n,): M stays positive definite with all of them there [kg, kg m²].
+        """Return the lowest added mass of each free axis, (n,), for which M is positive definite if all are
+        at it [kg, kg m²].
 
-        It is zero where the couplings of the file's M_A are scaled with its diagonal. Elsewhere M_RB
-        (or, where the file couples axes, all of M) less κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ below
-        the smallest eigenvalue of M scaled by c.
+        It is zero if the couplings of the file's M_A are scaled with its diagonal. Otherwise M_RB (or, if the
+        file couples axes, all of M) minus κ diag(c), c = 1/diag(M⁻¹), is positive definite for κ below the
+        smallest eigenvalue of M scaled by c.
         """
         couplings = self.M_A - np.diag(np.diag(self.M_A))
         if has_scalable_couplings(self.M_A):
@@ -369,11 +375,11 @@ class Parameters:
     # -- plants -------------------------------------------------------------------------------------------------
 
     def value(self, x: Array, name: str, default: float | None = None) -> Any:
-        """Column of a coordinate in vectors (W, P), or a default. The unit is that of the coordinate."""
+        """Return the column of a coordinate in vectors (W, P), or a default. The unit is that of the coordinate."""
         return x[:, self._at[name]] if name in self._at else default
 
     def matrices(self, x: Array) -> tuple[Array, Array, Array]:
-        """M_A, D1 and D2 at the set's reference point, (W, 6, 6) each.
+        """Return M_A, D1 and D2 at the set's reference point, (W, 6, 6) each.
 
         Couplings are scaled with the diagonals (`with_diagonal`).
 
@@ -394,7 +400,7 @@ class Parameters:
         return np.stack([self.value(x, name, file[:, j]) for j, name in enumerate(CENTRES)], axis=-1)
 
     def moved(self, x: Array) -> Vehicle:
-        """Return the vehicle with the centres of a vector (P,); the moment of weight and buoyancy stays as it is."""
+        """Return the vehicle with the centres of a vector (P,); the moment of weight and buoyancy is unchanged."""
         if not set(CENTRES) & set(self.names):
             return self.vehicle
         body, r_g = self.vehicle.body, self.centre_of_gravity(x[None])[0]
@@ -408,7 +414,7 @@ class Parameters:
         """Return the simulator's parameters.
 
         Args:
-            x: Vectors, (W, P); numbers outside the box count as on its edge.
+            x: Vectors in the units of the coordinates, (W, P); numbers outside the bounds are clipped.
         """
         x = np.clip(np.atleast_2d(x), self.low, self.high)
         W = len(x)
@@ -434,7 +440,7 @@ class Parameters:
             if "k" in self._at:
                 z = self.r_h[2]
                 r_b[:, 2] = z + (self.value(x, "k") + self.vehicle.weight * (r_g[:, 2] - z)) / B
-            # What tilts a vehicle at rest is beside its centre of gravity, and turns it once it rolls or pitches.
+            # A weight that tilts a vehicle at rest is off its centre of gravity, and acts when it rolls or pitches.
             r_b[:, 0] += self.value(x, "pitch.bias", 0.0) / B
             r_b[:, 1] -= self.value(x, "roll.bias", 0.0) / B
             fields["r_b"] = r_b[:, None]

@@ -1,4 +1,4 @@
-"""The vehicle's matrices and hydrostatics about the reference point of its coefficients."""
+"""Matrices and hydrostatics of the vehicle about the reference point of its coefficients."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UNITS = {
     "bias": ("N", "N m"),
     "k": ("N m/rad", "N m/rad"),
 }
-"""Units of the numbers of an axis, along it and about it."""
+"""Units of the numbers of an axis, for translation and rotation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Matrices:
     """6x6 matrices and hydrostatics about one point of the body."""
 
     H: Array
-    """Twist there from the twist at the body origin [-, m], (6, 6)."""
+    """Matrix from the twist at the body origin to that at the point [-, m], (6, 6)."""
     M_RB: Array
     """Rigid-body inertia [kg, kg m²]."""
     M_A: Array
@@ -41,7 +41,7 @@ class Matrices:
     D2: Array
     """Quadratic damping [N s²/m², N m s²]."""
     excess: float
-    """Buoyancy less weight, submerged [N]."""
+    """Buoyancy minus weight, submerged [N]."""
     arm: Array
     """B r_b - W r_g from the reference point [N m], (3,): the hydrostatic moment is arm × up."""
 
@@ -59,7 +59,7 @@ def matrices(vehicle: Vehicle) -> Matrices:
     if not isinstance(chosen, HydrodynamicSet):
         raise CalibrationError(
             f"{vehicle.name}: no coefficients in hydrodynamics.calibrated, expected a set with linear_damping and "
-            "quadratic_damping: add one, zeros will do, for the fit to fill"
+            "quadratic_damping: add one; zeros are sufficient, as the fit replaces them"
         )
     r = np.asarray(chosen.reference_point, float)
     H = twist_shift(r.tolist())
@@ -77,17 +77,17 @@ def matrices(vehicle: Vehicle) -> Matrices:
 
 
 def with_diagonal(matrix: Array, diagonal: Array) -> Array:
-    """Return a matrix of the vehicle file with other diagonals, and with couplings scaled to match.
+    """Return a matrix of the vehicle file with another diagonal, and with couplings scaled accordingly.
 
     Entry (i, j) is multiplied by √(a_i a_j), where a_i is the factor on diagonal entry i. This keeps a matrix positive
     semidefinite. A matrix that is not positive semidefinite keeps its couplings.
 
     Args:
         matrix: Added mass [kg, kg m²] or damping [N s/m, N s²/m²], with the units of moments, (6, 6).
-        diagonal: In the units of the matrix, (..., 6).
+        diagonal: New diagonal in the units of the matrix, (..., 6).
 
     Returns:
-        (..., 6, 6), in the units of the matrix.
+        Matrix in the units of the given one, (..., 6, 6).
     """
     own = np.diag(matrix)
     out = np.broadcast_to(matrix, (*diagonal.shape, 6)).copy()

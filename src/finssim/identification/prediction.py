@@ -1,4 +1,4 @@
-"""Replay: how well do hydrodynamic models reproduce recorded trials, above all trials they were not fitted on."""
+"""Replay: validation of hydrodynamic models with recorded trials, in particular held-out ones."""
 
 from __future__ import annotations
 
@@ -50,26 +50,26 @@ from finssim.vehicles.vehicle import AXES, Axis
 
 __all__ = ["Replay", "replay", "run_replay"]
 
-# Drive models with the recorded inputs of trials, from their recorded initial states.
+# Simulation of models with the recorded inputs of trials, from their recorded initial states.
 
 RATE = 50.0
-"""Responses are compared at this rate, or at the log's own where that is slower [1/s]."""
+"""Rate at which responses are compared, or the log's own rate if it is lower [1/s]."""
 
 STEP = 0.02
-"""Step of the simulation; integrated by RK4 [s]."""
+"""Time step of the simulation; integrated by RK4 [s]."""
 
 LATEST, LEAST_LATE = 0.25, 0.02
-"""Largest and smallest offset between the clocks of commands and motion that a comparison allows for [s]."""
+"""Largest and smallest offset between the clocks of commands and motion that a comparison compensates [s]."""
 
 SURE = 0.8
-"""Factor on the squared error that an offset has to reach to be believed."""
+"""Factor on the squared error below which an offset is accepted."""
 
 
 def check_models(vehicle: Vehicle, models: Sequence[str]) -> tuple[str, ...]:
-    """The models, each once.
+    """Return the models without duplicates.
 
     Raises:
-        CalibrationError: One is unknown, or the vehicle file has no numbers for it.
+        CalibrationError: A model is unknown, or the vehicle file has no parameters for it.
     """
     for model in models:
         if model not in HYDRODYNAMICS:
@@ -92,13 +92,13 @@ def replay_pairs(
     models: Sequence[str],
     progress: Callable[[str], None] | None = None,
 ) -> tuple[list[Pair], list[Finding]]:
-    """Return every trial with each model's prediction, simulated from its start and again after every gap.
+    """Return every trial with each model's prediction, simulated from its start and restarted after every gap.
 
     Args:
         trials: Recorded trials.
-        vehicle: The vehicle that all models are of.
+        vehicle: Vehicle of all models.
         models: Keys of its hydrodynamics.
-        progress: Told the name of each model before it runs.
+        progress: Function that is called with the name of each model before it runs.
 
     Returns:
         Pairs in the order of the trials, and a finding for every trial that could not be replayed.
@@ -130,7 +130,7 @@ def replay_pairs(
 
 
 def _bare_pair(s: Streams, vehicle: Vehicle) -> Pair:
-    """The measured side of a pair, on the grid of comparison."""
+    """Return the measured data of a pair, on the grid of comparison."""
     trial, m = s.trial, s.motion
     rate = _rate(s, vehicle)
     t = np.arange(0.0, float(trial.t[-1] - trial.t[0]) + 0.5 / rate, 1.0 / rate)
@@ -175,7 +175,7 @@ def _excited(s: Streams, vehicle: Vehicle) -> tuple[Axis, ...]:
 
 
 def _rate(s: Streams, vehicle: Vehicle) -> float:
-    """50 Hz, or that of the slowest measured velocity of an excited axis where it is below [1/s]."""
+    """Return 50 Hz, or the rate of the slowest measured velocity of an excited axis if it is lower [1/s]."""
     axes = steered(_excited(s, vehicle)) or AXES
     clocks = [s.trial.series(NU[AXES.index(axis)])[0] for axis in axes]
     rates = [1.0 / float(np.median(np.diff(t))) for t in clocks if len(t) > 1]
@@ -184,7 +184,7 @@ def _rate(s: Streams, vehicle: Vehicle) -> float:
 
 
 def _axes_of_passive(pair: Pair) -> Pair:
-    """A passive trial is scored on every axis that was measured to move."""
+    """Return the pair of a passive trial, which is scored on every axis with a measured motion."""
     if pair.axes:
         return pair
     moving = tuple(axis for axis in AXES if response_span(pair, pair.response(axis)).value is not None)
@@ -199,7 +199,7 @@ def _add(
     which: Sequence[int],
     vehicle: Vehicle,
 ) -> None:
-    """Write a model's prediction of a trial's segments into its pair."""
+    """Store a model's prediction of a trial's segments in its pair."""
     n = len(pair.t)
     pieces = []
     for number, (segment, k) in enumerate(zip(segments, which, strict=True)):
@@ -229,9 +229,9 @@ def _add(
 
 
 def _late(pair: Pair, at: Callable[[float], dict[str, Array]]) -> float:
-    """The lag of a log's motion behind its commands that fits best [s]; 0 where it does not show.
+    """Return the lag of a log's motion behind its commands that fits best [s]; 0 if it is not significant.
 
-    Commands and motion are often recorded by two computers, and a fit allows for their clocks as well.
+    Commands and motion are often recorded by two computers, and a fit compensates their clock offset as well.
     """
     scored = pair.scored()
     names = [pair.response(axis) for axis in steered(pair.axes) if pair.response(axis) in pair.measured]
@@ -253,7 +253,7 @@ def _late(pair: Pair, at: Callable[[float], dict[str, Array]]) -> float:
 
 
 def _responses(segment: Segment, response: Response, rows: slice, k: int) -> dict[str, Array]:
-    """All responses of one segment over its own steps, (steps + 1,) each."""
+    """Return all responses of one segment over its own steps, (steps + 1,) each."""
     nu = response.nu[rows, 0, k].astype(float)
     q = response.quaternion[rows, 0, k].astype(float)
     depth_at = np.broadcast_to(segment.sensors.depth_at, (len(q), 3))
@@ -264,32 +264,32 @@ def _responses(segment: Segment, response: Response, rows: slice, k: int) -> dic
 
 
 def _shifted(tau: Array, point: Array) -> Array:
-    """Moments about a body point, of wrenches about the body origin, (n, 6)."""
+    """Return wrenches with moments about a body point, from wrenches about the body origin, (n, 6)."""
     out = np.array(tau, dtype=np.float64)
     out[:, 3:] -= np.cross(np.asarray(point, dtype=np.float64), out[:, :3])
     return out
 
 
-# Short replays from measured states all along trials: what a model predicts some seconds ahead.
+# Short replays from measured states throughout trials: prediction some seconds ahead.
 
 STAGGER = 4
-"""Predictions start this many times per horizon."""
+"""Number of predictions that start per horizon."""
 
 
 def replay_predictions(
     trials: Sequence[Trial], pairs: Sequence[Pair], vehicle: Vehicle, models: Sequence[str], horizon: float
 ) -> dict[Axis, dict[str, Ahead]]:
-    """Errors of short replays that start from measured states all along the trials.
+    """Return errors of short replays that start from measured states throughout the trials.
 
     Args:
-        trials: Those of the pairs, in their order.
-        pairs: Which axes and samples count.
+        trials: Trials of the pairs, in their order.
+        pairs: Pairs with the scored axes and samples.
         vehicle: The vehicle.
         models: Keys of its hydrodynamics.
-        horizon: How far to look ahead [s].
+        horizon: Prediction horizon [s].
 
     Returns:
-        By axis and model; only where a prediction can be compared.
+        Errors by axis and model, where predictions can be compared.
     """
     cut: list[Segment] = []
     for i, trial in enumerate(trials):
@@ -332,32 +332,32 @@ def replay_predictions(
 
 
 def _ahead(pair: Pair, segment: Segment, ahead: Array, response: str) -> Array:
-    """Return the measurements at times after a segment's start that count, (T,)."""
+    """Return the scored measurements at times after a segment's start, (T,)."""
     since = ahead + segment.t0 - pair.t0
     values = resampled(pair.t, np.where(pair.scored(), pair.measured[response], np.nan), since)
     return np.where(ahead <= segment.duration + 1e-9, values, np.nan)
 
 
 def _padded(values: NDArray[np.float32], rows: int) -> Array:
-    """The first rows, NaN below the last, (rows, S)."""
+    """Return the first rows, padded with NaN, (rows, S)."""
     out = np.full((rows, values.shape[1]), np.nan)
     out[: len(values[:rows])] = values[:rows]
     return out
 
 
 SHORTEST_HORIZON, LONGEST_HORIZON = 0.1, 60.0
-"""[s]"""
+"""Shortest and longest prediction horizon [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Trials replayed with one model or several."""
+    """Replay of trials with one or several models."""
 
     vehicle: Vehicle
     models: tuple[str, ...]
-    """The first is the one that single numbers are of."""
+    """Models; single numbers refer to the first."""
     pairs: tuple[Pair, ...]
-    """Trials beside their replays."""
+    """Trials with their replays."""
     left_out: tuple[Finding, ...] = ()
     """Reason for each trial that could not be replayed."""
     horizon: float | None = None
@@ -369,7 +369,7 @@ class Replay:
 
     @cached_property
     def scores(self) -> dict[str, tuple[dict[Axis, Score], ...]]:
-        """Model -> for each trial, excited axis -> NRMSE over excitation and coast."""
+        """Model -> for each trial: excited axis -> NRMSE over excitation and coast."""
         return {
             model: tuple({axis: score(p, model, p.response(axis)) for axis in p.axes} for p in self.pairs)
             for model in self.models
@@ -377,15 +377,17 @@ class Replay:
 
     @property
     def in_sample(self) -> bool:
-        """Return whether there is no held-out trial: then all numbers rest on trials that the vehicle was fitted on."""
+        """Return whether there is no held-out trial: all numbers are then based on trials that the vehicle
+        was fitted on."""
         return bool(self.pairs) and all(pair.in_sample for pair in self.pairs)
 
     def aggregate(self, model: str, *, in_sample: bool | None = None) -> Aggregate:
-        """Equal-weight mean over the axes of the median over trials, with its bootstrap interval.
+        """Return the equal-weight mean over the axes of the median over trials, with its bootstrap interval.
 
         Args:
             model: One of `models`.
-            in_sample: Of the in-sample or the held-out trials; the held-out ones where there are any if None.
+            in_sample: True for the in-sample, False for the held-out trials; if None, the held-out ones if
+                there are any.
         """
         requested = self.in_sample if in_sample is None else in_sample
         chosen = [
@@ -400,7 +402,7 @@ class Replay:
         return aggregate(rows, seed=self.seed)
 
     def as_json(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the JSON object that `--json` prints."""
         return replay_json(self)
 
     def __repr__(self) -> str:
@@ -420,22 +422,22 @@ def replay(
     seed: int = SEED,
     progress: Callable[[str], None] | None = None,
 ) -> Replay:
-    """Drive models with the recorded inputs from the recorded initial states and compare their responses.
+    """Simulate models with the recorded inputs from the recorded initial states and compare their responses.
 
-    A whole trial is one replay, begun anew only after a gap. Responses are compared at 50 Hz, or at the
-    log's own rate where that is slower.
+    A complete trial is one replay, restarted only after a gap. Responses are compared at 50 Hz, or at the
+    log's own rate if it is lower.
 
     Args:
         trials: Recorded trials, with or without inputs (passive).
-        vehicle: The vehicle; it remembers the trials that it was fitted on.
-        hydrodynamics: A model or several: keys of the vehicle's hydrodynamics.
-        horizon: Also predict this far ahead from measured states all along the trials [s].
+        vehicle: The vehicle; its calibration records name the trials that it was fitted on.
+        hydrodynamics: One or several models: keys of the vehicle's hydrodynamics.
+        horizon: Horizon of additional predictions from measured states throughout the trials [s].
         out: Directory for `replay.json`, `replay.md` and the figures.
-        seed: Of the bootstrap.
-        progress: Told the name of each model before it runs.
+        seed: Seed of the bootstrap.
+        progress: Function that is called with the name of each model before it runs.
 
     Raises:
-        CalibrationError: A model or horizon that cannot be, or no trial could be replayed.
+        CalibrationError: A model or horizon is invalid, or no trial could be replayed.
     """
     models = check_models(vehicle, [hydrodynamics] if isinstance(hydrodynamics, str) else list(hydrodynamics))
     if horizon is not None and not SHORTEST_HORIZON <= horizon <= LONGEST_HORIZON:
@@ -468,7 +470,7 @@ def replay(
 
 
 def _seconds(horizon: float) -> Array:
-    """1, 2, ... s up to the horizon; quarters of it where it is below 2 s."""
+    """Return 1, 2, ... s up to the horizon; quarters of it if it is below 2 s."""
     full = np.arange(1.0, np.floor(horizon + 1e-9) + 1.0)
     if len(full) < 2:
         return np.asarray(horizon * np.arange(1, 5) / 4.0)
@@ -499,7 +501,7 @@ def run_replay(
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        CalibrationError, VehicleError, OutputError: As they say.
+        CalibrationError, VehicleError, OutputError: See these classes.
     """
     from finssim.trials.trial_files import load_trials
 

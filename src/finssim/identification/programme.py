@@ -1,4 +1,4 @@
-"""Excitation programmes: wrenches whose motion determines a vehicle's hydrodynamics."""
+"""Excitation programmes: wrenches whose resulting motion identifies a vehicle's hydrodynamics."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ __all__ = ["Programme", "RATE", "programmes", "which_axes", "write_programme"]
 
 Array = NDArray[np.float64]
 
-# Multi-sines: all axes together, each with separate frequencies, for fits of coupled dynamics.
+# Multi-sines: all axes together, each with its own frequencies, for fits of coupled dynamics.
 
 DRAWS = 30
-"""Random phases tried; those with the lowest peaks are taken."""
+"""Number of random phase sets that are tried; the one with the lowest peak is used."""
 
 
 def multisine(
@@ -45,24 +45,26 @@ def multisine(
     duration: float = 60.0,
     band: tuple[float, float] = (0.05, 1.0),
 ) -> Programme:
-    """One programme that drives several axes with interleaved harmonics of 1/duration.
+    """Return one programme that drives several axes with interleaved harmonics of 1/duration.
 
     tau_i(t) = a_i Σ_k k^(-1/2) cos(2π k t / duration + φ_k),   k = i-th, (i+n)-th, ... harmonic in the band
 
-    No two axes share a frequency, so their responses can be told apart; amplitudes fall with the root of frequency, so
-    that both speeds (damping) and accelerations (mass) are excited. Phases are the random ones, of a few draws, with
-    the lowest peaks.
+    No two axes share a frequency, so their responses can be separated; amplitudes decrease with the square
+    root of frequency, so that both speeds (damping) and accelerations (mass) are excited. Phases are random;
+    of several draws, the one with the lowest peak is used.
 
     Args:
-        peaks: Axis -> largest wrench [N, N m]; all are scaled down together until the thrusters can give the sum.
-        vehicle: Whose thrusters and damping count.
+        peaks: Axis -> largest wrench [N, N m]; all are scaled down by a common factor until the thrusters can
+            produce the sum.
+        vehicle: Vehicle with the thrusters and damping.
         index: Number in the name.
-        seed: Of the phases.
-        duration: Of the excitation [s].
+        seed: Seed of the phases.
+        duration: Duration of the excitation [s].
         band: Lowest and highest frequency [Hz].
 
     Raises:
-        CalibrationError: The band is too narrow for so many axes in this time, or too fast for the commands.
+        CalibrationError: The band is too narrow for the number of axes and the duration, or too fast for the
+            commands.
     """
     low, high = band
     if not (0.0 < low < high <= 0.2 * RATE):
@@ -92,7 +94,7 @@ def multisine(
 
 
 def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Generator) -> Array:
-    """The sum of cosines whose random phases give the lowest peak."""
+    """Return the sum of cosines whose random phases result in the lowest peak."""
     draws = (rng.uniform(0.0, 2.0 * math.pi, len(harmonics)) for _ in range(DRAWS))
     waves = (
         np.cos(2.0 * math.pi * turns[:, None] * harmonics + phases) @ harmonics**-0.5 for phases in draws
@@ -101,7 +103,7 @@ def _lowest_peak(harmonics: NDArray[np.int64], turns: Array, rng: np.random.Gene
 
 
 def _feasible(tau: Array, vehicle: Vehicle) -> float:
-    """Return the largest factor up to 1 at which the thrusters give the wrench at every time."""
+    """Return the largest factor up to 1 at which the thrusters can produce the wrench at every time."""
     start_warp()
     allocator = Allocator.from_vehicle(vehicle)
     weights = np.where(vehicle.wrench_limits > 0.0, 1.0 / np.maximum(vehicle.wrench_limits, 1e-9), 0.0)
@@ -123,13 +125,14 @@ KINDS = ("published", "validation", "multisine")
 RATE = 50.0
 """Rate of the commands [Hz]."""
 LONGEST = 3600.0
-"""Duration of a multi-sine [s]."""
+"""Longest duration of a multi-sine [s]."""
 
 PLANS = read_mapping(Path(__file__).with_name("programmes.yaml"), CalibrationError, such_as="steps: []")
-"""Sequences of phases [s], levels by axis [N, N m] and the limits of the vehicle that they are for [N, N m]."""
+"""Sequences of phases [s], levels by axis [N, N m] and the limits of the vehicle that they were designed for
+[N, N m]."""
 
 STEADY = 0.8
-"""Fastest surge and sway, part of `level_speed` [-]."""
+"""Largest surge and sway speed, relative to `level_speed` [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,19 +140,19 @@ class Programme:
     """Commands over time. Row k is held over [t_k, t_k + 1/rate)."""
 
     name: str
-    """Unique among the programmes made together; good as the name of a folder."""
+    """Name, unique among the programmes that are generated together, and valid as the name of a folder."""
     axes: tuple[Axis, ...]
     """Axes that it excites."""
     rate: float
-    """[Hz]"""
+    """Rate of the commands [Hz]."""
     tau_desired: Array
     """Wrench about the vehicle's `wrench_reference`, body frame [N, N m], (n, 6)."""
     phase: NDArray[np.str_]
-    """A word of `finssim.trials.trial.PHASES` for every row, (n,)."""
+    """Word of `finssim.trials.trial.PHASES` for every row, (n,)."""
     ascent_speed: float | None = None
-    """Speed at which the coast may end early, once the vehicle has risen faster for `ascent_time` [m/s]."""
+    """Speed above which the coast ends early if the vehicle has risen faster for `ascent_time` [m/s]."""
     ascent_time: float = 2.0
-    """[s]"""
+    """Duration of a rise above `ascent_speed` that ends the coast [s]."""
 
     def __repr__(self) -> str:
         return f"<Programme {self.name}: {self.duration:.1f} s at {self.rate:g} Hz, {' '.join(self.axes)}>"
@@ -161,7 +164,7 @@ class Programme:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return len(self.phase) / self.rate
 
     @property
@@ -172,31 +175,32 @@ class Programme:
 
 @dataclass(frozen=True)
 class Leg:
-    """Steps to both sides along one axis, each pair half as long as the one before."""
+    """Steps in both directions along one axis, each pair half as long as the previous one."""
 
     axis: Axis
     level: float
-    """[N, N m]"""
+    """Magnitude of the steps [N, N m]."""
     hold: float
-    """Length of the first step [s]."""
+    """Duration of the first step [s]."""
     times: int = 1
 
     @property
     def duration(self) -> float:
-        """Length with the rest around it, once [s]."""
+        """Duration of one repetition, including the rest around it [s]."""
         return 1.0 + self.hold * (2.0 * sum(SHRINK) + 1.0)
 
 
 SHRINK = (1.0, 0.5)
-"""Lengths of the pairs of steps of a `Leg`, relative to the first: shorter ones are lost between samples of a log."""
+"""Durations of the pairs of steps of a `Leg`, relative to the first: shorter ones would fall between samples
+of a log."""
 
 
 def alternating(leg: Leg, number: int = 1) -> Programme:
-    """Return the steps of a leg: long ones for drag, short ones for inertia, then a coast; it ends near where it began.
+    """Return the steps of a leg: long ones for drag, short ones for inertia, then a coast; it ends near its start.
 
     Args:
-        leg: Axis, level and length.
-        number: In the name.
+        leg: Axis, level and duration.
+        number: Number in the name.
     """
     lengths = [round(leg.hold * part * RATE) for part in SHRINK for _ in range(2)]
     push = np.repeat(leg.level * np.resize([1.0, -1.0], len(lengths)), lengths)
@@ -212,7 +216,7 @@ def read_legs(path: Path) -> list[Leg]:
     """Return the steps of the next dive that the report of a fit recommends.
 
     Args:
-        path: Its `fit.json`, or the directory of the report.
+        path: `fit.json` of the report, or the directory of the report.
 
     Raises:
         CalibrationError: There is no such file, or it recommends no dive.
@@ -228,20 +232,20 @@ def read_legs(path: Path) -> list[Leg]:
         raise CalibrationError(f"{path} recommends no next dive: {expected}") from None
     if not legs:
         raise CalibrationError(
-            f"{path} recommends no next dive, because its trials drove no axis: leave --from out"
+            f"{path} recommends no next dive, because its trials drove no axis: omit --from"
         )
     return legs
 
 
 def which_axes(names: str | Sequence[str], vehicle: Vehicle) -> tuple[Axis, ...]:
-    """Axes from words.
+    """Return the axes for given names.
 
     Args:
         names: `all`, a comma-separated list such as `surge,yaw`, or a sequence of names.
-        vehicle: Its `controlled_axes` are what `all` means.
+        vehicle: Vehicle whose `controlled_axes` are used for `all`.
 
     Raises:
-        CalibrationError: A word is no axis, is given twice, or the vehicle cannot control it.
+        CalibrationError: A word is not an axis, is given twice, or the vehicle cannot control the axis.
     """
     requested = [w.strip() for w in names.split(",")] if isinstance(names, str) else list(names)
     if requested == ["all"]:
@@ -270,30 +274,31 @@ def programmes(
     band: tuple[float, float] = (0.05, 1.0),
     legs: Sequence[Leg] = (),
 ) -> list[Programme]:
-    """Programmes that excite some axes of a vehicle, in the order in which to run them.
+    """Return programmes that excite some axes of a vehicle, in the order in which to run them.
 
-    `published` follows FinsROV's identification procedure: on every axis and in both directions, steps of 9 s on surge,
-    sway, heave and yaw, and pulses of 0.6 s with ring-down on roll and pitch. Downward heave steps are followed by a
-    coast of up to `coast` seconds, which shows buoyancy without thrust. `validation` are the finer steps with which
-    FinsROV was validated. `multisine` drives all axes at once, for coupled fits; see `multisine`.
+    `published` follows FinsROV's identification procedure: on every axis and in both directions, steps of 9 s
+    on surge, sway, heave and yaw, and pulses of 0.6 s with ring-down on roll and pitch. Downward heave steps
+    are followed by a coast of up to `coast` seconds, which determines the buoyancy without thrust.
+    `validation` contains the finer steps with which FinsROV was validated. `multisine` drives all axes
+    together, for coupled fits; see `multisine`.
 
     Levels are FinsROV's, times the ratio of this vehicle's wrench limit to FinsROV's on that axis (two digits), and
-    never above the limit; steps on surge and sway of a vehicle that hovers stay below what tilts it.
+    never above the limit; for a vehicle that hovers, steps on surge and sway stay below the level that tilts it.
 
     Args:
-        axes: As for `which_axes`.
-        vehicle: Whose limits count.
+        axes: Axes as for `which_axes`.
+        vehicle: Vehicle with the limits.
         levels: Magnitudes for every axis, or by axis [N, N m]; for a multi-sine the peak. Both directions are driven.
         kind: One of `KINDS`.
-        repeats: Repeats of every programme.
-        seed: Of a multi-sine's phases.
+        repeats: Number of repetitions of every programme.
+        seed: Seed of a multi-sine's phases.
         coast: Longest coast after a dive [s].
-        duration: Of one multi-sine [s].
-        band: Of a multi-sine [Hz].
-        legs: Of the dive that a fit recommends, to play those of the axes instead.
+        duration: Duration of one multi-sine [s].
+        band: Frequency band of a multi-sine [Hz].
+        legs: Steps of the dive that a fit recommends; those of the axes are used instead.
 
     Raises:
-        CalibrationError: An axis, level, kind or count that cannot be.
+        CalibrationError: An axis, level, kind or count is invalid.
     """
     chosen = which_axes(axes, vehicle)
     if legs:
@@ -328,7 +333,7 @@ def programmes(
 
 
 def _level_limit(axis: Axis, vehicle: Vehicle) -> float:
-    """Return the drag of surge or sway at `STEADY` of the speed at which a hovering vehicle begins to tilt [N]."""
+    """Return the drag of surge or sway at `STEADY` times the speed at which a hovering vehicle starts to tilt [N]."""
     i = AXES.index(axis)
     if i > 1 or not min(vehicle.wrench_limits[:2]) > 0.0:
         return math.inf
@@ -339,7 +344,7 @@ def _level_limit(axis: Axis, vehicle: Vehicle) -> float:
 def _levels(
     axis: Axis, vehicle: Vehicle, levels: Mapping[str, Sequence[float]] | Sequence[float] | None, kind: str
 ) -> tuple[float, ...]:
-    """Magnitudes for one axis, ascending."""
+    """Return the magnitudes for one axis, ascending."""
     limit = float(vehicle.wrench_limits[AXES.index(axis)])
     unit = "N" if AXES.index(axis) < 3 else "N m"
     requested = levels.get(axis) if isinstance(levels, Mapping) else levels
@@ -356,7 +361,7 @@ def _levels(
     for value in requested:
         if not (math.isfinite(value) and value > 0.0):
             raise CalibrationError(
-                f"levels of {axis}: {value:g} {unit} cannot be, expected magnitudes above 0 {unit} "
+                f"levels of {axis}: {value:g} {unit} is not possible, expected magnitudes above 0 {unit} "
                 "(both directions are driven)"
             )
         if value > limit * (1.0 + 1e-6):
@@ -367,13 +372,13 @@ def _levels(
 
 
 def _two_digits(x: float) -> float:
-    """x rounded to two significant digits, three where it starts with 1."""
+    """Return x rounded to two significant digits, three if it starts with 1."""
     digits = 2 if f"{x:e}"[0] == "1" else 1
     return float(f"{x:.{digits}e}")
 
 
 def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeats: int) -> Programme:
-    """One step or pulse."""
+    """Return a programme of one step or pulse."""
     pulse = kind == "published" and axis in ("roll", "pitch")
     dive = kind == "published" and axis == "heave" and level < 0.0
     sequence = [list(part) for part in PLANS["pulse" if pulse else "step"]]
@@ -391,15 +396,15 @@ def _step(axis: Axis, level: float, kind: str, coast: float, repeat: int, repeat
 
 
 def write_programme(programme: Programme, vehicle: Vehicle, folder: Path) -> None:
-    """Write what a robot needs to run one programme: `programme.csv` and `programme.yaml`.
+    """Write the files that a robot needs to run one programme: `programme.csv` and `programme.yaml`.
 
-    The table has `t` [s], the wrench wanted about `wrench_reference` [N, N m], the thrust of every thruster that the
-    exact allocator gives for it, `force_NAME` [N], and the phase. A row holds until the next.
+    The table has `t` [s], the requested wrench about `wrench_reference` [N, N m], the thrust of every thruster that
+    the exact allocator computes for it, `force_NAME` [N], and the phase. A row is held until the next.
 
     Args:
-        programme: What to run.
-        vehicle: Whose thrusters.
-        folder: To write into; made if missing.
+        programme: Programme to write.
+        vehicle: Vehicle with the thrusters.
+        folder: Folder to write to; created if missing.
 
     Raises:
         OutputError: The system refused to write.

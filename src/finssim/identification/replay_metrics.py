@@ -1,4 +1,4 @@
-"""Trials beside their replays, and the scores of a replay: NRMSE by axis, its aggregate, errors some seconds ahead."""
+"""Trials with their replays, and the scores of a replay: NRMSE by axis, its aggregate, errors some seconds ahead."""
 
 from __future__ import annotations
 
@@ -21,58 +21,59 @@ UNITS = {name: COLUMNS[name].unit for name in RESPONSES}
 """Response -> unit."""
 
 EXCITED = 0.3
-"""An axis counts as excited where its input reaches this share of that of the most excited axis."""
+"""Input of an excited axis, relative to that of the most excited axis."""
 
 ONSET = 0.1
-"""Share of its greatest magnitude at which the input has begun, and has ended."""
+"""Fraction of its greatest magnitude at which the input counts as started, and as ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair:
-    """One trial and its replays. All arrays are over the same n times; numbers that are not there are NaN."""
+    """Trial and its replays. All arrays are over the same n times; missing numbers are NaN."""
 
     name: str
     sha256: str
     t: Array
-    """Since the trial's first sample [s], uniform, (n,)."""
+    """Times since the trial's first sample [s], uniform, (n,)."""
     t0: float = 0.0
-    """The trial's first sample on its own clock [s]."""
+    """Time of the trial's first sample on its own clock [s]."""
     rate: float
-    """[1/s]"""
+    """Rate of the times [1/s]."""
     axes: tuple[Axis, ...]
     """Axes that the trial excites, which are scored."""
     phase: NDArray[np.str_]
     """Words of `PHASES`, (n,)."""
     tau: Array
-    """Wrench that acted, from the log, about the vehicle's `wrench_reference` [N, N m], (n, 6)."""
+    """Applied wrench, from the log, about the vehicle's `wrench_reference` [N, N m], (n, 6)."""
     measured: dict[str, Array]
-    """Response (of `RESPONSES`) -> values in the unit of the response, (n,); velocities and angles smoothed as for a
-    fit."""
+    """Response (of `RESPONSES`) -> values in the unit of the response, (n,); velocities and angles are
+    smoothed as for a fit."""
     raw: dict[str, Array] = field(default_factory=dict)
-    """Measured values in the unit of the response, not smoothed."""
+    """Unsmoothed measured values in the unit of the response."""
     source: dict[str, str] = field(default_factory=dict)
-    """Response -> "measured", or what it was derived from."""
+    """Response -> "measured", or the quantity it was derived from."""
     noise: dict[str, float] = field(default_factory=dict)
     """Response -> standard deviation of the noise of one measured sample, in its unit."""
     simulated: dict[str, dict[str, Array]] = field(default_factory=dict)
     """Model -> response -> values in the unit of the response, (n,)."""
     segment: NDArray[np.int64] | None = None
-    """Uninterrupted replay that a sample belongs to, -1 for none, (n,); None for a single one."""
+    """Index of the uninterrupted replay of each sample, -1 for none, (n,); None for a single replay."""
     diverged: dict[str, float] = field(default_factory=dict)
-    """Model -> time when its simulation stopped being finite [s]; only where it did."""
+    """Model -> time at which its simulation became non-finite [s]; only where it did."""
     late: dict[str, float] = field(default_factory=dict)
-    """Model -> by how much the recorded motion lags the recorded commands beyond the model's motors [s], for which the
-    comparison allows; only where it shows."""
+    """Model -> lag of the recorded motion behind the recorded commands beyond the model's motors [s], which
+    the comparison compensates; only where it is significant."""
     in_sample: bool = False
-    """True if the vehicle was fitted on this very trial."""
+    """True if the vehicle was fitted on this trial."""
     findings: tuple[Finding, ...] = ()
 
     def response(self, axis: Axis) -> str:
-        """The velocity of an axis: `u` of surge."""
+        """Return the velocity of an axis, such as `u` for surge."""
         return NU[AXES.index(axis)]
 
     def scored(self) -> NDArray[np.bool_]:
-        """Return the samples that a score of the trial covers: excitation and coast; all if there is neither, (n,)."""
+        """Return a mask of the samples that a score of the trial covers: excitation and coast; all if there
+        is neither, (n,)."""
         inside = np.isin(self.phase, ("excitation", "coast"))
         return inside if inside.any() else np.ones(len(self.t), dtype=bool)
 
@@ -80,24 +81,23 @@ class Pair:
 def excited_axes(
     tau: Array, limits: Array, named: Sequence[Axis] = (), swinging: Sequence[Axis] = ()
 ) -> tuple[Axis, ...]:
-    """The axes that a trial excites.
+    """Return the axes that a trial excites.
 
-    Where others are driven, roll and pitch count if they are seen to swing: their wrench rests on heights in the
-    vehicle file, which a calibration changes, and its replay has to be scored on the axes of the one before.
+    If other axes are driven, roll and pitch count if they swing measurably: their wrench depends on heights
+    in the vehicle file, which a calibration changes, and both replays must be scored on the same axes.
 
     Args:
         tau: Wrench about the vehicle's `wrench_reference` [N, N m], (n, 6).
-        limits: `Vehicle.wrench_limits` [N, N m], (6,): what counts as much on each axis; 0 where the thrusters have
-            no hold on an axis.
-        named: What the header says; taken as it is where it says anything.
-        swinging: Those of roll and pitch that the measured motion shows.
+        limits: `Vehicle.wrench_limits` [N, N m], (6,), to which the inputs are related; 0 for axes without control.
+        named: Axes in the header; used unchanged if there are any.
+        swinging: Those of roll and pitch with a measurable motion.
 
     Returns:
-        In canonical order; empty where there is no input (a passive trial, thrusters off).
+        Axes in canonical order; empty if there is no input (a passive trial, thrusters off).
     """
     if named:
         return tuple(axis for axis in AXES if axis in named)
-    # A vehicle without a limit on an axis can still be towed or pushed there: count it against 1 N or 0.1 N m of arm.
+    # A vehicle without a limit on an axis can still be towed or pushed: relate the input to 1 N or 0.1 N m.
     scale = np.where(
         limits > 0.0, limits, max(float(limits.max(initial=0.0)), 1.0) * np.repeat([1.0, 0.1], 3)
     )
@@ -110,20 +110,20 @@ def excited_axes(
 
 
 def steered(axes: Sequence[Axis]) -> tuple[Axis, ...]:
-    """Return axes without roll and pitch, which a push along another axis tilts; all where there is no other."""
+    """Return axes without roll and pitch, which a push along another axis tilts; all if there are no others."""
     return tuple(axis for axis in axes if axis not in SWINGING) or tuple(axes)
 
 
 def find_phases(
     t: Array, tau: Array, axes: Sequence[Axis], named: NDArray[np.str_] | None = None
 ) -> NDArray[np.str_]:
-    """Phase of every sample: as the log names it, else found from the input of the excited axes.
+    """Return the phase of every sample: as named in the log, otherwise detected from the input of the excited axes.
 
-    Excitation lasts from the first to the last time that the input is above a tenth of its greatest magnitude; before
-    it is baseline, after it coast. Without input there is only coast.
+    Excitation lasts from the first to the last time at which the input is above a tenth of its greatest
+    magnitude; it is preceded by the baseline and followed by the coast. Without input there is only coast.
 
     Args:
-        t: [s], (n,).
+        t: Times [s], (n,).
         tau: Wrench [N, N m], (n, 6).
         axes: The excited axes.
         named: Phases of the log, (n,), or None.
@@ -142,27 +142,28 @@ def find_phases(
 
 
 def onset(pair: Pair, axis: Axis) -> int | None:
-    """Index of the sample where the input of an axis first reaches a tenth of its greatest magnitude."""
+    """Return the index of the sample at which the input of an axis first reaches a tenth of its greatest
+    magnitude."""
     active = np.flatnonzero(_active(pair.tau, (axis,)))
     return int(active[0]) if len(active) else None
 
 
 def _active(tau: Array, axes: Sequence[Axis]) -> NDArray[np.bool_]:
-    """Return where the input of one of the axes is above a tenth of its greatest magnitude there, (n,)."""
+    """Return a mask of the samples with an input of one of the axes above a tenth of its greatest magnitude, (n,)."""
     magnitude = np.abs(np.nan_to_num(tau[:, [AXES.index(a) for a in axes]]))
     greatest = magnitude.max(axis=0, initial=0.0)
     return np.asarray(((magnitude >= ONSET * greatest) & (greatest > 0.0)).any(axis=1))
 
 
 def models_of(pairs: Sequence[Pair]) -> tuple[str, ...]:
-    """The replayed models, in their order."""
+    """Return the replayed models, in order."""
     return tuple(dict.fromkeys(model for pair in pairs for model in pair.simulated))
 
 
 def resampled(t: Array, values: Array, times: Array) -> Array:
-    """Linear interpolation that leaves holes holes: NaN where a neighbour is, or is far, or there is none.
+    """Return linearly interpolated values that are NaN where a neighbour is NaN, distant, or missing.
 
-    Units are kept.
+    Units are unchanged.
     """
     if values.ndim == 2:
         return np.stack([resampled(t, column, times) for column in values.T], axis=-1)
@@ -182,15 +183,15 @@ RESAMPLES, SEED = 2000, 20260903
 """Settings of the trial bootstrap, as in the paper's replay validation."""
 
 FEWEST = 8
-"""Samples that a score needs at least."""
+"""Least number of samples for a score."""
 
 NOISE_SPAN = 2.0
-"""A smoothed response must span this many standard deviations of a sample's noise, another twice as many: noise alone
-spans 3.3 from P5 to P95, and half of that or less after smoothing."""
+"""Number of standard deviations of a sample's noise that a smoothed response must span, another response
+twice as many: noise alone spans 3.3 from P5 to P95, and at most half of that after smoothing."""
 
 
 STILL = 0.002
-"""Spans below this are those of a vehicle at rest, whatever the noise [m/s, rad/s, rad]."""
+"""Span below which a vehicle counts as at rest, whatever the noise [m/s, rad/s, rad]."""
 
 
 class Score(NamedTuple):
@@ -202,20 +203,20 @@ class Score(NamedTuple):
 
 
 def span(values: ArrayLike) -> float:
-    """P95 - P5 of the finite values; NaN if there are none. The unit is kept."""
+    """Return P95 - P5 of the finite values; NaN if there are none. The unit is unchanged."""
     x = np.asarray(values, dtype=np.float64)
     x = x[np.isfinite(x)]
     return float(np.subtract(*np.percentile(x, (95.0, 5.0)))) if len(x) else float("nan")
 
 
 def nrmse(measured: Array, simulated: Array, scale: float, mask: NDArray[np.bool_] | None = None) -> Score:
-    """RMSE / (P95 - P5 of the measurement)                                            (paper, section IV-B)
+    """Return RMSE / (P95 - P5 of the measurement)                                            (paper, section IV-B)
 
     Args:
         measured: Values in the unit of the response, (n,), NaN where there is no measurement.
-        simulated: (n,), same unit.
+        simulated: Simulated values, (n,), same unit.
         scale: P95 - P5 of the measurement over the scored part of the trial, same unit.
-        mask: Samples to take; all if None.
+        mask: Samples to use; all if None.
     """
     error = (simulated - measured)[mask if mask is not None else slice(None)]
     error = error[np.isfinite(error)]
@@ -227,7 +228,7 @@ def nrmse(measured: Array, simulated: Array, scale: float, mask: NDArray[np.bool
 
 
 def response_span(pair: Pair, response: str) -> Score:
-    """P95 - P5 of a response over the scored part of a trial; none where it is absent or is but noise."""
+    """Return P95 - P5 of a response over the scored part of a trial; no value if it is missing or only noise."""
     values = pair.measured.get(response)
     if values is None or not np.isfinite(values).any():
         return Score(None, "not measured")
@@ -249,15 +250,15 @@ def response_span(pair: Pair, response: str) -> Score:
 
 
 def score(pair: Pair, model: str, response: str, phase: str | None = None) -> Score:
-    """NRMSE of one response of one model over the excitation and the coast of a trial, or over one phase.
+    """Return the NRMSE of one response of one model over the excitation and the coast of a trial, or over one phase.
 
-    The RMSE is of the phase, the span is that of the trial, so that phases can be compared.
+    The RMSE is that of the phase, the span that of the trial, so that phases can be compared.
 
     Args:
         pair: Trial and replays.
-        model: Which replay.
-        response: Of `RESPONSES`.
-        phase: Of `PHASES`; excitation and coast if None.
+        model: Name of the model.
+        response: One of `RESPONSES`.
+        phase: One of `PHASES`; excitation and coast if None.
     """
     mask = pair.scored() if phase is None else pair.phase == phase
     if not mask.any():
@@ -273,12 +274,12 @@ def score(pair: Pair, model: str, response: str, phase: str | None = None) -> Sc
 
 
 class Aggregate(NamedTuple):
-    """One number for many trials."""
+    """Aggregate score of many trials."""
 
     value: float | None
     """Mean NRMSE [-], or None."""
     ci95: tuple[float, float] | None
-    """Trial-level bootstrap [-], 2.5 and 97.5 %."""
+    """95 % interval by trial-level bootstrap [-]."""
     by_axis: dict[str, float]
     """Axis -> median NRMSE [-]."""
     trials: int
@@ -289,15 +290,15 @@ class Aggregate(NamedTuple):
 def aggregate(
     scores: Sequence[Mapping[Any, float | None]], *, resamples: int = RESAMPLES, seed: int = SEED
 ) -> Aggregate:
-    """Equal-weight mean over the axes of the median over the trials of an axis.
+    """Return the equal-weight mean over the axes of the median over the trials of an axis.
 
-    The bootstrap draws whole trials with replacement, among those that have the same axes, so that every axis keeps as
-    many trials as it has. An axis with one trial has nothing to draw from: then there is no interval.
+    The bootstrap draws complete trials with replacement, among those with the same axes, so that the number of trials
+    of every axis is preserved. For an axis with one trial, resampling is not possible: there is no interval then.
 
     Args:
         scores: For each trial, axis -> NRMSE [-] or None.
-        resamples: How many.
-        seed: Of the draws.
+        resamples: Number of resamples.
+        seed: Seed of the draws.
     """
     axes = list(dict.fromkeys(a for row in scores for a, x in row.items() if x is not None))
     if not axes:
@@ -326,22 +327,22 @@ def aggregate(
 
 
 class Ahead(NamedTuple):
-    """Error of predictions made from measured states, by how far they look ahead."""
+    """Error of predictions from measured states, by prediction time."""
 
     seconds: Array
-    """Times ahead [s], (H,)."""
+    """Prediction times [s], (H,)."""
     rmse: Array
-    """Root mean square errors in the response's unit, (H,); NaN if nothing could be compared."""
+    """Root mean square errors in the response's unit, (H,); NaN if there is nothing to compare."""
     persistence: Array
-    """Errors of the prediction that nothing changes, in the unit of the response, (H,)."""
+    """Errors of the constant prediction, in the unit of the response, (H,)."""
     nrmse: Array
     """Root mean square of error over span [-], (H,)."""
     count: NDArray[np.int64]
-    """Predictions compared, (H,)."""
+    """Number of compared predictions, (H,)."""
 
     @property
     def skill(self) -> Array:
-        """1 - rmse / persistence: 1 is perfect, 0 is no better than to say that nothing changes, (H,) [-]."""
+        """Skill 1 - rmse / persistence: 1 is perfect, 0 is no better than the constant prediction, (H,) [-]."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(self.persistence > 0.0, 1.0 - self.rmse / self.persistence, np.nan))
 
@@ -349,15 +350,15 @@ class Ahead(NamedTuple):
 def error_ahead(
     starts: Array, ahead: Array, measured: Array, simulated: Array, width: ArrayLike, seconds: ArrayLike
 ) -> Ahead:
-    """Root mean square over all predictions of the error a given time after each start.
+    """Return the root mean square over all predictions of the error at given times after each start.
 
     Args:
-        starts: Response, in its unit, in the state that each prediction starts from, (S,).
+        starts: Response, in its unit, in the initial state of each prediction, (S,).
         ahead: Times since the start [s], (T,).
         measured: Response in its unit, (T, S), NaN where there is no measurement.
         simulated: Response in its unit, (T, S).
-        width: Span that `nrmse` is relative to [unit of the response], of all or for each prediction, (S,).
-        seconds: Times of interest [s], (H,); the nearest of `ahead` is taken.
+        width: Span that `nrmse` is relative to [unit of the response], for all or for each prediction, (S,).
+        seconds: Prediction times [s], (H,); the nearest of `ahead` is used.
     """
     horizons = np.asarray(seconds, dtype=np.float64)
     rows = np.abs(ahead[:, None] - horizons).argmin(axis=0)

@@ -1,4 +1,4 @@
-"""A replay as a person reads it: figures, tables, plain values, and the folder of `--out`."""
+"""Output of a replay: figures, tables, plain values, and the folder of `--out`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COLORS = {"calibrated": BLUE, "mesh": GREEN, "simplified": VERMILION}
 OTHERS = (PINK, SKY, ORANGE)
 BLACK = "#1a1a1a"
 STYLES = {"calibrated": (0, ()), "mesh": (0, (6, 1.6)), "simplified": (0, (1.6, 1.2))}
-"""Line styles, for a print without colours."""
+"""Line styles, for print without colours."""
 
 BEFORE = 0.5
 """Time shown before the onset [s]."""
@@ -52,9 +52,9 @@ SYMBOLS = {"roll": "roll", "pitch": "pitch", "depth": "depth"} | {name: f"${name
 
 
 def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | None:
-    """A response over the time since the onset, sign-aligned and relative to the measured P5-P95 span.
+    """Return a response over the time since the onset, sign-aligned and relative to the measured P5-P95 span.
 
-    Signs are those of the input, and of the response itself where there is none.
+    Signs are those of the input, or of the response itself if there is no input.
 
     Args:
         pair: The trial.
@@ -62,8 +62,8 @@ def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | N
         axis: The axis.
 
     Returns:
-        Times since the onset of the input [s] and values [-], (n,) each; None where the trial has no such response. A
-        passive trial starts at its first scored sample.
+        Times since the onset of the input [s] and values [-], (n,) each; None if the trial lacks the
+        response. A passive trial starts at its first scored sample.
     """
     width = response_span(pair, pair.response(axis)).value
     if width is None:
@@ -78,15 +78,16 @@ def normalised(pair: Pair, values: Array, axis: Axis) -> tuple[Array, Array] | N
 
 
 def draw_response_envelopes(pairs: Sequence[Pair]) -> Figure:
-    """Axis-wise envelopes: a panel for each axis, pointwise median and middle half over its trials.
+    """Draw axis-wise envelopes: a panel for each axis, with pointwise median and interquartile range over its trials.
 
-    Held-out trials are drawn where there are any; else those the vehicle was fitted on, and the figure says so.
+    Held-out trials are drawn if there are any; otherwise those that the vehicle was fitted on, which the
+    figure states.
 
     Args:
         pairs: Trials with their replays.
 
     Raises:
-        ValueError: No trial has a response that could be drawn.
+        ValueError: No trial has a response that can be drawn.
     """
     held_out = [pair for pair in pairs if not pair.in_sample]
     drawn = held_out or list(pairs)
@@ -117,7 +118,7 @@ def draw_response_envelopes(pairs: Sequence[Pair]) -> Figure:
 
 
 def draw_overlay(pair: Pair) -> Figure:
-    """One trial: the input if any, the responses of the excited axes, attitude and depth where they were measured."""
+    """Draw one trial: the input if any, the responses of the excited axes, and measured attitude and depth."""
     responses = [pair.response(axis) for axis in pair.axes]
     responses += [r for r in ("roll", "pitch", "depth") if response_span(pair, r).value is not None]
     responses = [r for r in responses if r in pair.measured]
@@ -159,7 +160,7 @@ def draw_overlay(pair: Pair) -> Figure:
 def _panels(
     count: int, rows: int, columns: int, size: tuple[float, float], **shared: Any
 ) -> tuple[Figure, Any]:
-    """A figure of that size [inch] with `count` visible axes in a grid, (rows, columns)."""
+    """Return a figure of a size [inch] with `count` visible axes in a grid, (rows, columns)."""
     figure = new_figure(*size)
     axes_of = figure.subplots(rows, columns, squeeze=False, **shared)
     for axes in axes_of.flat[count:]:
@@ -216,7 +217,8 @@ def _coasts(pair: Pair, axis: Axis) -> bool:
 
 
 def _grid(pairs: Sequence[Pair], axis: Axis) -> Array:
-    """Times since the onset that three quarters of the trials cover [s], so that no trial's end shows as a step."""
+    """Return times since the onset that three quarters of the trials cover [s], so that the end of a trial
+    causes no step."""
     ends = []
     for pair in pairs:
         aligned = normalised(pair, pair.t, axis)
@@ -248,7 +250,7 @@ def _band(
     zorder: float,
     width: float = 1.5,
 ) -> None:
-    """Median and middle half where at least half of the trials have a value."""
+    """Draw median and interquartile range where at least half of the trials have a value."""
     enough = np.isfinite(values).mean(axis=0) >= 0.5
     quartiles = np.full((3, len(grid)), np.nan)
     if enough.any():
@@ -259,7 +261,7 @@ def _band(
 
 
 def _broken(pair: Pair, values: Array) -> Array:
-    """A gap in the line wherever a new replay starts."""
+    """Return values with a gap in the line wherever a new replay starts."""
     if pair.segment is None:
         return values
     out = values.copy()
@@ -285,18 +287,18 @@ def _tidy(axes: Any) -> None:
 DEFINITION = (
     "nrmse: RMSE / (P95 - P5 of the measured response), both over excitation and coast of a trial; phases use the "
     "same span. Measured velocities and angles are smoothed as for a fit. aggregate: median over the trials of an "
-    "axis, then the mean of the axes. ci95: trial bootstrap. Held-out trials count where there are any; in_sample "
-    "says that there are none."
+    "axis, then the mean of the axes. ci95: trial bootstrap. Held-out trials count if there are any; in_sample "
+    "states that there are none."
 )
 
 PHASES = ("excitation", "coast")
 
 
 def replay_json(replay: Replay) -> dict[str, Any]:
-    """Return what `finssim replay --json` prints and `replay.json` holds.
+    """Return the content of `finssim replay --json` and `replay.json`.
 
-    The numbers at the top are of the first model; `models` has those of all. What could not be computed is null, and
-    `why` says why.
+    The numbers at the top are those of the first model; `models` contains those of all. Missing numbers are
+    null, and `why` states the reason.
     """
     models = {model: _model(replay, model) for model in replay.models}
     first = models[replay.models[0]]
@@ -386,7 +388,7 @@ Rows = list[list[str]]
 
 
 def print_replay(replay: Replay, console: Console) -> None:
-    """Print NRMSE by axis and model, the trials, and what could not be scored."""
+    """Print NRMSE by axis and model, the trials, and the reasons for missing scores."""
     console.print(_headline(replay), highlight=False, markup=False)
     for title, heads, rows in _tables(replay):
         if title:
@@ -402,7 +404,7 @@ def print_replay(replay: Replay, console: Console) -> None:
 
 
 def replay_markdown(replay: Replay) -> str:
-    """`replay.md`."""
+    """Return the content of `replay.md`."""
     parts = [f"# Replay of {replay.vehicle.name}", _headline(replay)]
     for title, heads, rows in _tables(replay):
         lines = [heads, ["---"] + ["--:"] * (len(heads) - 1), *rows]
@@ -422,7 +424,7 @@ def replay_html(replay: Replay) -> str:
 
 
 def _tables(replay: Replay) -> list[tuple[str, list[str], Rows]]:
-    """Title, heads and rows of each table."""
+    """Return title, heads and rows of each table."""
     tables = [("", *_axis_table(replay))]
     if replay.ahead:
         title = "Error ahead, relative to the span; in brackets the skill against persistence"
@@ -443,7 +445,7 @@ def write_replay(replay: Replay, out: Path) -> None:
         try:
             draw_response_envelopes(replay.pairs).savefig(folder / "envelope.png", dpi=200)
         except ValueError:
-            pass  # nothing was measured on an excited axis; the tables say so
+            pass  # nothing was measured on an excited axis; the tables state it
         (folder / "trials").mkdir()
         for pair in replay.pairs:
             name = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in pair.name)
@@ -462,7 +464,7 @@ def _headline(replay: Replay) -> str:
 
 
 def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
-    """Return NRMSE by axis, a column for each model, with held-out and in-sample trials separate."""
+    """Return NRMSE by axis, with a column for each model, and separate held-out and in-sample trials."""
     kinds = [k for k in (False, True) if any(p.in_sample == k for p in replay.pairs)]
     rows: Rows = []
     for kind in kinds:
@@ -480,7 +482,7 @@ def _axis_table(replay: Replay) -> tuple[list[str], Rows]:
 
 
 def _trial_table(replay: Replay) -> tuple[list[str], Rows]:
-    """Every trial with the first model."""
+    """Return every trial with the scores of the first model."""
     model = replay.models[0]
     rows: Rows = []
     for pair, scores in zip(replay.pairs, replay.scores[model], strict=True):
@@ -506,8 +508,8 @@ def _ahead_table(replay: Replay) -> tuple[list[str], Rows]:
 
 
 def _remarks(replay: Replay) -> list[str]:
-    """Return remarks: what could not be scored or replayed, what was derived, and missing intervals; equal ones
-    together."""
+    """Return remarks: missing scores or replays, derived velocities, and missing intervals; equal ones are
+    combined."""
     findings: list[Finding] = [*replay.left_out]
     records = [one.settings for one in replay.vehicle.calibrations if "speeds" in one.settings]
     fitted = dict(records[-1]["speeds"]) if records else {}

@@ -1,4 +1,4 @@
-"""A calibration's report: one HTML page that loads nothing, the same as Markdown with pictures, and `fit.json`."""
+"""Report of a calibration: one self-contained HTML page, the same as Markdown with pictures, and `fit.json`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 
 def refuse_places(out: Path, report: Path | None, kind: str) -> None:
-    """Refuse a file that is no YAML, or a place that cannot be written, before anything is computed."""
+    """Refuse an output that is not a YAML file, or a path that cannot be written, before anything is computed."""
     refuse_unwritable(atomic_write(yaml_path(out, kind)))
     if report is not None:
         refuse_unwritable(atomic_directory(report, replaces=RECORD_FILE))
@@ -60,7 +60,7 @@ def refuse_places(out: Path, report: Path | None, kind: str) -> None:
 def publish(
     record: Mapping[str, Any] | None, show: Callable[[Console], None], written: Iterable[Path | None]
 ) -> None:
-    """Print one JSON object for programs; or, without one, for people, and which files were written."""
+    """Print one JSON object for programs; or, without one, tables for people and the names of the written files."""
     if record is not None:
         print(json.dumps(record, allow_nan=False))
         return
@@ -71,7 +71,7 @@ def publish(
 
 
 def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) -> str:
-    """The command line that does this again; options that are None, False or empty are left out."""
+    """Return the command line that repeats the calibration, without options that are None, False or empty."""
     tokens = ["finssim", "calibrate", kind, *map(str, inputs)]
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
@@ -86,11 +86,11 @@ def command_line(kind: str, inputs: Iterable[Path], options: Mapping[str, Any]) 
 GRAY = "0.6"
 PER_FIGURE = 6
 MAX_CURVES = 48
-"""Greatest number of drawn curves; the report states how many are not drawn."""
+"""Largest number of drawn curves; the report states how many are omitted."""
 
 
 def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
-    """File name -> what the picture shows, and the PNG; equal fits give equal pictures."""
+    """Return file name -> caption of the picture, and the PNG; equal fits result in equal pictures."""
     pictures: dict[str, tuple[str, Figure]] = {}
     for i, figure in enumerate(draw_curves(fit.curves), start=1):
         pictures[f"curves_{i}.png"] = ("Measured and simulated, and the residual", figure)
@@ -100,7 +100,7 @@ def fit_pictures(fit: Fit) -> dict[str, tuple[str, bytes]]:
 
 
 def draw_correlation(correlation: Correlation) -> Figure:
-    """The matrix, blue where errors go together, orange where they go against each other."""
+    """Draw the matrix, blue for positive and orange for negative correlation."""
     n = len(correlation.names)
     figure = new_figure(max(3.6, 1.9 + 0.36 * n), max(3.0, 1.3 + 0.36 * n))
     axes = figure.subplots()
@@ -119,14 +119,14 @@ def draw_correlation(correlation: Correlation) -> Figure:
 
 
 def draw_curves(curves: Sequence[Curve]) -> Iterator[Figure]:
-    """Figures of up to six curves each: measured and fitted, and below them what is left over."""
+    """Yield figures of up to six curves each: measured and fitted values, with the residuals below."""
     drawn = list(curves)[:MAX_CURVES]
     for start in range(0, len(drawn), PER_FIGURE):
         part = drawn[start : start + PER_FIGURE]
         columns = min(2, len(part))
         rows = math.ceil(len(part) / columns)
         width, height = (3.9 * columns if columns > 1 else 5.4), 2.9 * rows
-        # A fixed layout: finding the best one takes longer than drawing.
+        # A fixed layout: optimising it takes longer than drawing.
         figure = new_figure(width, height, constrained=False)
         edges = {"left": 0.85 / width, "right": 1.0 - 0.12 / width, "bottom": 0.5 / height}
         edges |= {"top": 1.0 - 0.3 / height, "hspace": 0.35, "wspace": 0.3}
@@ -175,27 +175,27 @@ def _draw(figure: Figure, cell: SubplotSpec, curve: Curve) -> None:
 
 
 def picture_axes(axes: Axes, lens: Lens) -> None:
-    """Axes of pixels over a lens's picture."""
+    """Set up axes of pixels for a lens's picture."""
     axes.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect="equal")
     axes.set(xlabel="u [px]", ylabel="v [px]")
 
 
 ARROW = 0.06
-"""Length of the 95th percentile of arrows in a figure, in widths of what is drawn."""
+"""Length of the 95th percentile of arrows in a figure, relative to the width of the drawing."""
 
 
 def draw_arrows(
     axes: Axes, at: Array, vectors: Array, used: NDArray[np.bool_], unit: str, per: float
 ) -> None:
-    """Points and enlarged arrows, and crosses where there is none; `per` of the arrows' unit make one of the axes'.
+    """Draw points with enlarged arrows, and crosses for unused points; `per` arrow units correspond to one axis unit.
 
     Args:
-        axes: To draw into.
-        at: Places in the unit of the axes, (N, 2).
+        axes: Axes to draw on.
+        at: Positions in the unit of the axes, (N, 2).
         vectors: Arrows in `unit`, (N, 2).
-        used: Which rows the calibration used, (N,).
-        unit: Of the arrows.
-        per: Arrow units in one of the axes' units.
+        used: Mask of the rows that the calibration used, (N,).
+        unit: Unit of the arrows.
+        per: Arrow units per unit of the axes.
     """
     good = used & np.isfinite(vectors).all(axis=1)
     size = float(np.percentile(np.linalg.norm(vectors[good], axis=1), 95)) if good.any() else 1.0
@@ -212,12 +212,12 @@ def draw_arrows(
 
 
 def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
-    """An empty figure.
+    """Return an empty figure.
 
     Args:
-        width: [inch]
-        height: [inch]
-        constrained: Whether the layout makes room for labels.
+        width: Width [inch].
+        height: Height [inch].
+        constrained: True if the layout reserves space for labels.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -228,7 +228,7 @@ def new_figure(width: float, height: float, constrained: bool = True) -> Figure:
 
 
 HEADS = ("parameter", "estimate", "95 % interval", "unit")
-"""Headings of every table of estimates; further ones differ."""
+"""Headings of every table of estimates; additional ones differ."""
 
 QUALITY = {
     "r2": "R²",
@@ -242,19 +242,19 @@ QUALITY = {
     "rejected": "rejected",
     "speed_low": "speeds",
 }
-"""Figures of a fit that the table on the terminal shows, in this order; the report has all."""
+"""Figures of a fit in the table on the terminal, in this order; the report contains all."""
 
 
 def fit_json(
     fit: Fit, vehicle: Vehicle, *, out: Path | None = None, findings: Sequence[Finding] = ()
 ) -> dict[str, Any]:
-    """Return what `--json` prints and the report's `fit.json` holds; numbers that are not finite are None.
+    """Return the content of `--json` and of the report's `fit.json`; non-finite numbers are None.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
-        out: File it was written to.
-        findings: The fit's and those about the calibrated vehicle.
+        out: File that the vehicle was written to.
+        findings: Findings of the fit and about the calibrated vehicle.
     """
     return {
         "kind": fit.kind,
@@ -276,13 +276,13 @@ def fit_json(
 
 
 def _cells(e: Estimate, fit: Fit, vehicle: Vehicle) -> tuple[str, ...]:
-    """Texts of an estimate, in the order of the heads."""
+    """Return the texts of an estimate, in the order of the heads."""
     before = number_text(file_number(e, fit.before))
     return e.name, number_text(e.estimate), interval_text(e), e.unit, before, state_text(e, fit, vehicle)
 
 
 def number_text(value: float | None) -> str:
-    """Four significant digits, small numbers as 3.71e-4; – where there is none. Any unit."""
+    """Return a number with four significant digits, small numbers as 3.71e-4; – if there is none. Any unit."""
     if value is None or not math.isfinite(value):
         return "–"
     mantissa, _, exponent = f"{value:.3e}".partition("e")
@@ -292,7 +292,7 @@ def number_text(value: float | None) -> str:
 
 
 def interval_text(estimate: Estimate) -> str:
-    """`37.9 to 40.2`; `unknown` where an end is not finite."""
+    """Return an interval such as `37.9 to 40.2`; `unknown` if an end is not finite."""
     low, high = estimate.ci95
     if not (math.isfinite(low) and math.isfinite(high)):
         return "unknown"
@@ -300,16 +300,16 @@ def interval_text(estimate: Estimate) -> str:
 
 
 def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
-    """Return the state of a parameter: `written`, `file kept`, or whether the data determine it if the file has no
-    place for it.
+    """Return the state of a parameter: `written`, `file kept`, or whether the data determine it if it is not
+    in the file.
 
-    `unsure`: written, though the data tell it together with another, as a part of the drag, and not alone.
+    `unsure`: written, although the data determine it only in combination with another one, as a part of the drag.
     """
     scales = estimate.name == "thrust_scale" or estimate.name.startswith("gain.")
     if scales and any(path.endswith(".c_plus") for path in fit.changes):
         return "written" if estimate.identifiable else "unsure"
     if estimate.path is None:
-        return "" if estimate.identifiable else "not told"
+        return "" if estimate.identifiable else "undetermined"
     before, after = number_in(fit.before, estimate.path), number_in(vehicle, estimate.path)
     if after != before or (after is not None and estimate.identifiable and after == estimate.estimate):
         return "written" if estimate.identifiable else "unsure"
@@ -317,11 +317,11 @@ def state_text(estimate: Estimate, fit: Fit, vehicle: Vehicle) -> str:
 
 
 def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
-    """`R² 0.998, NRMSE 0.021, samples 1204`.
+    """Return a text such as `R² 0.998, NRMSE 0.021, samples 1204`.
 
     Args:
-        figures: By key, in the units of a fit's quality.
-        every: All of them, or those of `QUALITY` alone.
+        figures: Figures by key, in the units of a fit's quality.
+        every: True for all figures, False for those of `QUALITY`.
     """
     keys = [key for key in QUALITY if key in figures]
     keys += [key for key in figures if key not in QUALITY] if every or not keys else []
@@ -333,27 +333,27 @@ def quality_text(figures: Mapping[str, float], *, every: bool = True) -> str:
 
 
 AS_STATED = "as given"
-"""Note of a number that was not estimated: the table on the terminal leaves it out."""
+"""Note of a number that was not estimated: the table on the terminal omits it."""
 
 ExtraTable = tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]
-"""Heads, rows, and a class of the page's style for each row."""
+"""Heads, rows, and a CSS class for each row."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A calibration for people, on the terminal and on a page."""
+    """Report of a calibration, for the terminal and as a page."""
 
     title: str
     """Title of the page."""
     headline: str
-    """Above the table on the terminal."""
+    """Text above the table on the terminal."""
     heads: Sequence[str]
     """Headings of the table of estimates."""
     estimates: Sequence[Estimate]
     cells: Callable[[Estimate], tuple[str, ...]]
-    """Texts of an estimate, in the order of `heads`."""
+    """Function that returns the texts of an estimate, in the order of `heads`."""
     summary: Sequence[str]
-    """The figures that say how good the calibration is, one sentence each."""
+    """Figures of the quality of the calibration, one sentence each."""
     findings: Sequence[Finding]
     reading: str
     """Meaning of the intervals."""
@@ -361,7 +361,7 @@ class Report:
     remarks: Sequence[str] = ()
     """Remarks on the estimates, below their table."""
     lead: Sequence[str] = ()
-    """Sentences that the page begins with, below its first picture; the summary if empty."""
+    """Sentences at the start of the page, below its first picture; the summary if empty."""
 
     @property
     def notes(self) -> list[str]:
@@ -370,11 +370,11 @@ class Report:
 
     @property
     def advice(self) -> list[str]:
-        """Findings that ask for something."""
+        """Findings that require attention."""
         return sentences(item for item in self.findings if item.severity != "note")
 
     def show(self, console: Console) -> None:
-        """Print estimates, figures and findings; fits 100 columns."""
+        """Print estimates, figures and findings in 100 columns."""
         table = Table(box=box.SIMPLE_HEAD)
         for heading in self.heads:
             right = heading in ("estimate", "file had")
@@ -402,14 +402,14 @@ class Report:
         """Write `report.html`, the pictures as PNG and `fit.json`.
 
         Args:
-            folder: Directory to make; an earlier report there is replaced.
-            record: What `fit.json` holds.
-            pictures: File name -> what the picture shows, and the PNG.
-            repeat: Lines of the section on how to repeat it.
-            tables: Further tables, after the pictures, by their headings.
+            folder: Directory to create; an earlier report there is replaced.
+            record: Content of `fit.json`.
+            pictures: File name -> caption of the picture, and the PNG.
+            repeat: Lines of the section on how to repeat the calibration.
+            tables: Additional tables after the pictures, by heading.
 
         Raises:
-            OutputError: The directory holds other files, or cannot be written.
+            OutputError: The directory contains other files, or cannot be written.
         """
         page = Page(self.title)
         first = next(iter(pictures)) if self.lead and pictures else None
@@ -432,7 +432,7 @@ class Report:
 
 
 READING = (
-    "The interval holds the true value in 19 of 20 such calibrations, if the model's form is right: it "
+    "The interval contains the true value in 19 of 20 such calibrations, if the model's form is right: it "
     "covers noise and the differences between trials, but not a wrong model. `unsure`: written, "
     "although determined only jointly with another number. `file kept`: the trials do not determine it, and "
     "the vehicle file's value is kept. Score the result on held-out trials with `finssim replay` before relying on it."
@@ -440,12 +440,12 @@ READING = (
 
 
 def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> Report:
-    """The report of a fit that ends in a vehicle file.
+    """Return the report of a fit that results in a vehicle file.
 
     Args:
         fit: The fit.
         vehicle: `calibrated(fit)`.
-        findings: The fit's and those about the calibrated vehicle.
+        findings: Findings of the fit and about the calibrated vehicle.
     """
     notes: dict[str, list[str]] = {}
     for name, estimate in fit.estimates.items():
@@ -477,15 +477,15 @@ def fit_report(fit: Fit, vehicle: Vehicle, findings: Sequence[Finding] = ()) -> 
 
 
 IMPLIED = (".added_mass", ".bias")
-"""Ends of the names of estimates that follow from others, or may well be zero."""
+"""Suffixes of the names of estimates that follow from others, or may well be zero."""
 
 
 RATIOS = ("/m_eff", ".terminal_speed")
-"""Ends of the names of what a motion without thrust shows of an axis, whose inertia is then assumed."""
+"""Suffixes of the names of estimates from a motion without thrust, whose inertia is assumed."""
 
 
 def _lead(fit: Fit) -> list[str]:
-    """Return what is known, what is not, and what to record next."""
+    """Return sentences about known and unknown parameters, and about the next dive."""
     known, unknown, given = list[str](), list[str](), list[str]()
     for name, e in fit.estimates.items():
         if e.note.startswith("given"):
@@ -494,7 +494,7 @@ def _lead(fit: Fit) -> list[str]:
             half = 0.5 * (e.ci95[1] - e.ci95[0])
             part = half / max(abs(e.estimate), 1e-12)
             size = f"±{100.0 * part:.{0 if part > 0.0095 else 1}f} %" if part < 1.0 else "hardly"
-            size = f"±{half:.2g} m" if e.unit == "m" else size  # of a place zero is a value like others
+            size = f"±{half:.2g} m" if e.unit == "m" else size  # zero is an ordinary value of a position
             (known if e.identifiable else unknown).append(f"{name} ({size})")
     free = {name.partition(".")[0] for name in fit.estimates if name.endswith(RATIOS)}
     assumed = [axis for axis in AXES if axis in free and f"{axis}.m_eff" not in fit.estimates]
@@ -520,14 +520,14 @@ def write_report(
 
     Args:
         fit: The fit.
-        folder: Directory to make; an earlier report there is replaced.
+        folder: Directory to create; an earlier report there is replaced.
         vehicle: `calibrated(fit)`.
-        command: The command line that makes the fit again.
-        findings: The fit's and those about the calibrated vehicle.
+        command: Command line that repeats the fit.
+        findings: Findings of the fit and about the calibrated vehicle.
         out: File that the vehicle was written to.
 
     Raises:
-        OutputError: The directory holds other files, or cannot be written.
+        OutputError: The directory contains other files, or cannot be written.
     """
     record = vehicle.calibrations[-1]
     quality = [(subject, quality_text(figures)) for subject, figures in fit.quality.items()]
@@ -545,14 +545,14 @@ def write_report(
     fit_report(fit, vehicle, findings).write(folder, as_object, fit_pictures(fit), repeat, tables)
 
 
-# What every `finssim calibrate` that ends in a vehicle file begins and ends with.
+# Common first and last steps of every `finssim calibrate` command that results in a vehicle file.
 
 
 def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
-    """The trials that a fit may use, and a finding on each of the others.
+    """Return the trials that a fit may use, and a finding about each of the others.
 
     Raises:
-        CalibrationError: None is left.
+        CalibrationError: No trial remains.
     """
     used = [trial for trial in trials if trial.header.role != "held-out"]
     excluded = [finding("held_out", trial.name) for trial in trials if trial.header.role == "held-out"]
@@ -562,7 +562,7 @@ def usable(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
 
 
 def usable_trials(paths: Sequence[Path]) -> tuple[list[Trial], list[Trial]]:
-    """Load trials for a fit and held-out ones; say on standard error what is left out and why."""
+    """Load trials for a fit, and held-out ones; report omitted trials with reasons on standard error."""
     trials = load_trials(paths)
     used, excluded = usable(trials)
     screen = Console(stderr=True)
@@ -573,12 +573,12 @@ def usable_trials(paths: Sequence[Path]) -> tuple[list[Trial], list[Trial]]:
 
 
 def finish(kind: str, fit: Fit, options: Mapping[str, Any]) -> Vehicle:
-    """Write the calibrated vehicle, the report and the ranges, and show them.
+    """Write and print the calibrated vehicle, the report and the ranges.
 
     Args:
-        kind: Of the command.
+        kind: Kind of the command.
         fit: The fit.
-        options: All arguments of the command by name, the inputs first.
+        options: All arguments of the command by name, starting with the inputs.
 
     Raises:
         KeyboardInterrupt: The fit was interrupted.

@@ -1,4 +1,4 @@
-"""Many candidate plants over many segments, as parallel worlds of one simulator."""
+"""Simulation of many candidate plants over many segments, as parallel worlds of one simulator."""
 
 from __future__ import annotations
 
@@ -25,35 +25,36 @@ from finssim.vehicles import AXES, Vehicle
 Array = NDArray[np.float64]
 
 STATES = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
-"""Numbers of an initial state: nu, a small turn about the body axes [rad], a world displacement [m]."""
+"""Components of an initial state: nu, a small rotation about the body axes [rad], a world displacement [m]."""
 
 MEMORY, SETTLED = 1.0, 10.0
-"""Commands before a segment that are kept, for delay and lag of the motors [s]; time constants after which an older
-command does not show."""
+"""Duration of the commands before a segment that are kept, for delay and lag of the motors [s]; number of
+time constants after which an older command has no effect."""
 
 DEEP = -30.0
-"""Added to the height of a vehicle that never came near the surface [m]: deep enough for its drift, not so deep that
-single precision would lose slow motion. Where nobody measured the depth that does not matter, and it is much deeper."""
+"""Offset of the height of a vehicle that never came near the surface [m]: deep enough for its drift, but not
+so deep that single precision would lose slow motions. If the depth was not measured this is irrelevant, and
+the offset is larger."""
 
 SLOW = 0.09
-"""Time between commands from which on their changes between two samples are unknown [s]."""
+"""Interval between commands from which on the times of their changes are considered unknown [s]."""
 
 CHANGES = 6
-"""Changes of a command within a segment whose times can be fitted: the largest ones."""
+"""Number of changes of a command within a segment whose times can be fitted: the largest ones."""
 
 FLIES = 0.15
-"""Height of the origin above the reach of a floating vehicle that is no height above the surface any more [m]."""
+"""Height of the origin above that of a floating vehicle from which it cannot be relative to the surface [m]."""
 
 
 class Changes(NamedTuple):
-    """Changes of a command between two of its samples, at times that are not known."""
+    """Changes of a command between two of its samples, at unknown times."""
 
     change: Array
-    """Change within whose sample interval each step lies, in the unit of the command, (steps, k)."""
+    """Change in whose sample interval each step lies, in the unit of the command, (steps, k)."""
     which: NDArray[np.int64]
-    """Index of that change, -1 outside of all, (steps,)."""
+    """Index of that change, -1 outside all changes, (steps,)."""
     place: Array
-    """Begin and end of each step as parts of that interval [-], (steps, 2)."""
+    """Start and end of each step as fractions of that interval [-], (steps, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,19 +62,19 @@ class Drive:
     """Commands of the motors in a segment."""
 
     force: Array
-    """Command in each step [N, N m]: the mean of a held command, which is the one before within a change; of an applied
-    force, which is linear between samples, the value at the step's end. (steps, k)"""
+    """Command in each step [N, N m]: the mean of a held command, which within a change is the previous value;
+    for an applied force, which is interpolated linearly, the value at the step's end. (steps, k)"""
     before: Array
-    """Command in its unit in the steps before, the newest last; repeats the first value before the trial began. (m,
-    k)"""
+    """Command in its unit in the previous steps, the newest last; before the start of the trial the first
+    value is repeated. (m, k)"""
     B: Array
     """Wrench about the body origin per unit force, (6, k)."""
     commanded: bool
-    """True if delay, dead zone, lag, slew and limits lie between `force` and what acts."""
+    """True if delay, dead zone, lag, slew and limits determine the applied force from `force`."""
     thrusters: bool
     """True if the k forces are the vehicle's channels: thrusters in canonical order, then its other actuators."""
     changes: Changes | None = None
-    """None without any."""
+    """Changes at unknown times; None if there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,72 +82,71 @@ class InitialState:
     """State at the start of a segment."""
 
     position: Array
-    """World frame [m], (3,); 0 if unknown."""
+    """Position in the world frame [m], (3,); 0 if unknown."""
     quaternion: Array
     """Body to world, (4,); level and heading 0 if unknown."""
     nu: Array
     """Velocity of the body origin [m/s, rad/s], (6,); 0 if unknown."""
     known: NDArray[np.bool_]
-    """Flags of nu (6), roll, pitch, yaw, x, y, z that come from measurements, (12,)."""
+    """Mask of the components nu (6), roll, pitch, yaw, x, y, z that were measured, (12,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorPlaces:
-    """Places of a trial's sensors."""
+    """Mounting positions of a trial's sensors."""
 
     velocity_at: Array
-    """Body point whose velocity u, v, w are [m]."""
+    """Body point to which the velocity u, v, w refers [m]."""
     velocity_in_water: bool
     """True if u, v, w are relative to the water."""
     position_at: Array
-    """Body point whose position x, y, z are [m]."""
+    """Body point to which the position x, y, z refers [m]."""
     depth_at: Array
     """Body point of the pressure sensor [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """One stretch of a trial on a uniform grid of `steps` steps."""
+    """Segment of a trial on a uniform grid of `steps` steps."""
 
     trial: str
     """Name of the trial."""
     index: int
     """Index of its trial in the fit."""
     t0: float
-    """Its start on the trial's clock [s]."""
+    """Start of the segment on the trial's clock [s]."""
     step: float
-    """[s]"""
+    """Time step [s]."""
     drive: Drive
     start: InitialState
     sink: float
-    """Added to the height while simulating [m], so that a vehicle that stayed wholly submerged cannot surface."""
+    """Offset of the height during simulation [m], so that a vehicle that stayed submerged cannot surface."""
     density: float
     """Density of the water [kg/m³]."""
     current: Array
-    """World frame [m/s], (3,)."""
+    """Current in the world frame [m/s], (3,)."""
     sensors: SensorPlaces
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times since t0 [s] and values."""
     held: Array | None = None
-    """nu [m/s, rad/s] that is imposed at the start and after every step, (steps + 1, 6); NaN where the simulation is
-    free."""
+    """Imposed nu [m/s, rad/s] at the start and after every step, (steps + 1, 6); NaN where the simulation is free."""
     aside: frozenset[str] = frozenset()
-    """Columns that show axes which its trial does not drive: what moves them besides has a noise of its own."""
+    """Columns of axes that the trial does not drive: their other disturbances require a separate noise level."""
 
     @property
     def steps(self) -> int:
-        """Length of the grid."""
+        """Number of steps."""
         return len(self.drive.force)
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return self.steps * self.step
 
 
 @dataclass(frozen=True, kw_only=True)
 class Streams:
-    """A trial prepared for cutting: its drive, its motion and its comparable columns."""
+    """Trial prepared for cutting: its inputs, its motion and its comparable columns."""
 
     trial: Trial
     drive: InputForces
@@ -154,11 +154,11 @@ class Streams:
     measured: dict[str, tuple[Array, Array]]
     """Column of `CHANNELS` -> times on the trial's clock [s] and values."""
     released: frozenset[str] = frozenset()
-    """Axes that move freely, of a trial without thrust that was cut to its free motions."""
+    """Axes that move freely, for a trial without thrust that was cut to its free motions."""
 
 
 def streams(trial: Trial, vehicle: Vehicle) -> Streams:
-    """Prepare a trial once, to cut it in several ways."""
+    """Prepare a trial once, so that it can be cut in several ways."""
     return Streams(
         trial=trial,
         drive=drive(trial, vehicle),
@@ -168,16 +168,16 @@ def streams(trial: Trial, vehicle: Vehicle) -> Streams:
 
 
 def released(s: Streams, axes: Sequence[str]) -> Streams:
-    """Return a trial without thrust cut to its free motions.
+    """Return a trial without thrust, cut to its free motions.
 
-    Each axis is compared within its own free motion alone.
+    Each axis is compared only within its own free motion.
 
     Args:
-        s: A trial whose header says that it is passive.
-        axes: Axes to look at.
+        s: Trial that is passive according to its header.
+        axes: Axes to evaluate.
 
     Raises:
-        CalibrationError: No axis moves freely; the message has the reason for each measured axis.
+        CalibrationError: No axis moves freely; the message states the reason for each measured axis.
     """
     windows, reasons = dict[str, tuple[float, float]](), list[str]()
     for axis in axes:
@@ -196,7 +196,7 @@ def released(s: Streams, axes: Sequence[str]) -> Streams:
         i, inside = AXES.index(axis), (t >= a) & (t <= b)
         nu[~inside, i] = np.nan
         if (own := s.measured.get(DETERMINED_BY[axis][0])) and len(own[0]):
-            # Smoothing leaves out the first samples, which are the fastest.
+            # Smoothing removes the first samples, which are the fastest.
             rows = inside & np.isnan(nu[:, i])
             nu[rows, i] = np.interp(t[rows], *own)
     for column, (at, values) in s.measured.items():
@@ -223,23 +223,23 @@ def segments(
     index: int = 0,
     changes: bool = False,
 ) -> list[Segment]:
-    """Cut a trial into stretches of about equal length; a gap in the recording always ends one.
+    """Cut a trial into segments of about equal length; a gap in the recording always ends one.
 
     Args:
         s: The trial.
-        vehicle: Whose it is.
-        length: Of each [s]; the whole trial, up to its gaps, if None.
-        step: Of the simulation [s].
-        start: Left out at the beginning [s].
-        index: Which of several trials this is.
-        changes: Whether a command that was logged slowly, and is not stated to hold, may have changed at any time since
-            the sample before: it then does so in the middle, and the times of the largest changes are free.
+        vehicle: Vehicle of the trial.
+        length: Length of each segment [s]; if None the complete trial, up to its gaps.
+        step: Time step of the simulation [s].
+        start: Duration that is omitted at the beginning [s].
+        index: Index of the trial.
+        changes: True if a slowly logged command that is not stated to be held may have changed at any time since the
+            previous sample: it then changes in the middle, and the times of the largest changes are free.
 
     Returns:
-        In order of time; none where nothing measured lies inside.
+        Segments in chronological order; empty if they contain no measurements.
 
     Raises:
-        CalibrationError: the step or length is not above zero.
+        CalibrationError: The step or length is not positive.
     """
     if not step > 0.0 or (length is not None and not length > 0.0):
         raise CalibrationError(
@@ -260,7 +260,7 @@ def segments(
 
 
 def without(s: Streams, gaps: Sequence[tuple[float, float]]) -> Streams:
-    """Return a trial without some stretches [s]."""
+    """Return a trial without some time intervals [s]."""
     spans = [(float(a), float(b)) for a, b in s.drive.spans]
     for begin, end in gaps:
         spans = [
@@ -279,7 +279,7 @@ def is_sampled(s: Streams) -> bool:
 
 
 def _changes(d: InputForces, t0: float, steps: int, step: float) -> Changes | None:
-    """Return the changes of a command within a stretch; None without any."""
+    """Return the changes of a command within a segment; None if there are none."""
     begin = t0 + step * np.arange(steps)
     row = np.searchsorted(d.t, begin + 0.5 * step, side="right")  # first sample after each step
     change = np.diff(d.force, axis=0)
@@ -309,7 +309,7 @@ def _segment(
         force[memory:][inside] = s.drive.at(t0 + step * (np.flatnonzero(inside) + 0.5))
     measured = {}
     for column, (t, values) in s.measured.items():
-        # The first sample is where the segment begins, so that neighbours do not share it.
+        # The first sample is where the segment starts, so that neighbours do not share it.
         inside = (t >= t0 - 1e-9) & (t < t0 + steps * step - 1e-9)
         if inside.any():
             measured[column] = (np.maximum(t[inside] - t0, 0.0), values[inside])
@@ -345,8 +345,8 @@ def _told(d: InputForces, edges: Array) -> Array:
     """Return the command of the motors in each step between `edges` [s], (steps, k); see `Drive.force`."""
     if d.commanded:
         return _means(d, edges)
-    # An actuator without lag ramps from one value to the next: each is the value at its step's end, or the mean around
-    # it where values jump or come faster than the steps.
+    # An actuator without lag ramps from one value to the next: each value is that at its step's end, or the mean around
+    # it where values jump or are sampled faster than the steps.
     half = 0.5 * np.diff(edges)
     if not d.held and float(np.median(np.diff(d.t))) > 0.7 * float(edges[1] - edges[0]):
         return d.at(edges[1:])
@@ -354,7 +354,8 @@ def _told(d: InputForces, edges: Array) -> Array:
 
 
 def _means(d: InputForces, edges: Array) -> Array:
-    """Mean force between successive times [s], (m + 1,) -> (m, k); before and after the recording the nearest value."""
+    """Return the mean force between successive times [s], (m + 1,) -> (m, k); outside the recording the
+    nearest value."""
     span = np.diff(d.t)[:, None]
     area = span * (d.force[:-1] if d.held else 0.5 * (d.force[:-1] + d.force[1:]))
     total = np.concatenate([np.zeros((1, d.force.shape[1])), np.cumsum(area, axis=0)])
@@ -368,7 +369,7 @@ def _means(d: InputForces, edges: Array) -> Array:
 
 
 def _start(s: Streams, t0: float) -> InitialState:
-    """Return the state at a time."""
+    """Return the state at a given time."""
     m = s.motion
     i = int(np.argmin(np.abs(m.t - t0)))
     near = slice(max(i - 3, 0), i + 4)
@@ -398,10 +399,10 @@ def _start(s: Streams, t0: float) -> InitialState:
 
 
 def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
-    """Return how far down to shift the simulation [m]: not at all if the vehicle came near the surface.
+    """Return the vertical offset of the simulation [m]: zero if the vehicle came near the surface.
 
-    No vehicle flies: heights well above 0 have another zero than the surface, such as a motion capture's on the floor,
-    and then the vehicle counts as submerged.
+    Vehicles do not fly: heights well above 0 are relative to another zero than the surface, such as a motion
+    capture system's floor, and the vehicle is then treated as submerged.
     """
     reach = max(vehicle.body.surface_half_height, 0.5 * float(vehicle.body.size[2]))
     height = m.position[np.isfinite(m.position[:, 2]), 2]
@@ -416,32 +417,32 @@ def _sink(m: Motion, vehicle: Vehicle, a: float, b: float) -> float:
     return DEEP if float(center.max()) < -reach else 0.0
 
 
-# Many candidate plants over many segments.
+# Simulation of many candidate plants over many segments.
 
 Single = NDArray[np.float32]
 
 BUDGET = 300e6
-"""Memory for the worlds and responses of one pass [bytes]; more candidates take several passes."""
+"""Memory for the worlds and responses of one pass [bytes]; more candidates require several passes."""
 
 WORLD = 6000.0
-"""Bytes of one world: plant, state, history, delay line."""
+"""Memory of one world [bytes]: plant, state, history, delay line."""
 
 LONGEST_STEP = 0.025
-"""Physics step above which a simulation step is divided [s]."""
+"""Physics step above which a simulation step is subdivided [s]."""
 
 MOTION = ("nu", "position", "quaternion", "tau", "pull", "earlier")
-"""Arguments of a rollout that are no fields of the plant."""
+"""Arguments of a rollout that are not fields of the plant."""
 
 OPEN = 1.0e6
-"""Force limit of an actuator that has none [N]."""
+"""Force limit of an unlimited actuator [N]."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """Response of every candidate on every segment; rows from a world's end, or its divergence, on are NaN."""
+    """Response of every candidate on every segment; rows after a world's end or divergence are NaN."""
 
     t: NDArray[np.float64]
-    """Since the segment's start [s], (n + 1,)."""
+    """Times since the segment's start [s], (n + 1,)."""
     nu: Single
     """Velocity of the body origin, body frame [m/s, rad/s], (n + 1, C, S, 6)."""
     position: Single
@@ -453,7 +454,7 @@ class Response:
 
 
 class Rollouts:
-    """Simulates segments under candidate plants."""
+    """Simulator of segments under candidate plants."""
 
     def __init__(
         self,
@@ -463,16 +464,16 @@ class Rollouts:
         hydrodynamics: str = "calibrated",
         max_delay: float = 0.5,
     ) -> None:
-        """Set up.
+        """Set up the simulator.
 
         Args:
-            vehicle: Gives every number that a candidate does not.
-            segments: All of one step; they may be of different lengths and drives.
+            vehicle: Vehicle with every number that a candidate does not define.
+            segments: Segments with one common step; their lengths and inputs may differ.
             hydrodynamics: Key of the vehicle's hydrodynamic sets.
-            max_delay: Longest delay that a candidate may have [s].
+            max_delay: Longest delay of a candidate [s].
 
         Raises:
-            CalibrationError: no segments, steps that differ, or a drive with more than eight channels.
+            CalibrationError: There are no segments, steps differ, or there are more than eight input channels.
         """
         steps = {round(s.step, 9) for s in segments}
         if not steps:
@@ -519,7 +520,8 @@ class Rollouts:
         self._held = self._imposed()
 
     def _imposed(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Single]]:
-        """Axes that are imposed together, the segments that do so, and their values by (n + 1, segments, axes)."""
+        """Return the imposed axes that occur together, the segments with them, and their values by (n + 1,
+        segments, axes)."""
         patterns: dict[tuple[int, ...], list[int]] = {}
         for i, s in enumerate(self.segments):
             axes = () if s.held is None else tuple(np.flatnonzero(np.isfinite(s.held).all(axis=0)).tolist())
@@ -533,7 +535,7 @@ class Rollouts:
         return out
 
     def _own_fields(self) -> dict[str, NDArray[np.float64]]:
-        """Plant fields in which segments differ: how forces reach the body, and the water's density. (S, ...)"""
+        """Return plant fields that differ between segments: force allocation, and the water's density. (S, ...)"""
         out: dict[str, list[Any]] = {}
         for d in (s.drive for s in self.segments):
             B = np.zeros((6, MAX_THRUSTERS))
@@ -543,7 +545,7 @@ class Rollouts:
             if d.commanded and d.thrusters:
                 field |= {name: self.nominal[name] for name in (*names, "delay", "speed_lag")}
             else:
-                # Wrenches that were asked for pass through the motors too, as if through six equal ones.
+                # Commanded wrenches also pass through the motors, as through six equal ones.
                 n = len(self.vehicle.thrusters)
                 tc = float(np.mean(self.nominal["time_constant"][:n])) if d.commanded else 0.0
                 values = (-OPEN, OPEN, 0.0, 0.0, tc, NO_LIMIT, 0.0)
@@ -568,18 +570,18 @@ class Rollouts:
         """Simulate every candidate over every segment.
 
         Args:
-            plant: Field of `VehicleParameters` -> values by (C, S, ...); either axis may be 1. Volume and mesh drag are
-                those in the vehicle file's water: a trial's own density scales them.
-            initial: `nu`, `quaternion`, `position` at the start where they are not the segments' own, (C, S, ...).
-            disturbance: Extra wrench about the body origin, body frame [N, N m], (C, S, 6).
-            pull: Extra force at the body origin [N], (C, S, 3): along the body's axes at the segment's start, and from
-                then on in the same direction of the world.
-            earlier: By how much each change of a sampled command comes before the middle between its samples, as a
-                part of the time between them [-], (C, S, `changes.max()`).
+            plant: Field of `VehicleParameters` -> values by (C, S, ...); either axis may be 1. Volume and
+                mesh drag are those in the vehicle file's water: a trial's own density scales them.
+            initial: `nu`, `quaternion`, `position` at the start, if they differ from the segments' own, (C, S, ...).
+            disturbance: Additional wrench about the body origin, body frame [N, N m], (C, S, 6).
+            pull: Additional force at the body origin [N], (C, S, 3): along the body's axes at the segment's
+                start, and from then on constant in the world frame.
+            earlier: Lead of each change of a sampled command relative to the middle between its samples, as a
+                fraction of the sample interval [-], (C, S, `changes.max()`).
             candidates: C; the longest first axis among the arrays if None.
 
         Returns:
-            Responses of all of them.
+            Responses of all candidates.
         """
         given = {**(plant or {}), **(initial or {}), "tau": disturbance, "earlier": earlier}
         if pull is not None and pull.any():
@@ -615,7 +617,7 @@ class Rollouts:
         return self._simulators[candidates]
 
     def _pass(self, C: int, given: dict[str, NDArray[Any]], out: dict[str, Single]) -> NDArray[np.bool_]:
-        """Simulate candidates that fit in memory; write their responses and return which reached the end."""
+        """Simulate candidates that fit in memory; store their responses and return which worlds reached the end."""
         sim, S = self._simulator(C), len(self.segments)
         shape = (C, S)
 
@@ -634,7 +636,7 @@ class Rollouts:
         write(sim.command.disturbance, given.get("tau", np.zeros((1, 1, 6))))
         self._place(sim, write, {})
         sim.reset()
-        # Motors without lag come to the first command in one step; with theirs they then follow the others.
+        # Without lag, motors reach the first command in one step; afterwards they follow the commands with their lag.
         longest = float(np.max(fields["delay"])) + SETTLED * float(np.max(fields["time_constant"]))
         limited = (fields["slew"] > 0.0) & (fields["slew"] < NO_LIMIT)
         needed = len(self._before) if limited.any() else math.ceil(longest / self.step)
@@ -656,7 +658,7 @@ class Rollouts:
     def _place(
         self, sim: Simulator, write: Callable[[Any, NDArray[Any]], None], start: dict[str, NDArray[Any]]
     ) -> None:
-        """Set every world to the state `start`, if it gives one, otherwise to its segment's own."""
+        """Set every world to the state `start`, if given, otherwise to its segment's own."""
         for name, own in (("nu", "velocity"), ("quaternion", "quaternion"), ("position", "position")):
             values = start.get(name, np.stack([getattr(s.start, name) for s in self.segments])[None])
             if name == "position":
@@ -667,7 +669,8 @@ class Rollouts:
         return np.asarray(sim.command.thrust.numpy().reshape(C, len(self.segments), MAX_THRUSTERS))
 
     def _impulses(self, sim: Simulator, C: int) -> list[Single]:
-        """Change of nu for a unit change of the imposed axes by an impulse on these alone, (C, segments, 6, axes)."""
+        """Return the change of nu for a unit change of the imposed axes by an impulse on these alone, (C,
+        segments, 6, axes)."""
         inverse = sim.plant.M_inv.numpy().reshape(C, len(self.segments), 6, 6)
         out = []
         for axes, those, _ in self._held:
@@ -676,7 +679,7 @@ class Rollouts:
         return out
 
     def _impose(self, nu: Single, impulses: list[Single], row: int) -> None:
-        """Let imposed axes move as given; what they push on the others by inertia, they do."""
+        """Set imposed axes to their given motion, including its inertial effect on the other axes."""
         for (axes, those, values), impulse in zip(self._held, impulses, strict=True):
             now = nu[:, those]
             now += (impulse @ (values[row] - now[..., axes])[..., None])[..., 0]
@@ -685,9 +688,9 @@ class Rollouts:
     def _march(
         self, sim: Simulator, C: int, out: dict[str, Single], given: dict[str, NDArray[Any]]
     ) -> NDArray[np.bool_]:
-        """Simulate the segments; write the response of every world and return which reached the end.
+        """Simulate the segments; store the response of every world and return which worlds reached the end.
 
-        Of what is given, pulls and earlier changes of commands are used here; see `run`.
+        From `given`, pulls and earlier changes of commands are used here; see `run`.
         """
         n, S = self._force.shape[:2]
         command, begin = self._command(sim, C), sim.state.steps.numpy().reshape(C, S).copy()
@@ -720,7 +723,7 @@ class Rollouts:
             for name, view in views.items():
                 out[name][k + 1] = view
         out["position"][..., 2] -= np.array([s.sink for s in self.segments], np.float32)
-        # A frozen world has counted the step in which it broke.
+        # A frozen world has counted the step in which it diverged.
         frozen = sim.state.frozen.numpy().reshape(C, S) != 0
         reached = np.where(frozen, sim.state.steps.numpy().reshape(C, S) - 1 - begin, n)
         last = np.minimum(reached, self._lengths)

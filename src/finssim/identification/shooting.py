@@ -1,4 +1,4 @@
-"""Simulated against measured segments: residuals, their derivatives, and the numbers that make them small."""
+"""Multiple shooting: residuals of simulated against measured segments, their derivatives, and the minimisation."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ CUT = 2.5
 """Whitened residual above which Huber's loss grows linearly."""
 
 LARGE_CURVATURE = 0.1
-"""Curvature of the loss of a large residual, as a part of its weight."""
+"""Curvature of the loss of a large residual, relative to its weight."""
 
 CLOSE = 0.25
-"""Part of a standard error (of independent noise) that a converged estimate may still be off."""
+"""Largest error of a converged estimate, as a fraction of its standard error for independent noise."""
 
 DAMPINGS = np.array([1e-2, 1e-1, 1.0, 1e1, 1e2, 1e4])
-"""Factors on the damping that are tried together."""
+"""Factors on the damping that are evaluated together."""
 
 PARTS = (1.0, 0.3, 0.1, 0.03)
-"""Parts of the step of a segment's own unknowns that are tried: the times of its changes of command, which mean nothing
-beyond the samples before and after, may overshoot while all other segments go on."""
+"""Fractions of the step of a segment's own unknowns that are evaluated: the times of its changes of command,
+which are meaningless beyond the adjacent samples, may overshoot while all other segments proceed."""
 
 SMALL = 0.05
-"""Decrease of half the sum of losses below which iteration ends: an error of a third of a standard error."""
+"""Decrease of half the sum of losses below which the iteration ends: an error of a third of a standard error."""
 
 
 class Point(NamedTuple):
-    """Values of all unknowns; with a leading axis of candidates where several are evaluated together."""
+    """Values of all unknowns; with a leading axis of candidates if several points are evaluated together."""
 
     theta: Array
     """Coordinates shared by all segments in their units, (P,)."""
@@ -64,7 +64,7 @@ class Linearization(NamedTuple):
 
 @dataclass(frozen=True)
 class FitSolution:
-    """End of a fit."""
+    """Result of a fit."""
 
     point: Point
     std: Array
@@ -81,16 +81,17 @@ class FitSolution:
 
 
 def weights_of(residual: Array, std: Array, cut: float = CUT) -> Array:
-    """Huber's weights over the variance of the samples, (N,): with the residual, the slope of half the loss."""
+    """Return Huber's weights over the variance of the samples, (N,): times the residual, the slope of half
+    the loss."""
     return huber_weight(np.abs(residual / std), cut) / std**2
 
 
 def curvatures_of(residual: Array, std: Array, cut: float = CUT) -> Array:
     """Return the second derivative of half the loss of every sample, (N,), per square of its unit.
 
-    Where the loss grows linearly it is zero; `LARGE_CURVATURE` of the weight is kept, for far from a solution all
-    residuals are large. With the whole weight a step among many large residuals would be much too short, and an
-    interval too narrow.
+    Where the loss is linear it is zero; `LARGE_CURVATURE` of the weight is used instead, since all residuals
+    are large far from a solution. With the full weight, a step among many large residuals would be much too
+    short, and an interval too narrow.
     """
     return np.where(np.abs(residual) <= cut * std, 1.0, LARGE_CURVATURE) * weights_of(residual, std, cut)
 
@@ -98,7 +99,7 @@ def curvatures_of(residual: Array, std: Array, cut: float = CUT) -> Array:
 def blocks_of(
     problem: Shooting, linear: Linearization, std: Array, point: Point, cut: float = CUT
 ) -> list[Block]:
-    """Newton's equations of every segment with the prior of z; that of theta is in the first.
+    """Return Newton's equations of every segment with the prior of z; the prior of theta is added to the first.
 
     `std` has the unit of each sample; `cut` is in standard deviations [-].
     """
@@ -118,15 +119,16 @@ def blocks_of(
 def step_of(
     problem: Shooting, reduced: tuple[Array, Array, list[Array]], point: Point, damping: float
 ) -> tuple[Array, Array, Array]:
-    """Steps of theta (P,) inside the box and of z (S, q), and standard errors of theta, (P,).
+    """Return steps of theta (P,) within the bounds and of z (S, q), and standard errors of theta, (P,).
 
-    They have the units of the coordinates.
+    The results have the units of the coordinates.
 
     Args:
-        problem: For its box.
-        reduced: Normal equations of theta alone at the point, per unit of theta, and how z follows; of `arrow_reduced`.
-        point: Where the step begins.
-        damping: What the diagonal of theta's grows by, as a part of itself [-].
+        problem: Problem with the bounds.
+        reduced: Normal equations of theta alone at the point, per unit of theta, and the dependence of z;
+            from `arrow_reduced`.
+        point: Start of the step.
+        damping: Relative increase of the diagonal for theta [-].
     """
     total, right, inners = reduced
     scale = np.sqrt(np.maximum(np.diagonal(total), 1e-30 + 1e-12 * np.diagonal(total).max()))
@@ -138,18 +140,20 @@ def step_of(
 
 
 def costs_of(problem: Shooting, residual: Array, std: Array, points: Point, cut: float = CUT) -> Array:
-    """Half the losses of several points with residuals (N, C), (C,); infinite where one has no answer.
+    """Return half the robust loss of several points with residuals (N, C), (C,); infinite where the
+    simulation diverged.
 
-    Residuals and `std` have the unit of each sample; losses have none [-].
+    Residuals and `std` have the unit of each sample; losses are dimensionless [-].
     """
     own = segment_costs(problem, residual, std, points.z, cut).sum(axis=-1)
     return np.asarray(own + 0.5 * np.square(problem.prior(points.theta)[0]).sum(axis=-1))
 
 
 def segment_costs(problem: Shooting, residual: Array, std: Array, z: Array, cut: float) -> Array:
-    """Half the losses within each segment of several points, (C, S); infinite where one has no answer.
+    """Return half the losses within each segment of several points, (C, S); infinite where the simulation diverged.
 
-    Residuals (N, C), `std` (N,) and z (C, S, q) have the unit of each sample and coordinate; losses have none [-].
+    Residuals (N, C), `std` (N,) and z (C, S, q) have the units of each sample and coordinate; losses are
+    dimensionless [-].
     """
     loss = np.add.reduceat(huber_loss(np.abs(residual.T / std), cut), problem.edges[:-1], axis=-1)
     loss = loss + np.square(z / problem.prior_std).sum(axis=-1)
@@ -159,17 +163,18 @@ def segment_costs(problem: Shooting, residual: Array, std: Array, z: Array, cut:
 def best_points(
     problem: Shooting, point: Point, steps: Sequence[tuple[Array, Array]], own: Array, std: Array, cut: float
 ) -> tuple[Point, Array]:
-    """Return the points that several steps lead to, and half their losses, (C,).
+    """Return the points that result from several steps, and half their losses, (C,).
 
-    Each segment goes that part of its own step, of `PARTS`, which suits it best: given theta, segments are independent.
+    Each segment takes the fraction of its own step, from `PARTS`, that fits best: given theta, segments are
+    independent.
 
     Args:
-        problem: For its bounds and its residuals.
-        point: Where the steps begin.
-        steps: Of theta (P,) and of z with it (S, q), in the units of the coordinates.
-        own: What these hold of the step of z that is best without a step of theta, in its units, (S, q).
+        problem: Problem with the bounds and residuals.
+        point: Start of the steps.
+        steps: Steps of theta (P,) and of z (S, q), in the units of the coordinates.
+        own: Part of these that is the best step of z without a step of theta, in its units, (S, q).
         std: Standard deviation of each sample in its unit, (N,).
-        cut: Huber's, in standard deviations [-].
+        cut: Huber's limit, in standard deviations [-].
     """
     theta = np.clip(point.theta + np.array([step for step, _ in steps]), problem.low, problem.high)
     less = np.multiply.outer(1.0 - np.array(PARTS), own)[:, None]
@@ -192,23 +197,23 @@ def solve(
     rough: bool = False,
     report: Callable[[int, float], None] | None = None,
 ) -> FitSolution:
-    """Fit; noise and robust weights are estimated along the way.
+    """Minimise the loss; noise and robust weights are estimated during the iteration.
 
-    Converged where the undamped step moves no judged parameter by more than `CLOSE` of its standard error and grain
-    together, and the noise no longer changes.
+    The fit has converged when the undamped step moves no judged parameter by more than `CLOSE` times its
+    standard error plus its grain, and the noise no longer changes.
 
     Args:
-        problem: What to fit.
-        start: Where to begin.
-        iterations: At most.
-        std: Standard deviation of every sample at the start, in the unit of its channel, (N,); from the residuals there
-            if None.
-        rough: Far from a solution: keep `std`, and let no residual count as an outlier, for that is what a wrong
-            parameter looks like too. Ends as soon as an iteration gains less than a hundredth.
-        report: Called with each iteration and the root mean square of the whitened residuals.
+        problem: Problem to solve.
+        start: Initial point.
+        iterations: Largest number of iterations.
+        std: Initial standard deviation of every sample, in the unit of its channel, (N,); estimated from the
+            residuals if None.
+        rough: True far from a solution: `std` is kept, and no residual is treated as an outlier, since a wrong
+            parameter has the same effect. The iteration ends when the cost decreases by less than a hundredth.
+        report: Function that is called with each iteration and the root mean square of the whitened residuals.
 
     Returns:
-        The best point; after Ctrl-C the best until then, with `interrupted`.
+        The best point; after Ctrl-C the best so far, with `interrupted`.
     """
     point, damping, done = start, 1e-2, 0
     linear = problem.linearise(point, one_sided=rough)
@@ -267,12 +272,13 @@ class Residuals:
     Attributes:
         names: Channels in use.
         channel: Index into `names` of each sample, (N,).
-        kind: The same, `len(names)` more where its trial does not drive the axis: samples of one noise, (N,).
-        segment: Index of its segment, (N,).
+        kind: As `channel`, plus `len(names)` if the trial does not drive the axis: samples with a common
+            noise level, (N,).
+        segment: Index of the segment, (N,).
         edges: First sample of each segment, and N, (S + 1,).
-        value: Measured, (N,).
-        time: Since the segment's start [s], (N,).
-        clock: On the trial's clock [s], (N,).
+        value: Measured values, (N,).
+        time: Times since the segment's start [s], (N,).
+        clock: Times on the trial's clock [s], (N,).
     """
 
     def __init__(self, segments: Sequence[Segment], channels: Sequence[str]) -> None:
@@ -301,15 +307,16 @@ class Residuals:
         return len(self.value)
 
     def predicted(self, response: Response, late: Array) -> tuple[Array, Array]:
-        """Return the readings of every candidate's sensors at the samples' times, and the first one's rate of change.
+        """Return the predicted sensor readings of every candidate at the samples' times, and the rate of
+        change of the first.
 
         Args:
-            response: Of the candidates.
-            late: By how much each sample lags what it shows [s], (N, C) or (N, 1).
+            response: Responses of the candidates.
+            late: Lag of each sample behind the measured quantity [s], (N, C) or (N, 1).
 
         Returns:
-            (N, C) and (N, 1) [unit of the channel, and the same per second]; NaN where a candidate diverged. Before a
-            segment's start it is extrapolated in a straight line.
+            (N, C) and (N, 1) [unit of the channel, and the same per second]; NaN where a candidate diverged.
+            Before a segment's start the response is extrapolated linearly.
         """
         step = self.segments[0].step
         candidates = response.nu.shape[1]
@@ -332,7 +339,7 @@ class Residuals:
         return value, rate
 
     def difference(self, predicted: Array) -> Array:
-        """Measured minus predicted, angles the short way round, (N, C). The unit is that of the channel."""
+        """Return measured minus predicted values, with angles wrapped, (N, C). The unit is that of the channel."""
         out = self.value[:, None] - predicted
         for j, name in enumerate(self.names):
             if name in EULER:
@@ -341,13 +348,13 @@ class Residuals:
         return np.asarray(out)
 
     def noise(self, residual: Array, floor: Array) -> Array:
-        """Standard deviation of each kind of sample from clipped residuals, (2 channels,).
+        """Return the standard deviation of each kind of sample from clipped residuals, (2 channels,).
 
-        It has the unit of the channel.
+        The unit is that of the channel.
 
         Args:
             residual: Measured minus predicted in the unit of the channel, (N,).
-            floor: Smallest per channel, in its unit, (channels,).
+            floor: Least value per channel, in its unit, (channels,).
         """
         floor = np.tile(floor, 2)
         out = np.array(floor, float)
@@ -357,16 +364,17 @@ class Residuals:
             sigma = 1.4826 * float(np.median(r)) if len(r) else 0.0
             sigma = sigma or float(np.sqrt(np.mean(r**2))) if len(r) else floor[j]
             for _ in range(10):
-                # The factor undoes the clipping for a normal distribution at 2.5 standard deviations.
+                # The factor compensates the clipping for a normal distribution at 2.5 standard deviations.
                 clipped = np.minimum(r, CUT * sigma)
                 sigma = 1.011 * float(np.sqrt(np.mean(clipped**2))) if sigma > 0.0 else 0.0
             out[j] = max(sigma, floor[j])
         return out
 
     def spread(self) -> Array:
-        """Range from the 2nd to the 98th percentile of each channel, the largest of the segments, (channels,).
+        """Return the range from the 2nd to the 98th percentile of each channel, the largest of the segments,
+        (channels,).
 
-        It has the unit of the channel.
+        The unit is that of the channel.
         """
         out = np.zeros(len(self.names))
         for j, values in self._runs():
@@ -374,9 +382,10 @@ class Residuals:
         return out
 
     def roughness(self) -> Array:
-        """Noise of each channel from third differences of successive samples, robust, (channels,).
+        """Return a robust estimate of the noise of each channel from third differences of successive samples,
+        (channels,).
 
-        It has the unit of the channel.
+        The unit is that of the channel.
         """
         steps: list[list[Array]] = [[np.empty(0)] for _ in self.names]
         for j, values in self._runs():
@@ -396,12 +405,12 @@ class Residuals:
 
 
 def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArray[np.float32]:
-    """A measured column on the simulation's grid.
+    """Return a measured column on the simulation's grid.
 
     Args:
-        name: Of `CHANNELS`.
-        response: Of every candidate over these segments.
-        segments: Give the sensors' places.
+        name: One of `CHANNELS`.
+        response: Responses of every candidate over these segments.
+        segments: Segments with the sensor positions.
 
     Returns:
         Values in the unit of the response, (n + 1, C, S).
@@ -430,7 +439,7 @@ def channel(name: str, response: Response, segments: Sequence[Segment]) -> NDArr
 
 
 def euler_angle(name: str, q: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Roll, pitch or yaw of unit quaternions, in their own precision, (..., 4) -> (...)."""
+    """Return roll, pitch or yaw of unit quaternions, in their own precision, (..., 4) -> (...)."""
     x, y, z, w = (q[..., i] for i in range(4))
     if name == "roll":
         return np.asarray(np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
@@ -439,7 +448,7 @@ def euler_angle(name: str, q: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0)))
 
 
-# Errors of sensors that a fit allows for: offsets of a stretch, and streams that come late.
+# Sensor errors that a fit estimates: offsets of a segment, and delayed streams.
 
 STREAMS = {
     "velocity": ("u", "v", "w"),
@@ -451,47 +460,49 @@ STREAMS = {
 """Channels that share a clock."""
 
 OFFSETS = {"p": 0.02, "q": 0.02, "r": 0.02, "roll": 0.03, "pitch": 0.03, "depth": 0.1}
-"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes in free
-motions and slow logs [rad/s], levels that were mounted askew [rad], pressure at the surface [m]."""
+"""Channels with an offset that is constant over a segment, and its standard deviation: biases of gyroscopes
+in free motions and slow logs [rad/s], misaligned tilt sensors [rad], pressure at the surface [m]."""
 
 DRIFTING_REST = {"roll drift": ("roll", "p"), "pitch drift": ("pitch", "q")}
-"""Angle and rate of an equilibrium that moves at a constant speed within a segment, as while a manipulator moves."""
+"""Angle and rate of an equilibrium that changes at constant speed within a segment, for example with a moving
+manipulator."""
 
 REST_STD, DRIFT_STD = 0.3, 0.02
 """Standard deviations of the equilibrium of a free swing [rad] and of its speed [rad/s]."""
 
 PULL, COASTING = 0.003, (0, 1, 5)
-"""Standard deviation of a constant pull on a vehicle that coasts, as of a tether, as a part of its weight, with half
-its length as the lever; and the axes that coast."""
+"""Standard deviation of a constant pull on a coasting vehicle, such as that of a tether, relative to its
+weight, with half its length as the lever arm; and the axes that coast."""
 
 TETHER = 0.01
-"""Standard deviation of the horizontal pull of a tether on a driven vehicle in slow logs, as a part of its weight. In a
-segment it keeps its direction in the world, while the vehicle turns."""
+"""Standard deviation of the horizontal pull of a tether on a driven vehicle in slow logs, relative to its
+weight. Within a segment its direction is constant in the world frame."""
 
 CHANGE_STD = 12.0**-0.5
-"""Standard deviation of the time of a change between two samples of a command, as a part of the time between them."""
+"""Standard deviation of the time of a change between two samples of a command, relative to the sample interval."""
 
 CHANGE_STEP = 0.05
-"""Step of its finite differences: a longer one would often reach beyond the samples, where nothing changes any more."""
+"""Step of its finite differences: a longer one would often exceed the sample interval, where nothing changes
+any more."""
 
 LATEST = 0.3
-"""Greatest lag or lead of a stream relative to the inputs [s]."""
+"""Largest lag or lead of a stream relative to the inputs [s]."""
 
 CLOCK_STD, LATE_STD = 0.05, 0.03
-"""Prior standard deviations of the lag that all streams of a log share and of what each adds [s]: noisy data do not
-distinguish a lag from inertia."""
+"""Prior standard deviations of the common lag of all streams of a log and of the individual additional lags
+[s]: noisy data do not distinguish a lag from inertia."""
 
 
-# Where each segment begins: what was measured there, and how far a fit may move it.
+# Initial state of each segment: measured values, and the range in which a fit may change them.
 
 UNKNOWN = np.array([0.5, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 1e-6, 1e-6, 1e-6, 1e-6])
-"""Standard deviation of unmeasured values; heading and place do not matter then."""
+"""Standard deviation of unmeasured values; heading and position are irrelevant then."""
 
 UNMOVED = np.array([0.05] * 6 + [0.3, 0.3, *UNKNOWN[8:]])
-"""Standard deviation of unmeasured values in a free motion, where nothing drives the other axes."""
+"""Standard deviation of unmeasured values in a free motion, in which the other axes are not driven."""
 
 LOOSE = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
-"""Standard deviation of measured and compared values: wide, for the same measurements count as residuals."""
+"""Standard deviation of measured and compared values: large, since the same measurements count as residuals."""
 
 TIGHT = np.array([0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.02, 0.02, 0.02, 0.03, 0.03, 0.03])
 """Standard deviation of measured values that are not compared."""
@@ -500,55 +511,57 @@ SHOWN_BY = (
     *(("u", "x", "y"), ("v", "x", "y"), ("w", "z", "depth"), ("p", "roll"), ("q", "pitch"), ("r", "yaw")),
     *(("roll",), ("pitch",), ("yaw",), ("x",), ("y",), ("z", "depth")),
 )
-"""Channels that show a state, in the order of `STATES`."""
+"""Channels that determine a state, in the order of `STATES`."""
 
 STEPS = np.array([0.002] * 9 + [0.005] * 3)
 """Steps of the finite differences of initial states [m/s, rad/s, rad, m]."""
 
 LINEAR_GROWTH = 8.0
-"""Growth within a segment above which these steps are smaller in proportion, because differences over large responses
-are not derivatives."""
+"""Growth within a segment above which these steps are reduced in proportion, since differences over large
+responses do not approximate derivatives."""
 
 
 RELATIVE_STEP = 0.006
-"""Step of the finite differences, relative to a coordinate's size: single precision leaves them three digits."""
+"""Step of the finite differences, relative to a coordinate's size: single precision leaves three digits."""
 
 FORCE_STEP = 0.15
-"""Relative step of damping and excess of a rise, which nearly trade off: the rounding of small steps would look like
-knowledge."""
+"""Relative step of damping and excess of a rise, which are nearly degenerate: rounding errors of small steps
+would appear as information."""
 
 GRAIN = 0.004
-"""Share of a number that is negligible."""
+"""Relative change of a number that is negligible."""
 
 COARSE = 0.05
-"""Size of residuals relative to a channel's range that counts as small while the parameters are far off."""
+"""Size of residuals relative to a channel's range that counts as small while the parameters are far from the
+solution."""
 
 VAGUE = 8.0
-"""Prior standard deviation of a fitted number: the file's value within so many times its scale."""
+"""Prior standard deviation of a fitted number about the file's value, in units of its scale."""
 
 EXACT_CLOCK = 1e-3
-"""Greatest lag of the stream that serves as the clock [s]."""
+"""Largest lag of the stream that serves as the clock [s]."""
 
 CONSTANT = 1e-3
-"""Noise of a channel that never changes, as where a sensor was missing [m, rad, m/s, rad/s]: single precision shows no
-less."""
+"""Least noise of a constant channel, for example without a sensor [m, rad, m/s, rad/s]: the resolution of
+single precision."""
 
 FEWEST_CORRELATED = 20
-"""Samples of a channel from which their correlation is estimated."""
+"""Least number of samples of a channel for an estimate of their correlation."""
 
 FLOOR = 1e-4
-"""Smallest noise of a channel, against the range it covers: below it are the simulation's own errors."""
+"""Least noise of a channel, relative to its range: smaller values are below the simulation's own errors."""
 
 
 class ParameterPrior:
-    """Knowledge of theta beforehand: of the parameters and of the lags of the streams.
+    """Prior of theta: of the parameters and of the lags of the streams.
 
-    Imposed axes have the file's inertia within a factor, the others within an order of magnitude: far from a solution,
-    over short segments, nothing else keeps them finite. Streams agree on the time to hundredths of a second.
+    The inertia of imposed axes is that of the file within a factor, that of the others within an order of
+    magnitude: far from a solution, over short segments, nothing else keeps them finite. The clocks of streams
+    agree to hundredths of a second.
     """
 
     def __init__(self, parameters: Parameters, streams: int, released: bool) -> None:
-        """Set up for a number of streams, of segments that are driven or `released`."""
+        """Set up the prior for a number of streams, for segments that are driven or `released`."""
         P, judged = len(parameters.names), len(parameters.names) - parameters.nuisances
         none = np.zeros(streams)
         self.mean = np.concatenate([parameters.expected, none])
@@ -559,7 +572,7 @@ class ParameterPrior:
         self.known = np.concatenate([size**-1.0, none])
         clocks = LATE_STD**2 * np.eye(streams) + CLOCK_STD**2
         if "thrust_delay" in parameters.names or released:
-            # A common lag of all streams equals a delay of the thrust: the first stream is the clock then.
+            # A common lag of all streams is equivalent to a delay of the thrust: the first stream is then the clock.
             clocks = np.diag(np.where(np.arange(streams) == 0, EXACT_CLOCK, CLOCK_STD) ** 2)
         rows, target = parameters.prior_rows()
         self.rows = np.zeros((len(rows) + streams, P + streams))
@@ -568,7 +581,8 @@ class ParameterPrior:
         self.target = np.concatenate([target, none])
 
     def __call__(self, theta: Array, weight: float) -> tuple[Array, Array]:
-        """Return the whitened differences of vectors (..., P), (..., R), and the slopes of one vector, (R, P).
+        """Return the whitened differences of vectors (..., P) from the prior, (..., R), and the slopes for
+        one vector, (R, P).
 
         Both are multiplied by a weight [-].
         """
@@ -581,23 +595,24 @@ class ParameterPrior:
 
 
 class Shooting:
-    """Residuals of segments under parameters and initial states.
+    """Residuals of segments for given parameters and initial states.
 
     Attributes:
         streams: Names of the streams in use; each may lag the inputs.
-        offsets: Names of the channels with an offset of their own in every segment, then of `DRIFTING_REST`.
-        free: Which of `STATES` a fit moves from the measured ones, indices (q,): velocities and tilt everywhere,
-            heading and place where some segment knows them and they matter; of the wrench of a tether, 12 to 17; and
-            of the times of changes of the command, from 18 on.
+        offsets: Names of the channels with a separate offset in every segment, then of `DRIFTING_REST`.
+        free: Indices into `STATES` of the components that a fit changes from their measured values, (q,):
+            velocities and tilt always, heading and position if they are known in some segment and relevant;
+            from 12 to 17, the wrench of a tether; from 18 on, the times of changes of the command.
         edges: First sample of each segment, and N, (S + 1,).
-        low: Least theta, (P,).
-        high: Largest theta, (P,).
-        prior_std: Of z around zero, (S, q).
-        released: Whether nothing drives any segment.
-        coasts: Whether, besides, the axes come to rest by drag alone.
-        farthest: Greatest deviations of z, (q,): of the time of a change half the time between its samples.
-        judged: How many of theta, from the first, have to be accurate; the rest are there for their sake.
-        repeats: Samples per independent one.
+        low: Lower bounds of theta, (P,).
+        high: Upper bounds of theta, (P,).
+        prior_std: Standard deviations of z around zero, (S, q).
+        released: True if no segment is driven.
+        coasts: True if, in addition, the axes come to rest by drag alone.
+        farthest: Largest deviations of z, (q,): for the time of a change half the sample interval.
+        judged: Number of components of theta, from the first, that must be accurate; the others are nuisance
+            parameters.
+        repeats: Number of samples per independent one.
     """
 
     def __init__(
@@ -612,18 +627,20 @@ class Shooting:
         few: bool = False,
         correlated: bool = True,
     ) -> None:
-        """Set up.
+        """Set up the problem.
 
         Args:
-            segments: What to fit.
-            parameters: What is free.
+            segments: Segments to fit.
+            parameters: Free parameters.
             channels: Measured columns to compare.
-            lagged: Which segments' inputs an estimated lag or delay acts on, (S,); the commanded ones if None.
-            swinging: Segments of a free motion, in which the equilibrium of roll and pitch may move, (S,).
-            twisted: Whether a constant moment may act on a vehicle that coasts, where the trials are coasts alone;
-                a force may in any case.
-            few: Whether some axis is excited by too few trials to show how trials differ.
-            correlated: Whether samples count as fewer against what is known beforehand where their errors correlate.
+            lagged: Mask of the segments whose inputs are subject to an estimated lag or delay, (S,); the
+                commanded ones if None.
+            swinging: Mask of the segments of a free motion, in which the equilibrium of roll and pitch may
+                move, (S,).
+            twisted: True if a constant moment may act on a coasting vehicle, if all trials are coasts; a
+                force may act in any case.
+            few: True if some axis is excited by too few trials to determine the differences between trials.
+            correlated: True if samples with correlated errors count as fewer relative to the prior.
         """
         self.segments, self.parameters = tuple(segments), parameters
         self.groups = np.array([s.index for s in segments])
@@ -648,7 +665,7 @@ class Shooting:
         self._prior = ParameterPrior(parameters, len(self.streams), self.released)
         forces = np.isin(parameters.names, ("heave.d1", "heave.d2", "buoyancy_excess"))
         self._relative_step = np.where(forces & self.released, FORCE_STEP, RELATIVE_STEP)
-        # A thruster that is higher by 1 m pushes with the moment e_z × axis more.
+        # A thruster that is 1 m higher adds the moment e_z × axis.
         by_thruster = np.array([s.drive.thrusters for s in segments])
         sideways = horizontal(parameters.vehicle)
         self._by_thruster = by_thruster[:, None, None]
@@ -660,17 +677,17 @@ class Shooting:
         noise = self.measured.roughness()
         self._floor = np.where(noise > 0.0, FLOOR * self.measured.spread() + 1e-12, CONSTANT)
         self.first_noise = np.maximum(noise, self._floor)
-        self._grown = np.ones(len(segments))  # by how much changes of the start grew when last linearised
+        self._grown = np.ones(len(segments))  # growth of changes of the start at the last linearisation
         self._latest: tuple[Point, Linearization, bool] | None = None
 
     def _states(self, swinging: NDArray[np.bool_], twisted: bool) -> Array:
-        """Choose the initial states, pulls and times of changes that are free, and return their standard deviations.
+        """Select the free initial states, pulls and times of changes, and return their standard deviations.
 
         `swinging` and `twisted` are those of the constructor.
         """
         segments, names, changes = self.segments, self.measured.names, self.rollouts.changes
         known = np.stack([s.start.known for s in segments])
-        # Heading and place are free where something that is compared depends on them.
+        # Heading and position are free if a compared quantity depends on them.
         flat, deep = {"x", "y"} & set(names), all(s.sink for s in segments)
         turned = flat or "yaw" in names or any(s.current.any() for s in segments)
         felt = [turned, "x" in names, "y" in names, {"z", "depth"} & set(names) or not deep]
@@ -689,16 +706,16 @@ class Shooting:
         return np.hstack([states_std, np.maximum(pulls[:, pulled], 1e-9), times_std])
 
     def _sensors(self, swinging: NDArray[np.bool_]) -> Array:
-        """Choose the errors of sensors that a fit allows for, and return the standard deviations of offsets."""
+        """Select the sensor errors that a fit estimates, and return the standard deviations of offsets."""
         m, names = self.measured, self.measured.names
-        # The initial height already takes up an offset of the depth, unless z is measured too.
+        # The initial height is already equivalent to an offset of the depth, unless z is measured too.
         self.offsets = tuple(c for c in names if c in OFFSETS and (c != "depth" or "z" in names))
         stream_of = {c: i for i, stream in enumerate(self.streams) for c in STREAMS[stream]}
         self._stream = np.array([stream_of[c] for c in names], int)[m.channel]
         rows = [names.index(name) for name in self.offsets]
         self._offset = (m.channel[:, None] == np.array(rows, int)).astype(float)
         std = np.tile([OFFSETS[c] for c in self.offsets], (len(self.segments), 1))
-        # In fast logs of a driven vehicle, errors of its drag would be taken for an offset of its gyroscope.
+        # In fast logs of a driven vehicle, an offset of the gyroscope would absorb errors of the drag.
         std[np.ix_(~swinging & ~self._slow, np.isin(self.offsets, STREAMS["rates"]))] = 1e-9
         for name, (angle, rate) in DRIFTING_REST.items() if swinging.any() else ():
             if angle in names:
@@ -717,7 +734,7 @@ class Shooting:
         """
         p, out = self.parameters, np.zeros((len(self.segments), 6))
         body, weight = p.vehicle.body, p.vehicle.weight
-        # In fast logs, which show the motion well, errors of the model would be taken for pulls.
+        # In fast logs, which resolve the motion well, pulls would absorb errors of the model.
         if {"surge", "sway"} & set(p.axes):
             out[self._slow & ~swinging, :2] = TETHER * weight
         coasting = set(p.axes).difference(p.biases)
@@ -727,18 +744,18 @@ class Shooting:
         return out
 
     def _scale(self, theta: Array) -> Array:
-        """Return the scale of thrust of vectors (C, P) [-], (C,), which pulls have too.
+        """Return the scale of thrust of vectors (C, P) [-], (C,), by which pulls are multiplied as well.
 
-        With known deviations they would tell the size of all forces, and so of all masses.
+        With absolute standard deviations they would determine the scale of all forces, and therefore of all masses.
         """
         names = self.parameters.names
         return theta[:, names.index("thrust_scale")] if "thrust_scale" in names else np.ones(len(theta))
 
     def prior(self, theta: Array) -> tuple[Array, Array]:
-        """Return the whitened differences of vectors (..., P) from what is known beforehand, (..., R), and the slopes
-        of one vector, (R, P).
+        """Return the whitened differences of vectors (..., P) from the prior, (..., R), and the slopes for
+        one vector, (R, P).
 
-        Samples count as independent in a cost, so that what is known counts `repeats` times.
+        Samples count as independent in the cost, so the prior counts `repeats` times.
         """
         return self._prior(theta, np.sqrt(self.repeats))
 
@@ -748,17 +765,18 @@ class Shooting:
         return self.parameters.names + tuple(f"{stream}.late" for stream in self.streams)
 
     def start(self) -> Point:
-        """The vehicle file's numbers, the measured initial states, no errors of sensors."""
+        """Return the vehicle file's numbers, the measured initial states, and no sensor errors."""
         rest = np.zeros(len(self.low) - len(self.parameters.names))
         return Point(np.concatenate([self.parameters.start, rest]), np.zeros(self.prior_std.shape))
 
     def cost(self, point: Point) -> float:
-        """Half the loss of one point, with what counts as large residuals far from a solution; clocks agree."""
+        """Return half the loss of one point [-], with residual sizes typical far from a solution and zero clock
+        offsets."""
         one = Point(point.theta[None], point.z[None])
         return float(costs_of(self, self.residuals(one), self.size(), one)[0])
 
     def residuals(self, points: Point) -> Array:
-        """Measured minus predicted of several points, (N, C). They have the unit of the channel."""
+        """Return measured minus predicted values of several points, (N, C), in the unit of the channel."""
         return self._residual(points, self._predicted(points)[0])
 
     def _residual(self, points: Point, value: Array) -> Array:
@@ -768,7 +786,7 @@ class Shooting:
         return self.measured.difference(value + out)
 
     def _predicted(self, points: Point) -> tuple[Array, Array]:
-        """Return the readings of sensors without offsets, (N, C), and the rate of change of the first, (N, 1)."""
+        """Return the sensor readings without offsets, (N, C), and the rate of change of the first, (N, 1)."""
         P, C = len(self.parameters.names), len(points.theta)
         p = self.parameters.plants(points.theta[:, :P])
         fields = dict(p.fields)
@@ -807,14 +825,15 @@ class Shooting:
         return self.measured.predicted(response, (late[:1] if same else late).T[self._stream])
 
     def linearise(self, point: Point, *, one_sided: bool = False) -> Linearization:
-        """Residuals and derivatives: differences for what moves the vehicle, exact for what sensors add.
+        """Return residuals and derivatives: finite differences for unknowns that affect the motion, exact for
+        sensor errors.
 
-        Those of the latest point are kept, because one solution often begins where another ended.
+        The result for the latest point is cached, since a solution often starts where another ended.
 
         Args:
-            point: Where.
-            one_sided: Whether differences to one side suffice, in place of central ones; never without thrust, where
-                numbers trade off more closely.
+            point: Point of the linearisation.
+            one_sided: True if one-sided differences suffice, instead of central ones; never without thrust,
+                where the parameters are more strongly correlated.
         """
         one_sided = one_sided and not self.released
         latest = self._latest
@@ -845,8 +864,8 @@ class Shooting:
         return linear
 
     def _neighbours(self, point: Point, one_sided: bool) -> tuple[Point, Array]:
-        """The point, one on one side of it or on either for every unknown that moves the vehicle, and the distances of
-        each sample, (N, P + q)."""
+        """Return the point with one- or two-sided neighbours for every unknown that affects the motion, and
+        the distances for each sample, (N, P + q)."""
         P = len(self.parameters.names)
         count, steps = P + len(self.free), np.tile(self._steps[self.free], (len(self.segments), 1))
         steps *= LINEAR_GROWTH / np.maximum(self._grown, LINEAR_GROWTH)[:, None]
@@ -884,28 +903,28 @@ class Shooting:
         return np.asarray(np.maximum.reduceat(own.max(axis=1), self.edges[:-1]))
 
     def grain(self, theta: Array) -> Array:
-        """Return negligible differences of theta, (P,). They have the units of theta."""
+        """Return negligible differences of theta, (P,), in the units of theta."""
         P = len(self.parameters.names)
         size = np.maximum(np.abs(theta[:P]), 0.1 * self.parameters.scale)
         return GRAIN * np.append(size, np.full(len(theta) - P, 1.0))
 
     def hold_clocks(self, hold: bool) -> None:
-        """Keep the lags of all streams at zero, or let them go: far from a solution they imitate inertia."""
+        """Fix the lags of all streams at zero, or release them: far from a solution they imitate inertia."""
         late, far = slice(len(self.parameters.names), None), 0.0 if hold else LATEST
         self.low[late], self.high[late] = -far, far
 
     def size(self) -> Array:
         """Return the size of a large residual of every sample far from a solution, (N,).
 
-        It has the unit of the channel.
+        The unit is that of the channel.
         """
         size = np.maximum(3.0 * self.first_noise, COARSE * self.measured.spread())
         return np.asarray(size[self.measured.channel])
 
     def noise(self, residual: Array) -> Array:
-        """Standard deviation of every sample: that of its channel. It has the unit of the channel.
+        """Return the standard deviation of every sample, which is that of its channel and has its unit.
 
-        The samples per independent one follow from the same residuals.
+        The number of samples per independent one is computed from the same residuals.
         """
         m, found = self.measured, []
         for j in np.unique(m.kind) if self._correlated else ():

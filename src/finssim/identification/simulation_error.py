@@ -1,4 +1,5 @@
-"""Hydrodynamics by simulation error: numbers with which the simulator, driven as the vehicle was, moves as it did."""
+"""Identification of hydrodynamics by simulation error: the parameters for which the simulated motion fits the
+measured one."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ __all__ = ["fit_by_simulation"]
 Array = NDArray[np.float64]
 
 EXPLAINED = 0.2
-"""R² below which the model of an axis explains nothing: at 0 the mean of the measurements does as well."""
+"""R² below which the model of an axis is rejected: at 0 it is no better than the mean of the measurements."""
 
 
 def finished(
@@ -127,12 +128,12 @@ def axis_results(
     figures: Mapping[str, Mapping[str, float]],
     others: Mapping[str, Estimate],
 ) -> tuple[dict[str, Estimate], dict[str, Any], list[Finding]]:
-    """Return all estimates, the changes of the vehicle by axis, and what has to be said of them.
+    """Return all estimates, the changes of the vehicle by axis, and findings about them.
 
     Args:
-        fit: Its trials and settings.
-        stage: The finished fit.
-        shapes: Drag of each axis whose shape was averaged.
+        fit: Trials and settings of the fit.
+        stage: Finished fit.
+        shapes: Drag of each axis with averaged drag models.
         numbers: Parameter -> value and interval.
         figures: Axis -> quality of the fit, in the units of `Fit.quality`.
         others: Estimates that belong to no axis.
@@ -141,7 +142,7 @@ def axis_results(
     found, axes, bounds = dict[str, Estimate](), dict[str, Any](), list[Finding]()
     for axis in fit.axes:
         own = speeds([s.motion for s in fit.used], axis)
-        # A coast shows drag at all speeds, and those in the middle best.
+        # A coast shows drag at all speeds, and most accurately at medium ones.
         speed = float(np.sqrt(own[0] * own[1])) if stage.problem.coasts else own[1]
         known = is_drag_known(p, x, stage.found, axis, speed, shapes.get(axis))
         result = axis_result(p, x, numbers, axis, speeds=own, drag_known=known, given=fit.known.get(axis))
@@ -160,29 +161,31 @@ def axis_results(
 
 
 def unbelievable(fit: Stages, stage: Stage, axis: str, r2: float) -> str:
-    """Return why nothing that was fitted to an axis can be believed, or an empty text.
+    """Return the reason why the fit of an axis is not credible, or an empty text.
 
     Args:
-        fit: Its trials and settings.
-        stage: The finished fit.
-        axis: The axis.
-        r2: R² of the whole axis [-].
+        fit: Trials and settings of the fit.
+        stage: Finished fit.
+        axis: Name of the axis.
+        r2: R² of the complete axis [-].
     """
     if r2 < EXPLAINED:
-        return f"the model explains nothing of this axis' motion: R² {r2:.2f}"
+        return f"the model does not explain the motion of this axis: R² {r2:.2f}"
     worst, least = unexplained(stage.problem, stage.solution, axis, fit.used)
     if least < EXPLAINED:
-        return f"the model explains nothing of how {worst} moves, R² {least:.2f}: fit its releases apart"
+        return (
+            f"the model does not explain the motion of {worst}, R² {least:.2f}: fit its releases separately"
+        )
     return ""
 
 
 def buoyancy(fit: Stages, excess: Estimate, reason: str) -> tuple[Estimate, list[Finding]]:
-    """Return the excess of buoyancy, not identifiable where it rests on an assumed mass, and what contradicts it.
+    """Return the excess of buoyancy, not identifiable if it depends on an assumed mass, and contradicting findings.
 
     Args:
-        fit: Its trials and settings.
+        fit: Trials and settings of the fit.
         excess: Estimate from the simulation.
-        reason: Why the axis cannot be believed; empty where it can.
+        reason: Reason why the axis is not credible; empty if it is.
     """
     file = matrices(fit.vehicle).excess
     assumed = "heave" in fit.free and "heave" not in fit.known
@@ -201,7 +204,7 @@ def free_estimates(fit: Stages, stage: Stage, result: AxisResult) -> dict[str, E
     axis, (_, top) = result.axis, result.speeds
     p, i, out = stage.problem.parameters, AXES.index(result.axis), dict[str, Estimate]()
     for name, e in result.estimates.items():
-        # The equilibrium of a swing may be that of a sensor that was mounted askew.
+        # The equilibrium of a swing may be due to a misaligned sensor.
         sure = e.identifiable and not name.endswith(".bias")
         out[name] = replace(e, identifiable=sure, note="; ".join(filter(None, [e.note, fit.notes.get(axis)])))
 
@@ -225,7 +228,7 @@ def free_estimates(fit: Stages, stage: Stage, result: AxisResult) -> dict[str, E
     if axis in SWINGING:
         rubbed = 8.0 / (3.0 * np.pi) * top
         add("natural_frequency", *of(lambda m, d1, d2, k, e: float(np.sqrt(k / m))), "rad/s")
-        # A quadratic term counts as the linear one that takes as much energy out of the largest swing.
+        # The quadratic term is converted to the linear one that dissipates equal energy in the largest swing.
         ratio = of(lambda m, d1, d2, k, e: (d1 + rubbed * d2) / (2.0 * float(np.sqrt(k * m))))
         add("damping_ratio", *ratio, "-", f"at a swing of {top:.2g} rad/s")
     if axis == "heave":
@@ -258,28 +261,28 @@ def fit_by_simulation(
 ) -> Fit:
     """Fit by simulation error over all trials together.
 
-    Trials are cut into segments with an initial state each; Levenberg-Marquardt moves the parameters, the initial
-    states, offsets of the sensors and lags of their streams, with derivatives from parallel worlds. All numbers hold at
-    the reference point of the vehicle's calibrated set.
+    Trials are cut into segments with an initial state each; Levenberg-Marquardt adjusts the parameters, the
+    initial states, offsets of the sensors and lags of their streams, with derivatives from parallel worlds.
+    All numbers refer to the reference point of the vehicle's calibrated set.
 
     Args:
-        trials: Of any inputs, rates and measured columns.
-        vehicle: Gives the rigid body, the motors and everything that is not fitted.
+        trials: Trials with any inputs, rates and measured columns.
+        vehicle: Vehicle with the rigid body, the motors and everything that is not fitted.
         axes: Axes to fit; those that the trials excite if None.
-        estimate: Of `EXTRAS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of its actuators, such
-            as `fin.lift_slope`, of which a factor is fitted. Buoyancy comes
-            with heave, stiffness with roll and pitch, a bias with the others.
+        estimate: Names from `EXTRAS`, parameters of the vehicle's terms, such as `lift.coefficient`, and of
+            its actuators, such as `fin.lift_slope`, for which a factor is fitted. Buoyancy is included with
+            heave, stiffness with roll and pitch, a bias with the others.
         damping: `auto`, `linear`, `quadratic` or `both`; or one of the last three by axis.
-        known: Effective inertias M_RB + M_A that are known, by axis [kg, kg m²].
+        known: Known effective inertias M_RB + M_A, by axis [kg, kg m²].
         horizon: Length of the segments [s]; from the data if None.
-        likely: Whether the thrust is known no better than by the voltages that batteries have; its scale is then fitted
-            with that as its prior, and goes to the file with the rest.
+        likely: True if the thrust is only known from usual battery voltages; its scale is then fitted with
+            that prior, and written to the file with the other numbers.
         published: `top_speed` [m/s] and `bollard_pull` [N], both ahead: data on drag and thrust.
-        design: Whether the next dive is designed.
-        progress: Called with the part done and a few words.
+        design: True to design the next dive.
+        progress: Function that is called with the completed fraction and a short text.
 
     Returns:
-        After Ctrl-C the best until then, with `interrupted`.
+        The fit; after Ctrl-C the best result so far, with `interrupted`.
 
     Raises:
         CalibrationError: No trial can be used, one is held out, or a word is unknown.
@@ -326,9 +329,9 @@ def prepare(
     axes: Sequence[str] | None = None,
     show: Callable[[str], None] = lambda name: None,
 ) -> tuple[list[Streams], list[Finding]]:
-    """Return the trials that can be used, and findings on what was assumed of them and on those that cannot.
+    """Return the usable trials, and findings about assumptions and about unusable trials.
 
-    A trial without thrust is cut to the free motions of its axes. `show` is called with the name of each.
+    A trial without thrust is cut to the free motions of its axes. `show` is called with the name of each trial.
 
     Raises:
         CalibrationError: No trial can be used.
@@ -358,7 +361,7 @@ def prepare(
 DAMPING = ("auto", "linear", "quadratic", "both")
 
 HORIZONS = (0.5, 60.0)
-"""Shortest and longest segments that can be asked for [s]."""
+"""Shortest and longest segments that can be requested [s]."""
 
 
 def _check(
@@ -389,7 +392,7 @@ def _check(
 def _axes(
     prepared: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str] | None
 ) -> tuple[tuple[str, ...], list[Finding]]:
-    """Axes to fit, and why some that were asked for are not."""
+    """Return the axes to fit, and findings about requested axes that cannot be fitted."""
     moved, seen = excited(prepared, vehicle), observable(prepared)
     if axes is None:
         if not moved:

@@ -1,4 +1,5 @@
-"""Stages of a fit by simulation error: which axes and numbers are free, and fits of longer and longer segments."""
+"""Stages of a fit by simulation error: selection of free axes and parameters, and fits of increasingly long
+segments."""
 
 from __future__ import annotations
 
@@ -27,25 +28,26 @@ from finssim.vehicles import AXES, Vehicle
 Array = NDArray[np.float64]
 
 STEP = 0.02
-"""Step of the simulation [s]."""
+"""Time step of the simulation [s]."""
 
 SHORT = 2.5
-"""Initial length of the segments [s]: over so short a time every problem is nearly linear."""
+"""Initial length of the segments [s]: over such a short time every problem is nearly linear."""
 
 ENOUGH = 120.0
-"""Length of all segments together that suffices for a start [s]."""
+"""Total length of all segments that suffices for the first stage [s]."""
 
 OWN_ERROR, BETWEEN = 0.003, 0.05
-"""Error of the simulation itself, as a part of an estimate; and how it grows with the time between samples of the
-inputs [1/s], for nobody recorded what happened in between."""
+"""Relative error of the simulation itself; and its increase with the sample interval of the inputs [1/s],
+since their course between samples is unknown."""
 
 GROWTH = 12.0
 """Growth of a disturbance of the initial velocity over a segment above which its trial is cut into shorter ones.
 
-A fast vehicle without fins turns broadside by itself, and derivatives over a long run of that mean little."""
+A fast vehicle without fins turns broadside on its own, so that derivatives over long segments are not useful.
+"""
 
 HALVINGS = 3
-"""How often a trial's segments are halved at most for that."""
+"""Largest number of times that a trial's segments are halved for this reason."""
 
 
 class FitProgress:
@@ -55,7 +57,7 @@ class FitProgress:
         self.progress, self.begin, self.part = progress, time.perf_counter(), 0.0
 
     def __call__(self, words: str, toward: float = 1.0) -> None:
-        # The number of remaining iterations is unknown; each takes a share of the rest.
+        # The number of remaining iterations is unknown; each advances by a fraction of the remainder.
         self.part += 0.2 * max(toward - self.part, 0.0)
         spent = time.perf_counter() - self.begin
         if self.progress:
@@ -63,19 +65,19 @@ class FitProgress:
 
 
 class Stages:
-    """The stages of one fit: they share trials and segments.
+    """Stages of one fit, which share trials and segments.
 
     Attributes:
         excites: Axes that each trial excites.
-        imposed: Axes that are not fitted and whose added mass pushes and turns the others.
-        unseen: Those of `imposed` that no trial measures, and that therefore are simulated.
-        free: Axes that move only in trials without thrust, which show ratios alone.
+        imposed: Axes that are not fitted and whose added mass pushes and rotates the others.
+        unseen: Axes of `imposed` that no trial measures, and that are therefore simulated.
+        free: Axes that move only in trials without thrust, which determine only ratios.
         held: Effective inertias that are not fitted [kg, kg m²].
-        notes: Axis -> what its numbers rest on.
-        extras: Parameters besides the axes' own that are fitted.
-        own_error: Error of the simulation itself, as a part of an estimate [-].
+        notes: Axis -> basis of its numbers.
+        extras: Fitted parameters besides the axes' own.
+        own_error: Relative error of the simulation itself [-].
         used: Trials with a segment.
-        remarks: Findings on the trials.
+        remarks: Findings about the trials.
     """
 
     def __init__(
@@ -94,8 +96,8 @@ class Stages:
         self.prepared, self.vehicle, self.axes, self.say = prepared, vehicle, axes, say
         self.given, self.known, self.likely = length, dict(known), likely
         self.excites = excitations(prepared, vehicle)
-        # The added mass of axes that are not fitted pushes and turns the others; roll's and pitch's hardly does, and
-        # without thrust nothing does.
+        # The added mass of axes that are not fitted pushes and rotates the others; that of roll and pitch hardly does,
+        # and without thrust none does.
         driven = any(one.drive.source != "passive" for one in prepared)
         self.imposed = tuple(a for a in ("surge", "sway", "heave", "yaw") if a not in axes and driven)
         self.unseen = tuple(
@@ -118,11 +120,11 @@ class Stages:
         rolled = any(a not in self.free and a not in self.held for a in swinging)
         if rolled and any(s.drive.thrusters for s in prepared):
             self.extras |= set(places(vehicle))
-            # Unequal thrusters show in what a push along one axis does to all others.
+            # Unequal thrusters are identifiable from the effect of a push along one axis on all others.
             self.slow = any(map(is_sampled, prepared))
             self.extras |= {GAINS} if self.slow and not self.imposed else set()
         self.fitted = self._fitted_axes()
-        # In a free swing alone, what tilts the vehicle at rest acts as a sensor that was mounted askew.
+        # In free swings alone, a static tilt of the vehicle is equivalent to a misaligned sensor.
         self.biases = [a for a in axes if a != "heave" and (a not in self.free or a in SWINGING and driven)]
         self.weak_start = self._weak_start()
 
@@ -131,7 +133,7 @@ class Stages:
         return {axis: sum(axis in one for one in self.excites) for axis in self.axes}
 
     def require_shown(self) -> None:
-        """Refuse a published number that is not of what is fitted.
+        """Refuse a published number that does not concern the fit.
 
         Raises:
             CalibrationError: Surge is not fitted, or the thrust is known.
@@ -152,15 +154,16 @@ class Stages:
             )
 
     def _fitted_axes(self) -> list[list[str]]:
-        """Return the axes of each trial whose motion is simulated and compared; the others move as they were seen to.
+        """Return the axes of each trial whose motion is simulated and compared; the others follow their
+        measured motion.
 
-        A surge, sway or yaw that a trial does not excite comes from couplings and disturbances. Where the centre of
-        gravity is not free the model lacks these: compared, it would determine the added mass of other axes through
-        their Coriolis moments. Where it is only noise it stays, for it keeps the initial state in place. So do heave,
-        roll and pitch: weight acts on them in every trial. In slow logs with a free centre of gravity all stay: it
-        shows in what a push along one axis does to the others, and as an imposed motion their noise would shake roll
-        and pitch. A fast log averages that noise, and what its thrusters do to other axes, being unequal, would be
-        taken for a bias.
+        Motion in surge, sway or yaw that a trial does not excite is caused by couplings and disturbances. If
+        the centre of gravity is not free, the model lacks these: if compared, they would determine the added
+        mass of other axes through their Coriolis moments. An axis with noise only stays, since it constrains
+        the initial state. So do heave, roll and pitch: hydrostatic forces act on them in every trial. In slow
+        logs with a free centre of gravity all axes stay: it is identifiable from the effect of a push along
+        one axis on the others, and the noise of an imposed motion would excite roll and pitch. A fast log
+        averages that noise, and effects of unequal thrusters on other axes would be attributed to a bias.
         """
         if self.slow:
             return [list(self.axes) for _ in self.prepared]
@@ -172,17 +175,17 @@ class Stages:
         return out
 
     def _free_axes(self) -> tuple[str, ...]:
-        """Return the axes that move only in trials without thrust, which show ratios alone."""
+        """Return the axes that move only in trials without thrust, which determine only ratios."""
         trials = zip(self.prepared, self.excites, strict=True)
         driven = set[str]().union(*(moved for one, moved in trials if one.drive.source != "passive"))
         moving = set[str]().union(*(one.released for one in self.prepared))
         return tuple(a for a in self.axes if a in moving - driven)
 
     def _assumed(self, swinging: Sequence[str]) -> tuple[dict[str, float], dict[str, str]]:
-        """Return effective inertias that are not fitted [kg, kg m²], and what the numbers of an axis rest on.
+        """Return effective inertias that are not fitted [kg, kg m²], and the basis of an axis' numbers.
 
-        Where the weight rights the vehicle, the file's stiffness gives the scale of a free motion, elsewhere the file's
-        inertia does, unless an inertia is given.
+        For axes with a restoring moment, the file's stiffness determines the scale of a free motion, for
+        others the file's inertia, unless an inertia is given.
         """
         plant = matrices(self.vehicle)
         k = float(plant.arm[2])
@@ -200,10 +203,10 @@ class Stages:
         return held, notes
 
     def _weak_start(self) -> dict[str, float]:
-        """Return the numbers of the weak form, and cut the trials where it finds a jolt.
+        """Return the numbers of the weak form, and cut the trials where it detects a jolt.
 
-        A vehicle with fins or other actuators has none, because the weak form leaves out their forces: fits of a
-        torpedo that began with its numbers often ended at a wrong minimum.
+        For a vehicle with fins or other actuators there are none, since the weak form omits their forces:
+        fits of a torpedo that started from its numbers often ended in a wrong minimum.
         """
         if self.vehicle.actuators:
             return {}
@@ -232,7 +235,7 @@ class Stages:
         return start
 
     def rough(self, kinds: dict[str, str], starts: Sequence[Mapping[str, float]]) -> Stage:
-        """Fit short segments from the best of several starts, without regard to outliers and clocks.
+        """Fit short segments from the best of several starts, ignoring outliers and clock offsets.
 
         Starts have the units of the coordinates.
         """
@@ -250,7 +253,7 @@ class Stages:
         return Stage(problem, rough, confidence(problem, rough))
 
     def thin_out(self) -> None:
-        """Keep the segments of each trial in which the inputs change most, about `ENOUGH` of all."""
+        """Keep the segments of each trial in which the inputs change most, about `ENOUGH` in total."""
         part = min(1.0, ENOUGH / sum(s.duration for s in self.segments))
         kept = list[Segment]()
         for g in range(len(self.used)):
@@ -260,7 +263,7 @@ class Stages:
         self.segments = kept
 
     def refuse_divergence(self, solution: FitSolution) -> None:
-        """Raise a `CalibrationError` if the simulation has no finite answer."""
+        """Raise a `CalibrationError` if the simulation has diverged."""
         if not np.isfinite(solution.cost):
             raise CalibrationError(
                 f"the simulation diverges within segments of {self.length:.3g} s: give a vehicle file with better "
@@ -268,9 +271,9 @@ class Stages:
             )
 
     def first(self, kinds: dict[str, str], start: Mapping[str, float]) -> Stage:
-        """Fit segments of the length that the numbers of a start call for.
+        """Fit segments of a length that suits the numbers of a start.
 
-        If the simulation with them diverges, the fit begins with the vehicle file's numbers instead.
+        If the simulation with them diverges, the fit starts from the vehicle file's numbers instead.
         """
         p = self.parameters(kinds, start)
         self.cut(
@@ -295,14 +298,14 @@ class Stages:
         ended = stage.solution.converged or stage.solution.interrupted
         if ended or self.given or not self.shorter or not long:
             return stage
-        # Where some trials grow so fast that they were cut shorter, the others may do so on the way to the solution.
+        # If some trials grow so fast that they were cut shorter, others may do so during the iteration.
         self.shorter |= dict.fromkeys(long, least)
         self.cut(self.length)
         problem = self.problem(kinds, start)
         return self.finish(problem, problem.start(), 0.6)
 
     def finish(self, problem: Shooting, point: Point, toward: float) -> Stage:
-        """Fit with robust weights and clocks let go, after a first approach without."""
+        """Fit with robust weights and free clocks, after a first approximation without."""
         report = self.report("fit", toward)
         problem.hold_clocks(True)
         rough = solve(problem, point, iterations=6, std=problem.size(), rough=True, report=report)
@@ -314,7 +317,7 @@ class Stages:
         return Stage(problem, solution, confidence(problem, solution))
 
     def shapes(self, stage: Stage) -> dict[str, DragShape]:
-        """Return what the trials show of the drag of each axis, over its shapes."""
+        """Return the drag of each axis, averaged over its models."""
         problem, motions, out = stage.problem, [s.motion for s in self.used], dict[str, DragShape]()
         for axis in self.axes:
             low, top = speeds(motions, axis)
@@ -324,11 +327,12 @@ class Stages:
         return out
 
     def report(self, words: str, toward: float) -> Callable[[int, float], None]:
-        """Return a function that reports an iteration and its residual; `toward` is the share of the work done then."""
+        """Return a function that reports an iteration and its residual; `toward` is the completed fraction of
+        the work then."""
         return lambda i, rms: self.say(f"{words}: iteration {i}, residual {rms:.4g} σ", toward)
 
     def cut(self, length: float) -> None:
-        """Cut the trials into segments of about a length [s]."""
+        """Cut the trials into segments of about this length [s]."""
         shown = {column for axis in self.axes for column in DETERMINED_BY[axis]}
         aside = [
             frozenset(c for axis in {"surge", "sway", "yaw"} - moved for c in DETERMINED_BY[axis])
@@ -354,9 +358,9 @@ class Stages:
         return self.shorter.get(one.trial.name, 1.0)
 
     def parameters(self, kinds: dict[str, str], start: Mapping[str, float]) -> Parameters:
-        """Return the free parameters for a choice of damping, from a start.
+        """Return the free parameters for given damping models and initial values.
 
-        The start has the units of the coordinates.
+        The initial values have the units of the coordinates.
         """
         return Parameters(
             self.vehicle, axes=self.axes, damping=kinds, extras=tuple(self.extras), biases=self.biases, start=start,
@@ -368,10 +372,10 @@ class Stages:
     ) -> Shooting:
         """Return the problem of the free parameters, over the segments or over other, driven ones.
 
-        The start has the units of the coordinates.
+        The initial values have the units of the coordinates.
         """
         swinging = np.array([not other and bool(self.used[s.index].released) for s in other or self.segments])
-        # If every input is stated to have acted, a request for a lag doubts that.
+        # If every input is stated to have been applied, a requested lag contradicts that.
         acted = not any(s.drive.commanded for s in self.segments)
         return Shooting(
             other or self.segments,

@@ -1,13 +1,4 @@
-"""Synthetic trials: programmes run in the simulator, measured with noise, logged as a robot would log them.
-
-Time stamps. Row k of a trial at `rate` has time t_k = k / rate and holds
-
-- the state at t_k: velocity of the body origin, attitude, position, angular rate, and what an accelerometer at the
-  IMU's place reads at t_k (later by the sensor's latency where the vehicle's own sensors measure);
-- commands that are held over [t_k, t_k + 1/rate);
-- applied inputs (`rpm_*`, `force_*`, `tau_*`, `actuator_*`) at t_k, as telemetry gives them (motors lag, so they are
-  continuous).
-"""
+"""Synthetic trials: programmes run in the simulator, measured with noise, logged as by a robot."""
 
 from __future__ import annotations
 
@@ -44,7 +35,7 @@ __all__ = ["NoiseProfile", "Recording", "record", "simulate_programme", "trials_
 Array = NDArray[np.float64]
 
 STEP = 0.005
-"""Physics step and time between recorded states [s]."""
+"""Physics step and interval between recorded states [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +43,7 @@ class Recording:
     """True motion of some worlds, one programme each, by (step, world)."""
 
     step: float
-    """Between states [s]."""
+    """Interval between states [s]."""
     position: NDArray[np.float32]
     """Body origin, world frame [m], (n, W, 3)."""
     quaternion: NDArray[np.float32]
@@ -62,8 +53,8 @@ class Recording:
     acceleration: NDArray[np.float32]
     """nu_dot [m/s², rad/s²], (n, W, 6)."""
     thrust: NDArray[np.float32]
-    """Thrust that the vehicle file gives for the propellers' speeds, before a plant's `gain` [N], and the values of the
-    other actuators, by channel, (n, W, k)."""
+    """Thrust according to the vehicle file at the propellers' speeds, before a plant's `gain` [N], and the
+    values of the other actuators, by channel, (n, W, k)."""
     command: NDArray[np.float32]
     """Command of each channel from this state on: thrust [N], others in their unit, (n, W, k)."""
 
@@ -83,24 +74,25 @@ def record(
     spread: float = 1.0,
     each_step: Callable[[Simulator], None] | None = None,
 ) -> Recording:
-    """The motion that programmes cause, each in a world of one simulator, through motors and allocation.
+    """Simulate the motion that programmes cause, each in one world of a simulator, through motors and allocation.
 
     Args:
-        programmes: What to run, W of them.
+        programmes: Programmes to run, W of them.
         vehicle: The vehicle; its thrusters are commanded by the allocator of `finssim.control.allocation`.
-        seed: Of the initial conditions.
+        seed: Seed of the initial conditions.
         hydrodynamics: Key of the vehicle's hydrodynamic sets.
-        plant: Where the real plant differs from the file: field of `VehicleParameters` -> value in its unit, or one for
-            each world.
-        disturbance: Extra wrench about the body origin, body frame [N, N m], (6,) or (W, 6).
+        plant: Differences of the real plant from the file: field of `VehicleParameters` -> value in its unit,
+            or one for each world.
+        disturbance: Additional wrench about the body origin, body frame [N, N m], (6,) or (W, 6).
         water: Currents and waves; still water if None.
-        tether: None if None.
-        depth: Of the body origin at the start [m].
-        speed: Mean surge at the start [m/s], one number or (W,).
-        spread: Scales the scatter of the initial conditions around that, level and without another velocity: at 1,
+        tether: Tether of the vehicle; none if None.
+        depth: Initial depth of the body origin [m].
+        speed: Mean initial surge velocity [m/s], one number or (W,).
+        spread: Scale of the scatter of the initial conditions around level attitude and zero other velocities: at 1,
             standard deviations of 0.02 m/s, 0.02 rad/s, 0.01 rad of roll and pitch, and any heading.
-        each_step: Called before every step, for what the engine does not have: it may read the simulator's state and
-            write `command.thrust`, `command.disturbance` or plant fields that nothing is derived from, such as `gain`.
+        each_step: Function that is called before every step, for effects that the engine lacks: it may read
+            the simulator's state and write `command.thrust`, `command.disturbance` or plant fields from which
+            nothing is derived, such as `gain`.
 
     Raises:
         CalibrationError: There is no programme, a field of the plant is unknown, or the motion did not stay finite.
@@ -144,7 +136,7 @@ def record(
     if len(simulator.frozen_worlds()):
         first = programmes[int(simulator.frozen_worlds()[0])].name
         raise CalibrationError(f"{first}: the motion did not stay finite; give lower levels")
-    # There is no acceleration before the first step; the one right after it is that of the start.
+    # There is no acceleration before the first step; that of the start is the first one after it.
     states["acceleration"][0] = states["acceleration"][1]
     nominal = _nominal_thrust(states.pop("actuator"), vehicle, bool(simulator.plant.speed_lag.numpy().any()))
     told[-1] = told[-2]
@@ -157,7 +149,7 @@ def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> f
 
 
 def _override(simulator: Simulator, plant: Mapping[str, ArrayLike]) -> None:
-    """Write fields of the plant and refresh what follows from them."""
+    """Write fields of the plant and update the fields derived from them."""
     for name, value in plant.items():
         if name not in simulator.plant.fields or name in DERIVED:
             available = ", ".join(f for f in simulator.plant.fields if f not in DERIVED)
@@ -187,7 +179,8 @@ def _start(simulator: Simulator, depth: float, speed: ArrayLike, spread: float, 
 
 
 def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.float32]:
-    """Thrusts by (row, world, thruster) [N] that the speed controllers give, zero after the end of a programme."""
+    """Return thrusts by (row, world, thruster) [N] as produced by the speed controllers, zero after the end
+    of a programme."""
     allocator = Allocator.from_vehicle(vehicle)
     length = max(len(p.phase) for p in programmes)
     tau = np.zeros((length, len(programmes), 6))
@@ -195,24 +188,25 @@ def _commands(programmes: Sequence[Programme], vehicle: Vehicle) -> NDArray[np.f
         tau[: len(programme.phase), w] = programme.tau_desired
     distinct, index = np.unique(tau.reshape(-1, 6), axis=0, return_inverse=True)
     thrust = allocator.allocate(distinct)
-    # The allocator leaves dust of its rounding where nothing is wanted.
+    # The allocator leaves rounding errors where the requested wrench is zero.
     thrust[~distinct.any(axis=1)] = 0.0
     for k, thruster in enumerate(vehicle.thrusters.values()):
-        if thruster.esc is not None:  # which does not turn the shaft slowly
+        if thruster.esc is not None:  # the controller cannot turn the shaft slowly
             pulse = thruster.pulse(thruster.speed(thrust[:, k]))
             thrust[:, k] = thruster.thrust(thruster.shaft_speed(pulse))
     return np.asarray(thrust[index.ravel()].reshape(length, len(programmes), -1), dtype=np.float32)
 
 
 def _nominal_thrust(actuator: NDArray[np.float32], vehicle: Vehicle, speeds: bool) -> NDArray[np.float32]:
-    """Thrusts from what lags in the simulator: forces already, or shaft speeds; other actuators as they are."""
+    """Return thrusts from the lagged quantity in the simulator, force or shaft speed; other actuators are
+    unchanged."""
     out = actuator.copy()
     for k, thruster in enumerate(vehicle.thrusters.values() if speeds else ()):
         out[..., k] = thruster.thrust(actuator[..., k])
     return out
 
 
-# What sensors make of a true motion: noise profiles for synthetic trials.
+# Measurement of a true motion: noise profiles for synthetic trials.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,13 +214,13 @@ class NoiseProfile:
     """Errors of the measurements of a trial; standard deviations are per logged sample."""
 
     own_sensors: bool = False
-    """IMU and depth as the vehicle file's sensors give them: rate, noise, bias, quantisation, latency, dropout."""
+    """True to use the vehicle file's IMU and depth sensor: rate, noise, bias, quantisation, latency, dropout."""
     velocity_std: float = 0.0
-    """Standard deviation of u, v, w from outside [m/s]."""
+    """Standard deviation of externally measured u, v, w [m/s]."""
     attitude_std: float = 0.0
     """Standard deviation of roll and pitch [rad]."""
     yaw_std: float = 0.0
-    """[rad]"""
+    """Standard deviation of the yaw [rad]."""
     position_std: float = 0.0
     """Standard deviation of x, y, z [m]."""
     depth_std: float = 0.0
@@ -236,8 +230,8 @@ class NoiseProfile:
     accel_std: float = 0.0
     """Standard deviation of the accelerometer, if the vehicle's own IMU is not used [m/s²]."""
     velocity_window: float | None = None
-    """u, v, w come from measured position, depth and attitude by local parabolas over this time [s], as an offline
-    smoother makes them; `velocity_std` is then not used."""
+    """Window of local parabolas by which u, v, w are computed from measured position, depth and attitude [s],
+    as by an offline smoother; `velocity_std` is then unused."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -261,8 +255,8 @@ NOISE_PROFILES: dict[str, NoiseProfile] = {
         velocity_window=1.0,
     ),
 }
-"""`sensors`: the vehicle's own IMU and pressure sensor, and a velocity from outside of 1 cm/s; `published`: the fusion
-settings that FinsROV's software was published with, which are larger than any noise; `none`: the truth."""
+"""`sensors`: the vehicle's own IMU and pressure sensor, and an external velocity of 1 cm/s; `published`: the fusion
+settings that FinsROV's software was published with, which exceed any actual noise; `none`: the truth."""
 
 
 class _Recorded:
@@ -282,7 +276,7 @@ class _Recorded:
         self._clock = self.steps.numpy()
 
     def show(self, step: int) -> None:
-        """Put the state of one step there."""
+        """Copy the state of one step to the arrays."""
         for view, values in self._views:
             view[...] = values[step]
         self._clock[...] = step
@@ -291,14 +285,14 @@ class _Recorded:
 def measure(
     recording: Recording, vehicle: Vehicle, noise: NoiseProfile, *, every: int, seed: int
 ) -> dict[str, Array]:
-    """Measured columns of all worlds of a recording at every `every`-th step.
+    """Return measured columns of all worlds of a recording at every `every`-th step.
 
     Args:
         recording: The true motion.
-        vehicle: Whose sensors measure.
-        noise: Errors.
-        every: Steps between rows.
-        seed: Of all errors.
+        vehicle: Vehicle with the sensors.
+        noise: Errors of the measurements.
+        every: Number of steps between rows.
+        seed: Seed of all errors.
 
     Returns:
         Canonical column -> values in the unit of the column (rows, worlds); NaN where a sensor had no new sample.
@@ -351,7 +345,7 @@ def _sensor_channels(
     gyro, accel = np.full((rows, worlds, 3), np.nan), np.full((rows, worlds, 3), np.nan)
     depth = np.full((rows, worlds), np.nan)
     readings: list[tuple[Array, Array, Array]] = []
-    """Which worlds have a new sample, the samples, and the rows that take them."""
+    """Return which worlds have a new sample, the samples, and the rows that receive them."""
     if (imu := suite.imu) is not None:
         readings += [
             (imu.fresh.numpy(), imu.gyro.numpy(), gyro),
@@ -379,7 +373,7 @@ def _sensor_channels(
 
 
 def _specific_force(recording: Recording, vehicle: Vehicle, every: int) -> Array:
-    """Return the reading of an ideal accelerometer at the IMU's place, body axes [m/s²]."""
+    """Return the reading of an ideal accelerometer at the IMU's position, body axes [m/s²]."""
     nu, nu_dot = recording.velocity[::every].astype(float), recording.acceleration[::every].astype(float)
     q = recording.quaternion[::every].astype(float)
     imu = vehicle.sensors.imu
@@ -392,13 +386,13 @@ def _specific_force(recording: Recording, vehicle: Vehicle, every: int) -> Array
 
 
 def _from_position(x: Array, q: Array, window: float, interval: float) -> Array:
-    """Body velocity from measured positions and attitudes by local parabolas over a window [m/s]."""
+    """Return the body velocity from measured positions and attitudes by local parabolas over a window [m/s]."""
     from scipy.signal import savgol_filter
 
     n = max(3, 2 * round(0.5 * window / interval) + 1)
     n = min(n, len(x) - 1 + len(x) % 2)
     v = savgol_filter(x, n, 2, deriv=1, delta=interval, axis=0, mode="interp")
-    # q and -q are one attitude: choose signs so that the numbers do not jump, also after a full turn.
+    # q and -q are the same attitude: choose signs so that the numbers are continuous, also after a full turn.
     jump = np.where(np.sum(q[1:] * q[:-1], axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
     q = np.concatenate([q[:1], q[1:] * np.cumprod(jump, axis=0)])
     smooth = savgol_filter(q, n, 2, axis=0, mode="interp")
@@ -418,17 +412,17 @@ Input = Literal["rpm", "force", "wrench", "pwm", "command"]
 def simulate_programme(
     programmes: Sequence[Programme], vehicle: Vehicle, *, seed: int = 0, **options: Any
 ) -> list[Trial]:
-    """Trials of a vehicle, one for each programme: `record` and then `trials_of`.
+    """Return trials of a vehicle, one for each programme: `record` followed by `trials_of`.
 
     Args:
-        programmes: What to run.
-        vehicle: The vehicle, whose file says what it believes of itself.
-        seed: Of initial conditions and noise; equal seeds give equal trials.
+        programmes: Programmes to run.
+        vehicle: The vehicle, as its file describes it.
+        seed: Seed of initial conditions and noise; equal seeds give equal trials.
         options: Arguments of `trials_of` (noise, rate, columns, inputs) and of `record` (hydrodynamics,
             plant, disturbance, water, tether, depth, speed, spread).
 
     Raises:
-        CalibrationError: An argument that cannot be.
+        CalibrationError: An argument is invalid.
     """
     measured = {name: options.pop(name) for name in MEASURED & options.keys()}
     recording = record(programmes, vehicle, seed=seed, **options)
@@ -438,7 +432,7 @@ def simulate_programme(
 
 
 MEASURED = {"noise", "rate", "columns", "inputs"}
-"""Arguments of `simulate_programme` that say how the motion is measured."""
+"""Arguments of `simulate_programme` that specify the measurement of the motion."""
 
 
 def trials_of(
@@ -453,23 +447,23 @@ def trials_of(
     inputs: Sequence[Input] = ("rpm", "wrench"),
     current: tuple[float, float, float] | None = None,
 ) -> list[Trial]:
-    """Trials that measure a recording.
+    """Return trials that measure a recording.
 
-    Calling it again with another seed gives the same motion with other noise.
+    Another call with another seed returns the same motion with other noise.
 
     Args:
         recording: The true motion.
-        programmes: What was run.
-        vehicle: Whose sensors measure.
-        noise: A profile or the name of one.
-        seed: Of the noise.
-        rate: Of the rows [Hz].
+        programmes: Programmes that were run.
+        vehicle: Vehicle with the sensors.
+        noise: Noise profile or its name.
+        seed: Seed of the noise.
+        rate: Rate of the rows [Hz].
         columns: Measured columns to log; `DEFAULT_COLUMNS` if None.
-        inputs: Which inputs to log.
-        current: What the header says of the water's velocity, world frame [m/s].
+        inputs: Inputs to log.
+        current: Water velocity in the header, world frame [m/s].
 
     Raises:
-        CalibrationError: A rate, column, input or profile that cannot be.
+        CalibrationError: A rate, column, input or profile is invalid.
     """
     if isinstance(noise, str) and noise not in NOISE_PROFILES:
         raise CalibrationError(f"unknown noise '{noise}'; available: {', '.join(NOISE_PROFILES)}")
@@ -514,7 +508,7 @@ def trials_of(
 
 
 def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every: int) -> dict[str, Array]:
-    """Input columns, (rows, W) each."""
+    """Return the input columns, (rows, W) each."""
     for name in inputs:
         if name not in get_args(Input):
             raise CalibrationError(f"unknown input '{name}'; available: {', '.join(get_args(Input))}")
@@ -543,7 +537,7 @@ def _inputs(recording: Recording, vehicle: Vehicle, inputs: Sequence[str], every
 
 
 def _end(programme: Programme, recording: Recording, world: int) -> float:
-    """When the trial ends [s]: with the programme, or with the part of the coast that shows a steady ascent."""
+    """Return the end of the trial [s]: that of the programme, or of the part of the coast with a steady ascent."""
     if programme.ascent_speed is None:
         return programme.duration
     t = np.arange(len(recording.position)) * recording.step

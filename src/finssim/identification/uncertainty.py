@@ -1,8 +1,8 @@
-"""Uncertainty of estimates: the evidence of every trial, and the agreement of the trials.
+"""Uncertainty of estimates: the evidence of every trial, and the agreement between trials.
 
-Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
-matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. Nothing else
-is needed.
+Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the
+    normal matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ
+    s_g = 0. No other data is needed.
 """
 
 from __future__ import annotations
@@ -36,53 +36,54 @@ FLOOR = 1e-13
 """Eigenvalue of the scaled normal matrix (unit diagonal) below which a direction counts as unknown."""
 
 FAINT = 0.05
-"""Share of the information on a direction, times the number of trials, below which a trial shows nothing of it."""
+"""Fraction of the information on a direction, times the number of trials, below which a trial does not
+contribute to it."""
 
 ALONE = 0.9
-"""Share of the information on a parameter above which it rests on one trial."""
+"""Fraction of the information on a parameter above which it is determined by one trial alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Evidence of each trial on the parameters, linearised at the solution."""
+    """Evidence of each trial for the parameters, linearised at the solution."""
 
     names: tuple[str, ...]
-    """(P,)"""
+    """Names of the parameters, (P,)."""
     normal: Array
     """N_g with W the inverse variance of the residuals, per product of the units of theta, (G, P, P)."""
     score: Array
-    """s_g per unit of theta, (G, P); they add up to zero where no bound is active."""
+    """s_g per unit of theta, (G, P); they sum to zero if no bound is active."""
     unit: str = "trials"
     """Unit of the groups: `trials`, or `blocks` of consecutive samples if there are too few trials."""
     prior: Array | None = None
-    """Inverse covariance of what was known before any trial, per product of the units of theta, (P, P); None
-    without."""
+    """Inverse covariance of the prior, per product of the units of theta, (P, P); None without a prior."""
 
     @property
     def information(self) -> Array:
-        """Σ_g N_g and the prior's, (P, P). It is per product of the units of theta."""
+        """Information Σ_g N_g plus that of the prior, (P, P), per product of the units of theta."""
         total = np.asarray(self.normal, float).sum(axis=0)
         return total if self.prior is None else total + self.prior
 
 
 @dataclass(frozen=True, kw_only=True)
 class Covariance:
-    """Two answers to one question; where they differ much, the model or the noise is not as assumed."""
+    """Two estimates of the covariance; if they differ strongly, the assumptions about model or noise are wrong."""
 
     names: tuple[str, ...]
     local: Array
-    """Inverse information Σ_g N_g: errors independent and of the stated variance, in the units of theta, (P, P)."""
+    """Inverse information (Σ_g N_g)⁻¹: for independent errors of the stated variance, in the units of theta,
+    (P, P)."""
     trials: Array
-    """Covariance from the disagreement of the trials in the units of theta, (P, P): valid for any noise within a
-    trial."""
+    """Covariance from the disagreement between trials in the units of theta, (P, P): valid for any noise
+    within a trial."""
     dof: Array
-    """Degrees of freedom [-] of each variance in `trials`, (P,); infinite where `local` has to serve."""
+    """Degrees of freedom [-] of each variance in `trials`, (P,); infinite if `local` is used instead."""
     alone: NDArray[np.bool_]
-    """True if a parameter rests on one trial, so that no disagreement can show, (P,)."""
+    """True if a parameter is determined by one trial alone, so that no disagreement can be observed, (P,)."""
 
     @property
     def std(self) -> Array:
-        """Standard errors, (P,): from the trials, from `local` for what rests on one trial.
+        """Standard errors, (P,): from the trials, or from `local` for parameters determined by one trial alone.
 
         They have the units of theta.
         """
@@ -91,11 +92,10 @@ class Covariance:
 
 
 def _whitener(normal: Array) -> tuple[Array, Array]:
-    """T (P, K) with Tᵀ N T = 1 on the K known directions, and the parameters that touch unknown ones, (P,) bool."""
+    """Return T (P, K) with Tᵀ N T = 1 on the K known directions, and a mask of the parameters affected by
+    unknown ones, (P,)."""
     if not np.isfinite(normal).all():
-        raise CalibrationError(
-            "the trials hold numbers that cannot be computed with: check the units of their columns"
-        )
+        raise CalibrationError("the trials contain numbers that overflow: check the units of their columns")
     scale = np.sqrt(np.maximum(np.diagonal(normal), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(normal / np.outer(safe, safe))
@@ -106,21 +106,22 @@ def _whitener(normal: Array) -> tuple[Array, Array]:
 
 
 def trial_covariance(evidence: Evidence) -> Covariance:
-    """Local and trial-based covariance of the estimates.
+    """Return the local and the trial-based covariance of the estimates.
 
     V = N⁻¹ [Σ_g A_g s_g s_gᵀ A_gᵀ + N_0] N⁻¹,  A_g = (1 - N_g N⁻¹)⁻¹           (CR3; Bell and McCaffrey 2002)
 
     with N = Σ_g N_g + N_0 and the information N_0 of a prior, whose variance is taken as stated.
 
-    N⁻¹ A_g s_g is what leaving trial g out changes: V is the jackknife over trials. The power -½ would be exact for
-    independent errors, and too small where few trials with much weight differ as a whole, as they do. The degrees of
-    freedom are Satterthwaite's for independent errors, so that few or unequal trials give wide intervals.
+    N⁻¹ A_g s_g is the change when trial g is left out: V is the jackknife over trials. The power -½ would be
+    exact for independent errors, but too small if a few trials with large weight differ systematically, as
+    they do. The degrees of freedom are Satterthwaite's for independent errors, so that few or unequal trials
+    result in wide intervals.
 
     Args:
-        evidence: Contributions of G trials; with one, `local` has to serve for all.
+        evidence: Contributions of G trials; with one trial, `local` is used for all parameters.
 
     Returns:
-        Infinite variances where the information matrix is singular.
+        The covariance; variances are infinite where the information matrix is singular.
     """
     N_g, s_g = np.asarray(evidence.normal, float), np.asarray(evidence.score, float)
     P = len(evidence.names)
@@ -135,7 +136,7 @@ def trial_covariance(evidence: Evidence) -> Covariance:
             dof=np.full(P, np.inf),
             alone=np.ones(P, bool),
         )
-    B = T.T @ N_g @ T  # leverage of each trial: the shares of the information, they add up to 1
+    B = T.T @ N_g @ T  # leverage of each trial: the fractions of the information, which sum to 1
     share, axes = np.linalg.eigh(B)
     remaining = 1.0 - np.clip(share, 0.0, 1.0)
     root = np.where(remaining > 1e-3, 1.0 / np.maximum(remaining, 1e-3), 0.0)
@@ -153,11 +154,11 @@ def trial_covariance(evidence: Evidence) -> Covariance:
     index = np.arange(len(N_g))
     gram[:, index, index] += np.einsum("gpk,gpk->pg", a, Ba)
     trace = np.trace(gram, axis1=1, axis2=2)
-    # In units of the largest entry: squares of the variance of a parameter that is hardly known would overflow.
+    # In units of the largest entry: squares of the variance of a nearly undetermined parameter would overflow.
     unit = gram / np.maximum(np.abs(gram).max(axis=(1, 2), keepdims=True), 1e-300)
     square = np.einsum("pgh,pgh->p", unit, unit)
     dof = np.where(square > 0.0, np.trace(unit, axis1=1, axis2=2) ** 2 / np.maximum(square, 1e-300), 1.0)
-    # A stated variance has infinitely many degrees of freedom; Satterthwaite's sum of both.
+    # A stated variance has infinitely many degrees of freedom; Satterthwaite's formula for the sum of both.
     mixed = (1.0 + np.minimum(np.diagonal(stated) / np.maximum(trace, 1e-300), 1e6)) ** 2
 
     variance = np.maximum(np.diagonal(T @ T.T), 1e-300)
@@ -173,12 +174,12 @@ def trial_covariance(evidence: Evidence) -> Covariance:
 
 
 def pooled_covariance(evidence: Evidence) -> Covariance:
-    """Return the covariance of the estimates with one factor on all of it, from the disagreement of all trials on all
-    parameters together.
+    """Return the covariance of the estimates scaled by one common factor, from the disagreement of all trials
+    on all parameters.
 
     V = max(1, Q / ν) N⁻¹,  Q = Σ_g s_gᵀ N_g⁺ s_g,  with ν the expectation of Q for independent errors.
 
-    A few equal trials tell one scatter far better than a variance for each parameter.
+    A few equal trials determine one common scatter far better than a variance for each parameter.
 
     Args:
         evidence: Contributions of G trials, at least 2.
@@ -200,7 +201,7 @@ def pooled_covariance(evidence: Evidence) -> Covariance:
 
 
 def _scatter(evidence: Evidence, T: Array) -> tuple[float, float]:
-    """Return Q of `pooled_covariance` and its expectation ν for independent errors, under a whitener, (P, n)."""
+    """Return Q of `pooled_covariance` and its expectation ν for independent errors, for a whitener, (P, n)."""
     q = dof = 0.0
     for normal, score in zip(evidence.normal, evidence.score, strict=True):
         values, axes = np.linalg.eigh(T.T @ normal @ T)
@@ -213,7 +214,7 @@ def _scatter(evidence: Evidence, T: Array) -> tuple[float, float]:
 def releases_disagree(evidence: Evidence) -> bool:
     """Return whether releases differ by more than their noise: Q of `pooled_covariance` beyond 95 % of χ²(ν).
 
-    Blocks of too few trials cannot show that they agree.
+    With blocks of too few trials, agreement cannot be established: the result is True.
     """
     from scipy.stats import chi2
 
@@ -222,31 +223,31 @@ def releases_disagree(evidence: Evidence) -> bool:
 
 
 def intervals(theta: Array, covariance: Covariance) -> Array:
-    """Student's 95 % intervals of the estimates.
+    """Return Student's 95 % intervals of the estimates.
 
     Args:
         theta: Estimates in their units, (P,).
-        covariance: Theirs.
+        covariance: Covariance of the estimates.
 
     Returns:
-        Lower and upper ends in the units of theta, (P, 2); infinite where nothing is known.
+        Lower and upper ends in the units of theta, (P, 2); infinite for unknown parameters.
     """
     from scipy.stats import norm, t
 
     finite = np.isfinite(covariance.dof)
     quantile = np.where(finite, t.ppf(0.975, np.where(finite, covariance.dof, 1.0)), norm.ppf(0.975))
-    # Few trials may agree by chance: no interval is narrower than independent errors make it.
+    # Few trials may agree by chance: no interval is narrower than that for independent errors.
     half = np.maximum(quantile * covariance.std, norm.ppf(0.975) * np.sqrt(np.diagonal(covariance.local)))
     return np.stack([theta - half, theta + half], axis=-1)
 
 
 def correlated_samples(residual: Array, breaks: Sequence[int] = ()) -> float:
-    """Return the number of samples per independent one: 1 + 2 Σ ρ_k up to the first pair with negative sum (Geyer
-    1992).
+    """Return the number of samples per independent one: 1 + 2 Σ ρ_k up to the first pair with negative sum
+    (Geyer 1992).
 
     Args:
-        residual: Equally spaced, in any unit, (n,).
-        breaks: Indices at which a new stretch begins; no product runs across.
+        residual: Equally spaced residuals, in any unit, (n,).
+        breaks: Indices at which a new segment starts; no product crosses them.
 
     Returns:
         The number of samples, at least 1.
@@ -269,15 +270,15 @@ TIGHT = 0.98
 LOOSE = 0.1
 """Relative standard error below which a trade-off does not matter."""
 EXACT = 0.9999
-"""Multiple correlation above which parameters trade off however well they seem to be known: a fit may move them far
-along their common direction, and their errors are then small beside their values [-]."""
+"""Multiple correlation above which parameters trade off however well they seem to be known: a fit may move
+them far along their common direction, so that their errors are small relative to their values [-]."""
 
 
 def correlation(names: Sequence[str], covariance: Array) -> Correlation:
-    """Correlation of the errors; zero for parameters without a finite variance.
+    """Return the correlation of the errors; zero for parameters without a finite variance.
 
     Args:
-        names: (P,)
+        names: Names of the parameters, (P,).
         covariance: Covariance in the units of theta, (P, P).
     """
     variance = np.diagonal(covariance)
@@ -291,19 +292,19 @@ def correlation(names: Sequence[str], covariance: Array) -> Correlation:
 def degeneracy(
     names: Sequence[str], covariance: Array, theta: Array | None = None
 ) -> tuple[Correlation, list[Finding]]:
-    """Correlation of the errors, and a finding for each group of parameters that trade off.
+    """Return the correlation of the errors, and a finding for each group of parameters that trade off.
 
-    The groups are the weak directions of the scaled information: eigenvectors of the errors' correlation with large
-    eigenvalues. A trade-off among parameters that are all known well is left out, unless it is exact.
+    The groups are the weak directions of the scaled information: eigenvectors of the errors' correlation with
+    large eigenvalues. A trade-off among well-known parameters is omitted, unless it is exact.
 
     Args:
-        names: (P,)
-        covariance: Covariance of the estimates in their units, best the local one, (P, P); infinite variances name
-            unknown parameters.
-        theta: Estimates, to tell which are known well; all count as loose where not given, (P,).
+        names: Names of the parameters, (P,).
+        covariance: Covariance of the estimates in their units, preferably the local one, (P, P); infinite
+            variances mark unknown parameters.
+        theta: Estimates, from which well-known ones are identified; all count as loose if None, (P,).
 
     Returns:
-        Correlation, and what trades off and what would settle it.
+        Correlation, and findings with the trade-offs and their remedies.
     """
     correlations = correlation(names, covariance)
     variance = np.diagonal(covariance)
@@ -354,13 +355,13 @@ def _traded(group: list[str], ratio: float) -> Finding:
 def arrow_evidence(
     blocks: Sequence[Block], names: tuple[str, ...], unit: str, groups: int | None = None
 ) -> Evidence:
-    """Return the evidence of each group on the shared unknowns without its own.
+    """Return the evidence of each group for the shared unknowns, after elimination of its own.
 
     Args:
-        blocks: At the solution.
-        names: Of the shared unknowns.
-        unit: What a group is.
-        groups: Join consecutive blocks into that many; None keeps each for itself.
+        blocks: Normal equations at the solution.
+        names: Names of the shared unknowns.
+        unit: Kind of the groups.
+        groups: Number of groups of consecutive blocks; None keeps each block separate.
     """
     normal, score, _ = zip(*(eliminated(block, 0.0) for block in blocks), strict=True)
     parts = np.array_split(np.arange(len(blocks)), min(groups or len(blocks), len(blocks)))

@@ -1,4 +1,5 @@
-"""A calibration as files: the vehicle with a fit's changes, origins and comments, and ranges to draw from."""
+"""Calibration results as files: the vehicle with a fit's changes, origins and comments, and ranges for
+randomisation."""
 
 from __future__ import annotations
 
@@ -42,12 +43,12 @@ Key = tuple[str, ...]
 
 
 def file_tree(vehicle: Vehicle) -> dict[str, Any]:
-    """The values that the vehicle's file gives, with diagonal matrices by their diagonals."""
+    """Return the values in the vehicle's file, with diagonal matrices represented by their diagonals."""
     return dict(_shortened(vehicle.values()))
 
 
 def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
-    """Path and value of every number below a node of plain values. Values have the units of the file."""
+    """Yield path and value of every number below a node of plain values. Values have the units of the file."""
     if isinstance(node, Mapping):
         for key, value in node.items():
             yield from leaves(value, (*path, str(key)))
@@ -59,14 +60,14 @@ def leaves(node: Any, path: Key = ()) -> Iterator[tuple[Key, float]]:
 
 
 def number_origins(vehicle: Vehicle) -> dict[Key, Provenance]:
-    """Origin of every number of `file_tree(vehicle)`, by path; calibration records are not numbers of the vehicle."""
+    """Return the origin of every number of `file_tree(vehicle)`, by path; calibration records are not included."""
     return {path: vehicle.origin_of(".".join(full_path)) for path, full_path, _ in numbers(vehicle)}
 
 
 def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
-    """Every number of `file_tree(vehicle)`: its path there, its path in `vehicle.values()`, and its value.
+    """Yield every number of `file_tree(vehicle)`: its path there, its path in `vehicle.values()`, and its value.
 
-    The two paths differ in a diagonal matrix, where the tree has one row; calibration records are left out.
+    The two paths differ in a diagonal matrix, where the tree has one row; calibration records are omitted.
     """
     tree, values = file_tree(vehicle), vehicle.values()
     tree.pop("calibrations", None)
@@ -75,7 +76,8 @@ def numbers(vehicle: Vehicle) -> Iterator[tuple[Key, Key, float]]:
 
 
 def folded(tree: Any, origins: Mapping[Key, Provenance]) -> dict[str, Provenance]:
-    """Origins by dotted path, as reading the file gives them: one entry for a list whose numbers share theirs."""
+    """Return origins by dotted path, as on reading the file: one entry for a list whose numbers share their
+    origin."""
     folded_origins: dict[str, Provenance] = {}
     _fold(tree, (), origins, folded_origins)
     return folded_origins
@@ -84,7 +86,7 @@ def folded(tree: Any, origins: Mapping[Key, Provenance]) -> dict[str, Provenance
 def _fold(
     node: Any, path: Key, origins: Mapping[Key, Provenance], result: dict[str, Provenance]
 ) -> Provenance | None:
-    """Record what lies below; returns the common origin of a number or list, which the caller records."""
+    """Record the origins below a node; return the common origin of a number or list, which the caller records."""
     if isinstance(node, Mapping):
         for key, value in node.items():
             common = _fold(value, (*path, str(key)), origins, result)
@@ -119,26 +121,26 @@ def _at(tree: Any, path: Key) -> Any:
     return tree
 
 
-# The text of a vehicle file: sections in the catalogue's order, origins at the highest level they hold for, units.
+# Text of a vehicle file: sections in the catalogue's order, origins at the highest possible level, units.
 
 WIDTH = 118
-"""Longest line of prose."""
+"""Longest line of descriptive text."""
 LONG = 180
-"""Longest line of a section of `ONE_LINE`."""
+"""Longest line of a section of `SINGLE_LINE`."""
 
 UNITS = read_mapping(Path(__file__).with_name("units.yaml"), CalibrationError, such_as="mass: kg")
-"""Key -> unit of its value, written behind it."""
+"""Key -> unit of its value, written after it as a comment."""
 
 SINGLE_LINE = (("water",), ("hull",), ("thrusters", "*"), ("tags", "mounts", "*"), ("perception", "*"))
-"""Sections that are written on one line where they fit."""
+"""Sections that are written on one line if they fit."""
 
 
 def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> str:
-    """YAML of a vehicle file.
+    """Return the YAML text of a vehicle file.
 
     Args:
-        tree: Plain values by section; `title`, `description` and `calibrations` included.
-        origins: Origin of every number of it, by path.
+        tree: Plain values by section, including `title`, `description` and `calibrations`.
+        origins: Origin of every number in it, by path.
     """
     prose = ("title", "description", "calibrations")
     body = {key: value for key, value in tree.items() if key not in prose}
@@ -151,13 +153,13 @@ def vehicle_text(tree: Mapping[str, Any], origins: Mapping[Key, Provenance]) -> 
         lines += ["", *_lines(key, _annotated(node, (key,), common, origins), (key,), "")]
     text = "\n".join(lines) + "\n"
     if tree.get("calibrations"):
-        text += "\n# How numbers above were fitted, oldest first: trial -> SHA-256 of what it holds.\n"
+        text += "\n# Calibrations of the numbers above, oldest first: trial -> SHA-256 of its content.\n"
         text += yaml_text({"calibrations": tree["calibrations"]}, default_flow_style=False, width=math.inf)
     return text
 
 
 def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapping[Key, Provenance]) -> Any:
-    """Return a node with the marks that give the origins of its numbers to a reader who inherits one."""
+    """Return a node with the marks that state the origins of its numbers relative to an inherited one."""
     if isinstance(node, Mapping):
         common = _common(node, path, origins, inherited)
         inner = {key: _annotated(v, (*path, str(key)), common, origins) for key, v in node.items()}
@@ -172,7 +174,7 @@ def _annotated(node: Any, path: Key, inherited: Provenance | None, origins: Mapp
 
 
 def _lines(key: Any, node: Any, path: Key, pad: str) -> Iterator[str]:
-    """Lines of `key: node`: sections in blocks, numbers and rows of them on one line each."""
+    """Yield the lines of `key: node`: sections as blocks, numbers and rows of numbers on one line each."""
     head = f"{pad}{_word(key)}:"
     flow = f"{head} {_word(node)}"
     unit = f"  # [{_unit(path)}]" if _unit(path) else ""
@@ -189,7 +191,7 @@ def _lines(key: Any, node: Any, path: Key, pad: str) -> Iterator[str]:
 
 
 def _items(rows: list[Any], pad: str) -> Iterator[str]:
-    """An item of a list on one line; a row whose entries have long notes on a line for each."""
+    """Yield the items of a list on one line each; a row whose entries have long notes on one line per entry."""
     for item in rows:
         flow = f"{pad}- {_word(item)}"
         if _rows(item) and len(flow) > LONG:
@@ -200,7 +202,7 @@ def _items(rows: list[Any], pad: str) -> Iterator[str]:
 
 
 def _rows(node: Any) -> bool:
-    """Return whether a node is a list of more than plain values."""
+    """Return whether a node is a list with nested lists or mappings."""
     return isinstance(node, list) and any(isinstance(item, (list, Mapping)) for item in node)
 
 
@@ -213,9 +215,9 @@ def _unit(path: Key) -> str:
 def _common(
     node: Any, path: Key, origins: Mapping[Key, Provenance], inherited: Provenance | None
 ) -> Provenance | None:
-    """The origin to state for a section: that of most of its values, counting a list once.
+    """Return the origin to state for a section: that of most of its values, counting a list once.
 
-    Values of one origin and source that differ in their notes share the section's, each with its note alone.
+    Values of one origin and source with different notes share the section's origin, with their own notes.
     """
     values = dict.fromkeys(
         (leaf[:-1] if leaf[-1].isdigit() else leaf, origins[leaf])
@@ -229,12 +231,12 @@ def _common(
     notes = Counter(origin.note for _, origin in values if origin[:2] == best)
     if inherited is not None and inherited[:2] == best and inherited.note in notes:
         return inherited
-    # A value without a note under one would need its origin and source again.
+    # A value without a note in a section with one would need its origin and source again.
     return Provenance(*best, "" if "" in notes else notes.most_common(1)[0][0])
 
 
 def _marks(origin: Provenance | None, inherited: Provenance | None) -> dict[str, str]:
-    """Return what must be written so that a reader who inherits one origin finds the other."""
+    """Return the marks by which the inherited origin is changed to another one."""
     if origin is None or origin == inherited:
         return {}
     if inherited is not None and origin.origin == inherited.origin:
@@ -254,12 +256,12 @@ def _on_single_line(path: Key) -> bool:
 
 
 def _word(value: Any) -> str:
-    """Return a value as YAML on one line, as allowed inside a list or mapping."""
+    """Return a value as YAML on one line, valid inside a list or mapping."""
     return yaml_text([value], default_flow_style=True, width=math.inf).strip()[1:-1]
 
 
 def _prose(text: str) -> list[str]:
-    """The description as a folded block, or in quotes where folding would change it."""
+    """Return the description as a folded block, or in quotes if folding would change it."""
     body = text.rstrip("\n")
     lines = textwrap.wrap(body, WIDTH - 2, break_long_words=False, break_on_hyphens=False)
     if not lines or " ".join(lines) != body or len(text) - len(body) > 1 or not body.isprintable():
@@ -268,23 +270,23 @@ def _prose(text: str) -> list[str]:
 
 
 PER_THRUSTER = ("position", "axis", "group", "motor_index", "motor_sign")
-"""Keys of a single thruster; the rest is written for its group if all its members agree."""
+"""Keys of a single thruster; the others are written for its group if all members agree."""
 
 
 def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
-    """Write a self-contained vehicle file: every number, its origin, and the calibrations behind it.
+    """Write a self-contained vehicle file: every number with its origin, and the calibration records.
 
-    It reads back with the same `sha256` and the same origins. A hull mesh and sensors' files are copied beside it,
-    under names that end with a part of their digest, unless they lie there already; the notice of a mesh's licence,
-    `NAME.NOTICE`, goes with it.
+    Reading it yields the same `sha256` and the same origins. A hull mesh and device files are copied beside
+    it, with a part of their digest in the name, unless they are already there; the licence notice of a mesh,
+    `NAME.NOTICE`, is copied with it.
 
     Args:
-        vehicle: Any vehicle.
+        vehicle: Vehicle to write.
         path: File to write, .yaml; an earlier file is replaced.
 
     Raises:
-        CalibrationError: Another suffix.
-        OutputError: The place cannot be written.
+        CalibrationError: The file has another suffix.
+        OutputError: The file cannot be written.
     """
     target = yaml_path(path, "vehicle")
     tree, origins = file_tree(vehicle), number_origins(vehicle)
@@ -297,14 +299,14 @@ def write_vehicle(vehicle: Vehicle, path: str | os.PathLike[str]) -> None:
                 entry["device"] = _beside(Path(entry["device"]), target)
         temporary.write_text(vehicle_text(tree, origins), encoding="utf-8")
         if load_vehicle(temporary).sha256 != vehicle.sha256:
-            raise RuntimeError(f"{path}: the file would not hold the same vehicle; nothing was written")
+            raise RuntimeError(f"{path}: the file would not contain the same vehicle; nothing was written")
 
 
 def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
-    """The path of a vehicle, ranges, pool or camera file to write.
+    """Return the path of a vehicle, ranges, pool or camera file to write.
 
     Raises:
-        CalibrationError: It does not end in .yaml or .yml.
+        CalibrationError: The path does not end in .yaml or .yml.
     """
     target = Path(path)
     if target.suffix not in (".yaml", ".yml"):
@@ -315,7 +317,8 @@ def yaml_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 
 def _beside(mesh: Path, target: Path) -> str:
-    """Name of a mesh, or of a sensor's file, beside the target, copied there if need be; never over another file."""
+    """Return the name of a mesh or device file beside the target, copied there if necessary; no other file is
+    overwritten."""
     folder = Path(os.path.realpath(target)).parent
     if mesh.resolve().parent == folder:
         return mesh.name
@@ -335,7 +338,7 @@ def _beside(mesh: Path, target: Path) -> str:
 def _grouped(
     tree: dict[str, Any], origins: dict[tuple[str, ...], Provenance]
 ) -> tuple[dict[str, Any], dict[tuple[str, ...], Provenance]]:
-    """Numbers that all thrusters of a group share, with one origin, move to `thruster_groups`."""
+    """Move numbers that all thrusters of a group share, with one origin, to `thruster_groups`."""
     groups: dict[str, dict[str, Any]] = {}
     origins = dict(origins)
     thrusters = {name: dict(values) for name, values in tree["thrusters"].items()}
@@ -359,7 +362,7 @@ def _grouped(
         if section == "thrusters":
             if groups:
                 result["thruster_groups"] = groups
-            first_keys = ("group", "position", "axis")  # as a person writes them
+            first_keys = ("group", "position", "axis")  # in the usual order
             result["thrusters"] = {
                 name: {key: own[key] for key in first_keys if key in own} | own
                 for name, own in thrusters.items()
@@ -376,22 +379,23 @@ def _same(
     thrusters: Mapping[str, Any],
     origins: Mapping[tuple[str, ...], Provenance],
 ) -> bool:
-    """Return whether two thrusters hold the same under a key, of the same origin."""
+    """Return whether two thrusters have the same value and origin for a key."""
     if key not in thrusters[member] or thrusters[first][key] != thrusters[member][key]:
         return False
     paths = [path for path, _ in leaves(thrusters[first][key], (key,))]
     return all(origins[("thrusters", first, *p)] == origins[("thrusters", member, *p)] for p in paths)
 
 
-# From a fit to a vehicle: the numbers that the data determine, each with its origin and interval, and the record.
+# Conversion of a fit to a vehicle: the determined numbers, each with its origin and interval, and the record.
 
 
 SCALED = ("c_plus", "c_minus", "force_min", "force_max")
-"""Numbers of a thruster that `thrust_scale` multiplies."""
+"""Numbers of a thruster that are multiplied by `thrust_scale`."""
 
 
 def scaled_thrust(vehicle: Vehicle, scale: float, gains: Sequence[float] = ()) -> dict[str, float]:
-    """Changes of the vehicle file that multiply every thrust by a scale, and by a gain of its thruster if given [-]."""
+    """Return the changes of the vehicle file that multiply every thrust by a scale, and by individual gains
+    if given [-]."""
     gains = gains or [1.0] * len(vehicle.thrusters)
     return {
         f"thrusters.{name}.{key}": scale * gain * float(getattr(thruster, key))
@@ -401,25 +405,25 @@ def scaled_thrust(vehicle: Vehicle, scale: float, gains: Sequence[float] = ()) -
 
 
 def calibrated(fit: Fit) -> Vehicle:
-    """The vehicle with what the fit determined; everything else keeps its number and its origin.
+    """Return the vehicle with the numbers that the fit determined; all others keep their values and origins.
 
-    A number that the fit changed is `measured`, its note is its 95 % interval. The record of the calibration, with the
-    digests of its trials, comes after those that the vehicle had.
+    The origin of a changed number is `measured`, with its 95 % interval as the note. The record of the
+    calibration, with the digests of its trials, is appended to those of the vehicle.
 
     Raises:
-        CalibrationError: The estimates make no vehicle that can be simulated.
+        CalibrationError: The estimates do not form a vehicle that can be simulated.
     """
     before = fit.before
     number = len(before.calibrations) + 1
     record = _calibration_record(fit)
     source = f"calibration {number}: {record.sentence()}"
     try:
-        # Seven digits: far more than any interval needs, and a readable file.
+        # Seven digits: far more than any interval requires, and a readable file.
         changes = plain(fit.changes, 7)
         after = before.replace(changes, Provenance("measured", source)) if changes else before
     except VehicleError as error:
         raise CalibrationError(
-            f"the estimates make no vehicle: {error}: use fewer axes, or trials that excite them more"
+            f"the estimates do not form a valid vehicle: {error}: use fewer axes, or trials that excite them more"
         ) from None
     old_values = dict(leaves(before.values()))
     changed = [tuple(path.split(".")) for path in fit.changes]
@@ -441,9 +445,9 @@ def calibrated(fit: Fit) -> Vehicle:
 
 
 def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
-    """Parameters with a place in the vehicle file that the fit left as they were, with the number they keep.
+    """Return the parameters in the vehicle file that the fit did not change, with their values.
 
-    They have the units of the estimates.
+    Values have the units of the estimates.
 
     Args:
         fit: The fit.
@@ -460,7 +464,7 @@ def retained_values(fit: Fit, vehicle: Vehicle) -> dict[str, float]:
 
 
 def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
-    """Return the vehicle's own number for an estimate, in its unit; None where the vehicle file has no place for it."""
+    """Return the vehicle's own number for an estimate, in its unit; None if it is not in the vehicle file."""
     if estimate.path is None:
         return None
     if estimate.name == "buoyancy_excess":
@@ -471,8 +475,8 @@ def file_number(estimate: Estimate, vehicle: Vehicle) -> float | None:
 
 
 def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
-    """Return the findings of a fit, and those against its vehicle: checks that it fails and its parent did not, and
-    fits without use.
+    """Return the findings of a fit, and those about its vehicle: checks that it fails but its predecessor
+    passed, and a fit without results.
 
     Args:
         fit: The fit.
@@ -493,7 +497,8 @@ def all_findings(fit: Fit, vehicle: Vehicle) -> list[Finding]:
 
 
 def number_in(vehicle: Vehicle, path: str) -> float | None:
-    """The number at a dotted path of the vehicle file, `*` and groups by their first thruster; None where none is.
+    """Return the number at a dotted path of the vehicle file, for `*` and groups that of the first thruster;
+    None if there is none.
 
     It has the unit of the file.
     """
@@ -501,11 +506,14 @@ def number_in(vehicle: Vehicle, path: str) -> float | None:
     for leaf, full_path, value in numbers(vehicle):
         if _same_number(keys, leaf, vehicle) or keys == full_path:
             return value
-    return dict(leaves(vehicle.values())).get(keys)  # a coupling of a matrix whose file gives the diagonal
+    return dict(leaves(vehicle.values())).get(
+        keys
+    )  # a coupling of a matrix that is given by its diagonal in the file
 
 
 def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:
-    """The estimate that is of the number at a dotted path, or None; an entry of a matrix by row and column."""
+    """Return the estimate of the number at a dotted path, or None; an entry of a matrix is given by row and
+    column."""
     leaf = tuple(path.split("."))
     return _estimate_of(leaf, fit.estimates, vehicle) or (
         _estimate_of(leaf[:-1], fit.estimates, vehicle) if leaf[-1] == leaf[-2] else None
@@ -527,7 +535,7 @@ def _calibration_record(fit: Fit) -> CalibrationRecord:
 
 
 def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
-    """Return whether one of the changes set this number, or a list or section that holds it."""
+    """Return whether one of the changes set this number, or a list or section that contains it."""
     return any(
         _same_number(change, leaf[: len(change)], vehicle) or _same_number(change, leaf, vehicle)
         for change in changes
@@ -535,10 +543,10 @@ def _covers(changes: Sequence[Key], leaf: Key, vehicle: Vehicle) -> bool:
 
 
 def _same_number(pattern: Key, leaf: Key, vehicle: Vehicle) -> bool:
-    """Return whether a path of an estimate or change means a number of the file's tree.
+    """Return whether a path of an estimate or change refers to a number of the file's tree.
 
-    `*` is any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may be given by
-    row and column or by row alone.
+    `*` matches any name; `thruster_groups.G.x` is x of every thruster of G; an entry of a diagonal matrix may
+    be given by row and column or by row alone.
     """
     if pattern[0] == "thruster_groups" and leaf[0] == "thrusters" and len(leaf) > 1:
         thruster = vehicle.thrusters.get(leaf[1])
@@ -562,7 +570,8 @@ def _estimate_of(leaf: Key, estimates: Mapping[str, Estimate], vehicle: Vehicle)
 
 
 def _note(estimate: Estimate | None, value: float) -> str:
-    """`95 % interval 37.9 to 40.2`, with the estimate itself where the file holds something else of it."""
+    """Return a text such as `95 % interval 37.9 to 40.2`, with the estimate itself if the file contains a
+    derived number."""
     if estimate is None:
         return ""
     low, high = estimate.ci95
@@ -572,22 +581,22 @@ def _note(estimate: Estimate | None, value: float) -> str:
     return "; ".join(filter(None, [text, estimate.note]))
 
 
-# Ranges of domain randomisation from the intervals of a calibration.
+# Ranges for domain randomisation from the intervals of a calibration.
 
 NARROWEST = 0.02
-"""Least variation of a determined parameter to either side: intervals cover noise, not a wrong model."""
+"""Least variation of a determined parameter in both directions: intervals include noise, but no model errors."""
 WIDEST = (0.0, 5.0)
-"""Factors beyond these are cut."""
+"""Limits of the factors."""
 UNTOLD = (0.5, 2.0)
-"""Range of what the trials could not determine, and of what the vehicle file guesses."""
+"""Range of parameters that the trials could not determine, or that are guesses in the vehicle file."""
 OTHER = (0.9, 1.1)
-"""For what was not asked of the trials, and the vehicle file has from somewhere."""
+"""Range of parameters that were not estimated, and are not guesses in the vehicle file."""
 
 FAMILIES = ("added_mass", "linear_damping", "quadratic_damping")
 
 
 class Factor(NamedTuple):
-    """Range of a factor, and why."""
+    """Range of a factor, and the reason for it."""
 
     low: float
     high: float
@@ -599,23 +608,24 @@ def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None
 
     A factor on a number of the vehicle file is drawn uniformly between
 
-    - the ends of its 95 % interval over the estimate, where the trials tell it; at least 2 % to either side;
-    - 0.5 and 2, where they do not, or where the vehicle file guesses it;
-    - 0.9 and 1.1, where it was not asked for and the file has it from somewhere.
+    - the ends of its 95 % interval over the estimate, if the trials determine it, with at least 2 % in both
+      directions;
+    - 0.5 and 2, if they do not, or if it is a guess in the vehicle file;
+    - 0.9 and 1.1, if it was not estimated and has another origin in the file.
 
-    The numbers are drawn one by one, though the errors of linear and quadratic damping go against each other: the drag
-    varies by more than the data allow, never by less.
+    The numbers are drawn independently, although the errors of linear and quadratic damping are negatively
+    correlated: the drag varies by more than the data allow, never by less.
 
     Args:
         fit: The fit.
         path: File to write, .yaml.
-        vehicle: `calibrated(fit)`, where it is at hand.
+        vehicle: `calibrated(fit)`, if it is already computed.
 
     Raises:
-        CalibrationError: Another suffix, or a vehicle without a calibrated set.
-        OutputError: The place cannot be written.
+        CalibrationError: The file has another suffix, or the vehicle has no calibrated set.
+        OutputError: The file cannot be written.
     """
-    from finssim.sim.ranges_file import load_ranges  # Warp, which other fits need not
+    from finssim.sim.ranges_file import load_ranges  # imports Warp, which other fits do not need
 
     target = yaml_path(path, "ranges")
     vehicle = calibrated(fit) if vehicle is None else vehicle
@@ -623,8 +633,8 @@ def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None
     for entry, factor in range_factors(fit, vehicle).items():
         _insert(tree, entry, factor)
     lines = [
-        "# Factors on the numbers of the calibrated vehicle. told: 95 % interval over the estimate, at least",
-        "# 2 % to either side; not told by the trials, or guessed: half to double; not asked for: 0.9 to 1.1.",
+        "# Factors on the numbers of the calibrated vehicle. determined: 95 % interval over the estimate, at",
+        "# least 2 % to either side; undetermined by the trials, or guessed: half to double; not fitted: 0.9 to 1.1.",
         f'source: "95 % intervals, {vehicle.calibrations[-1].sentence()}; vehicle {vehicle.sha256[:16]}"',
         *_factor_lines(tree),
     ]
@@ -634,7 +644,7 @@ def write_ranges(fit: Fit, path: str | os.PathLike[str], vehicle: Vehicle | None
 
 
 def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
-    """Every factor by its place in the ranges file, `linear_damping.surge` or `delay`.
+    """Return every factor by its path in the ranges file, such as `linear_damping.surge` or `delay`.
 
     Args:
         fit: The fit.
@@ -642,12 +652,12 @@ def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
     """
     chosen = vehicle.hydrodynamics.get("calibrated")
     if not isinstance(chosen, HydrodynamicSet):
-        raise CalibrationError(f"{vehicle.name} has no coefficients named 'calibrated' to vary")
+        raise CalibrationError(f"{vehicle.name} has no hydrodynamic set 'calibrated' to vary")
     factors = {}
     for family in FAMILIES:
         matrix = getattr(chosen, family)
         for i, axis in enumerate(AXES):
-            if matrix[i, i] != 0.0:  # a factor on nothing is nothing
+            if matrix[i, i] != 0.0:  # a factor on zero has no effect
                 path = f"hydrodynamics.calibrated.{family}.{i}.{i}"
                 factors[f"{family}.{axis}"] = _factor(path, fit, vehicle)
     for path in chosen.term_scalars:
@@ -656,7 +666,7 @@ def range_factors(fit: Fit, vehicle: Vehicle) -> dict[str, Factor]:
     excess = fit.estimates.get("buoyancy_excess")
     if excess is not None and excess.identifiable:
         low, high = ((vehicle.weight + x) / (vehicle.weight + excess.estimate) for x in excess.ci95)
-        factors["volume"] = Factor(low, high, "told")
+        factors["volume"] = Factor(low, high, "determined")
     for kind, key in (name.split(".", 1) for name in fit.estimates if name.partition(".")[0] in ACTUATORS):
         factors[f"{kind}.{key}"] = _of_estimate(fit.estimates[f"{kind}.{key}"])
     scale = fit.estimates.get("thrust_scale")
@@ -679,23 +689,23 @@ def _factor(path: str, fit: Fit, vehicle: Vehicle) -> Factor:
         return _of_estimate(estimate)
     if vehicle.origin_of(path).origin == "guessed":
         return Factor(*UNTOLD, "guessed")
-    return Factor(*OTHER, "not asked for")
+    return Factor(*OTHER, "not fitted")
 
 
 def _of_estimate(estimate: Estimate) -> Factor:
-    """The range that an estimate allows."""
+    """Return the range for an estimate."""
     low, high = estimate.ci95
     if not (
         estimate.identifiable and math.isfinite(low) and math.isfinite(high) and estimate.estimate != 0.0
     ):
-        return Factor(*UNTOLD, "not told")
+        return Factor(*UNTOLD, "undetermined")
     low, high = sorted((low / estimate.estimate, high / estimate.estimate))
     low, high = min(low, 1.0 - NARROWEST), max(high, 1.0 + NARROWEST)
-    return Factor(max(low, WIDEST[0]), min(high, WIDEST[1]), "told")
+    return Factor(max(low, WIDEST[0]), min(high, WIDEST[1]), "determined")
 
 
 def _around(factors: Iterable[Factor]) -> Factor:
-    """The range that holds all of them."""
+    """Return the range that contains all factors."""
     every = list(factors)
     reason = ", ".join(dict.fromkeys(factor.why for factor in every))
     return Factor(min(f.low for f in every), max(f.high for f in every), reason)
@@ -706,7 +716,7 @@ def _stated(vehicle: Vehicle, path: str) -> bool:
 
 
 def _factor_lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:
-    """YAML of factors, each with its reason."""
+    """Yield the YAML lines of factors, each with its reason."""
     for key, node in tree.items():
         if isinstance(node, Factor):
             yield f"{pad}{key}: [{node.low:.4g}, {node.high:.4g}]  # {node.why}"
@@ -716,7 +726,7 @@ def _factor_lines(tree: Mapping[str, Any], pad: str = "") -> Iterator[str]:
 
 
 def _insert(tree: dict[str, Any], entry: str, drawn: Any) -> None:
-    """Put what is drawn where a ranges file has it: `linear_damping.surge` under `axes` of its family."""
+    """Insert a factor at its path in a ranges file: `linear_damping.surge` under `axes` of its family."""
     *above, key = entry.split(".")
     for name in [*above, "axes"] if key in AXES else above:
         tree = tree.setdefault(name, {})

@@ -1,10 +1,10 @@
-"""A first estimate of the numbers of every axis by least squares, from which the simulation-error fit starts.
+"""Weak form: initial estimates of the parameters of every axis by least squares, for the simulation-error fit.
 
     m nu_dot + d1 nu + d2 |nu| nu + b (+ k sin eta) = tau - c tau_dot
 
-holds about the reference point of the coefficients; c is the time by which the motion was recorded late. Both sides are
-averaged under smooth bumps, and integration by parts moves the derivatives onto the bump (the weak form), so that no
-noise is differentiated. Couplings between axes are left out: the simulation has them.
+is valid about the reference point of the coefficients; c is the time by which the motion was recorded late. Both
+sides are averaged with smooth bump functions, and integration by parts moves the derivatives to these (the weak
+form), so that no noise is differentiated. Couplings between axes are neglected: the simulation includes them.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Array = NDArray[np.float64]
 TERMS = ("m_eff", "d1", "d2", "bias", "late", "k")
 
 HALF_WIDTH = (0.5, 0.25)
-"""Half width of a bump [s]: wide where nothing swings, shorter for roll and pitch."""
+"""Half width of a bump [s]: large for axes that do not swing, smaller for roll and pitch."""
 
 LATE_STD = 0.15
 """Prior standard deviation of the lag of the motion behind the input [s]."""
 
 ROUNDS, CUT = 8, 1.345
-"""Rounds of reweighting, and standard deviations beyond which a residual loses weight (Huber)."""
+"""Number of rounds of reweighting, and number of standard deviations beyond which a residual loses weight (Huber)."""
 
 JOLT, PART, WIDER = 8.0, 0.4, 0.25
-"""A force that is not explained is a jolt beyond so many robust standard deviations and beyond a part of the range of
-the recorded input; and how much wider than its bumps' centres it is left out [s]."""
+"""An unexplained force is a jolt if it exceeds this number of robust standard deviations and this fraction of
+the range of the recorded input; and the margin around the bumps' centres that is left out with it [s]."""
 
 SHARED = 6.0
 """Number of bumps that share most of their samples, and therefore most of their noise."""
@@ -47,9 +47,10 @@ class Found(NamedTuple):
     """Result of the weak form for one axis."""
 
     values: dict[str, float]
-    """Numbers by name, of `TERMS`, in their units; none where the trials determine no positive inertia."""
+    """Numbers by name, from `TERMS`, in their units; empty if the trials do not determine a positive inertia."""
     jolts: list[tuple[int, float, float]]
-    """Index of a trial, begin and end [s] of a stretch whose force nothing in the log explains, as an impact."""
+    """Index of a trial, start and end [s] of an interval with a force that nothing in the log explains, such
+    as an impact."""
 
 
 def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Mapping[str, float]) -> Found:
@@ -58,7 +59,7 @@ def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Map
     Args:
         trials: Trials that excite the axis.
         axis: One of six.
-        vehicle: Gives the reference point.
+        vehicle: Vehicle with the reference point.
         known: Numbers of `TERMS` that are known already and are not estimated.
     """
     i = AXES.index(axis)
@@ -86,12 +87,12 @@ def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Map
         variance = SHARED * float(np.mean(weight * size**2))
         prior = np.array([LATE_STD**-2 if n == "late" else 0.0 for n in names])
     values = {**dict(zip(names, theta.tolist(), strict=True)), **known}
-    # Roll and pitch follow the other axes too, and what moves fast all axes: this form leaves that out.
+    # Roll and pitch also depend on the other axes, and fast motion couples all axes: this form neglects that.
     known_force = pushed > 0.0 and i not in (3, 4) and values["m_eff"] > 0.0 and not vehicle.actuators
     loud = size > max(JOLT * std, PART * pushed) if known_force else np.zeros(len(y), bool)
     jolts, row = list[tuple[int, float, float]](), 0
     for g, matrix, _, at in parts:
-        # A velocity that was derived from positions has jumps without any force.
+        # A velocity that was derived from positions may jump without any force.
         seen = loud[row : row + len(matrix)] & (DETERMINED_BY[axis][0] in trials[g].measured)
         jolts += [(g, float(at[a]) - WIDER, float(at[b - 1]) + WIDER) for a, b in spans_of(seen)]
         row += len(matrix)
@@ -99,7 +100,7 @@ def weak_form(trials: Sequence[Streams], axis: str, vehicle: Vehicle, known: Map
 
 
 def _rows(s: Streams, i: int, H: Array) -> list[tuple[Array, Array, Array]]:
-    """Return columns of `TERMS`, (n, 6), force or moment [N, N m], (n,), and time [s], (n,), of each stretch
+    """Return columns of `TERMS`, (n, 6), force or moment [N, N m], (n,), and time [s], (n,), of each segment
     without a gap."""
     m = s.motion
     nu = np.nan_to_num(m.nu) @ H.T
@@ -112,7 +113,7 @@ def _rows(s: Streams, i: int, H: Array) -> list[tuple[Array, Array, Array]]:
     x = np.arange(-n, n + 1) / (n + 1)
     phi = (1.0 - x**2) ** 3
     phi /= phi.sum()
-    # Reads a derivative: exact for parabolas.
+    # Differentiator, exact for parabolas.
     slope = x * (1.0 - x**2) ** 2
     slope /= slope @ np.arange(-n, n + 1) / m.rate
     out = []
