@@ -1,4 +1,4 @@
-"""Software of the robot: the wire, the bridge, the control loop, the record. No simulator, no torch, no ROS."""
+"""Software of the robot: links, the bridge, the control loop, the recorder. No simulator, no torch, no ROS."""
 
 from typing import TYPE_CHECKING
 

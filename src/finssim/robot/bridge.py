@@ -1,4 +1,4 @@
-"""Between a controller and the motors: arming, watchdogs, limits. Nothing but an explicit `arm` starts a thruster.
+"""The bridge between a controller and the motors: arming, watchdogs, limits. Only an explicit `arm` starts a thruster.
 
     disarmed --arm--> armed <--condition passed, fresh command-- hold
         ^               |  `------transient condition------------^ |
@@ -27,17 +27,17 @@ from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
-# Events of a bridge for its operator and its record, in order, a repeated one at most once a second.
+# Events of a bridge for its operator and its record, in order; repeated ones are noted at most once a second.
 
 
 KEPT = 1000
-"""Greatest number of events that are kept until they are read."""
+"""Greatest number of events that are stored until they are read."""
 REPEAT = 1.0
 """Least time between two events of one kind and source [s]."""
 
 
 class Event(NamedTuple):
-    """Something that happened."""
+    """An event of the bridge."""
 
     time: float
     """Robot's clock [s]."""
@@ -48,7 +48,7 @@ class Event(NamedTuple):
 
 
 class EventLog:
-    """The newest events, and how many there were of each kind."""
+    """The newest events, and their number by kind."""
 
     def __init__(self) -> None:
         self.events: deque[Event] = deque(maxlen=KEPT)
@@ -56,7 +56,7 @@ class EventLog:
         self._last: dict[str, float] = {}
 
     def add(self, time: float, kind: str, text: str) -> None:
-        """Notes an event, always.
+        """Add an event unconditionally.
 
         Args:
             time: Robot's clock [s].
@@ -67,7 +67,7 @@ class EventLog:
         self.events.append(Event(time, kind, text))
 
     def repeat(self, time: float, kind: str, text: str) -> None:
-        """Counts an event that may come with every message, and notes it if none of its kind was noted just now.
+        """Count an event that may recur with every message, and add it unless one of its kind was added recently.
 
         Args:
             time: Robot's clock [s].
@@ -82,28 +82,28 @@ class EventLog:
         self.add(time, kind, text)
 
     def drain(self) -> list[Event]:
-        """All events since the last call, oldest first."""
+        """Return all events since the last call, oldest first."""
         drained = list(self.events)
         self.events.clear()
         return drained
 
 
-# The limits of a bridge: from the safety section of a vehicle file, or changed one by one.
+# Limits of a bridge: from the safety section of a vehicle file, with individual changes.
 
 
 Array = npt.NDArray[np.float64]
 
 FULL_RANGE = 0.1
-"""Time from full reverse to full forward where the vehicle file gives no slew limit of the thrust [s]."""
+"""Time from full reverse to full forward if the vehicle file gives no slew limit of the thrust [s]."""
 
 
 class BridgeError(ValueError):
-    """A bridge was set up with limits it cannot keep: the message states which and what to give."""
+    """The limits of a bridge are invalid; the message states which and what to give."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeSettings:
-    """Limits that stop the thrusters. Make them with `of`; `math.inf` switches a watchdog off."""
+    """Limits that stop the thrusters. Create them with `of`; `math.inf` disables a watchdog."""
 
     slew: Array
     """Fastest change of each thrust, canonical order [N/s], (n,)."""
@@ -112,29 +112,30 @@ class BridgeSettings:
     telemetry_timeout: float = 0.5
     """Longest silence of the motor controller [s]."""
     state_timeout: float = 0.5
-    """Oldest reading to act on [s]."""
+    """Greatest age of a reading that may be used [s]."""
     frozen_limit: float = 0.3
-    """Longest time that gyro or accelerometer may repeat its numbers to the last bit [s]."""
+    """Longest time for which gyroscope or accelerometer may repeat exactly the same numbers [s]."""
     max_tilt: float = math.inf
-    """[rad]"""
+    """Greatest tilt [rad]."""
     max_tilt_duration: float = 1.0
     """Longest time above `max_tilt` [s]."""
     workspace_lower: Array
-    """Lower corner of the allowed box, world frame [m], (3,)."""
+    """Lower corner of the workspace, world frame [m], (3,)."""
     workspace_upper: Array
-    """Upper corner [m], (3,)."""
+    """Upper corner of the workspace [m], (3,)."""
     workspace_margin: float = 0.1
-    """Thrust may only push inwards this near to a face, on either side; further outside is a fault [m]."""
+    """Distance from a face, on either side, within which thrust may only push inwards; further outside is a fault
+    [m]."""
     hold_limit: float = 5.0
-    """Longest hold before it becomes a fault, unless the operator asked for it [s]."""
+    """Longest hold before it becomes a fault, except for a hold by the operator [s]."""
     clock_step: float = 1.0
-    """Longest step of the clock forward between two calls [s]."""
+    """Longest forward step of the clock between two calls [s]."""
     reject_limit: float = 0.5
-    """Longest time for which the motor controller may refuse every command, or receive none [s]."""
+    """Longest time for which the motor controller may refuse or miss every command [s]."""
     need_reading: bool = True
-    """True if the estimator must be ready; False lets an operator drive without localization."""
+    """True if the estimator must be ready; False allows driving without localization."""
     vision_modes: tuple[str, ...] = ("fresh", "coast")
-    """Modes of vision in which a reading may be acted on."""
+    """States of vision in which a reading may be used."""
 
     def __post_init__(self) -> None:
         for name in DURATIONS:
@@ -151,14 +152,14 @@ class BridgeSettings:
 
     @classmethod
     def of(cls, vehicle: Vehicle, **changes: Any) -> BridgeSettings:
-        """Limits of a vehicle's `safety` section.
+        """Return the limits of a vehicle's `safety` section.
 
         Args:
-            vehicle: Its `safety` section and the slew limits of its thrusters are read.
-            changes: Fields by name that shall differ.
+            vehicle: Vehicle with the `safety` section and the slew limits of its thrusters.
+            changes: Changed fields by name.
 
         Raises:
-            BridgeError: A limit that cannot be kept, or no field of that name.
+            BridgeError: A limit is invalid, or there is no field with that name.
         """
         names = {field.name for field in fields(cls)}
         if not changes.keys() <= names:
@@ -180,7 +181,7 @@ FROM_FILE = (
     "workspace_lower",
     "workspace_upper",
 )
-"""Fields that the safety section of a vehicle file gives under the same name."""
+"""Fields with the same name in the safety section of a vehicle file."""
 DURATIONS = (
     "command_timeout",
     "telemetry_timeout",
@@ -194,13 +195,14 @@ DURATIONS = (
 
 
 def _slew(vehicle: Vehicle) -> Array:
-    """Fastest change of each thrust [N/s], (n,): the file's own where it limits thrust, else from range and time."""
+    """Return the slew limit of each thrust [N/s], (n,): the file's own if it limits thrust, otherwise range over
+    time."""
     lower, upper = vehicle.force_limits
     stated = np.array([t.slew if t.domain == "force" else math.inf for t in vehicle.thrusters.values()])
     return np.where(np.isfinite(stated), stated, (upper - lower) / FULL_RANGE)
 
 
-# Who commands a robot, and the newest command that was fit to be used.
+# Sources of commands, and the newest accepted command.
 
 
 EARLY = 0.1
@@ -208,14 +210,15 @@ EARLY = 0.1
 
 
 class Commander:
-    """Takes commands; what it refuses does not count as a sign of life."""
+    """Receiver of commands; a refused command does not reset the command timeout."""
 
     def __init__(self, thrusters: int, timeout: float, others: int = 0) -> None:
-        """
+        """Start without a command.
+
         Args:
-            thrusters: Thrusts in a command, n.
-            others: Values of other actuators that may follow them, m.
-            timeout: Age at which a command, or a word from another source, no longer counts [s].
+            thrusters: Number of thrusts in a command, n.
+            others: Number of values of other actuators that may follow them, m.
+            timeout: Age at which a command, or a message of another source, expires [s].
         """
         self._thrusters, self._others = thrusters, others
         self._timeout = timeout
@@ -224,11 +227,11 @@ class Commander:
     def forget(self) -> None:
         """Reset to the state before the first command."""
         self.force: Array = np.zeros(self._thrusters)
-        """Of the newest command, canonical order [N], (n,)."""
+        """Thrusts of the newest command, canonical order [N], (n,)."""
         self.setpoints: Array | None = None
         """Values of the other actuators in the newest command that has them [rad, m³ or m], (m,)."""
         self.received = -math.inf
-        """When it came [s]."""
+        """Arrival of the newest command [s]."""
         self.source = ""
         self._stamp = -math.inf
         self._heard: dict[str, float] = {}
@@ -243,18 +246,18 @@ class Commander:
         return next((name for name in self._heard if name != source), "")
 
     def sources(self, now: float) -> list[str]:
-        """Everybody heard within the timeout. `now` is the time [s]."""
+        """Return all sources of commands within the timeout. `now` is the time [s]."""
         return [name for name, time in self._heard.items() if now - time <= self._timeout]
 
     def accept(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None) -> str:
-        """Accept a command if it is fit to be used; otherwise return the reason and keep the one before.
+        """Accept a valid command; otherwise return the reason and keep the previous command.
 
         Args:
-            now: When it came [s].
+            now: Arrival of the command [s].
             force: Thrusts along the thrusters' axes, canonical order [N], (n,), or these and the values of the other
                 actuators [rad, m³ or m], (n + m,).
-            source: Who sent it.
-            stamp: Time of what its sender knew, robot's clock [s]; None: it does not tell.
+            source: Sender of the command.
+            stamp: Time of the state on which the command is based, robot's clock [s]; None if unknown.
         """
         try:
             requested = np.array(force, float)
@@ -278,28 +281,28 @@ class Commander:
         return ""
 
     def asks(self, now: float) -> bool:
-        """Return whether the newest command still counts and demands thrust."""
+        """Return whether the newest command has not expired and demands thrust. `now` is the time [s]."""
         return now - self.received <= self._timeout and bool(self.force.any())
 
 
-# What watches the messages of a robot: each watchdog takes a message with its time and answers in one sentence.
+# Watchdogs of a robot's messages: each one receives a message with its time and answers in one sentence.
 
 
 TOLD, FOLLOWS = int(StatusFlag.DIAGNOSTICS), int(StatusFlag.DIRECT_THRUSTERS)
 SENSED = ("quaternion", "gyro", "accel")
-"""Sensors of telemetry whose repetition is noted."""
+"""Sensors of telemetry whose repetition is monitored."""
 REORDERED = 1000
-"""A datagram may be overtaken by this much of the controller's clock [ms]; further back is a restart."""
+"""Greatest backward step of the controller's clock of an overtaken datagram [ms]; a larger one is a restart."""
 
 
 class TelemetryWatch:
-    """Watch telemetry for silence, repetition and restarts; `timeout` is in [s]."""
+    """Watchdog of telemetry: silence, repetition and restarts; `timeout` is in [s]."""
 
     def __init__(self, outputs: int, timeout: float, others: int = 0) -> None:
         self._outputs, self._others = outputs, others
         self._timeout = timeout
         self.watched: tuple[tuple[str, ...], ...] = (("gyro",), ("accel",))
-        """Groups of sensors: those of one that all repeat their numbers have frozen."""
+        """Groups of sensors: a group is frozen if all of its sensors repeat their numbers."""
         self.forget()
 
     def forget(self) -> None:
@@ -310,7 +313,7 @@ class TelemetryWatch:
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Return the values of the other actuators in the newest message [rad, m³ or m]; empty where it has none."""
+        """Values of the other actuators in the newest message [rad, m³ or m]; empty if it has none."""
         return () if self._last is None else self._last.actuators
 
     @property
@@ -319,7 +322,7 @@ class TelemetryWatch:
         return self._last is not None and len(self.values) < self._others
 
     def age(self, now: float) -> float:
-        """Time since the last message that brought something new [s]; infinite before the first."""
+        """Return the time since the last message with new data [s]; infinite before the first."""
         return now - self.fresh_since
 
     def malformed(self, message: Telemetry) -> str:
@@ -334,17 +337,17 @@ class TelemetryWatch:
         return ""
 
     def accept(self, now: float, message: Telemetry) -> str:
-        """Takes a well-formed message; a repeated or overtaken one refreshes nothing.
+        """Accept a well-formed message; a repeated or overtaken one does not count as new data.
 
         `now` is the time [s].
 
         Returns:
-            "restarted" if the controller's clock went back, "old" if the message brings nothing new, "" otherwise.
+            "restarted" if the controller's clock went back, "old" if the message has no new data, "" otherwise.
         """
         last = self._last
         if last is not None and (message.sequence, message.mcu_ms) == (last.sequence, last.mcu_ms):
             return "old"
-        # After a silence the old numbers say nothing about the new ones.
+        # After a silence the old numbers do not constrain the new ones.
         if last is None or self.age(now) > self._timeout:
             restarted = last is not None and _signed(message.mcu_ms - last.mcu_ms, 32) < -REORDERED
             self._take(now, message, None)
@@ -362,7 +365,7 @@ class TelemetryWatch:
         """Return the sensors that have repeated their exact numbers for longer than `limit` [s]; "" if none have."""
         for sensors in self.watched:
             changed = max(self._changed[sensor] for sensor in sensors)
-            # Silence is another watchdog's: what counts is how long messages kept coming with the same numbers.
+            # Silence has another watchdog: only the time counts for which messages arrived with the same numbers.
             if min(now, self.fresh_since) - changed > limit:
                 return " and ".join(sensors)
         return ""
@@ -376,29 +379,29 @@ class TelemetryWatch:
 
 
 class Lasting:
-    """Duration for which a condition held at every check."""
+    """Duration for which a condition was true at every check."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Reset to the state before the condition ever held."""
+        """Reset to the state before the condition was ever true."""
         self._since, self._until = math.inf, -math.inf
 
     def look(self, now: float, so: bool) -> None:
-        """Note whether the condition holds now [s]."""
+        """Note whether the condition is true now [s]."""
         if so:
             self._since, self._until = min(self._since, now), now
         else:
             self.forget()
 
     def longer(self, limit: float, now: float | None = None) -> bool:
-        """Return whether it has held for longer than `limit` [s], until `now`, or until the last check if None."""
+        """Return whether it was true for longer than `limit` [s], until `now`, or until the last check if None."""
         return (self._until if now is None else now) - self._since > limit
 
 
 class EchoWatch:
-    """Echoes of commands by the motor controller."""
+    """Watchdog of the motor controller's command echoes."""
 
     def __init__(self) -> None:
         self.forget()
@@ -408,10 +411,11 @@ class EchoWatch:
         self._count: int | None = None
         self._mcu_ms = 0
         self.rejected = Lasting()
-        """Whether commands are refused."""
+        """Duration for which commands are refused."""
 
     def accept(self, now: float, echo: CommandEcho, armed: bool) -> str:
-        """Takes an echo; "restarted" if its count of commands began again, "rejected" if it refused one, else ""."""
+        """Accept an echo; return "restarted" if its count of commands restarted, "rejected" if it refused one,
+        otherwise ""."""
         elapsed = _signed(echo.mcu_ms - self._mcu_ms, 32)
         restarted = False
         if self._count is not None:
@@ -430,11 +434,12 @@ class TiltWatch:
     """Duration of a vehicle's tilt beyond a limit."""
 
     def __init__(self, limit: float, duration: float, level: npt.ArrayLike = (0.0, 0.0, 1.0)) -> None:
-        """
+        """Start without an attitude.
+
         Args:
-            limit: [rad]
+            limit: Greatest tilt [rad].
             duration: Longest time beyond it [s].
-            level: The body's z axis in the frame whose attitude is given, (3,).
+            level: The body's z axis in the frame of the given attitudes, (3,).
         """
         self._cosine = math.cos(min(limit, math.pi)) if math.isfinite(limit) else -math.inf
         self._duration = duration
@@ -443,7 +448,7 @@ class TiltWatch:
         self.forget = self._tilted.forget
 
     def accept(self, now: float, quaternion: npt.ArrayLike) -> None:
-        """Takes an attitude, given frame to world, xyzw, of any length, (4,)."""
+        """Accept an attitude, frame to world, xyzw, of any length, (4,)."""
         x, y, z, w = (float(part) for part in np.asarray(quaternion, float))
         a, b, c = self._level
         square = x * x + y * y + z * z + w * w
@@ -451,18 +456,19 @@ class TiltWatch:
         self._tilted.look(now, up < self._cosine * square)
 
     def over(self, now: float) -> bool:
-        """Return whether it lasted too long. `now` is the time [s]."""
+        """Return whether the tilt has lasted too long. `now` is the time [s]."""
         return self._tilted.longer(self._duration, now)
 
 
 class StateWatch:
-    """State of the estimator, and whether it may be acted on."""
+    """Watchdog of the estimator's state."""
 
     def __init__(self, timeout: float, modes: tuple[str, ...]) -> None:
-        """
+        """Start without a reading.
+
         Args:
-            timeout: Oldest reading to act on [s].
-            modes: Modes of vision in which one may be acted on.
+            timeout: Greatest age of a reading that may be used [s].
+            modes: States of vision in which a reading may be used.
         """
         self._timeout = timeout
         self._modes = modes
@@ -475,17 +481,17 @@ class StateWatch:
         self._pose: tuple[Array, Array] | None = None
 
     def accept(self, now: float, reading: Reading) -> None:
-        """Takes a reading. `now` is the time [s]."""
+        """Accept a reading. `now` is the time [s]."""
         self._oldest = min(now, reading.time)
         self._why = self._unfit(reading)
         self._pose = None if self._why else (np.asarray(reading.position), np.asarray(reading.quaternion))
 
     def pose(self, now: float) -> tuple[Array, Array] | None:
-        """World position [m], (3,), and quaternion, (4,), of the newest reading; None where it may not be acted on."""
+        """Return world position [m], (3,), and quaternion, (4,), of the newest reading; None if it may not be used."""
         return None if self.missing(now) else self._pose
 
     def missing(self, now: float) -> str:
-        """Return why there is no state to act on; "" if there is. `now` is the time [s]."""
+        """Return why there is no usable state; "" if there is one. `now` is the time [s]."""
         if self._why:
             return self._why
         return (
@@ -495,7 +501,7 @@ class StateWatch:
         )
 
     def _unfit(self, reading: Reading) -> str:
-        """Return why a reading cannot be acted on; "" if it can."""
+        """Return why a reading cannot be used; "" if it can."""
         if not reading.ready:
             return f"the estimator is not ready: {reading.reason or 'no reason given'}"
         if reading.mode not in self._modes:
@@ -510,27 +516,28 @@ class StateWatch:
 
 
 def _signed(difference: int, bits: int) -> int:
-    """A difference of two counters modulo 2^bits, as the nearest signed number."""
+    """Return the difference of two counters modulo 2^bits, as the nearest signed number."""
     half = 1 << (bits - 1)
     return (difference + half) % (1 << bits) - half
 
 
-# The box a vehicle may move in: near a face thrust may only push inwards.
+# The workspace of a vehicle: near a face thrust may only push inwards.
 
 
 ROUNDING = 1e-3
-"""Outward force that is left to the rounding of the allocation [N]."""
+"""Outward force that is tolerated as rounding of the allocation [N]."""
 
 
 class Workspace:
-    """A box in the world frame with a margin to both sides of each face."""
+    """A box in the world frame with a margin on both sides of each face."""
 
     def __init__(self, vehicle: Vehicle, lower: npt.ArrayLike, upper: npt.ArrayLike, margin: float) -> None:
-        """
+        """Set up the box.
+
         Args:
-            vehicle: Whose thrusters push.
-            lower: Corner, world frame [m], (3,).
-            upper: Opposite corner [m], (3,).
+            vehicle: Vehicle with the thrusters.
+            lower: Lower corner, world frame [m], (3,).
+            upper: Upper corner [m], (3,).
             margin: Half width of the band around each face in which thrust may only push inwards [m].
         """
         self.lower: Array = np.array(lower, float)
@@ -541,8 +548,8 @@ class Workspace:
         self._allocator = Allocator.from_vehicle(vehicle)
 
     def left(self, position: Array) -> str:
-        """Return the face that lies more than the margin behind the vehicle; "" while it is inside. World frame [m],
-        (3,)."""
+        """Return the face that the vehicle has crossed by more than the margin; "" while it is inside. World frame
+        [m], (3,)."""
         for axis, name in enumerate("xyz"):
             if not self._outer[0][axis] <= position[axis] <= self._outer[1][axis]:
                 box = f"{self.lower[axis]:g} to {self.upper[axis]:g}"
@@ -550,7 +557,7 @@ class Workspace:
         return ""
 
     def outward(self, position: Array) -> Array:
-        """Return the direction out of the box on each axis where the vehicle is near a face, else 0: -1, 0 or 1, (3,).
+        """Return the outward direction on each axis near whose face the vehicle is, otherwise 0: -1, 0 or 1, (3,).
 
         Args:
             position: World frame [m], (3,).
@@ -561,7 +568,7 @@ class Workspace:
         return (position > self._inner[1]).astype(float) - (position < self._inner[0])
 
     def inward_only(self, force: Array, position: Array, quaternion: Array) -> Array:
-        """Thrusts without the part of their net force that pushes further out; the moment is kept.
+        """Return the thrusts without the outward components of their net force; the moment is preserved.
 
         tau = B f,   the outward components of R tau_F are removed,   f = allocate(tau)
 
@@ -571,7 +578,7 @@ class Workspace:
             quaternion: Body to world, xyzw, (4,).
 
         Returns:
-            Thrusts [N], (n,); zeros where the thrusters cannot give the wrench without pushing out.
+            Thrusts [N], (n,); zeros if the thrusters cannot produce the wrench without an outward force.
         """
         outward = self.outward(position)
         if not outward.any():
@@ -588,24 +595,25 @@ class Workspace:
         return allocated if bool((still <= ROUNDING).all()) else np.zeros_like(force)
 
 
-# All that watches a robot together: whether it is in danger, in want of something, or fit to be armed.
+# All watchdogs of a robot together: serious conditions, transient conditions, and readiness for arming.
 
 
 UP = (0.0, 0.0, 1.0)
 BACK = 0.05
-"""The clock may seem to go back by this much, where messages are handed over out of the order of their arrival [s]."""
+"""Apparent backward step of the clock that is tolerated, for messages processed out of order of arrival [s]."""
 
 
 class BridgeClock:
-    """The time of the latest call, and whether time runs as it should."""
+    """The time of the latest call, with a check of its steps."""
 
     def __init__(self, step: float) -> None:
-        """
+        """Start without a time.
+
         Args:
-            step: Longest step forward between two calls [s].
+            step: Longest forward step between two calls [s].
         """
         self.now = 0.0
-        """The latest [s]."""
+        """Time of the latest call [s]."""
         self._step = step
         self._started = False
 
@@ -623,12 +631,13 @@ class BridgeClock:
 
 
 class Supervision:
-    """The watchdogs of one vehicle and what they conclude. Every answer is one sentence, "" where all is well."""
+    """The watchdogs of one vehicle and their conclusions. Every answer is one sentence, or "" if there is no
+    problem."""
 
     def __init__(self, vehicle: Vehicle, settings: BridgeSettings, outputs: int) -> None:
         self.settings = settings
         self.peer = "motor controller"
-        """Who sends telemetry, in sentences."""
+        """Name of the sender of telemetry in messages."""
         self._others = tuple(vehicle.actuators)
         m = len(self._others)
         self.commander = Commander(len(vehicle.thrusters), settings.command_timeout, m)
@@ -653,19 +662,19 @@ class Supervision:
             tilt.forget()
 
     def take_telemetry(self, now: float, message: Telemetry, armed: bool) -> str:
-        """Note a well-formed message that came while `armed` or not; return "restarted" if the controller did.
+        """Process a well-formed message, received while `armed` or not; return "restarted" if the controller restarted.
 
         `now` is the time [s].
         """
         news = self.telemetry.accept(now, message)
         if news != "old":
-            # Frames may be lost unseen; a firmware that sets no status bits does not report it.
+            # Frames may be lost undetected; a firmware that sets no status bits does not report it.
             self.deaf.look(now, armed and bool(message.flags & TOLD) and not message.flags & FOLLOWS)
             self.tilts["telemetry"].accept(now, message.quaternion)
         return news if news == "restarted" else ""
 
     def take_reading(self, now: float, reading: Reading) -> None:
-        """Takes a reading of the estimator. `now` is the time [s]."""
+        """Accept a reading of the estimator. `now` is the time [s]."""
         self.state.accept(now, reading)
         pose = self.state.pose(now)
         if pose is None:
@@ -674,7 +683,7 @@ class Supervision:
             self.tilts["estimator"].accept(now, pose[1])
 
     def danger(self, now: float) -> str:
-        """Return what must stop the thrusters until an operator has acknowledged it; "" if nothing.
+        """Return the condition that must stop the thrusters until an operator acknowledges it; "" if there is none.
 
         `now` is the time [s].
         """
@@ -702,8 +711,8 @@ class Supervision:
         return side and f"left the workspace: {side}"
 
     def want(self, now: float, since: float) -> str:
-        """Return what thrust waits for: the estimator, or a command, counted from `since` [s] at the earliest."""
-        # The estimator first: without a state, a controller is silent for that very reason.
+        """Return the transient condition that prevents thrust: no state, or no command, counted from `since` [s] on."""
+        # The estimator first: without a state, a controller sends no commands.
         reason = self._estimator(now)
         if reason:
             return reason
@@ -723,7 +732,7 @@ class Supervision:
         return ""
 
     def limited(self, now: float, force: Array) -> Array:
-        """Thrusts without what pushes out of the workspace, canonical order [N], (n,).
+        """Return the thrusts without what pushes out of the workspace, canonical order [N], (n,).
 
         Args:
             now: [s]
@@ -738,7 +747,7 @@ class Supervision:
 
 STATES = ("disarmed", "armed", "hold", "fault")
 RUNNING = ("armed", "hold")
-"""States in which the watchdogs bite."""
+"""States in which the watchdogs are active."""
 
 
 class MotorDevice(Protocol):
@@ -747,24 +756,29 @@ class MotorDevice(Protocol):
     peer: str
     """Name of the device in messages."""
     watched: tuple[tuple[str, ...], ...]
-    """Groups of its sensors; those of one that all repeat their numbers have frozen."""
+    """Groups of its sensors; a group is frozen if all of its sensors repeat their numbers."""
 
     def prepare(self, now: float) -> str:
-        """Prepare arming; called by `Bridge.arm` if nothing else prevents it. Return "" once commands count, else the
-        reason."""
+        """Prepare arming; `Bridge.arm` calls it if nothing else prevents arming. `now` is the time [s].
+
+        Returns:
+            "" once commands are accepted, otherwise the reason.
+        """
 
     def alarm(self, now: float) -> str:
-        """Asked at every tick of an armed bridge: why the vehicle is no longer ours; "" while it is.
+        """Return why the vehicle is no longer under our control; "" while it is. Called at every tick of an armed
+        bridge.
 
         `now` is the time [s].
         """
 
     def pause(self, now: float) -> str:
-        """Return why no thrust may be given now, which passes; "" otherwise. `now` is the time [s]."""
+        """Return why thrust is temporarily not possible; "" otherwise. `now` is the time [s]."""
 
 
 class Bridge:
-    """State machine of one vehicle. Every method takes the robot's clock `now` [s]; it reads no clock itself."""
+    """State machine of one vehicle. Every method has the robot's clock `now` [s] as an argument; it reads no clock
+    itself."""
 
     def __init__(self, vehicle: Vehicle, settings: BridgeSettings | None = None) -> None:
         self.vehicle = vehicle
@@ -774,16 +788,16 @@ class Bridge:
             raise BridgeError(f"slew has {len(self.settings.slew)} rates, expected {self.motors.thrusters}")
         self._autopilot: MotorDevice | None = None
         self.getting_ready = False
-        """Whether arming was last refused by nothing but an autopilot that has yet to get ready."""
+        """True if arming was last refused only because an autopilot is not ready yet."""
         self.state = "disarmed"
         self.reason = ""
-        """Why it is in hold or fault."""
+        """Reason of a hold or fault."""
         self.log = EventLog()
         self.force: Array = np.zeros(self.motors.thrusters)
         """Thrusts of the last tick after all limits, delivered on average, canonical order [N], (n,)."""
         others = list(vehicle.actuators.values())
         self.setpoints: Array = np.zeros(len(others))
-        """Values that the last tick asked of the other actuators, within their travel [rad, m³ or m], (m,)."""
+        """Commanded values of the other actuators in the last tick, within their travel [rad, m³ or m], (m,)."""
         self._rest = np.array([math.nan if a.off is None else a.off for a in others])
         self._travel = np.array([a.minimum for a in others]), np.array([a.maximum for a in others])
         self._watchdogs = Supervision(vehicle, self.settings, self.motors.outputs)
@@ -797,7 +811,7 @@ class Bridge:
 
     @property
     def autopilot(self) -> MotorDevice | None:
-        """Has to be ready before the bridge arms, and may end it; None: there is none."""
+        """Device that must be ready before the bridge arms, and that may end arming; None: there is none."""
         return self._autopilot
 
     @autopilot.setter
@@ -805,10 +819,10 @@ class Bridge:
         self._autopilot, self._watchdogs.peer = autopilot, autopilot.peer
         self._watchdogs.telemetry.watched = autopilot.watched
 
-    # -- what the operator says -------------------------------------------------------------------------------
+    # -- operator commands ----------------------------------------------------------------------------------------
 
     def arm(self, now: float, source: str) -> str:
-        """Let commands through from now on. Returns "" or, in one sentence, why it is refused.
+        """Start to pass commands on. Return "", or in one sentence why arming is refused.
 
         `now` is the time [s].
         """
@@ -826,24 +840,24 @@ class Bridge:
         return ""
 
     def disarm(self, now: float) -> None:
-        """Thrusters off; a fault stays until it is acknowledged. `now` is the time [s]."""
+        """Switch the thrusters off; a fault remains until it is acknowledged. `now` is the time [s]."""
         self._at(now)
         if self.state in RUNNING:
             self._enter("disarmed", "", "disarmed")
 
     def stop(self, now: float, reason: str) -> None:
-        """Emergency stop, in every state. `now` is the time [s]."""
+        """Make an emergency stop, in any state. `now` is the time [s]."""
         self._at(now)
         self._fault(reason or "stopped")
 
     def acknowledge(self, now: float) -> None:
-        """End a fault; the bridge is disarmed then. `now` is the time [s]."""
+        """End a fault; the bridge is then disarmed. `now` is the time [s]."""
         self._at(now)
         if self.state == "fault":
             self._enter("disarmed", "", f"acknowledged: {self.reason}")
 
     def hold(self, now: float) -> None:
-        """Pause an armed vehicle without thrust until `resume`, for as long as the operator likes.
+        """Pause an armed vehicle without thrust until `resume`, without a time limit.
 
         `now` is the time [s].
         """
@@ -853,24 +867,24 @@ class Bridge:
             self._hold("the operator holds")
 
     def resume(self, now: float) -> None:
-        """End the operator's hold; thrust returns with the first command after it. `now` is the time [s]."""
+        """End the operator's hold; thrust resumes with the next command. `now` is the time [s]."""
         self._at(now)
         self._operator = False
 
-    # -- what comes in ----------------------------------------------------------------------------------------
+    # -- inputs -----------------------------------------------------------------------------------------------------
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
-        """A command; one that is refused does not count as a sign of life.
+        """Process a command; a refused command does not reset the command timeout.
 
         Args:
-            now: When it came [s].
-            force: Thrusts along the thrusters' axes, canonical order [N], (n,); these and the values of the other
-                actuators [rad, m³ or m], (n + m,), which otherwise stay where they are.
-            source: Who sent it; two at a time are a fault.
-            stamp: Time of what its sender knew, robot's clock [s].
+            now: Arrival of the command [s].
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,); or these and the values of the other
+                actuators [rad, m³ or m], (n + m,), which are otherwise unchanged.
+            source: Sender of the command; two senders at a time are a fault.
+            stamp: Time of the state on which the command is based, robot's clock [s].
 
         Returns:
-            The thrusts within their limits and the workspace's [N], (n,); zeros where they will not be used.
+            The thrusts within their limits and those of the workspace [N], (n,); zeros if they are not used.
         """
         unused = np.zeros_like(self.force)
         if not self._at(now):
@@ -884,7 +898,7 @@ class Bridge:
         return self._limited(now) if self.state == "armed" and not reason else unused
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
-        """A message from the motor controller. `now` is the time [s]."""
+        """Process a message from the motor controller. `now` is the time [s]."""
         if not self._at(now):
             return
         reason = self._watchdogs.telemetry.malformed(telemetry)
@@ -894,7 +908,7 @@ class Bridge:
             self._alarm("restart", f"the {self._watchdogs.peer} restarted: its clock went back")
 
     def echo(self, now: float, echo: CommandEcho) -> None:
-        """Note the motor controller's echo of a command. `now` is the time [s]."""
+        """Process the motor controller's echo of a command. `now` is the time [s]."""
         if not self._at(now):
             return
         news = self._watchdogs.echo.accept(now, echo, self.state == "armed")
@@ -905,14 +919,14 @@ class Bridge:
             self.log.repeat(now, "command rejected", f"the {self._watchdogs.peer} refused a command: {flags}")
 
     def reading(self, now: float, reading: Reading) -> None:
-        """Note a reading of the estimator. `now` is the time [s]."""
+        """Process a reading of the estimator. `now` is the time [s]."""
         if self._at(now):
             self._watchdogs.take_reading(now, reading)
 
-    # -- what goes out ----------------------------------------------------------------------------------------
+    # -- outputs ----------------------------------------------------------------------------------------------------
 
     def tick(self, now: float) -> ThrusterCommand:
-        """The frame to send now; call it at every turn of the loop, in every state. `now` is the time [s]."""
+        """Return the frame to send now; call it in every step of the loop, in every state. `now` is the time [s]."""
         dt = self._period(now)
         if self.state in RUNNING:
             self._watch(self._clock.now)
@@ -929,26 +943,26 @@ class Bridge:
 
     @property
     def source(self) -> str:
-        """Return the source of the newest command."""
+        """Source of the newest command."""
         return self._commander.source
 
     @property
     def requested(self) -> Array:
-        """The newest command before all limits, canonical order [N], (n,)."""
+        """Thrusts of the newest command before all limits, canonical order [N], (n,)."""
         return self._commander.force
 
     def note(self, now: float, text: str) -> None:
-        """Add a sentence of the device between us and the motors to the events. `now` is the time [s]."""
+        """Add a sentence of the device between the bridge and the motors to the events. `now` is the time [s]."""
         self.log.repeat(now, "autopilot", text)
 
     def drain(self) -> list[Event]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         return self.log.drain()
 
-    # -- inside -----------------------------------------------------------------------------------------------
+    # -- internal ---------------------------------------------------------------------------------------------------
 
     def _limited(self, now: float) -> Array:
-        """The newest command within the limits of the thrusters and of the workspace [N], (n,)."""
+        """Return the newest command within the limits of the thrusters and of the workspace [N], (n,)."""
         return self._watchdogs.limited(now, self.motors.limited(self._commander.force))
 
     def _refusal(self, now: float) -> str:
@@ -962,7 +976,7 @@ class Bridge:
         return self._pause(now) or self._watchdogs.unfit(now)
 
     def _watch(self, now: float) -> None:
-        """Let the watchdogs look: fault, hold, or on with it."""
+        """Evaluate the watchdogs, and enter fault or hold, or continue."""
         lost = self.autopilot.alarm(now) if self.autopilot is not None else ""
         danger = lost or self._watchdogs.danger(now)
         if danger:
@@ -975,11 +989,12 @@ class Bridge:
             self._wait(now, want, limited=not pause)
 
     def _pause(self, now: float) -> str:
-        """Return what the device between us and the motors waits for; "" if nothing."""
+        """Return what the device between the bridge and the motors waits for; "" if nothing."""
         return self.autopilot.pause(now) if self.autopilot is not None else ""
 
     def _wait(self, now: float, want: str, *, limited: bool) -> None:
-        """In hold: continue with the first command after the condition passed, or give up after the limit, if any."""
+        """Process a hold: continue with the first command after the condition passed, or fault after the limit, if
+        any."""
         if want:
             self.reason, self._passed_at = want, None
         elif self._passed_at is None:
@@ -996,7 +1011,7 @@ class Bridge:
         self._enter("hold", reason, reason)
 
     def _period(self, now: float) -> float:
-        """Time since the last tick [s], 0 at the first."""
+        """Return the time since the last tick [s], 0 at the first."""
         if not self._at(now):
             return 0.0
         before, self._ticked = self._ticked, self._clock.now
@@ -1006,10 +1021,10 @@ class Bridge:
         return step
 
     def _at(self, now: float) -> bool:
-        """Watches the clock; False where `now` is no time at all."""
+        """Check the clock; return False if `now` is not a number."""
         wrong = self._clock.wrong(now)
         if wrong and math.isfinite(now):
-            # Nothing that was heard before a jump has an age any more.
+            # Messages from before a jump no longer have a known age.
             self._watchdogs.forget()
             self._ticked = None
         if wrong:
@@ -1017,21 +1032,21 @@ class Bridge:
         return math.isfinite(now)
 
     def _alarm(self, kind: str, text: str) -> None:
-        """A fault where thrusters could turn, otherwise only an event."""
+        """Enter a fault if thrusters could turn, otherwise only add an event."""
         if self.state in RUNNING:
             self._fault(text)
         else:
             self.log.repeat(self._clock.now, kind, text)
 
     def _fault(self, reason: str) -> None:
-        """Stop; the first reason is kept until it is acknowledged."""
+        """Enter the fault state; the first reason is kept until it is acknowledged."""
         if self.state == "fault":
             self.log.repeat(self._clock.now, "also", reason)
         else:
             self._enter("fault", reason, reason)
 
     def _enter(self, state: str, reason: str, text: str) -> None:
-        """Changes state; no thrust is carried over."""
+        """Change the state; thrust is reset to zero."""
         self.state, self.reason, self._passed_at = state, reason, None
         self._operator = self._operator and state == "hold"
         self.force, self._memory = np.zeros_like(self.force), self.motors.reset()

@@ -17,26 +17,27 @@ from finssim.vehicles import Vehicle
 
 
 class GoalError(ValueError):
-    """A goal that cannot be read or that the vehicle may not go to."""
+    """A goal cannot be read, or the vehicle may not go there."""
 
 
 AHEAD = 2.0
-"""Time for which a goal without messages continues its motion before it stops [s]."""
+"""Longest time for which a goal continues its motion without messages before it stops [s]."""
 
 
 class HeardGoal:
-    """A moving goal from messages: between them it continues its motion, for `AHEAD` at most.
+    """A moving goal from messages; between them it continues its motion, for at most `AHEAD`.
 
     Attributes:
-        started: When the guide's time began, on the clock of the tracks [s].
+        started: Start of the guide's time, on the clock of the tracks [s].
     """
 
     name, duration = "target", math.inf
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
-        """
+        """Follow the track of the target.
+
         Args:
-            tracks: What is heard of others, `target` among them as soon as it is.
+            tracks: Received tracks of other vehicles; `target` is among them once it has been received.
         """
         self._tracks, self.started = tracks, math.nan
 
@@ -56,10 +57,11 @@ class HeardGoal:
 
 
 def station_of(text: str) -> Station:
-    """A station from "x,y,z,yaw_deg" (world frame [m], left positive [deg]) or from a file (.yaml) with such a `goal`.
+    """Return a station from "x,y,z,yaw_deg" (world frame [m], left positive [deg]), or from a file (.yaml) with a
+    `goal`.
 
     Raises:
-        GoalError: Neither four finite numbers nor a file that holds them.
+        GoalError: The text is neither four finite numbers nor a file that contains them.
     """
     if text.endswith((".yaml", ".yml")):
         return _numbers(text, _goal_in(Path(text)))
@@ -67,10 +69,10 @@ def station_of(text: str) -> Station:
 
 
 def place_of(text: str) -> tuple[float, float]:
-    """A place in the plane from "x,y", world frame [m].
+    """Return a horizontal position from "x,y", world frame [m].
 
     Raises:
-        GoalError: It is no such thing.
+        GoalError: The text is not two finite numbers.
     """
     try:
         x, y = map(float, text.split(","))
@@ -82,11 +84,11 @@ def place_of(text: str) -> tuple[float, float]:
 
 
 def guide_of(goal: str | None, trajectory: str | None) -> Guide:
-    """The wanted motion of a command line: one of the two.
+    """Return the guide of a command line: either a goal or a trajectory.
 
     Raises:
-        GoalError: Both, none, or a goal that cannot be read.
-        ControlError: A trajectory that cannot be.
+        GoalError: Both or neither are given, or the goal cannot be read.
+        ControlError: The trajectory is invalid.
     """
     if (goal is None) == (trajectory is None):
         raise GoalError(
@@ -100,7 +102,7 @@ def guide_of(goal: str | None, trajectory: str | None) -> Guide:
 
 
 def highest(guide: Guide) -> float:
-    """Return the greatest z to which a guide leads, world frame [m]."""
+    """Return the greatest z along a guide, world frame [m]."""
     return float(_places(guide)[:, 2].max())
 
 
@@ -111,10 +113,10 @@ def _places(guide: Guide) -> npt.NDArray[np.float64]:
 
 
 def check_reachable(guide: Guide, vehicle: Vehicle) -> None:
-    """Refuse a motion that leaves the box in which the vehicle may move, or that is faster than it can go.
+    """Refuse a motion that leaves the vehicle's workspace, or that is faster than the vehicle.
 
     Raises:
-        GoalError: It does, or is; says where or when.
+        GoalError: The motion is refused; the message states where or when.
     """
     places, end = _places(guide), guide.duration if math.isfinite(guide.duration) else 0.0
     lower, upper = vehicle.safety.workspace_lower, vehicle.safety.workspace_upper

@@ -1,4 +1,4 @@
-"""Ctrl-C, or a terminal that closes, ends a loop between two steps, so that thrusters are stopped in good order."""
+"""Interruption of a loop between two steps by Ctrl-C or a closed terminal, so that thrusters are stopped properly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from finssim.core.system import caused_by_interrupt, handled
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether a stop signal has come; a second signal interrupts immediately."""
+    """Yield a function that returns whether a stop signal was received; a second signal interrupts immediately."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
@@ -30,7 +30,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def interrupting() -> Iterator[None]:
-    """Raise KeyboardInterrupt for every stop signal, also where Ctrl-C was ignored at the start."""
+    """Raise KeyboardInterrupt for every stop signal, even if Ctrl-C was ignored at the start."""
     with handled(signal.default_int_handler):
         try:
             yield

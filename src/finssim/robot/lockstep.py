@@ -1,10 +1,10 @@
-"""Lock-step: the robot's software and a world take turns, so that time goes as fast as both can compute.
+"""Lock-step: the robot's software and a world advance in turns, as fast as both can compute.
 
 Over a stream every message is its length (u32), a kind (u8) and a body, all little endian:
 
     1 request   until f64, n u32, n frames
     2 delivery  time f64, n u32, n x (arrival f64, frame), m u32, m pictures
-    3 refusal   a sentence, UTF-8: the world cannot go on
+    3 refusal   a sentence, UTF-8: the world cannot continue
 
 A frame or a picture is its length (u32) and bytes; those of a picture are as on the UDP wire, uncompressed.
 """
@@ -25,18 +25,19 @@ from finssim.robot.runtime import Runtime
 
 REQUEST, DELIVERY, REFUSAL = 1, 2, 3
 LONGEST = 256 * 2**20
-"""A longer message is none [bytes]."""
+"""Greatest length of a message [bytes]."""
 
 _F8, _U4, _KIND = struct.Struct("<d"), struct.Struct("<I"), struct.Struct("<IB")
 _ARRIVED = struct.Struct("<dI")
 
 
 class LockstepError(ValueError):
-    """The other end is absent, has gone, or does not use this protocol."""
+    """The other end is missing, has closed the connection, or does not use this protocol."""
 
 
 def encode_request(until: float, sent: Sequence[bytes]) -> bytes:
-    """Return a request to advance a world to a time [s] with the frames that the robot sent to its motor controller."""
+    """Return a request to advance a world to a time [s] with the frames that the robot sent to its motor
+    controller."""
     parts = [_F8.pack(until), _U4.pack(len(sent))]
     for frame in sent:
         parts += (_U4.pack(len(frame)), frame)
@@ -44,10 +45,10 @@ def encode_request(until: float, sent: Sequence[bytes]) -> bytes:
 
 
 def decode_request(kind: int, body: bytes) -> tuple[float, tuple[bytes, ...]]:
-    """Time [s] and frames of a request.
+    """Return time [s] and frames of a request.
 
     Raises:
-        LockstepError: It is none.
+        LockstepError: The message is not a request.
     """
     if kind != REQUEST:
         raise LockstepError(
@@ -59,7 +60,7 @@ def decode_request(kind: int, body: bytes) -> tuple[float, tuple[bytes, ...]]:
 
 
 def encode_delivery(delivery: Delivery) -> bytes:
-    """Answer a request."""
+    """Return the response to a request."""
     parts = [_F8.pack(delivery.time), _U4.pack(len(delivery.frames))]
     for arrival, frame in delivery.frames:
         parts += (_ARRIVED.pack(arrival, len(frame)), frame)
@@ -71,15 +72,15 @@ def encode_delivery(delivery: Delivery) -> bytes:
 
 
 def encode_refusal(sentence: str) -> bytes:
-    """Return the answer that the world cannot continue, and why."""
+    """Return the response that the world cannot continue, with the reason."""
     return _message(REFUSAL, [sentence.encode()])
 
 
 def decode_delivery(kind: int, body: bytes) -> Delivery:
-    """Return what reached the robot.
+    """Return the content of a response.
 
     Raises:
-        LockstepError: A refusal, with its sentence, or no delivery.
+        LockstepError: The response is a refusal, whose sentence is the message, or not a delivery.
     """
     if kind == REFUSAL:
         raise LockstepError(body.decode(errors="replace"))
@@ -98,10 +99,10 @@ def decode_delivery(kind: int, body: bytes) -> Delivery:
 
 
 def receive(connection: socket.socket) -> tuple[int, bytes] | None:
-    """The next message's kind and body; None where the other end has closed between two messages.
+    """Return kind and body of the next message; None if the other end has closed between two messages.
 
     Raises:
-        LockstepError: It closed within a message, or what came is none.
+        LockstepError: The other end closed within a message, or the message is invalid.
         OSError: The connection broke or was silent for longer than its timeout.
     """
     head = _exactly(connection, _KIND.size)
@@ -129,7 +130,7 @@ def _picture(reader: _Reader) -> Picture:
 
 
 def _exactly(connection: socket.socket, size: int) -> bytes | None:
-    """Return that many bytes; None if the connection ended before the first."""
+    """Return exactly `size` bytes; None if the connection ended before the first."""
     buffer = bytearray(size)
     view, at = memoryview(buffer), 0
     while at < size:
@@ -143,7 +144,7 @@ def _exactly(connection: socket.socket, size: int) -> bytes | None:
 
 
 class _Reader:
-    """Reads the values of a body in order."""
+    """Reader of the values of a body in order."""
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0
@@ -159,34 +160,34 @@ class _Reader:
 
 
 DEFAULT_PORT = 58768
-"""Port of a pool for a robot in lock-step, on this machine."""
+"""Port of a pool on this machine for a robot in lock-step."""
 LAST_FRAMES = 3
-"""Frames without thrust that a run ends with."""
+"""Number of frames without thrust at the end of a run."""
 
 
 class Exchange(Protocol):
-    """A world whose time stops until it is asked to advance."""
+    """A world whose time advances only on request."""
 
     def exchange(self, until: float, sent: Sequence[bytes]) -> Delivery:
         """Advance the world.
 
         Args:
-            until: To this time, robot's clock [s].
+            until: New time, robot's clock [s].
             sent: Datagrams to the motor controller, sent at the time of the last call.
 
         Returns:
-            What has reached the robot's computer meanwhile.
+            Everything that reached the robot's computer meanwhile.
         """
 
 
 class Carrier(Protocol):
-    """Carries datagrams from one robot to the others."""
+    """Carrier of datagrams between robots."""
 
     def send(self, now: float, sender: str, datagram: bytes) -> None:
-        """Take one at a time [s]."""
+        """Send a datagram at a time [s]."""
 
     def receive(self, now: float, name: str) -> Sequence[bytes]:
-        """Return what has reached a robot by a time [s]."""
+        """Return the datagrams that have reached a robot by a time [s]."""
 
 
 class LockstepClient:
@@ -200,7 +201,7 @@ class LockstepClient:
             timeout: Longest silence [s].
 
         Raises:
-            LockstepError: Nobody answers there.
+            LockstepError: There is no response at this address.
         """
         host, _, port = address.rpartition(":")
         self.address = address
@@ -217,7 +218,7 @@ class LockstepClient:
         """Advance the world; see `Exchange`.
 
         Raises:
-            LockstepError: It refused, fell silent or has gone.
+            LockstepError: The world refused, did not respond or closed the connection.
         """
         try:
             self._connection.sendall(encode_request(until, sent))
@@ -232,7 +233,7 @@ class LockstepClient:
         return decode_delivery(*message)
 
     def close(self) -> None:
-        """Let go of the world."""
+        """Close the connection to the world."""
         self._connection.close()
 
     def __enter__(self) -> LockstepClient:
@@ -253,18 +254,18 @@ def run_lockstep(
     show: Callable[[Runtime], None] = lambda runtime: None,
     until: Callable[[Runtime], bool] = lambda runtime: False,
 ) -> float:
-    """Run a robot against a world until the time is over or `until` returns true; then stop its thrusters.
+    """Run a robot in a world until the time is over or `until` returns True; then stop its thrusters.
 
     Args:
         runtime: The robot.
-        world: Its world, which stands at `start`.
-        duration: How long [s].
-        rate: Steps a second [Hz].
+        world: Its world, at the time `start`.
+        duration: Duration [s].
+        rate: Steps per second [Hz].
         start: Robot's clock at the beginning [s].
-        gentle: Ctrl-C and SIGTERM end the run as its time does. Else they interrupt it, so that a trial that was
-            cut short is not taken for a whole one.
+        gentle: True if Ctrl-C and SIGTERM end the run as its duration does. Otherwise they interrupt it, so that an
+            interrupted trial is not taken for a complete one.
         show: Called after every step.
-        until: Ends the run early where it says so; asked after every step.
+        until: Called after every step; the run ends if it returns True.
 
     Returns:
         Robot's clock at the end [s].
@@ -286,17 +287,17 @@ def run_together(
     show: Callable[[], None] = lambda: None,
     until: Callable[[], bool] = lambda: False,
 ) -> float:
-    """Run several robots, each against its world, on one clock; as `run_lockstep`.
+    """Run several robots, each in its world, on one clock; see `run_lockstep`.
 
     Args:
         stacks: Robot and world by name.
-        duration: How long [s].
-        carrier: Of what the robots tell each other; None: they tell nothing.
-        rate: Steps a second [Hz].
+        duration: Duration [s].
+        carrier: Carrier of messages between the robots; None: they exchange no messages.
+        rate: Steps per second [Hz].
         start: Robots' clock at the beginning [s].
-        gentle: As of `run_lockstep`.
+        gentle: See `run_lockstep`.
         show: Called after every step of all.
-        until: Ends the run early where it says so; asked after every step of all.
+        until: Called after every step of all; the run ends if it returns True.
 
     Returns:
         Robots' clock at the end [s].
@@ -322,7 +323,7 @@ def run_together(
             show()
             if until():
                 break
-    # A world that ended above has stopped: only one that continues needs the last frames.
+    # A world that has ended is already stopped: only one that continues needs the last frames.
     last = [
         world.exchange(now + 1.0 / rate, runtime.stop(now, LAST_FRAMES)).time
         for runtime, world in stacks.values()

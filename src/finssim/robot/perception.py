@@ -1,4 +1,4 @@
-"""The state that a controller reads, from telemetry and pictures. Bad data is counted and never raises."""
+"""The state for a controller, from telemetry and pictures. Invalid data are counted and never raise an exception."""
 
 from __future__ import annotations
 
@@ -51,24 +51,25 @@ from finssim.robot.messages import (
 from finssim.robot.reading import Reading
 from finssim.vehicles import Vehicle
 
-# Telemetry as samples for the estimator: body axes, times of measurement, no sample twice, nothing that has frozen.
+# Telemetry as samples for the estimator: body axes, times of measurement, no duplicates, no frozen sensors.
 
 
 Three = tuple[float, float, float]
 
 FASTEST, STRONGEST, DEEPEST = 100.0, 1000.0, 1.0e4
-"""Rates [rad/s], specific forces [m/s²] and depths [m] beyond these are no measurements."""
+"""Greatest plausible rates [rad/s], specific forces [m/s²] and depths [m]."""
 IMU_STUCK, DEPTH_STUCK = 0.2, 1.0
-"""A sensor that has noise and repeats one value for this long has frozen [s]."""
+"""Time after which a noisy sensor that repeats one value counts as frozen [s]."""
 
 
 class Stuck:
     """Detector of a source that repeats the same value for too long."""
 
     def __init__(self, longest: float) -> None:
-        """
+        """Start without a value.
+
         Args:
-            longest: Time for which a live source may repeat itself [s]; inf: for ever.
+            longest: Time for which a working source may repeat itself [s]; inf: without limit.
         """
         self.longest = longest
         self._value: Hashable = None
@@ -78,8 +79,8 @@ class Stuck:
         """Note a value, and return whether the source has frozen.
 
         Args:
-            value: What it says.
-            time: When it said so [s].
+            value: Value of the source.
+            time: Time of the value [s].
         """
         if value != self._value or time < self._since:
             self._value, self._since = value, time
@@ -87,12 +88,14 @@ class Stuck:
 
 
 class VehicleSensors:
-    """The sensors aboard one vehicle. The methods return a sample, or in a word why there is none ("" for no news)."""
+    """The sensors aboard one vehicle. The methods return a sample, or in a word why there is none ("" if there is
+    no news)."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        """
+        """Read the properties of the sensors.
+
         Args:
-            vehicle: Its sensors' mounting, rates, latencies and noise.
+            vehicle: Vehicle with the mounting, rates, latencies and noise of its sensors.
         """
         imu, depth = vehicle.sensors.imu, vehicle.sensors.depth
         R = quat_to_matrix(imu.orientation if imu else (0.0, 0.0, 0.0, 1.0))
@@ -109,12 +112,12 @@ class VehicleSensors:
         self._depth, self._depth_time = math.nan, -math.inf
 
     def imu(self, telemetry: Telemetry, time: float, arrival: float) -> ImuSample | str:
-        """The angular rate, specific force and tilt of a telemetry.
+        """Return angular rate, specific force and tilt of a telemetry message.
 
         Args:
-            telemetry: As it came.
-            time: When it was sent, robot's clock [s].
-            arrival: When it came [s].
+            telemetry: The message.
+            time: Time of sending, robot's clock [s].
+            arrival: Time of arrival [s].
         """
         gyro, accel = telemetry.gyro, telemetry.accel
         if not (_within(gyro, FASTEST) and _within(accel, STRONGEST)):
@@ -125,12 +128,12 @@ class VehicleSensors:
         return ImuSample(time - self._imu_latency, omega, force, self.tilt(telemetry), arrival)
 
     def depth(self, telemetry: Telemetry, time: float, arrival: float) -> DepthSample | str:
-        """The depth, once each time that it was measured: telemetry repeats it until there is a new one.
+        """Return the depth, once per measurement: telemetry repeats it until there is a new one.
 
         Args:
-            telemetry: As it came.
-            time: When it was sent, robot's clock [s].
-            arrival: When it came [s].
+            telemetry: The message.
+            time: Time of sending, robot's clock [s].
+            arrival: Time of arrival [s].
         """
         depth = telemetry.depth
         if not abs(depth) <= DEEPEST:
@@ -138,18 +141,18 @@ class VehicleSensors:
         if self._depth_stuck.look(depth, time):
             return "frozen"
         waited = time - self._depth_time
-        # The same value may have been measured again; half a period lets a jittery sensor be early.
+        # The same value may have been measured again; the factor of a half allows for jitter of the sensor.
         if 0.0 <= waited < (0.5 if depth != self._depth else 1.0) * self._depth_period - 1e-6:
             return ""
         self._depth, self._depth_time = depth, time
         return DepthSample(time - self._depth_latency, depth, arrival)
 
     def aid(self, aid: NavigationAid, arrival: float) -> Sample | str:
-        """The sample of a navigation aid, or in a word why there is none.
+        """Return the sample of a navigation aid, or in a word why there is none.
 
         Args:
-            aid: As it came.
-            arrival: When it came [s].
+            aid: The received message.
+            arrival: Time of arrival [s].
         """
         time = arrival - max(aid.age, 0.0)
         x, y, z = aid.values
@@ -172,14 +175,16 @@ class VehicleSensors:
         return x, y, z
 
     def tilt(self, telemetry: Telemetry) -> tuple[float, float] | None:
-        """Roll and pitch of the body [rad], from what the attitude filter takes for upwards; None: it has none."""
+        """Return roll and pitch of the body [rad] from the attitude filter's vertical; None if it has no valid
+        attitude."""
         if not _is_unit(telemetry.quaternion):
             return None
         x, y, z = self._R_bs @ quat_inverse_rotate(telemetry.quaternion, (0.0, 0.0, 1.0))
         return math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
 
     def yaw(self, telemetry: Telemetry) -> float:
-        """Heading of the body's x axis by the attitude filter alone [rad], which drifts; NaN where it has none."""
+        """Return the heading of the body's x axis by the attitude filter alone [rad], which drifts; NaN if it is
+        invalid."""
         if not _is_unit(telemetry.quaternion):
             return math.nan
         x, y, _ = quat_rotate(telemetry.quaternion, self._R_bs[0])
@@ -192,7 +197,7 @@ def _is_unit(q: tuple[float, float, float, float]) -> bool:
 
 
 def _within(values: Three, bound: float) -> bool:
-    """Return whether all are numbers of at most that size."""
+    """Return whether all numbers have at most this magnitude."""
     return all(abs(v) <= bound for v in values)
 
 
@@ -202,9 +207,9 @@ def _within(values: Three, bound: float) -> bool:
 Array = npt.NDArray[np.float64]
 
 ALPHA = 0.35
-"""Part of a new difference that enters the speed (published velocity filter)."""
+"""Weight of a new difference in the speed (published velocity filter)."""
 LONGEST = 0.5
-"""Longest time over which a difference gives a speed [s]."""
+"""Longest time over which a difference yields a speed [s]."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +232,7 @@ class _Axis:
 
 
 class Unfused:
-    """Position, velocity and heading in the pool frame as the sensors alone have them."""
+    """Position, velocity and heading in the pool frame directly from the sensors."""
 
     def __init__(self) -> None:
         self._xy = _Axis(np.full(2, math.nan), np.zeros(2))
@@ -236,21 +241,21 @@ class Unfused:
         self._offset = math.nan
 
     def heading(self, yaw: float) -> None:
-        """Take in the attitude filter's own heading [rad]."""
+        """Store the attitude filter's own heading [rad]."""
         if math.isfinite(yaw):
             self._heading = yaw
 
     def height(self, z: float, time: float) -> None:
-        """Take in the height of the body origin [m]."""
+        """Store the height of the body origin [m]."""
         if math.isfinite(z):
             self._z = self._z.after(np.array([z]), time)
 
     def fix(self, position: tuple[float, float], yaw: float | None, time: float) -> None:
-        """Note a fix; the first with a yaw gives the zero of the attitude filter.
+        """Store a fix; the first one with a yaw determines the offset of the attitude filter's heading.
 
         Args:
             position: x, y of the body origin, pool frame [m].
-            yaw: Left positive, pool frame [rad]; None where it is not known.
+            yaw: Left positive, pool frame [rad]; None if unknown.
             time: Middle of the exposure [s].
         """
         self._xy = self._xy.after(np.array(position), time)
@@ -259,25 +264,25 @@ class Unfused:
 
     @property
     def vision_time(self) -> float | None:
-        """Time of the latest fix [s]."""
+        """Time of the latest fix [s]; None before the first."""
         return None if math.isnan(self._xy.time) else self._xy.time
 
     @property
     def x(self) -> Array:
-        """Position [m] and velocity [m/s], (6,); NaN where not known."""
+        """Position [m] and velocity [m/s], (6,); NaN if unknown."""
         return np.concatenate([self._xy.value, self._z.value, self._xy.speed, self._z.speed])
 
     @property
     def yaw(self) -> float:
-        """[rad]; NaN before the first fix."""
+        """Yaw [rad]; NaN before the first fix."""
         return float(wrap_angle(self._heading + self._offset))
 
 
-# What a vehicle knows of itself without a camera: attitude and rates, no position. Enough for a person who drives.
+# State of a vehicle without a camera: attitude and rates, no position. Sufficient for manual driving.
 
 
 class Unlocated:
-    """Replacement of `Perception` without a pool file: never ready, so that no pilot that needs a state acts."""
+    """Replacement of `Perception` without a pool file: never ready, so that pilots that need a state do not act."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle, self.let_in = vehicle, None
@@ -288,12 +293,12 @@ class Unlocated:
         self._nu = np.full(6, np.nan)
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Take attitude and rates; what is not finite is passed over.
+        """Store attitude and rates; messages that are not finite are ignored.
 
         Args:
-            now: When it came [s].
-            telemetry: As it was decoded.
-            time: When it was measured, the vehicle's clock mapped to ours [s].
+            now: Time of arrival [s].
+            telemetry: The decoded message.
+            time: Time of measurement, on the robot's clock [s].
         """
         q, gyro = np.array(telemetry.quaternion), self._R_body_imu @ telemetry.gyro
         if np.isfinite(q).all() and np.isfinite(gyro).all():
@@ -301,14 +306,14 @@ class Unlocated:
             self._nu[3:] = gyro
 
     def aid(self, arrival: float, aid: NavigationAid) -> None:
-        """Nothing is located, so nothing is aided. `arrival` is a time [s]."""
+        """Ignore a navigation aid, since nothing is located. `arrival` is a time [s]."""
 
     def picture(self, now: float, picture: Picture) -> Any:
-        """Pictures say nothing without a pool file."""
+        """Ignore a picture, which cannot be evaluated without a pool file."""
         return None
 
     def reading(self, now: float) -> Reading:
-        """Attitude and rates at a time [s]; position and velocity are NaN."""
+        """Return attitude and rates at a time [s]; position and velocity are NaN."""
         return Reading(
             time=now,
             position=np.full(3, np.nan),
@@ -321,20 +326,20 @@ class Unlocated:
 
 
 PICTURE_STUCK = 0.4
-"""Corners that stay the same to the last digit for this long are one picture sent again and again [s]."""
+"""Time after which exactly constant corners count as one picture that is sent repeatedly [s]."""
 
 LET_IN_STD = 0.05
 """Standard deviation of the initial position of a vehicle, per axis [m]."""
 LET_IN_AFTER = 0.5
-"""Time from the first requested state until the position is given: by then there is inertial data to integrate [s]."""
+"""Time from the first request of the state until the initial position is used; by then there is inertial data [s]."""
 
 JUMP = 1.0
-"""Data that is older than the newest by more than this comes from a clock that was set back [s]."""
+"""Age relative to the newest data above which the sender's clock counts as set back [s]."""
 
 
 class Perception:
-    """The state of one vehicle from its telemetry and what else there is: an overhead camera, position fixes on the
-    wire, Doppler log and compass."""
+    """State of one vehicle from its telemetry and other sources: an overhead camera, position fixes on the link, DVL
+    and compass."""
 
     def __init__(
         self,
@@ -347,17 +352,18 @@ class Perception:
         settings: Settings | None = None,
         let_in: Sequence[float] | None = None,
     ) -> None:
-        """
+        """Set up the estimator.
+
         Args:
-            vehicle: Its tags and sensors.
-            pool: Camera, water and frames; None where no camera looks: the pool frame is then the world's.
-            method: How tags become fixes, a name of `localization.poses.methods.METHODS`.
-            mode: Of the estimator: constant-velocity or error-state. None: error-state, which takes the accelerations
-                of an IMU, on a vehicle that has one.
+            vehicle: Vehicle with its tags and sensors.
+            pool: Camera, water and frames; None without a camera: the pool frame is then the world frame.
+            method: Method for position fixes from tags, a name of `localization.poses.methods.METHODS`.
+            mode: Mode of the estimator: constant-velocity or error-state. None: error-state, which uses the
+                accelerations of an IMU, for a vehicle with one, otherwise constant-velocity.
             fusion: False: no filter, for the ablation "without EKF" (`Unfused`).
-            settings: Of the estimator; the vehicle file's noises if None.
-            let_in: x, y of where the vehicle begins, world frame [m]: the one fix that dead reckoning starts from.
-                None: something else tells where it is.
+            settings: Settings of the estimator; the vehicle file's noises if None.
+            let_in: Initial x, y of the vehicle, world frame [m]: the single fix from which dead reckoning starts. None:
+                another source provides the position.
 
         Raises:
             LocalizationError: Unknown method or mode; a vehicle without tags; a pool whose z is not up.
@@ -379,16 +385,16 @@ class Perception:
         self._pictures = Stuck(PICTURE_STUCK)
         self._last_picture = -math.inf
         self.let_in = None if let_in is None else (float(let_in[0]), float(let_in[1]))
-        """x, y of where the vehicle begins, world frame [m]; None: not given."""
+        """Initial x, y of the vehicle, world frame [m]; None: not given."""
         self._let_in, self._asked_since = self.let_in, math.nan
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Take in what the vehicle sent.
+        """Process telemetry of the vehicle.
 
         Args:
-            now: When it came [s].
-            telemetry: As it was decoded.
-            time: When it was measured, the vehicle's clock mapped to ours [s].
+            now: Time of arrival [s].
+            telemetry: The decoded message.
+            time: Time of measurement, on the robot's clock [s].
         """
         imu = self._aboard.imu(telemetry, time, now)
         if isinstance(imu, ImuSample):
@@ -407,10 +413,10 @@ class Perception:
             self.estimator.refuse("depth", depth)
 
     def picture(self, now: float, picture: Picture) -> str:
-        """Take in a picture, or the tags that were found in it.
+        """Process a picture, or the tags detected in it.
 
         Returns:
-            `accepted`, or why it gave no fix.
+            `accepted`, or the reason why there is no fix.
         """
         time = min(picture.time, now) if math.isfinite(picture.time) else math.nan
         if _older(time, self._last_picture):
@@ -425,7 +431,7 @@ class Perception:
         corners = tuple(tuple(d.corners.ravel().tolist()) for d in detections)
         if corners and self._pictures.look(corners, time):
             return self.estimator.refuse("vision", "frozen")
-        assert self.fixes is not None  # found is None without a pool
+        assert self.fixes is not None  # detections is None without a pool
         fix = self.fixes.fix(Frame(time, "", tuple(detections)), self.estimator)
         if not isinstance(fix, VisionSample):
             return self.estimator.refuse("vision", fix)
@@ -434,11 +440,11 @@ class Perception:
         return self.estimator.add(fix)
 
     def aid(self, arrival: float, aid: NavigationAid) -> None:
-        """Take in what a navigation instrument sent.
+        """Process a message of a navigation instrument.
 
         Args:
-            arrival: When it came [s].
-            aid: As it was decoded.
+            arrival: Time of arrival [s].
+            aid: The decoded message.
         """
         sample = self._aboard.aid(aid, arrival)
         if isinstance(sample, str):
@@ -447,7 +453,7 @@ class Perception:
             self.estimator.put(self._frame.in_pool(sample))
 
     def reading(self, now: float) -> Reading:
-        """The state at a time [s], in world and body axes."""
+        """Return the state at a time [s], in world and body axes."""
         estimate = self._estimate(now)
         health = health_of(estimate, self.estimator.settings, self.estimator.site, {}, "", {})
         self._tell_let_in(now)
@@ -464,11 +470,11 @@ class Perception:
         )
 
     def health(self) -> Health:
-        """The estimator's condition at the time of its newest sample, with what it refused and why."""
+        """Return the estimator's health at the time of its newest sample, with counts of refused samples by reason."""
         return self.estimator.health(self.estimator.estimate())
 
     def _tell_let_in(self, now: float) -> None:
-        """Give the estimator, once, the initial position of the vehicle: as soon as there is inertial data."""
+        """Provide the estimator once with the initial position of the vehicle, as soon as there is inertial data."""
         if self._let_in is None or (self.vehicle.sensors.imu is not None and self._omega_time == -math.inf):
             return
         self._asked_since = now if math.isnan(self._asked_since) else self._asked_since
@@ -485,7 +491,7 @@ class Perception:
         return replace(estimate, x=raw.x, yaw=raw.yaw, vision_time=raw.vision_time)
 
     def _turning(self, estimate: PoseEstimate) -> Array:
-        """Return the angular velocity, body frame [rad/s], minus the known gyro bias about the vertical."""
+        """Return the angular velocity, body frame [rad/s], minus the estimated gyroscope bias about the vertical."""
         if not math.isfinite(estimate.yaw_rate):
             return np.full(3, math.nan)
         omega, roll, cos = np.array(self._omega), estimate.roll, math.cos(estimate.pitch)
@@ -494,7 +500,7 @@ class Perception:
         return omega - bias * up
 
     def _height(self, telemetry: Telemetry) -> float:
-        """Height of the body origin in the pool frame from depth and tilt alone [m]."""
+        """Return the height of the body origin in the pool frame from depth and tilt alone [m]."""
         tilt, site = self._aboard.tilt(telemetry), self.estimator.site
         if tilt is None:
             return math.nan
@@ -510,7 +516,7 @@ class Perception:
             return None
         if self._tracker is None:
             tags = self.vehicle.tags
-            assert tags is not None  # the locator has refused such a vehicle
+            assert tags is not None  # the locator refuses a vehicle without tags
             self._tracker = RegionTracker(detector(tags.family), set(tags.mounts))
         return self._tracker.detect(picture.image, time)
 
@@ -524,11 +530,11 @@ class _WorldFrame:
         self._R_wg = self._R_wp @ axes_of_up(up)
         self._q_wg = matrix_to_quat(self._R_wg)
         self._plain = bool(np.allclose(self._R_wp, np.eye(3), atol=1e-12))
-        # Heading of the pool frame's level axes, in which the estimator counts yaw.
+        # Heading of the pool frame's level axes, the reference of the estimator's yaw.
         self._yaw = math.atan2(self._R_wg[1, 0], self._R_wg[0, 0])
 
     def in_pool(self, sample: Sample) -> Sample:
-        """A fix or heading of the world, in the pool frame; a velocity is the body's own and stays."""
+        """Transform a fix or heading from the world to the pool frame; a velocity in body axes is unchanged."""
         if isinstance(sample, HeadingSample):
             return replace(sample, yaw=math.remainder(sample.yaw - self._yaw, math.tau))
         if not isinstance(sample, VisionSample):
@@ -539,13 +545,13 @@ class _WorldFrame:
         return replace(sample, position=(cos * x + sin * y, cos * y - sin * x), yaw=yaw)
 
     def state(self, estimate: PoseEstimate) -> tuple[Array, Array, Array]:
-        """Position [m], attitude xyzw, velocity in body axes [m/s]."""
+        """Return position [m], attitude xyzw, and velocity in body axes [m/s]."""
         position = self._R_wp @ estimate.x[:3] + self._t
         q = quat_multiply(self._q_wg, quat_from_euler(estimate.roll, estimate.pitch, estimate.yaw))
         return position, q, quat_inverse_rotate(q, self._R_wp @ estimate.x[3:])
 
     def std(self, estimate: PoseEstimate) -> Array:
-        """Standard deviations of position, velocity (world axes) and yaw, (7,)."""
+        """Return the standard deviations of position, velocity (world axes) and yaw, (7,)."""
         if self._plain:
             return estimate.std()
         P = np.zeros((6, 6))
@@ -555,12 +561,12 @@ class _WorldFrame:
 
 
 def _older(time: float, last: float) -> bool:
-    """Return whether a sample is repeated or late; a very late one means that the clock was set back."""
+    """Return whether a sample is repeated or late; a very late one indicates that the clock was set back."""
     return last - JUMP < time <= last
 
 
 def _why(health: Health, camera: bool) -> str:
-    """Return why a state is not ready, in words for a user with or without a camera."""
+    """Return why a state is not ready, for a user with or without a camera."""
     if math.isnan(health.age_imu) or not health.imu_fresh:
         return "no inertial data"
     if math.isnan(health.age_depth) or not health.depth_fresh:

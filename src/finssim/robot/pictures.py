@@ -1,4 +1,4 @@
-"""Pictures on their way to the robot: as bytes, over UDP, and searched for tags on a thread."""
+"""Transport of pictures to the robot: encoding, UDP, and detection of tags in a thread."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from finssim.robot.messages import Picture, TagCorners
 from finssim.vehicles import Vehicle
 from finssim.vehicles.equipment import SENSOR_NAME
 
-# Pictures of a record, in JPEG.
+# Pictures of a record, as JPEG.
 
 
 QUALITY = 90
@@ -34,20 +34,21 @@ Image = npt.NDArray[np.uint8]
 
 
 def jpeg(image: Image) -> bytes | None:
-    """A gray picture (h, w) or one in blue, green and red (h, w, 3); None where it is no such picture."""
+    """Return a gray picture (h, w) or one in blue, green and red (h, w, 3) as JPEG; None if it is not such a
+    picture."""
     import cv2
 
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or not image.size:
         return None
     try:
         well, packed = cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    except cv2.error:  # a size that the format has not
+    except cv2.error:  # a size that the format does not support
         return None
     return packed.tobytes() if well else None
 
 
 def picture_of(data: Image | bytes, *, colour: bool = False) -> Image | None:
-    """The gray picture, (h, w), or in red, green and blue, (h, w, 3); None where the data are none."""
+    """Return the gray picture, (h, w), or in red, green and blue, (h, w, 3); None if the data are not a picture."""
     import cv2
 
     kind = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
@@ -56,14 +57,15 @@ def picture_of(data: Image | bytes, *, colour: bool = False) -> Image | None:
 
 
 def resized(image: Image | None, shape: Sequence[int]) -> Image:
-    """A picture in another size, each pixel the mean of those that it covers; of a sonar's the nearest range cells.
+    """Return a picture in another size, each pixel the mean of those that it covers; for a sonar the nearest range
+    cells.
 
     Args:
-        image: In colour, gray, or a sonar's echoes by beam and range cell.
-        shape: Rows, columns, and 3 of one in colour; of a sonar beams, range cells and 1.
+        image: Picture in colour, gray, or a sonar's echoes by beam and range cell.
+        shape: Rows, columns, and 3 for colour; for a sonar beams, range cells and 1.
 
     Raises:
-        LinkError: It is none, or of another kind.
+        LinkError: There is no picture, or it is of another kind.
     """
     if image is not None and image.ndim == 2 and len(shape) == 3:
         cut = image[:, : shape[1], None]
@@ -79,10 +81,10 @@ def resized(image: Image | None, shape: Sequence[int]) -> Image:
     return np.asarray(cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# A picture as bytes: a head, the sensor's name, the tags, and the image as it is or as JPEG.
+# Encoding of a picture: a header, the sensor's name, the tags, and the image, raw or as JPEG.
 #
 # magic "FSPC", version u8, format u8, tags u16, time f64, late f64, sequence u32, rows u32, columns u32,
-# length of the image u32; of version 2, for the vehicle's own sensors, its name in 32 bytes, filled up with 0;
+# length of the image u32; in version 2, for the vehicle's own sensors, its name in 32 bytes, padded with 0;
 # per tag: id i32, corners 8 x f64; the image, or ranges as f32. All little endian.
 
 
@@ -94,7 +96,7 @@ NO_IMAGE, RAW, JPEG, COLOUR, COLOUR_JPEG, RANGES = range(6)
 """Formats: none, gray, red green blue with 3 bytes a pixel, or ranges in one row."""
 MOST_TAGS = 256
 LARGEST = 64 * 2**20
-"""Pixels; a larger picture is none."""
+"""Greatest number of pixels of a picture."""
 
 
 @dataclass(frozen=True)
@@ -104,16 +106,16 @@ class Posted:
     picture: Picture
     """`time` is on the sender's clock."""
     late: float
-    """Delay of its sending after `time` [s]: the drawing time beyond the camera's latency."""
+    """Delay of its sending after `time` [s]: the rendering time beyond the camera's latency."""
 
 
 def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = False) -> bytes:
-    """A picture as bytes.
+    """Return a picture as bytes.
 
     Args:
         picture: Gray or in colour, tags alone, or ranges.
         late: Time of sending minus `picture.time` [s].
-        compress: As JPEG of quality 90, which moves corners by 0.004 px and takes an eighth of the bytes.
+        compress: True for JPEG of quality 90, which shifts corners by 0.004 px and needs an eighth of the bytes.
     """
     image, (rows, columns), kind, data = picture.image, (0, 0), NO_IMAGE, b""
     if picture.ranges is not None:
@@ -132,7 +134,7 @@ def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = Fals
 
 
 def decode_picture(data: bytes) -> Posted | None:
-    """The picture; None where the bytes are none. Never raises."""
+    """Return the picture; None if the bytes are invalid. Never raises an exception."""
     if len(data) < _HEAD.size:
         return None
     magic, version, kind, n, time, late, sequence, rows, columns, size = _HEAD.unpack_from(data)
@@ -172,7 +174,7 @@ def _tags(data: bytes, n: int) -> tuple[TagCorners, ...] | None:
 def _image(
     kind: int, data: bytes, rows: int, columns: int
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
-    """Pixels, None where they are not those that the head announces."""
+    """Return the pixels; None if they do not match the header."""
     colour = kind in (COLOUR, COLOUR_JPEG)
     shape = (rows, columns, 3) if colour else (rows, columns)
     if kind in (RAW, COLOUR) and len(data) == math.prod(shape) > 0:
@@ -184,7 +186,7 @@ def _image(
 
 
 def _announced(data: bytes) -> tuple[int, int] | None:
-    """Rows and columns in a JPEG's own frame header, so that no bomb is unpacked."""
+    """Return rows and columns in a JPEG's own header, so that no decompression bomb is decoded."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
@@ -194,7 +196,7 @@ def _announced(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-# Messages longer than a datagram: cut into numbered fragments, and put together again with bounded memory.
+# Messages longer than a datagram: split into numbered fragments, and reassembled with bounded memory.
 #
 # magic "FSPF", message u32, index u16, count u16, CRC-32 of the complete message u32; then a piece of it.
 # All little endian; every piece but the last has the same length.
@@ -203,21 +205,22 @@ def _announced(data: bytes) -> tuple[int, int] | None:
 _FRAGMENT_HEAD = struct.Struct("<4sIHHI")
 _FRAGMENT_MAGIC = b"FSPF"
 LONGEST_FRAGMENT = 60_000
-"""Bytes of the message in a datagram, within the limit of loopback. Elsewhere 1400 are below a network's MTU."""
+"""Bytes of the message in a datagram, within the limit of the loopback interface; 1400 are below the MTU of other
+networks."""
 MOST_FRAGMENTS = 4096
 UNFINISHED = 4
-"""Greatest number of messages under way; an older one is dropped."""
+"""Greatest number of incomplete messages; older ones are dropped."""
 MOST_BYTES = 32 * 2**20
-"""Greatest size of all unfinished messages together."""
+"""Greatest size of all incomplete messages together."""
 
 
 def fragments(data: bytes, number: int, size: int = LONGEST_FRAGMENT) -> list[bytes]:
-    """Datagrams that carry a message.
+    """Return the datagrams of a message.
 
     Args:
         data: The message.
-        number: Of the message, counting up; the next one's is different.
-        size: Bytes of the message in each.
+        number: Number of the message, different from the next one's.
+        size: Bytes of the message in each datagram.
     """
     pieces = [data[i : i + size] for i in range(0, len(data), size)] or [b""]
     crc = zlib.crc32(data)
@@ -228,17 +231,18 @@ def fragments(data: bytes, number: int, size: int = LONGEST_FRAGMENT) -> list[by
 
 
 class Assembler:
-    """Assembles fragments in any order, some repeated and some lost, to complete messages. Never raises."""
+    """Assembler of complete messages from fragments in any order, with repetitions and losses. Never raises an
+    exception."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        """whole, unknown (no fragment), incomplete (given up), corrupt (CRC)."""
+        """Numbers of messages: whole, unknown (not a fragment), incomplete (dropped), corrupt (CRC)."""
         self._parts: OrderedDict[tuple[int, int, int], dict[int, bytes]] = OrderedDict()
         self._held = 0
         self._done: OrderedDict[tuple[int, int, int], None] = OrderedDict()
 
     def add(self, datagram: bytes) -> bytes | None:
-        """The message that this fragment completes, if it does."""
+        """Return the message that this fragment completes, or None."""
         if len(datagram) < _FRAGMENT_HEAD.size:
             self.counts["unknown"] += 1
             return None
@@ -277,32 +281,33 @@ class Assembler:
             self.counts["incomplete"] += 1
 
 
-# Pictures over UDP from one peer alone, received by a separate thread so that none waits for the control loop.
+# Pictures over UDP from one peer only, received by a separate thread so that they do not wait for the control loop.
 
 
 _WAITING = 16
-"""Pictures and readings that wait for the loop; the oldest is forgotten."""
+"""Greatest number of waiting pictures and readings; the oldest is dropped."""
 _BUFFER = 4 * 2**20
-"""Asked of the system for what has not been read yet [bytes]."""
+"""Requested size of the system's receive buffer [bytes]."""
 _LATEST = 10.0
-"""A picture cannot be later than this [s]."""
+"""Greatest delay of a picture [s]."""
 
 
 class UdpPictures:
-    """The camera's end is one address; what others send is refused, counted and named once in the log.
+    """Receiver of pictures from one address; datagrams of others are refused, counted and logged once.
 
-    A picture's time is that of its reception, less what its sender says that sending was late.
+    A picture's time is that of its reception minus the sending delay that the sender reports.
     """
 
     def __init__(self, bind: tuple[str, int], peer: tuple[str, int], *, polled: bool = False) -> None:
-        """
+        """Start receiving.
+
         Args:
-            bind: Address and port of this end; port 0 takes a free one (see `address`).
-            peer: Address and port of the camera's end.
-            polled: Read the wire in `receive` alone, whose time is then that of reception, by whatever clock.
+            bind: Local address and port; port 0 selects a free one (see `address`).
+            peer: Address and port of the camera.
+            polled: True to read the socket only in `receive`, whose time is then that of reception, on any clock.
 
         Raises:
-            LinkError: An address cannot be found or bound.
+            LinkError: An address cannot be resolved or bound.
         """
         self.not_understood = 0
         self.assembler = Assembler()
@@ -315,7 +320,7 @@ class UdpPictures:
             self._thread.start()
 
     def receive(self, now: float) -> list[Picture]:
-        """Pictures since the last call, oldest first, with times on the clock of `now` [s]."""
+        """Return the pictures since the last call, oldest first, with times on the clock of `now` [s]."""
         received, later = [], 0.0 if self._thread is None else realtime.now() - now
         for data in self._wire.receive() if self._thread is None else ():
             self._add(now, data)
@@ -325,14 +330,14 @@ class UdpPictures:
         return received
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._open = False
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         self._wire.close()
 
     def describe(self) -> str:
-        """Both ends, and what went wrong so far."""
+        """Return both addresses and the errors so far."""
         counts = self.assembler.counts
         bad = counts["incomplete"] + counts["corrupt"] + counts["unknown"] + self.not_understood
         text = f"{self._wire.describe()}, {counts['whole']} pictures"
@@ -356,53 +361,53 @@ class UdpPictures:
         self._waiting.append((came - posted.late, posted.picture))
 
 
-# Where pictures come from: over UDP, or nowhere.
+# Sources of pictures: UDP, or none.
 
 
 DEFAULT_CAMERA = "127.0.0.1:58767"
 """Address of the virtual pool's camera."""
 DEFAULT_PICTURES = "127.0.0.1:54322"
-"""Address at which the robot takes its pictures."""
+"""Address at which the robot receives its pictures."""
 
 
 class PictureSource(Protocol):
-    """The robot's end of the camera's wire. No call blocks, and none raises for what happens on the wire."""
+    """The robot's end of the camera link. No call blocks, and no event on the link raises an exception."""
 
     def receive(self, now: float) -> list[Picture]:
-        """Pictures that came since the last call, oldest first, each with its time on the clock of `now` [s]."""
+        """Return the pictures since the last call, oldest first, each with its time on the clock of `now` [s]."""
 
     def close(self) -> None:
-        """Let go of the wire."""
+        """Close the link."""
 
     def describe(self) -> str:
-        """The wire and how it fares, in a few words."""
+        """Return the address and the state of the link, in a few words."""
 
 
 class NoPictures:
     """No camera."""
 
     def receive(self, now: float) -> list[Picture]:
-        """Nothing. `now` is the time [s]."""
+        """Return no pictures. `now` is the time [s]."""
         return []
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing."""
 
     def describe(self) -> str:
-        """Return that there is none."""
+        """Return the description that there is none."""
         return "no pictures"
 
 
 def open_pictures(address: str, bind: str = DEFAULT_PICTURES, *, polled: bool = False) -> PictureSource:
-    """The source that an address names.
+    """Return the source of pictures at an address.
 
     Args:
-        address: "udp://HOST:PORT" of the camera's end, or "none".
-        bind: "ADDRESS:PORT" of this end, for UDP.
-        polled: As of `UdpPictures`.
+        address: "udp://HOST:PORT" of the camera, or "none".
+        bind: Local "ADDRESS:PORT", for UDP.
+        polled: See `UdpPictures`.
 
     Raises:
-        LinkError: It names no source, or the source cannot be opened.
+        LinkError: The address is invalid, or the source cannot be opened.
     """
     kind, _, rest = address.partition(":")
     if kind == "udp" and rest.startswith("//"):
@@ -412,20 +417,20 @@ def open_pictures(address: str, bind: str = DEFAULT_PICTURES, *, polled: bool = 
     raise LinkError(f"unknown source of pictures {address!r}: give udp://HOST:PORT or none")
 
 
-# A picture source whose tags are found on a separate thread, so that the control loop never waits for a detector.
+# A picture source that detects tags in a separate thread, so that the control loop never waits for a detector.
 
 
 _TAGS_LOG = logging.getLogger(__name__)
 POLL = 0.002
-"""Time between two looks for a new picture [s]."""
+"""Time between two checks for a new picture [s]."""
 WAITING = 16
-"""Pictures and readings that wait for the loop."""
+"""Greatest number of pictures and readings that wait for the loop."""
 
 
 class TagFinder:
-    """Pictures in, pictures with their tags out; one without tags comes out without its image.
+    """Source of pictures with their detected tags; the image is removed from a picture without tags.
 
-    Readings of the vehicle's own sensors pass as they are.
+    Readings of the vehicle's own sensors are passed on unchanged.
     """
 
     def __init__(
@@ -436,13 +441,13 @@ class TagFinder:
         size: tuple[int, int],
         clock: Callable[[], float] = realtime.now,
     ) -> None:
-        """Start looking.
+        """Start the detection.
 
         Args:
-            source: Where pictures come from; it belongs to the finder from now on.
-            vehicle: Its tags are looked for.
-            size: Rows and columns of the camera's pictures; others are passed on as they are, to be refused.
-            clock: The robot's [s].
+            source: Source of pictures, owned by the finder from now on.
+            vehicle: Vehicle with the tags to detect.
+            size: Rows and columns of the camera's pictures; others are passed on unchanged, to be refused.
+            clock: The robot's clock [s].
         """
         assert vehicle.tags is not None
         self._source, self._size, self._clock = source, size, clock
@@ -450,26 +455,26 @@ class TagFinder:
         self._found: deque[Picture] = deque(maxlen=WAITING)
         self._over = threading.Event()
         self.problem = ""
-        """Why a picture could not be searched, as the detector said it first; it passed as one without tags."""
+        """First error of the detector; the picture is passed on as one without tags."""
         self.skipped = 0
-        """Pictures that were left out because newer ones had come meanwhile."""
+        """Number of pictures that were skipped because newer ones had arrived."""
         self._thread = threading.Thread(target=self._look, name="tag finder", daemon=True)
         self._thread.start()
 
     def receive(self, now: float) -> list[Picture]:
-        """Return the pictures that were searched since the last call."""
+        """Return the pictures processed since the last call."""
         pictures = []
         while self._found:
             pictures.append(self._found.popleft())
         return pictures
 
     def describe(self) -> str:
-        """The source and how it fares, in a few words."""
+        """Return the description of the source and of the detection, in a few words."""
         problem = f", {self.problem}" if self.problem else ""
         return f"{self._source.describe()}, {self.skipped} skipped{problem}"
 
     def close(self) -> None:
-        """Stop looking and let go of the source."""
+        """Stop the detection and close the source."""
         self._over.set()
         self._thread.join()
         self._source.close()
@@ -489,7 +494,7 @@ class TagFinder:
             return picture
         try:
             detections = self._tracker.detect(image, picture.time)
-        except Exception as error:  # whatever it is: the next picture may be better
+        except Exception as error:  # any error: the next picture may be valid
             if not self.problem:
                 self.problem = f"tags cannot be sought: {type(error).__name__}: {error}"
                 _TAGS_LOG.warning(self.problem)

@@ -1,4 +1,4 @@
-"""Pilots: a PID, a policy or a person, with one interface; a switch between them."""
+"""Pilots with one interface: a PID, a policy or a human, and a switch between them."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 BY_AXES, TURN = 2.0 / 3.0, 1.0
-"""Share of a task's reach, and greatest turn that is observed [rad], for a vehicle that is steered by axes: a Doppler
-log locates it, and loses the floor when the vehicle leans."""
+"""Fraction of a task's observed goal distance, and greatest observed heading difference [rad], for a vehicle that is
+steered by ArduSub's axes: it is located by a DVL, which loses the floor at large tilts."""
 
 
 class Pilot(Protocol):
-    """Decides thrusts, every `period` seconds."""
+    """Controller that computes thrusts every `period` seconds."""
 
     @property
     def name(self) -> str:
-        """Name by which the bridge identifies who commands."""
+        """Name of the command source for the bridge."""
 
     @property
     def period(self) -> float:
@@ -47,37 +47,37 @@ class Pilot(Protocol):
 
     @property
     def needs_state(self) -> bool:
-        """Return whether it may only decide on a reading that is ready."""
+        """True if it requires a reading that is ready."""
 
     def describe(self) -> dict[str, Any]:
         """Return its description as plain data."""
 
     def reset(self) -> None:
-        """Forget what was before."""
+        """Reset the memory."""
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,); or one number per channel of the vehicle, in the order of
-        `Vehicle.channel_names`: thrusts, then the values of the other actuators [rad, m³ or m].
+        """Return the requested thrusts in canonical order [N], (n,); or one number per channel of the vehicle, in the
+        order of `Vehicle.channel_names`: thrusts, then the values of the other actuators [rad, m³ or m].
 
         Args:
             reading: The vehicle's state.
-            guide: Where it should be.
+            guide: Motion to follow.
             t: Time since the guide's start [s].
         """
 
 
 class AgentPilot:
-    """An agent at the helm: a PID, a policy or a baseline of a task, fed with the reading of one vehicle.
+    """An agent as pilot: a PID, a policy or a baseline of a task, applied to the reading of one vehicle.
 
     Attributes:
-        agent: Who decides, as in a batch.
-        observer: What of the reading it sees; None for a controller that looks at state and goal alone.
-        mode: What its actions mean.
+        agent: The agent, as in a batch.
+        observer: Observation of the reading; None for a controller that uses state and goal alone.
+        mode: Action mode.
         period: Time between two decisions [s].
-        observation: What was seen at the last decision; empty before the first.
-        action: What was done, in [-1, 1]; empty before the first.
-        pictures: Shape of what the agent sees, by name of the vehicle's sensor; () of a range in the observation.
-        took: What the last decision of the agent took [s]; NaN before the first.
+        observation: Observation of the last decision; empty before the first.
+        action: Action of the last decision, in [-1, 1]; empty before the first.
+        pictures: Shape of the agent's pictures, by name of the vehicle's sensor; () for a range in the observation.
+        took: Computation time of the last decision [s]; NaN before the first.
     """
 
     needs_state = True
@@ -89,12 +89,13 @@ class AgentPilot:
         observer: Observer | None = None,
         pictures: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
-        """
+        """Set up the pilot.
+
         Args:
-            agent: Made for the vehicle.
-            vehicle: Its thrusters are commanded.
-            observer: Of the task that the agent does; None where it sees no observation.
-            pictures: Shape of the pictures that it sees, by the name of the vehicle's sensor: (height, width, 3), of a
+            agent: Agent for the vehicle.
+            vehicle: Vehicle whose thrusters are commanded.
+            observer: Observer of the agent's task; None if the agent has no observation.
+            pictures: Shape of the agent's pictures, by the name of the vehicle's sensor: (height, width, 3), for a
                 sonar (beams, range cells, 1).
 
         Raises:
@@ -120,9 +121,9 @@ class AgentPilot:
             self._steersman = CoursePilot(linear_model(vehicle), vehicle.name, self.period)
         reach = task.approach * task.fit.size if hasattr(task, "approach") else math.inf
         self.reach = reach * (BY_AXES if self.mode.pilot else 1.0)
-        """Goals farther away than this are shown so far ahead on the way to them [m]."""
+        """Greatest observed distance to a goal; farther goals are moved to this distance in their direction [m]."""
         self.turn = TURN if self.mode.pilot and math.isfinite(reach) else math.inf
-        """Headings farther away than this are shown so far round on the way to them [rad]."""
+        """Greatest observed heading difference; larger ones are limited to it [rad]."""
         self._input_noise: dict[str, float] = {}
         self.took = math.nan
         self.reset()
@@ -140,7 +141,7 @@ class AgentPilot:
         }
 
     def reset(self) -> None:
-        """Forget what was seen and done."""
+        """Reset memory, observation and action."""
         self._memory = self.agent.reset(1)
         self._steering = None if self._steersman is None else self._steersman.reset()
         self.observation = self.action = np.zeros(0, np.float32)
@@ -151,19 +152,19 @@ class AgentPilot:
     def disturb_input(self, *, position_std: float, yaw_std: float, seed: int = 0) -> None:
         """Add independent errors to position and heading, drawn for every decision.
 
-        The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it touches the controller's
-        input alone.
+        The published ablation "+ localization noise" has 5 cm per axis and 10 degrees; it affects only the controller's
+        input.
 
         Args:
             position_std: Standard deviation of each coordinate [m].
-            yaw_std: Of the heading [rad].
-            seed: Of the errors; `reset` starts them again.
+            yaw_std: Standard deviation of the heading [rad].
+            seed: Seed of the errors; `reset` restarts them.
         """
         self._input_noise = {"position_std_m": position_std, "yaw_std_rad": yaw_std, "seed": seed}
         self.reset()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,), or values of all channels, as of `Pilot`."""
+        """Return the requested thrusts in canonical order [N], (n,), or values of all channels, as `Pilot.act`."""
         pictures = {
             name: resized(reading.pictures[name].image, shape)[None]  # type: ignore[attr-defined]
             for name, shape in self.pictures.items()
@@ -198,7 +199,7 @@ class AgentPilot:
 
 
 class WrenchPilot:
-    """A person's wrench, allocated to the thrusters; it needs to know nothing of where the vehicle is."""
+    """A human's wrench command, allocated to the thrusters; it needs no estimate of the state."""
 
     needs_state = False
 
@@ -210,11 +211,12 @@ class WrenchPilot:
         name: str = "teleop",
         period: float = 0.05,
     ) -> None:
-        """
+        """Set up the pilot.
+
         Args:
-            wrench: Gives the wanted wrench about `vehicle.wrench_reference`, body frame [N, N m], (6,).
-            vehicle: Its limits bound the wrench, axis by axis.
-            name: By which the bridge knows who commands.
+            wrench: Returns the requested wrench about `vehicle.wrench_reference`, body frame [N, N m], (6,).
+            vehicle: Vehicle whose limits bound the wrench, axis by axis.
+            name: Name of the command source for the bridge.
             period: Time between two decisions [s].
         """
         self.name, self.period = name, period
@@ -222,22 +224,22 @@ class WrenchPilot:
         self._limits = np.asarray(vehicle.wrench_limits, float)
 
     def describe(self) -> dict[str, Any]:
-        """Name and rate."""
+        """Return name and rate."""
         return {"name": self.name, "kind": "teleop", "action": "wrench6", "period_s": self.period}
 
     def reset(self) -> None:
-        """A person remembers."""
+        """Nothing to reset: a human pilots."""
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
+        """Return the requested thrusts in canonical order [N], (n,)."""
         tau = np.asarray(self._wrench(), float)
         return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
 
 class HelmPilot:
-    """A person at the helm of a vehicle with fins: orders to its autopilot, or its propellers and fins themselves.
+    """A human pilot of a vehicle with fins: commands to its autopilot, or directly to its propellers and fins.
 
-    Forward sets speed or thrust; without it the propellers stand still. Left and up steer.
+    Forward deflection sets speed or thrust; without it the propellers stop. Left and up steer.
     """
 
     def __init__(
@@ -249,13 +251,14 @@ class HelmPilot:
         name: str = "teleop",
         period: float = 0.05,
     ) -> None:
-        """
+        """Set up the pilot.
+
         Args:
-            deflection: Gives surge, sway, heave and yaw, each in [-1, 1], (4,).
-            vehicle: Whose channels are commanded.
+            deflection: Returns surge, sway, heave and yaw, each in [-1, 1], (4,).
+            vehicle: Vehicle whose channels are commanded.
             action: `course_pitch`: speed, change of course and pitch, by the autopilot; `surfaces`: each fin by its
                 effect on yaw and pitch.
-            name: By which the bridge knows who commands.
+            name: Name of the command source for the bridge.
             period: Time between two decisions [s].
 
         Raises:
@@ -270,21 +273,21 @@ class HelmPilot:
         self._pilot = CoursePilot(model, vehicle.name, period)
         self.needs_state = action == "course_pitch"
         self._thrusters, self._limits = len(vehicle.thrusters), np.asarray(vehicle.channel_limits, float)
-        effect = model.B[len(model.speeds) // 2][[4, 5]] * model.travel  # on pitch and yaw
+        effect = model.B[len(model.speeds) // 2][[4, 5]] * model.travel  # effect on pitch and yaw
         effect[:, : self._thrusters] = 0.0
         self._share = effect / np.maximum(np.abs(effect).max(axis=1, keepdims=True), 1e-12)
         self.reset()
 
     def describe(self) -> dict[str, Any]:
-        """Name, action and rate."""
+        """Return name, action and rate."""
         return {"name": self.name, "kind": "teleop", "action": self.action, "period_s": self.period}
 
     def reset(self) -> None:
-        """Forget the autopilot's integrals."""
+        """Reset the autopilot's integrals."""
         self._memory = self._pilot.reset()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted values of all channels, as of `Pilot`."""
+        """Return the requested values of all channels, as `Pilot.act`."""
         surge, _, heave, yaw = np.asarray(self._deflection(), float)
         if self.needs_state and surge > 0.0:
             action = [[2.0 * surge - 1.0, yaw, -heave]]
@@ -298,14 +301,15 @@ class HelmPilot:
 
 
 HELM = ("surfaces", "course_pitch")
-"""Actions of a person at the helm of a vehicle with fins."""
+"""Actions of a human pilot of a vehicle with fins."""
 
 
 class ModeSwitch:
-    """Several pilots of which one steers; itself a pilot."""
+    """A pilot that delegates to one of several pilots."""
 
     def __init__(self, pilots: Mapping[str, Pilot], selected: str | None = None) -> None:
-        """
+        """Select a pilot.
+
         Args:
             pilots: Mode -> pilot, at least one.
             selected: Mode at the start; the first if None.
@@ -320,7 +324,7 @@ class ModeSwitch:
         self.select(selected or self.mode)
 
     def select(self, mode: str) -> None:
-        """Hand over to another pilot, which starts without memory.
+        """Switch to another pilot, which starts without memory.
 
         Raises:
             ControlError: No such mode.
@@ -332,37 +336,38 @@ class ModeSwitch:
 
     @property
     def pilot(self) -> Pilot:
-        """Return the active pilot."""
+        """Active pilot."""
         return self._pilots[self.mode]
 
     name = "mode-switch"
-    """One for all pilots: to the bridge they are one commander, and no second publisher when they change."""
+    """One name for all pilots: for the bridge they are one command source, so that a switch is not a second
+    publisher."""
 
     @property
     def period(self) -> float:
-        """Time between two decisions of the pilot that steers [s]."""
+        """Time between two decisions of the active pilot [s]."""
         return self.pilot.period
 
     @property
     def needs_state(self) -> bool:
-        """Return whether the active pilot may only decide on a reading that is ready."""
+        """True if the active pilot requires a reading that is ready."""
         return self.pilot.needs_state
 
     @property
     def pictures(self) -> Mapping[str, Sequence[int]]:
-        """Pictures that the pilot that steers sees."""
+        """Pictures that the active pilot observes."""
         return getattr(self.pilot, "pictures", {})
 
     def describe(self) -> dict[str, Any]:
-        """The mode and its pilot."""
+        """Return the mode and the description of its pilot."""
         return {"mode": self.mode, **self.pilot.describe()}
 
     def reset(self) -> None:
-        """Forget what was before."""
+        """Reset the memory of the active pilot."""
         self.pilot.reset()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
+        """Return the requested thrusts of the active pilot in canonical order [N], (n,)."""
         return self.pilot.act(reading, guide, t)
 
 
@@ -373,17 +378,17 @@ def make_pilot(
     task: str | None = None,
     agent: str | None = None,
 ) -> AgentPilot:
-    """A PID by its name, the policy of a directory, or a baseline of the task.
+    """Return a PID by its name, the policy of a directory, or a baseline of the task.
 
     Args:
-        name_or_directory: Who.
-        vehicle: It must be the very one that a policy was trained for.
-        task: Its name, or FILE.py:CLASS of one's own, which a policy was trained for; None: whatever a policy
-            was trained for, and T1 of a PID.
-        agent: Its place in a task of several; the first if None.
+        name_or_directory: Name or policy directory.
+        vehicle: The same vehicle for which a policy was trained.
+        task: Name of the task for which a policy was trained, or FILE.py:CLASS of a user-defined one; None: the task in
+            the policy directory, and T1 for a PID.
+        agent: Role in a task with several agents; the first if None.
 
     Raises:
-        PolicyError, ControlError: It does not fit the vehicle or the task, in one sentence.
+        PolicyError, ControlError: It does not fit the vehicle or the task.
     """
     from finssim.agents.agent import TASKS_OF_PIDS, BaselineAgent, PidAgent, PolicyAgent
     from finssim.agents.catalogue import baselines_of

@@ -16,10 +16,10 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reading:
-    """State of the vehicle at one time, in the form of a `control.guidance.Measured`."""
+    """State of the vehicle at one time, with the attributes of a `control.guidance.Measured`."""
 
     time: float
-    """[s], the robot's clock."""
+    """Time on the robot's clock [s]."""
     position: Array
     """Body origin, world frame (z = 0 on the still water) [m], (3,); NaN while unknown."""
     quaternion: Array
@@ -27,11 +27,11 @@ class Reading:
     nu: Array
     """Velocity of the body origin and angular velocity, body frame [m/s, rad/s], (6,)."""
     ready: bool
-    """True if a controller may act on it."""
+    """True if a controller may use the state."""
     mode: str = "fresh"
-    """Mode of vision: uninitialized, fresh, coast, hold or lost."""
+    """State of vision: uninitialized, fresh, coast, hold or lost."""
     reason: str = ""
-    """Reason why it is not ready; empty if it is."""
+    """Reason why the state is not ready; empty if it is."""
     std: Array = field(default_factory=lambda: np.full(7, np.nan))
     """Standard deviations of position [m], velocity [m/s] and yaw [rad], (7,)."""
     tracks: Mapping[str, Track] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The vehicle and the pool of a record, from the files that it keeps."""
+"""Vehicle and pool of a record, from the files attached to it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ POOL = "pool.yaml"
 
 
 def vehicle_of(record: Record) -> Vehicle:
-    """Return the vehicle that a record names, from the file that it keeps where the catalogue has another one now.
+    """Return the vehicle of a record, from the attached file if that of the catalogue has changed.
 
     Raises:
-        RecordError: It names none, or one by a path.
-        VehicleError: The catalogue has none of that name and the record keeps none, or the file is wrong.
+        RecordError: The record names no vehicle, or one by a path.
+        VehicleError: Neither the catalogue nor the record has that vehicle, or the file is invalid.
     """
     name = record.metadata.get("vehicle")
     if name is None:
@@ -42,11 +42,11 @@ def vehicle_of(record: Record) -> Vehicle:
 
 
 def pool_of(record: Record) -> Pool | None:
-    """Return the pool that a record keeps; None where it keeps none.
+    """Return the pool attached to a record; None if there is none.
 
     Raises:
-        RecordError: The pool's file names another file by a path.
-        LocalizationError: The pool's file is wrong.
+        RecordError: The pool's file refers to another file by a path.
+        LocalizationError: The pool's file is invalid.
     """
     if POOL not in record.files:
         return None
@@ -56,13 +56,13 @@ def pool_of(record: Record) -> Pool | None:
 
 @contextmanager
 def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Iterator[Path]:
-    """Yield a file that the record keeps, in a folder of its own, beside those that it extends.
+    """Yield an attached file in a temporary folder, together with those that it extends.
 
-    `references` are the keys that may name other files. So may the devices of a vehicle's `perception`.
+    `references` are the keys that may name other files; the devices of a vehicle's `perception` may as well.
     """
     with tempfile.TemporaryDirectory() as folder:
         names = [name]
-        for one in names:  # which grows
+        for one in names:  # the list grows within the loop
             file = Path(folder) / one
             file.write_text(record.files[one], encoding="utf-8")
             tree: Any = read_mapping(file, RecordError, such_as="name: value")
@@ -79,7 +79,7 @@ def _kept_file(record: Record, name: str, *references: tuple[str, ...]) -> Itera
 
 
 def _value_at(tree: Any, keys: tuple[str, ...]) -> Any:
-    """Return the value below some keys of nested mappings; None where there is none."""
+    """Return the value at a sequence of keys in nested mappings; None if there is none."""
     for key in keys:
         tree = tree.get(key) if isinstance(tree, dict) else None
     return tree

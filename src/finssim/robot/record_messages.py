@@ -1,4 +1,4 @@
-"""Data of a robot as ROS 2 messages: topics and their policies, types, and functions that make the messages.
+"""Data of a robot as ROS 2 messages: topics with their QoS policies, types, and functions that create the messages.
 
 Frames are map, base_link and imu_link, units SI.
 """
@@ -37,7 +37,7 @@ from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import with_navigation
 from finssim.vehicles.device_files import CameraDevice, Device, RangeDevice, SonarDevice, device_of
 
-# Names, types, frames and policies of all data of a robot: one table, for topics, records and the page.
+# Names, types, frames and QoS policies of all data of a robot: one table, for topics, records and the documentation.
 
 
 STREAM, COMMAND, LATCHED, SENSOR = "stream", "command", "latched", "sensor"
@@ -48,7 +48,8 @@ QUALITIES = {
     LATCHED: "reliable, transient local, depth 1",
     SENSOR: "best effort, volatile, depth 5",
 }
-"""The policies in use. A best-effort publisher gives nothing to a reliable subscription; every other pair fits."""
+"""QoS policies in use. A best-effort publisher is incompatible with a reliable subscription; every other pair
+matches."""
 
 
 INFINITE = (9223372036, 854775807)
@@ -61,20 +62,20 @@ def is_reliable(quality: str) -> bool:
 
 
 def is_latched(quality: str) -> bool:
-    """Return whether a late subscriber gets the last message."""
+    """Return whether a late subscriber receives the last message."""
     return quality == LATCHED
 
 
 def depth_of(quality: str) -> int:
-    """Messages kept."""
+    """Return the depth of the history, the number of stored messages."""
     return {STREAM: 10, SENSOR: 5}.get(quality, 1)
 
 
 def offered_qos(quality: str) -> str:
-    """Return the topic's policies in the form of rosbag2: a list of profiles in YAML, as numbers, which every release
-    reads.
+    """Return the topic's QoS policies in the form of rosbag2: a list of profiles in YAML, as numbers, which every
+    release reads.
 
-    Its names for policies came with Jazzy, whose reader tries numbers first; Humble's knows nothing else.
+    Names of policies came with Jazzy, whose reader tries numbers first; Humble's reader supports only numbers.
     """
     forever = f"{{sec: {INFINITE[0]}, nsec: {INFINITE[1]}}}"
     policies = {
@@ -96,19 +97,19 @@ class Topic:
     """One topic."""
 
     name: str
-    """Below the vehicle's namespace, unless it begins with a slash."""
+    """Name below the vehicle's namespace, unless it begins with a slash."""
     type: str
     """Type such as `nav_msgs/msg/Odometry`."""
     quality: str
     """One of `QUALITIES`."""
     frame: str
-    """`frame_id` of its header; empty where it has none."""
+    """`frame_id` of its header; empty if it has none."""
     sender: str
     """Nodes that publish it."""
     meaning: str
 
     def under(self, vehicle: str) -> str:
-        """Full name for a vehicle."""
+        """Return the full name for a vehicle."""
         return self.name if self.name.startswith("/") else f"/{vehicle}/{self.name}"
 
 
@@ -222,17 +223,17 @@ FAN_ROWS = 400
 
 
 def own_kind(device: Device) -> str:
-    """Return which of `OWN_TOPICS` a device has."""
+    """Return the kind of a device, a key of `OWN_TOPICS`."""
     if isinstance(device, CameraDevice):
         return "camera"
     return "sonar" if isinstance(device, SonarDevice) else "beams" if device.beams == 4 else "range"
 
 
 def own_topics(vehicle: Vehicle) -> dict[str, Topic]:
-    """Topics of the cameras, sonars and altimeters of a vehicle, by key: `front_camera/image`.
+    """Return the topics of the cameras, sonars and altimeters of a vehicle, by key: `front_camera/image`.
 
     Raises:
-        DeviceError: The device of one of them is refused.
+        DeviceError: A device description is invalid.
     """
     return {
         f"{name}/{key}": replace(
@@ -247,7 +248,7 @@ def own_topics(vehicle: Vehicle) -> dict[str, Topic]:
 
 
 class RecordError(ValueError):
-    """A record cannot be read, or not played as asked."""
+    """A record cannot be read, or not played as requested."""
 
 
 METADATA = "finssim"
@@ -256,7 +257,7 @@ METADATA = "finssim"
 
 @cache
 def types() -> Any:
-    """A rosbags type store of ROS 2 Humble's messages, of those for sonars, and ours."""
+    """Return a rosbags type store of ROS 2 Humble's messages, those for sonars, and FinsSim's own."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -268,23 +269,23 @@ def types() -> Any:
 
 
 def definition(kind: str) -> str:
-    """Text of a type and of all that it uses."""
+    """Return the text of a type and of all types that it uses."""
     text, _ = types().generate_msgdef(kind, ros_version=2)
     return str(text)
 
 
 LENS_MODELS = {"plumb_bob": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
-"""Our name of a lens model -> that of ROS, with the same coefficients in the same order."""
+"""FinsSim's name of a lens model -> that of ROS, with the same coefficients in the same order."""
 
 MAP, BASE, IMU, LOG = "map", "base_link", "imu_link", "dvl_link"
 SHARED = ("", MAP, "camera", "camera_link", "camera_optical")
-"""Frames of the pool and its camera, which vehicles have in common."""
+"""Frames of the pool and its camera, which several vehicles share."""
 
 IMU_VARIANCES = ((0.02, 0.02, 0.05), (0.01,) * 3, (0.1,) * 3)
 """Variances of attitude [rad²], rates [rad²/s²] and specific force [m²/s⁴], as in the published bridge."""
 
 UNKNOWN = 1.0e6
-"""Variance of what is not known [m², rad², m²/s²]."""
+"""Variance of unknown quantities [m², rad², m²/s²]."""
 
 DIAGONAL = np.diag_indices(6)
 
@@ -292,7 +293,7 @@ PRESSURE_VARIANCE = (0.05 * 9.81e3) ** 2
 """Variance of 0.05 m of water [Pa²]: the published 0.0025 m²."""
 
 STATES = ("disarmed", "armed", "hold", "fault")
-"""Words for the states of the bridge, in their order."""
+"""Names of the states of the bridge, in their order."""
 
 MOST = 2**32 - 1
 """Largest count of a uint32."""
@@ -301,17 +302,18 @@ FIRST_TIME, LAST_TIME = -(2**31) * 10**9, 2**31 * 10**9 - 1
 """Range of builtin_interfaces/Time, whose seconds are an int32 [ns]."""
 
 LEVELS = ("ok", "warn", "error", "stale")
-"""Words for the levels of a diagnostic, in their order."""
+"""Names of the levels of a diagnostic, in their order."""
 
 
 class Messages:
-    """Makes messages of one vehicle; times are integers [ns]."""
+    """Constructor of the messages of one vehicle; times are integers [ns]."""
 
     def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
-        """
+        """Prepare the constants of the messages.
+
         Args:
-            vehicle: Its instruments, thrusters and their order.
-            prefix: Of the vehicle's own frames, such as `robot_1/`, where several share /tf.
+            vehicle: Vehicle with its instruments and the order of its thrusters.
+            prefix: Prefix of the vehicle's own frames, such as `robot_1/`, if several vehicles share /tf.
         """
         self._prefix = prefix
         self.types = types()
@@ -320,7 +322,7 @@ class Messages:
         imu = vehicle.sensors.imu
         q_body_imu = np.array([0.0, 0.0, 0.0, 1.0]) if imu is None else np.array(imu.orientation)
         self._R_body_imu = quat_to_matrix(q_body_imu)
-        # Multiplying by a constant quaternion from the right is a matrix, and a call of it takes a microsecond.
+        # Right multiplication by a constant quaternion is a matrix, whose product takes a microsecond.
         self._to_body = quat_multiply(np.eye(4), quat_conjugate(q_body_imu)).T
         self._imu_variances = [np.diag(v).ravel() for v in IMU_VARIANCES]
         sensors = with_navigation(vehicle).sensors
@@ -338,11 +340,11 @@ class Messages:
         return {name: device_of(self._vehicle, name) for name in self._vehicle.perception}
 
     def cdr(self, message: Any, kind: str) -> bytes:
-        """A message's bytes."""
+        """Return the serialised message."""
         return bytes(self.types.serialize_cdr(message, kind))
 
     def imu(self, stamp: int, telemetry: Telemetry) -> Any:
-        """Attitude of the body, rates and specific force in body axes."""
+        """Return attitude of the body, and rates and specific force in body axes."""
         attitude, rates, force = self._imu_variances
         return self._of["sensor_msgs/msg/Imu"](
             self.header(stamp, BASE),
@@ -355,18 +357,18 @@ class Messages:
         )
 
     def pressure(self, stamp: int, telemetry: Telemetry) -> Any:
-        """Absolute pressure at the port."""
+        """Return the absolute pressure at the port."""
         return self._of["sensor_msgs/msg/FluidPressure"](
             self.header(stamp, BASE), telemetry.pressure, PRESSURE_VARIANCE
         )
 
     def filled(self, kind: str, stamp: int, frame: str, values: Mapping[str, Any]) -> Any:
-        """A message of ours with what there is of its fields; others are NaN, 0 or empty, by their type."""
+        """Return a FinsSim message with the given fields; others are NaN, 0 or empty, depending on their type."""
         fields = {name: make(values.get(name, default)) for name, make, default in fields_of(kind)}
         return self._of[f"finssim_msgs/msg/{kind}"](header=self.header(stamp, frame), **fields)
 
     def telemetry(self, stamp: int, received: int, telemetry: Telemetry) -> Any:
-        """The snapshot as it came."""
+        """Return the received telemetry."""
         values = {
             "received": self.time(received),
             "sequence": telemetry.sequence & 0xFFFF,
@@ -385,7 +387,7 @@ class Messages:
         """Return the message of a navigation instrument, with the key of its topic; None if there is no such
         instrument.
 
-        What it does not measure has the variance `UNKNOWN`; rates and specific force of a compass are told as missing.
+        Unmeasured components have the variance `UNKNOWN`; rates and specific force of a compass are marked as missing.
         """
         x, y, z = aid.values
         std, turn = aid.std[0] or POSITION_STD, aid.std[1] or YAW_STD
@@ -414,24 +416,25 @@ class Messages:
         return "positioning", of["geometry_msgs/msg/PoseWithCovarianceStamped"](self.header(stamp, MAP), fix)
 
     def shafts(self, stamp: int, motor_rpm: Sequence[float]) -> Any | None:
-        """Measured shaft speeds by thruster, with the signs of positive thrust [rad/s]; None if not of all."""
+        """Return measured shaft speeds by thruster, with the signs of positive thrust [rad/s]; None if not all are
+        known."""
         if len(self._outputs) < len(self.names) or len(motor_rpm) <= max(self._outputs):
             return None
         speed, none = np.asarray(motor_rpm, float)[self._outputs] * self._rad_per_s, np.zeros(0)
         return self._of["sensor_msgs/msg/JointState"](self.header(stamp, BASE), self.names, none, speed, none)
 
     def actuators(self, stamp: int, values: npt.ArrayLike) -> Any:
-        """Values of the actuators besides thrusters, in the vehicle file's order [rad, m³ or m]."""
+        """Return values of the actuators besides thrusters, in the vehicle file's order [rad, m³ or m]."""
         none = np.zeros(0)
         return self._of["sensor_msgs/msg/JointState"](
             self.header(stamp, BASE), self.others, np.asarray(values, float), none, none
         )
 
     def odometry(self, stamp: int, reading: Reading) -> Any:
-        """Pose in the map, velocity in body axes; covariances of one reading's standard deviations, all numbers.
+        """Return pose in the map and velocity in body axes, with covariances from the reading's standard deviations.
 
-        Roll, pitch and rates, which a reading does not judge, are as uncertain as in `imu`; what is not known has
-        `UNKNOWN`.
+        Roll, pitch and rates, which have no standard deviation in a reading, have the variances of `imu`; unknown
+        components have `UNKNOWN`.
         """
         variance = np.square(np.asarray(reading.std, float))
         R = quat_to_matrix(reading.quaternion)
@@ -453,7 +456,7 @@ class Messages:
         )
 
     def transform(self, stamp: int, reading: Reading) -> Any:
-        """map to base_link, for viewers."""
+        """Return the transform from map to base_link, for viewers."""
         of = self._of
         pose = of["geometry_msgs/msg/Transform"](
             self.vector(reading.position), self.quaternion(reading.quaternion)
@@ -462,14 +465,14 @@ class Messages:
         return of["tf2_msgs/msg/TFMessage"]([stamped])
 
     def estimator(self, stamp: int, reading: Reading, health: Mapping[str, Any]) -> Any:
-        """Return whether the estimate may be acted on; values missing in `health` are NaN, 0 or empty."""
+        """Return the estimator's status; values missing in `health` are NaN, 0 or empty."""
         std = np.asarray(reading.std, float)
         judged = {"position_std": std[:3], "velocity_std": std[3:6], "yaw_std": std[6]}
         status = {"ready": reading.ready, "mode": reading.mode, "reason": reading.reason}
         return self.filled("EstimatorStatus", stamp, MAP, {**health, **status, **judged})
 
     def goal(self, stamp: int, position: Any, yaw: float) -> Any:
-        """A level pose in the map.
+        """Return a level pose in the map.
 
         Args:
             stamp: [ns]
@@ -480,12 +483,12 @@ class Messages:
         return self._of["geometry_msgs/msg/PoseStamped"](self.header(stamp, MAP), pose)
 
     def wrench(self, stamp: int, tau: Any) -> Any:
-        """A wrench asked for, body axes, (6,) [N, N m]."""
+        """Return a requested wrench, body axes, (6,) [N, N m]."""
         wrench = self._of["geometry_msgs/msg/Wrench"](self.vector(tau[:3]), self.vector(tau[3:]))
         return self._of["geometry_msgs/msg/WrenchStamped"](self.header(stamp, BASE), wrench)
 
     def command(self, stamp: int, force: Any, source: str) -> Any:
-        """Thrusts asked for, canonical order [N]."""
+        """Return requested thrusts, canonical order [N]."""
         values = {"source": source, "names": self.names, "force": force}
         return self.filled("ThrusterCommand", stamp, BASE, values)
 
@@ -495,7 +498,7 @@ class Messages:
         return self.filled("ThrusterState", stamp, BASE, {**values, **values_of_bridge})
 
     def policy(self, stamp: int, pilot: str, values: Mapping[str, Any]) -> Any:
-        """One decision of a controller."""
+        """Return one decision of a controller."""
         return self.filled("PolicyInfo", stamp, BASE, {**values, "pilot": pilot})
 
     def echo(self, stamp: int, echo: CommandEcho) -> Any:
@@ -503,14 +506,14 @@ class Messages:
         return self.filled("CommandEcho", stamp, BASE, vars(echo))
 
     def picture(self, stamp: int, packed: bytes | None, frame: str = "camera") -> Any | None:
-        """A picture in JPEG; None where it could not be packed."""
+        """Return a picture in JPEG; None if it could not be encoded."""
         if packed is None:
             return None
         data = np.frombuffer(packed, np.uint8)
         return self._of["sensor_msgs/msg/CompressedImage"](self.header(stamp, frame), "jpeg", data)
 
     def image(self, stamp: int, image: npt.NDArray[np.uint8], frame: str = "camera_optical") -> Any:
-        """A picture, gray or in red, green and blue."""
+        """Return a picture, gray or in red, green and blue."""
         rows, columns, *channels = image.shape
         return self._of["sensor_msgs/msg/Image"](
             header=self.header(stamp, frame), height=rows, width=columns, encoding="rgb8" if channels else "mono8",
@@ -518,7 +521,7 @@ class Messages:
         )  # fmt: skip
 
     def camera_info(self, stamp: int, lens: Lens, frame: str = "camera_optical") -> Any:
-        """A camera's calibration."""
+        """Return a camera's calibration."""
         K = [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0]
         P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
         full_region = self._of["sensor_msgs/msg/RegionOfInterest"](
@@ -531,11 +534,11 @@ class Messages:
         )  # fmt: skip
 
     def of_own(self, stamp: int, picture: Picture) -> dict[str, Callable[[], Any]]:
-        """Return functions that make the messages of a reading of the vehicle's own sensors, by key of its topic; empty
-        for an unknown sensor.
+        """Return functions that create the messages of a reading of the vehicle's own sensors, by key of the topic;
+        empty for an unknown sensor.
 
         Args:
-            stamp: Of its exposure [ns].
+            stamp: Time of the exposure [ns].
             picture: The reading.
         """
         name, device, image = picture.source, self.own.get(picture.source), picture.image
@@ -561,7 +564,7 @@ class Messages:
         return {}
 
     def _sonar(self, stamp: int, device: SonarDevice, picture: Picture) -> Any:
-        """A ping; the frame has z forward, x up, hence beams to the left at negative y."""
+        """Return a ping; the frame has z forward and x up, so beams to the left have negative y."""
         assert picture.image is not None
         of, (beams, bins) = self._of, picture.image.shape
         azimuth = device.sector * (0.5 - (np.arange(beams) + 0.5) / beams)
@@ -586,7 +589,7 @@ class Messages:
         )  # fmt: skip
 
     def _beams(self, stamp: int, device: RangeDevice, name: str, ranges: npt.NDArray[np.float64]) -> Any:
-        """Ranges of four beams; beam k is turned from y (left) towards the log's x."""
+        """Return ranges of four beams; beam k is rotated from y (left) towards the DVL's x."""
         turn = 2.0 * math.pi * (np.arange(4) + 0.5) / 4.0
         c, s, reached = math.cos(device.beam_angle), math.sin(device.beam_angle), np.isfinite(ranges)
         unknown = np.full(4, -1.0, np.float32)
@@ -603,16 +606,16 @@ class Messages:
         )  # fmt: skip
 
     def tags(self, picture: Picture) -> Any:
-        """Corners of the tags that came with a picture [px], as JSON."""
+        """Return the corners of the tags that were sent with a picture [px], as JSON."""
         tags = [{"id": tag.tag_id, "corners": np.asarray(tag.corners).tolist()} for tag in picture.tags]
         return self.words({"sequence": picture.sequence, "tags": tags})
 
     def words(self, values: Mapping[str, Any]) -> Any:
-        """Values as JSON."""
+        """Return values as JSON."""
         return self._of["std_msgs/msg/String"](json.dumps(values, default=str))
 
     def diagnostics(self, stamp: int, name: str, level: str, message: str, values: Mapping[str, Any]) -> Any:
-        """One status of the vehicle; level is one of ok, warn, error, stale."""
+        """Return one status of the vehicle; level is one of ok, warn, error, stale."""
         of = self._of
         pairs = [of["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in values.items()]
         status = of["diagnostic_msgs/msg/DiagnosticStatus"](
@@ -629,24 +632,24 @@ class Messages:
         return name if name in SHARED else self._prefix + name
 
     def header(self, stamp: int, frame: str) -> Any:
-        """Stamp and frame."""
+        """Return a header with stamp and frame."""
         return self._of["std_msgs/msg/Header"](self.time(stamp), self.frame(frame))
 
     def time(self, stamp: int) -> Any:
-        """A time; one before or after those that the type has, 1901 to 2038, is the first or last of them."""
+        """Return a time, limited to the range of the type, 1901 to 2038."""
         stamp = min(max(stamp, FIRST_TIME), LAST_TIME)
         return self._of["builtin_interfaces/msg/Time"](stamp // 1_000_000_000, stamp % 1_000_000_000)
 
     def vector(self, v: Any) -> Any:
-        """A vector, (3,)."""
+        """Return a vector, (3,)."""
         return self._of["geometry_msgs/msg/Vector3"](float(v[0]), float(v[1]), float(v[2]))
 
     def quaternion(self, q: Any) -> Any:
-        """A quaternion, xyzw."""
+        """Return a quaternion, xyzw."""
         return self._of["geometry_msgs/msg/Quaternion"](float(q[0]), float(q[1]), float(q[2]), float(q[3]))
 
     def pose(self, position: Any, q: Any) -> Any:
-        """A pose."""
+        """Return a pose."""
         point = self._of["geometry_msgs/msg/Point"](
             float(position[0]), float(position[1]), float(position[2])
         )
@@ -654,13 +657,13 @@ class Messages:
 
 
 def count(number: Any) -> int:
-    """A count as a uint32 holds it, at most `MOST`: a clock that leaps forward makes any number of turns be missed."""
+    """Return a count limited to a uint32, `MOST`: a clock that steps forward causes any number of missed turns."""
     return min(int(number), MOST)
 
 
 @cache
 def fields_of(kind: str) -> list[tuple[str, Callable[[Any], Any], Any]]:
-    """Fields of a message of ours after its header: name, what makes its value, and the value where there is none."""
+    """Return the fields of a FinsSim message after its header: name, constructor of the value, and default value."""
     numbers = {"float64": (float, math.nan), "string": (str, ""), "bool": (bool, False)}
     fields: list[tuple[str, Callable[[Any], Any], Any]] = []
     for name, (_, detail) in types().fielddefs[f"finssim_msgs/msg/{kind}"][1][1:]:
@@ -670,18 +673,19 @@ def fields_of(kind: str) -> list[tuple[str, Callable[[Any], Any], Any]]:
             fields.append((name, listed, (math.nan,) * length))
         elif isinstance(detail, tuple):
             fields.append((name, *numbers.get(element, (count, 0))))
-        else:  # a message, which is given as one
+        else:  # a message, which is given as such
             fields.append((name, lambda value: value, None))
     return fields
 
 
 def floats(values: Any) -> npt.NDArray[np.float64]:
-    """Return a copy of numbers, of any unit, as rosbags wants them."""
+    """Return a copy of numbers, of any unit, in the form that rosbags requires."""
     return np.array(values, dtype=np.float64).ravel()
 
 
 def numbers_of(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """A covariance (6, 6) row by row, (36,): unknown variances large and uncorrelated, for filters take no NaN.
+    """Return a covariance (6, 6) row by row, (36,): unknown variances are large and uncorrelated, since filters reject
+    NaN.
 
     The units are kept.
     """

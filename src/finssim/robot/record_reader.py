@@ -1,6 +1,6 @@
-"""Reader of records, complete or cut: their description, and messages in time order; repair of cut ones.
+"""Reader of records, complete or truncated: description, messages in time order, and repair.
 
-`finssim record info`, `record repair` and `play`.
+It implements `finssim record info`, `record repair` and `play`.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ def repair(file: Path, *, out: Path | None = None, as_json: bool = False) -> Non
 
 
 def repair_record(path: Path, out: Path) -> list[str]:
-    """Write a complete record of all that can be read of a cut or damaged one.
+    """Write a complete record with everything that can be read of a truncated or damaged one.
 
     Args:
-        path: The record; it stays as it is.
+        path: The record, which is not changed.
         out: File to write.
 
     Returns:
-        What was found damaged, one sentence each; none of a record that is well.
+        Damage, one sentence each; empty for an intact record.
 
     Raises:
-        RecordError: Not an MCAP file, or the same as `out`.
+        RecordError: It is not an MCAP file, or the same as `out`.
         OutputError: `out` cannot be written.
     """
     refuse_foreign(path)
@@ -68,10 +68,10 @@ def repair_record(path: Path, out: Path) -> list[str]:
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuse what is no MCAP file.
+    """Refuse a file that is not an MCAP file.
 
     Raises:
-        RecordError: It is none, or cannot be read.
+        RecordError: It is not an MCAP file, or cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -86,7 +86,7 @@ class RecordedMessage(NamedTuple):
     """One message of a record."""
 
     time: float
-    """When it was recorded, robot's clock [s]."""
+    """Time of recording, robot's clock [s]."""
     topic: str
     kind: str
     """Its type, such as `sensor_msgs/msg/Imu`."""
@@ -106,15 +106,15 @@ class Record:
         self._reader = reader
         self.path = path
         self.notes = notes
-        """What was found damaged, one sentence each."""
+        """Damage, one sentence each."""
         self.metadata: dict[str, str] = next(
             (m.metadata for m in reader.iter_metadata() if m.name == METADATA), {}
         )
-        """What the recorder was told; empty of a file that FinsSim did not write."""
+        """Metadata given to the recorder; empty for a file that FinsSim did not write."""
         self.files: dict[str, str] = {
             a.name: a.data.decode("utf-8", errors="replace") for a in reader.iter_attachments()
         }
-        """Name -> text of the files kept in it."""
+        """Name -> text of the attached files."""
         self.topics: dict[str, str] = {
             c.topic: summary.schemas[c.schema_id].name if c.schema_id else NO_TYPE
             for c in summary.channels.values()
@@ -124,29 +124,29 @@ class Record:
 
     @property
     def cut(self) -> bool:
-        """Return whether it has no proper end, as after a crash or while it is being written."""
+        """True if the file has no proper end, as after a crash or during recording."""
         return bool(self.notes)
 
     def topic(self, name: str) -> str:
-        """The topic that ends in `/name`, such as `odom`; the name itself if there is none."""
+        """Return the topic that ends in `/name`, such as `odom`; the name itself if there is none."""
         return next((topic for topic in sorted(self.topics) if topic.endswith(f"/{name}")), name)
 
     def sizes(self) -> Iterator[tuple[float, str, int]]:
-        """Time [s], topic and size [bytes] of each message, none of them decoded."""
+        """Yield time [s], topic and size [bytes] of each message, without decoding it."""
         for _, channel, message in self._reader.iter_messages():
             yield self._seconds(message.log_time), channel.topic, len(message.data)
 
     def messages(
         self, topics: Collection[str] | None = None, start: float | None = None
     ) -> Iterator[RecordedMessage]:
-        """Messages in time order.
+        """Yield messages in time order.
 
         Args:
             topics: Names, or their last parts, such as `odom`; all that have a type if None.
-            start: Earlier ones are passed over [s].
+            start: Time before which messages are skipped [s].
 
         Raises:
-            RecordError: There is no such topic, or one of a type that cannot be decoded.
+            RecordError: There is no such topic, or its type cannot be decoded.
         """
         if topics is None:
             topics = [topic for topic, kind in self.topics.items() if kind != NO_TYPE]
@@ -180,10 +180,10 @@ class Record:
 
 @contextmanager
 def open_record(path: Path | str) -> Iterator[Record]:
-    """Open a record; one that was cut is read up to the cut.
+    """Open a record; a truncated one is read up to its damaged part.
 
     Raises:
-        RecordError: Not an MCAP file, or one without messages.
+        RecordError: It is not an MCAP file, or has no messages.
     """
     from mcap.reader import make_reader
 
@@ -194,23 +194,23 @@ def open_record(path: Path | str) -> Iterator[Record]:
         yield Record(path, make_reader(file), tuple(notes))
 
 
-# What a record holds, in figures: topics, rates, gaps, events.
+# Statistics of a record: topics, rates, gaps, events.
 
 
 GAP = 5.0
-"""A pause longer than so many usual intervals of a topic is a gap; pauses below `SHORTEST_GAP` are none."""
+"""Ratio to the usual interval of a topic from which a pause is a gap; pauses below `SHORTEST_GAP` are not gaps."""
 
 SHORTEST_GAP = 0.1
-"""[s]"""
+"""Shortest gap [s]."""
 
 
 def figures_of(kind: str, times: Sequence[float], size: int) -> dict[str, Any]:
-    """One topic in figures.
+    """Return the statistics of one topic.
 
     Args:
         kind: Its type.
-        times: Of its messages [s], (n,).
-        size: Of all of them [bytes].
+        times: Times of its messages [s], (n,).
+        size: Total size of its messages [bytes].
     """
     steps = np.diff(times)
     usual = np.sort(steps)[len(steps) // 2] if len(steps) >= GAP else math.inf
@@ -227,7 +227,7 @@ def figures_of(kind: str, times: Sequence[float], size: int) -> dict[str, Any]:
 
 
 def describe_record(record: Record) -> dict[str, Any]:
-    """Duration, vehicle, topics, events and damage, as plain values."""
+    """Return duration, vehicle, topics, events and damage, as plain values."""
     times: dict[str, list[float]] = {topic: [] for topic in sorted(record.topics)}
     sizes = Counter[str]()
     for at, topic, size in record.sizes():
@@ -250,7 +250,7 @@ def describe_record(record: Record) -> dict[str, Any]:
 
 
 def events_of(record: Record) -> list[dict[str, Any]]:
-    """Events in their order: time [s], kind, text; words that are no event of ours are passed over."""
+    """Return the events in order: time [s], kind, text; texts that are not events of FinsSim are skipped."""
     topic = record.topic("events")
     events = []
     for entry in record.messages([topic]) if topic in record.topics else ():
@@ -266,7 +266,7 @@ def events_of(record: Record) -> list[dict[str, Any]]:
 
 
 def plain(value: Any) -> Any:
-    """A message as dictionaries, lists and numbers; pictures by their size."""
+    """Return a message as dictionaries, lists and numbers; pictures as their size."""
     if hasattr(value, "__dataclass_fields__"):
         names = [name for name in value.__dataclass_fields__ if not name.startswith("_")]
         return {name: plain(getattr(value, name)) for name in names}
@@ -280,7 +280,7 @@ def plain(value: Any) -> Any:
 
 
 def json_line(entry: RecordedMessage) -> str:
-    """One line of JSON."""
+    """Return a message as one line of JSON."""
     line = {"time": entry.time, "topic": entry.topic, "type": entry.kind, "message": plain(entry.message)}
     return json.dumps(line)
 
@@ -315,15 +315,15 @@ def play_record(
     topics: Annotated[Sequence[str] | None, ","] = None,
     start: Annotated[float, (0.0, None)] = 0.0,
 ) -> None:
-    """Print the messages of a record in their order, a JSON object a line [s, SI units]; pictures by their size.
+    """Print the messages of a record in order, one JSON object per line [s, SI units]; pictures as their size.
 
     Args:
         path (FILE): Record of a run (.mcap).
-        topics (NAMES): Only these, with commas between: odom,thruster_cmd.
+        topics (NAMES): Topics to print, separated by commas: odom,thruster_cmd.
         start: Offset from the start of the record [s].
 
     Raises:
-        RecordError: Not a record, or no such topic.
+        RecordError: It is not a record, or there is no such topic.
     """
     with open_record(path) as record:
         for note in record.notes:

@@ -1,4 +1,4 @@
-"""The recorder: everything the robot sees, decides and does in one MCAP of ROS 2 messages."""
+"""The recorder: all inputs, decisions and outputs of the robot in one MCAP file of ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from finssim.vehicles import Vehicle, load_vehicle
 
 
 class _Whole:
-    """A file opened without a buffer, as a stream that writes every piece completely or raises."""
+    """An unbuffered file as a stream that writes every piece completely or raises an exception."""
 
     def __init__(self, file: Any) -> None:
         self._file, self.written = file, 0
 
     def write(self, data: bytes) -> None:
-        """Write all of it; counted only when the system has written it completely."""
+        """Write all of the data; they are counted only once the system has written them completely."""
         view = memoryview(data)
         while view:
             view = view[self._file.write(view) or 0 :]
@@ -49,11 +49,11 @@ class _Whole:
         return self.written
 
     def flush(self) -> None:
-        """Return when what was written is on disk."""
+        """Return once the written data are on disk."""
         os.fsync(self._file.fileno())
 
 
-# The thread that puts a record on disk: the control loop never waits for it, and a full disk never stops it.
+# The thread that writes a record to disk: the control loop never waits for it, and a full disk never stops it.
 
 
 Payload = bytes | Callable[[], "bytes | None"]
@@ -61,21 +61,22 @@ Payload = bytes | Callable[[], "bytes | None"]
 LOG = logging.getLogger(__name__)
 
 LARGEST_CHUNK = 1 << 20
-"""A chunk is closed when it has grown to so many bytes."""
+"""Size at which a chunk is closed [bytes]."""
 
 DISORDER = 1_000_000_000
-"""A message that is late by less is recorded at the time of the one before; later ones mean a clock set back [ns]."""
+"""Delay below which a late message is recorded at the time of the previous one; a larger one is a clock step back
+[ns]."""
 
 POLLS = 5
-"""The queue is looked at so many times a chunk."""
+"""Number of checks of the queue per chunk."""
 
 
 class RecordSink:
-    """A file that one thread adds messages to and another one writes.
+    """A file with a queue of messages that a thread writes.
 
-    A chunk is written and flushed to disk when its messages span `chunk_seconds`, or lie in it that long: a process
-    that is killed loses no more than that and a fifth of it. Where the system refuses to write, the file is closed
-    after its last whole chunk, `problem` says why in a sentence, and what comes later is dropped and counted.
+    A chunk is written and flushed to disk when its messages span `chunk_seconds`, or have waited that long: a process
+    that is killed loses at most that time and a fifth of it. If the system refuses to write, the file is closed after
+    its last complete chunk, `problem` states the reason in a sentence, and later messages are dropped and counted.
     """
 
     def __init__(
@@ -87,14 +88,14 @@ class RecordSink:
         longest_queue: int = 64 << 20,
     ) -> None:
         """Args:
-            path: File to make; an existing one is refused.
+            path: File to create; an existing one is refused.
             announce: Registers the channel of a key with an `mcap.writer.Writer` when its first message is written, and
                 returns its number.
-            chunk_seconds: [s]
-            longest_queue: Bytes that may wait for the disk; more are dropped.
+            chunk_seconds: Longest time span of a chunk [s].
+            longest_queue: Greatest number of waiting bytes; further messages are dropped.
 
         Raises:
-            OutputError: The file exists or cannot be made.
+            OutputError: The file exists or cannot be created.
         """
         if os.path.lexists(path):
             raise OutputError(
@@ -106,13 +107,13 @@ class RecordSink:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.problem = ""
-        """Why recording stopped; empty while it goes on."""
+        """Reason why recording stopped; empty while it continues."""
         self.dropped = 0
-        """Messages that were not recorded."""
+        """Number of messages that were not recorded."""
         self._file = open(path, "xb", buffering=0)
         self._stream: Any = _Whole(self._file)
         self.writer = Writer(self._stream, chunk_size=LARGEST_CHUNK, compression=CompressionType.LZ4)
-        """For metadata and attachments, before `start`."""
+        """Writer for metadata and attachments, before `start`."""
         self.writer.start(profile="ros2", library="finssim")
         self._announce = announce
         self._channels: dict[str, int] = {}
@@ -126,7 +127,7 @@ class RecordSink:
         self._thread = threading.Thread(target=self._run, name=f"recorder {path.name}", daemon=True)
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start the writing thread."""
         self._stream.flush()
         self._thread.start()
 
@@ -134,15 +135,15 @@ class RecordSink:
         """Queue a message.
 
         Args:
-            key: Of its channel.
+            key: Key of its channel.
             time: [ns]
-            payload: Its bytes, or what makes them, called on the writing thread; None where it cannot.
-            size: About how many bytes wait.
+            payload: Its bytes, or a function that creates them in the writing thread; None if that fails.
+            size: Approximate number of waiting bytes.
         """
         if self.problem or self._put_bytes - self._taken_bytes > self._longest_queue:
             self.dropped += 1
             return
-        # Readers of a file without an index want its messages in order; their own stamps keep when things were.
+        # Readers of a file without an index need messages in order; the original times are in the messages' own stamps.
         if 0 < self._newest - time < DISORDER:
             time = self._newest
         self._newest = time
@@ -150,7 +151,7 @@ class RecordSink:
         self._queue.append((key, time, payload, size))
 
     def close(self) -> None:
-        """Write what waits, and the summary; returns when it is on disk."""
+        """Write the waiting messages and the summary; return once they are on disk."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -194,7 +195,7 @@ class RecordSink:
         self._opened = None
 
     def _stop(self, error: Exception) -> None:
-        """Give up: the file ends after its last complete record, if the system permits it."""
+        """Stop recording: the file ends after its last complete record, if the system permits it."""
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         self.problem = (
             f"{self.path}: recording stopped: {reason}: the record up to then is kept; free some "
@@ -208,19 +209,19 @@ class RecordSink:
             self._file.seek(0, os.SEEK_END)
             self._file.write(END)
         except OSError:
-            # No room even for that: readers find the last complete record themselves.
+            # No space even for that: readers find the last complete record themselves.
             LOG.warning("%s: ends without a summary: `finssim record repair` writes one", self.path)
 
 
 class Recorder:
-    """Writes a record; every method returns immediately, and none raises because of the disk.
+    """Writer of a record; every method returns immediately, and no disk error raises an exception.
 
         with Recorder("run.mcap", vehicle, {"seed": 1, "command": "finssim run"}) as recorder:
             recorder.telemetry(now, telemetry)
             recorder.reading(now, reading)
 
-    Times are the robot's clock [s]; `epoch` puts it on another, such as that of 1970, in the record. Not for several
-    threads at a time.
+    Times are the robot's clock [s]; in the record they are offset by `epoch`, for example to Unix time. Methods must
+    not be called by several threads at a time.
     """
 
     def __init__(
@@ -235,16 +236,16 @@ class Recorder:
         files: Mapping[str, Path | str] | None = None,
     ) -> None:
         """Args:
-            path: File to make; an existing one is refused.
-            vehicle: Whose record it is.
-            meta: Configuration, seed and what else belongs to the run: plain values, kept as JSON.
-            pictures: Whether camera pictures are kept.
-            chunk_seconds: How much of the record is written at a time [s].
-            epoch: What the record's clock shows when the robot's shows 0 [s].
-            files: Name -> file that the record keeps, such as the pool's; the vehicle's is always kept.
+            path: File to create; an existing one is refused.
+            vehicle: Vehicle of the record.
+            meta: Configuration, seed and other facts on the run: plain values, stored as JSON.
+            pictures: Format of camera pictures; none omits them.
+            chunk_seconds: Time span of the record that is written at a time [s].
+            epoch: Time of the record at time 0 of the robot's clock [s].
+            files: Name -> file to attach, such as the pool's; the vehicle's is always attached.
 
         Raises:
-            OutputError: The file exists or cannot be made.
+            OutputError: The file exists or cannot be created.
             OSError: One of `files` cannot be read.
         """
         texts = {name: Path(file).read_bytes() for name, file in (files or {}).items()}
@@ -252,7 +253,7 @@ class Recorder:
         self._name, self._vehicle, self._messages = vehicle.name, vehicle, Messages(vehicle)
         self._topics = TOPICS | own_topics(vehicle)
         self._schemas: dict[str, int] = {}
-        # Compiles what packs a type: the first message of each must not wait for it.
+        # Compiles the serialisation of each type, so that its first message does not wait for it.
         for topic in self._topics.values():
             self._messages.types.get_msgdef(topic.type)
         self._pictures, self._epoch = pictures, round(epoch * 1e9)
@@ -273,26 +274,26 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the file."""
         return self._sink.path
 
     @property
     def problem(self) -> str:
-        """Return why recording stopped, in a sentence; empty while it runs."""
+        """Reason in a sentence why recording stopped; empty while it continues."""
         return self._sink.problem
 
     @property
     def dropped(self) -> int:
-        """Messages that are not in the record: after it stopped, or when the disk was too slow."""
+        """Number of messages that are not in the record: after it stopped, or when the disk was too slow."""
         return self._sink.dropped
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float | None = None) -> None:
-        """A snapshot of the motor controller: raw, and as Imu, FluidPressure, shaft speeds and other actuators' values.
+        """Record telemetry: raw, and as Imu, FluidPressure, shaft speeds and other actuators' values.
 
         Args:
-            now: When it came [s].
-            telemetry: The snapshot.
-            time: When it was measured [s]; `now` if not known.
+            now: Time of arrival [s].
+            telemetry: The message.
+            time: Time of measurement [s]; `now` if unknown.
         """
         received, make = self._ns(now), self._messages
         stamp = received if time is None else self._ns(time)
@@ -306,11 +307,11 @@ class Recorder:
             self._put("actuators", received, make.actuators(stamp, telemetry.actuators))
 
     def reading(self, now: float, reading: Reading) -> None:
-        """The estimate, as Odometry, transform and EstimatorStatus.
+        """Record an estimate, as Odometry, transform and EstimatorStatus.
 
         Args:
             now: [s]
-            reading: What a controller is given; the record's stamp is its time.
+            reading: Reading for the controller; the record's stamp is its time.
         """
         at, make = self._ns(now), self._messages
         stamp = self._ns(reading.time)
@@ -320,14 +321,14 @@ class Recorder:
             self._put("transform", at, make.transform(stamp, reading))
 
     def command(self, now: float, force: npt.ArrayLike, source: str = "", wrench: Any = None) -> None:
-        """Thrusts that a controller asks for, values of other actuators, and the wrench of the thrusts.
+        """Record requested thrusts of a controller, values of other actuators, and the wrench of the thrusts.
 
         Args:
             now: [s]
             force: Along the thrusters' axes, canonical order [N], (n,), or these and the values of the other actuators
                 [rad, m³ or m], (n + m,).
-            source: Who asks.
-            wrench: Body axes [N, N m], (6,); None where there is none.
+            source: Source of the command.
+            wrench: Body axes [N, N m], (6,); None if there is none.
         """
         at = self._ns(now)
         channels, n = np.asarray(force, float), len(self._vehicle.thrusters)
@@ -354,23 +355,24 @@ class Recorder:
         self._put("echo", at, self._messages.echo(at, echo))
 
     def aid(self, now: float, aid: NavigationAid) -> None:
-        """A fix, velocity or heading of a navigation instrument that came now [s], stamped with its measurement."""
+        """Record a reading of a navigation instrument that arrived now [s], stamped with the time of its
+        measurement."""
         message = self._messages.aid(self._ns(now - aid.age), aid)
         if message is not None:
             self._put(message[0], self._ns(now), message[1])
 
     def policy(self, now: float, pilot: str, **values: Any) -> None:
-        """One decision of a controller; fields of `finssim_msgs/PolicyInfo`. `now` is the time [s]."""
+        """Record one decision of a controller; fields of `finssim_msgs/PolicyInfo`. `now` is the time [s]."""
         at = self._ns(now)
         self._put("policy", at, self._messages.policy(at, pilot, values))
 
     def goal(self, now: float, position: npt.ArrayLike, yaw: float) -> None:
-        """Record the goal of the vehicle now, map frame [m], (3,), and its heading [rad]."""
+        """Record the current goal of the vehicle, map frame [m], (3,), and its heading [rad]."""
         at = self._ns(now)
         self._put("goal", at, self._messages.goal(at, np.asarray(position, float), yaw))
 
     def event(self, now: float, kind: str, text: str = "", **values: Any) -> None:
-        """Something that happened, such as arm, disarm, fault, trial_start; or a `phase` of an experiment.
+        """Record an event, such as arm, disarm, fault, trial_start; or a `phase` of an experiment.
 
         `now` is the time [s].
         """
@@ -380,12 +382,13 @@ class Recorder:
     def diagnostics(
         self, now: float, name: str, level: str, message: str, values: Mapping[str, Any] | None = None
     ) -> None:
-        """The health of a part; level is ok, warn, error or stale. `now` is the time [s]."""
+        """Record the health of a component; level is ok, warn, error or stale. `now` is the time [s]."""
         at = self._ns(now)
         self._put("diagnostics", at, self._messages.diagnostics(at, name, level, message, values or {}))
 
     def picture(self, now: float, picture: Picture) -> None:
-        """A picture of the camera, the tags its own processor found, or a reading of the vehicle's own sensors."""
+        """Record a picture of the camera, the tags that its own processor detected, or a reading of the vehicle's
+        own sensors."""
         if picture.source:
             self._own(now, picture)
             return
@@ -398,7 +401,7 @@ class Recorder:
             self._sink.put("picture", at, compressed, image.nbytes)
 
     def _own(self, now: float, picture: Picture) -> None:
-        """Its messages but for raw pictures, made on the writing thread."""
+        """Record the messages of a reading, except raw pictures; the writing thread creates them."""
         if picture.source not in self._vehicle.perception:
             return
         stamp = self._ns(picture.time - self._vehicle.perception[picture.source].latency)
@@ -408,12 +411,12 @@ class Recorder:
                 self._sink.put(key, self._ns(now), partial(self._made, key, make), size)
 
     def _made(self, key: str, make: Callable[[], Any]) -> bytes | None:
-        """Runs on the writing thread."""
+        """Return a serialised message; called in the writing thread."""
         message = make()
         return None if message is None else self._messages.cdr(message, self._topics[key].type)
 
     def close(self) -> None:
-        """Finish the file; returns when it is on disk."""
+        """Finish the file; return once it is on disk."""
         self._sink.close()
 
     def __enter__(self) -> Recorder:
@@ -437,7 +440,7 @@ class Recorder:
         self._sink.put(key, at, data, len(data))
 
     def _ns(self, seconds: float) -> int:
-        # An MCAP has no time before 0: a clock that was set back further is recorded as standing there.
+        # An MCAP file has no times before 0: a clock that was set back further is recorded as constant.
         return max(self._epoch + (round(seconds * 1e9) if math.isfinite(seconds) else 0), 0)
 
 
@@ -451,15 +454,15 @@ def recording(
     lockstep: bool = False,
     pictures: Literal["jpeg", "none"] = "jpeg",
 ) -> Iterator[Recorder | None]:
-    """A record for as long as a run lasts, with the pool's file in it; none where there is no path.
+    """Yield a recorder for the duration of a run, with the pool's file attached; None without a path.
 
     Args:
-        path: As of `Recorder`; nothing is recorded if None.
-        vehicle: As of `Recorder`.
-        meta: As of `Recorder`.
-        pool_file: Kept in the record as `pool.yaml`.
-        lockstep: Whether the robot's clock starts at 0; else it is this machine's, and the record's that of 1970.
-        pictures: As of `Recorder`.
+        path: See `Recorder`; nothing is recorded if None.
+        vehicle: See `Recorder`.
+        meta: See `Recorder`.
+        pool_file: Attached to the record as `pool.yaml`.
+        lockstep: True if the robot's clock starts at 0; otherwise it is this machine's, and the record has Unix time.
+        pictures: See `Recorder`.
     """
     if path is None:
         yield None
@@ -471,7 +474,7 @@ def recording(
 
 
 def _vehicle_files(vehicle: Vehicle) -> dict[str, bytes]:
-    """The vehicle's file and those of its folder that it extends; its values where a program changed them."""
+    """Return the vehicle's file and those of its folder that it extends; its values if a program changed them."""
     path = vehicle.path
     if path is None or path.suffix not in (".yaml", ".yml") or load_vehicle(path).sha256 != vehicle.sha256:
         return {f"{vehicle.name}.json": json.dumps(vehicle.values(), default=str).encode()}

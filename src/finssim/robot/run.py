@@ -55,32 +55,32 @@ __all__ = [
 ]
 
 
-# What a person wants to know of a run: how near the goal it was, what stopped it, and whether it was in time.
+# Results of a run for the user: error to the goal, reasons of a stop, and timing.
 
 
 LAST = 20.0
-"""Errors are those of this much of the end [s]."""
+"""Time at the end of a run over which errors are evaluated [s]."""
 EVERY = 0.1
-"""Between two errors [s]."""
+"""Time between two errors [s]."""
 UPDATE = 1.0
-"""Between two updates of the line on the terminal [s]."""
+"""Time between two updates of the status line on the terminal [s]."""
 AFTERWARDS = 2.0
-"""A trajectory's end is held for so long before the run ends [s]."""
+"""Time for which the end of a trajectory is held before the run ends [s]."""
 MUTE = 3.0
 """Silence of a vehicle after which it is reported [s]."""
 
 
 class _Monitor:
-    """Observer of a runtime after every step, which decides when the run is over, and reports at the end.
+    """Observer that checks a runtime after every step, determines when the run is over, and reports at the end.
 
     Note:
-        Errors are those of the estimate, which is all that a robot knows: from where the guide is now, or from the path
-        of a task along one.
+        Errors are those of the estimate, the only state available on a robot: relative to the guide's current pose, or
+        to the path of a path task.
     """
 
     def __init__(self, runtime: Runtime, duration: float | None, robot: str, console: Console) -> None:
         self.state = runtime.bridge.state
-        """Of the bridge, before the run is ended."""
+        """State of the bridge, before the run is ended."""
         follows = duration is None and math.isfinite(runtime.guide.duration)
         self._end = runtime.guide.duration + AFTERWARDS if follows else math.inf
         self._robot, self._console = robot, console
@@ -88,10 +88,10 @@ class _Monitor:
         self._next = self._spoken = -math.inf
         self._mute_at = math.nan
         self.status: Any = None
-        """The line on the terminal, if there is one."""
+        """Status line on the terminal, if there is one."""
 
     def look(self, runtime: Runtime) -> None:
-        """Take down state and errors, and say how it goes."""
+        """Store state and errors, and update the status line."""
         self.state = runtime.bridge.state
         reading = runtime.reading
         if reading is None:
@@ -124,14 +124,14 @@ class _Monitor:
 
     @property
     def _newest(self) -> str:
-        """The latest error in words."""
+        """Text of the latest error."""
         if not self._errors:
             return "no error to a goal is known"
         distance, turn = self._errors[-1]
         return f"{100.0 * distance:.1f} cm and {math.degrees(turn):+.1f} deg off"
 
     def report(self, runtime: Runtime, duration: float) -> dict[str, Any]:
-        """All of it as plain data, after a run of a duration [s]."""
+        """Return the results as plain data, after a run of a duration [s]."""
         rms = np.sqrt(np.mean(np.square(self._errors), axis=0)) if self._errors else (None, None)
         faults = [event.text for event in runtime.counters.events if event.kind == "fault"]
         return {
@@ -149,17 +149,17 @@ class _Monitor:
 
 
 def _waiting(runtime: Runtime) -> str:
-    """Return what a run that never started was waiting for; empty for one that did."""
+    """Return what a run that never started was waiting for; empty for one that did start."""
     began = not math.isnan(runtime.started)
     return "" if began or runtime.reading is None else runtime.reading.reason
 
 
 AIDS = {"vision": "position fixes", "velocity": "velocities", "heading": "compass headings"}
-"""Streams of the filter that a site may have in place of pictures, and what their samples are called."""
+"""Streams of the filter that a site may have instead of pictures -> names of their samples."""
 
 
 def _used(report: Mapping[str, Any]) -> dict[str, str]:
-    """Return how many pictures were used for the state, and how many of their replacements."""
+    """Return how many pictures, or samples of other streams, were used for the state."""
     rows = {}
     for stream, name in AIDS.items():
         verdicts = report["samples"].get(stream)
@@ -207,7 +207,7 @@ def show(report: dict[str, Any], console: Console) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Mission:
-    """Controller of a run, and what it is to do."""
+    """Controller of a run, and its goal."""
 
     policy: str | None = None
     """(DIR|NAME) A policy's directory, pid or pid-paper, or with --task one of the task's baselines."""
@@ -231,7 +231,7 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class Localization:
-    """Vehicle of a run, and what locates it."""
+    """Vehicle of a run, and its localization."""
 
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
@@ -251,10 +251,10 @@ class Localization:
     constant-velocity."""
 
     def pool(self) -> tuple[Path, Pool] | tuple[None, None]:
-        """Return the pool file and what it holds; None twice without a camera.
+        """Return the pool file and its content; None twice without a camera.
 
         Raises:
-            ControlError: There is none.
+            ControlError: There is no pool file.
         """
         if self.pool_file == "none":
             return None, None
@@ -271,11 +271,11 @@ class Localization:
 
 
 APART = 10
-"""Ports between one vehicle of a team and the next."""
+"""Distance between the ports of two consecutive vehicles of a team."""
 MESSAGES = 5
-"""The messages of a team are so far from the first vehicle's port."""
+"""Distance of the port of a team's messages from the first vehicle's port."""
 POLL = 0.05
-"""Between looks whether they have ended [s]."""
+"""Time between two checks whether the processes have ended [s]."""
 
 
 class TeamOutcome(NamedTuple):
@@ -290,15 +290,15 @@ class TeamOutcome(NamedTuple):
 def run_team(
     mission: Mission, wiring: Wiring, localization: Localization, *, record: Path | None, arm: bool
 ) -> TeamOutcome:
-    """Run every agent of a task in its own process; one that ends leaves the others alone.
+    """Run every agent of a task in its own process; the others continue if one ends.
 
     Args:
-        mission: Its `team` is the policy's directory, or a baseline of the task, for all.
-        wiring: Of the first; the others' ports are ten further on, each. What carries messages is five ports after
-            `robot` if it names none.
-        localization: Vehicle, and what locates it: open water without a camera if it names none.
-        record: Folder that takes AGENT.mcap of each; nothing is kept if None.
-        arm: Arm, as soon as the state is known.
+        mission: Mission, whose `team` is the policy's directory, or a baseline of the task, for all.
+        wiring: Connection of the first agent; the ports of each further one are ten higher. The relay of messages is
+            five ports after `robot` unless it is given.
+        localization: Vehicle and its localization; open water without a camera by default.
+        record: Folder for AGENT.mcap of each; nothing is recorded if None.
+        arm: Arm as soon as the state is known.
 
     Raises:
         ControlError, PolicyError, LinkError: Policy, task, vehicle and addresses do not fit.
@@ -368,7 +368,7 @@ def run_team(
 
 
 def _tell(report: dict[str, Any], as_json: bool) -> None:
-    """Print the result of each."""
+    """Print the result of each agent."""
     if as_json:
         print(json.dumps(report))
         return
@@ -384,9 +384,9 @@ FAULT = 3
 UNHEARD = 4
 """Exit status of a run in which the vehicle sent nothing."""
 _GO = Station((0.0, 0.0, 0.0), 0.0, name="team")
-"""The guide of a vehicle that goes by the others alone."""
+"""Guide of a vehicle whose only references are the other vehicles."""
 _SEEN = Station((0.0, 0.0, 0.0), 0.0, name="sight")
-"""The guide of a vehicle that goes by its pictures alone."""
+"""Guide of a vehicle whose only references are its pictures."""
 
 
 def run(
@@ -408,17 +408,17 @@ def run(
     Example: finssim run --team runs/team --duration 60 --arm
 
     Args:
-        mission: Controller, and what it is to do.
+        mission: Controller and its goal.
         wiring: Connection of the robot.
-        localization: Vehicle, and what locates it.
+        localization: Vehicle and its localization.
         record (FILE): Record everything to this file (.mcap); with --team a folder with a file for each.
-        identify (FILE): Estimate while it runs what has changed on the vehicle (payload, drag, thrusters), print it,
+        identify (FILE): Estimate during the run what has changed on the vehicle (payload, drag, thrusters), print it,
             and write the vehicle with these changes (.yaml).
-        arm: Arm, as soon as the state is known. Without it the thrusters never turn.
+        arm: Arm as soon as the state is known. Without it the thrusters never turn.
         as_json: Print one JSON object instead of tables.
 
     Raises:
-        ControlError, PolicyError, GoalError, VehicleError, LinkError, OutputError: What cannot be used.
+        ControlError, PolicyError, GoalError, VehicleError, LinkError, OutputError: An input cannot be used.
     """
     follow_parent()
     if _is_address(mission.team or ""):
@@ -452,7 +452,7 @@ def run_alone(
     arm: bool,
     identify: Path | None = None,
 ) -> dict[str, Any]:
-    """Run one vehicle; return the result as plain data. Arguments and errors as of `run`."""
+    """Run one vehicle; return the result as plain data. See `run` for arguments and errors."""
     assert mission.policy is not None
     console, site = Console(stderr=True), localization.site or "pool"
     file, pool = localization.pool()
@@ -523,7 +523,7 @@ def run_alone(
 
 
 def _follower(vehicle: Vehicle, out: Path) -> Follower:
-    """Return the estimator of what has changed on a vehicle, ready to start; refuse a file that cannot be written."""
+    """Return the estimator of changes on a vehicle, ready to start; refuse a file that cannot be written."""
     from finssim.identification.adaptation import Follower
     from finssim.identification.report import refuse_places
 
@@ -532,7 +532,7 @@ def _follower(vehicle: Vehicle, out: Path) -> Follower:
 
 
 def _guide(mission: Mission, wiring: Wiring, pilot: Pilot, vehicle: Vehicle) -> Guide:
-    """Return what the pilot follows: a goal, a trajectory, the others of its team, or what it sees."""
+    """Return the pilot's guide: a goal, a trajectory, the others of its team, or its pictures."""
     if mission.goal is None and mission.trajectory is None:
         if wiring.messages:
             return _GO
@@ -544,7 +544,7 @@ def _guide(mission: Mission, wiring: Wiring, pilot: Pilot, vehicle: Vehicle) -> 
 
 
 def _is_address(text: str) -> bool:
-    """Return whether that is HOST:PORT."""
+    """Return whether a text is HOST:PORT."""
     host, _, port = text.rpartition(":")
     return bool(host) and port.isdecimal()
 
@@ -555,23 +555,23 @@ def _pilot(mission: Mission, vehicle: Vehicle) -> Pilot:
     if task is not None:
         from finssim.tasks.observer import fitted_task
 
-        fitted_task(task, vehicle)  # refuses what is no task, or none for this vehicle
+        fitted_task(task, vehicle)  # refuses an unknown task, or one that does not fit this vehicle
     if policy in CONTROLLERS:
         task = task or ("t2" if mission.trajectory is not None else None)
     return make_pilot(policy, vehicle, task=task, agent=mission.agent)
 
 
 def _alone(pilot: Pilot) -> bool:
-    """Return whether it does a task of one vehicle."""
+    """Return whether the pilot's task has one vehicle."""
     observer = getattr(pilot, "observer", None)
     return observer is not None and len(observer.task.vehicles) == 1
 
 
 def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
-    """This vehicle's end of the team's wire; None where it is alone.
+    """Return this vehicle's message exchange with its team; None without messages.
 
     Raises:
-        ControlError: The task has one vehicle, or several and no wire between them.
+        ControlError: `--messages` is given, but the pilot's task has one vehicle and a fixed goal.
     """
     observer = getattr(pilot, "observer", None)
     names = observer.task.vehicles if observer is not None else ()
@@ -593,7 +593,7 @@ def _team(pilot: Pilot, wiring: Wiring) -> Team | None:
 def _opened(
     link: AbstractContextManager[RobotDriver], record: AbstractContextManager[Recorder | None]
 ) -> Iterator[tuple[RobotDriver, Recorder | None]]:
-    """Yield the connection of the robot, and a record; no record remains of a run that could not be connected."""
+    """Yield the connection of the robot, and a record; the record is deleted if the robot could not be connected."""
     with ExitStack() as stack:
         recorder = stack.enter_context(record)
         try:

@@ -29,33 +29,34 @@ if TYPE_CHECKING:
 __all__ = ["Counters", "Intake", "Link", "Runtime", "Ticks"]
 
 
-# What a run counts: steps, decisions that came late, and the time from camera to command.
+# Statistics of a run: steps, late decisions, and the time from picture to command.
 
 
 EARLY = 0.002
-"""A decision may come this much before its time [s], so that a loop that jitters misses no turn."""
+"""Greatest lead of a decision over its due time [s], so that a loop with jitter misses no turn."""
 MISSES = 3.0
-"""Periods of a camera after which its last picture is too old to act on, if they are longer than `state_timeout`."""
+"""Age of a camera's last picture, in periods, above which it is too old, if that exceeds `state_timeout`."""
 REMEMBERED = 20_000
-"""Latencies that are kept: half an hour at ten a second."""
+"""Greatest number of stored latencies: half an hour at ten per second."""
 
 
 class Ticks:
-    """When a periodic thing is due: on the grid of its start, never later because an earlier turn was late."""
+    """Schedule of a periodic task: on a fixed grid from its start, so that a late turn does not delay later ones."""
 
     def __init__(self, start: float = 0.0) -> None:
-        """
+        """Set the first turn.
+
         Args:
             start: First turn [s].
         """
         self._next = start
 
     def due(self, now: float, period: float) -> tuple[bool, int]:
-        """Return whether it is time, and how many turns were missed altogether since the last one.
+        """Return whether the task is due, and how many turns were missed completely since the last one.
 
         Args:
             now: [s]
-            period: From now on [s].
+            period: Current period [s].
         """
         early = min(EARLY, 0.1 * period)
         if self._next - now > 2.0 * period:  # the clock was set back, or the period has become shorter
@@ -70,34 +71,34 @@ class Ticks:
 
 @dataclass
 class Counters:
-    """Totals of a run."""
+    """Counts and timing of a run."""
 
     steps: int = 0
     telemetry: int = 0
     pictures: int = 0
     fixes: int = 0
-    """Pictures that became part of the state."""
+    """Pictures that were used in the state."""
     decisions: int = 0
     missed: int = 0
-    """Turns of the pilot that passed without a decision because the loop was late."""
+    """Turns of the pilot without a decision because the loop was late."""
     overruns: int = 0
     """Steps that took longer than their period."""
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """Time from the arrival of the newest picture in the state to the command that is decided on it [s]."""
+    """Times from the arrival of the newest picture in the state to the resulting command [s]."""
     events: deque[Any] = field(default_factory=lambda: deque(maxlen=200))
     """The latest events of the bridge."""
     onboard: Counter[str] = field(default_factory=Counter)
     """Readings of the vehicle's own cameras, sonars and altimeters, by name."""
     sight: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """Time from the exposure of the oldest picture that a decision uses to its command [s]."""
+    """Times from the exposure of the oldest picture that a decision uses to its command [s]."""
     inference: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """Duration of decisions, of a pilot that uses pictures [s]."""
+    """Durations of decisions, of a pilot that uses pictures [s]."""
     _newest: float = math.nan
     _pending: float = math.nan
     _exposed: float = math.nan
 
     def picture(self, arrival: float, used: bool) -> None:
-        """A picture came [s]."""
+        """Count a picture that arrived at a time [s]."""
         self.pictures += 1
         if used:
             self.fixes += 1
@@ -107,8 +108,8 @@ class Counters:
         """Note a decision on the current state.
 
         Args:
-            exposed: When the oldest picture that it is made on was taken [s]; NaN without pictures.
-            took: What it took [s].
+            exposed: Time of exposure of the oldest picture used [s]; NaN without pictures.
+            took: Computation time [s].
         """
         self._pending, self._newest = self._newest, math.nan
         self._exposed = exposed
@@ -116,7 +117,7 @@ class Counters:
             self.inference.append(took)
 
     def sent(self, now: float) -> None:
-        """Note that the decision was sent [s]."""
+        """Note the time at which the decision was sent [s]."""
         if not math.isnan(self._pending):
             self.latencies.append(now - self._pending)
             self._pending = math.nan
@@ -125,7 +126,7 @@ class Counters:
             self._exposed = math.nan
 
     def summary(self) -> dict[str, Any]:
-        """Totals as plain data; percentiles of the latency [s], None where there was none."""
+        """Return counts as plain data, with percentiles of the latency [s], None if there is none."""
         names = ("steps", "telemetry", "pictures", "fixes", "decisions", "missed", "overruns")
         totals = {name: getattr(self, name) for name in names} | {"latency_s": _percentiles(self.latencies)}
         if self.onboard:
@@ -141,33 +142,34 @@ def _percentiles(times: deque[float]) -> dict[str, float | None]:
     return {f"p{p}": float(np.percentile(values, p)) if values.size else None for p in (50, 95, 99)}
 
 
-# Everything that arrives: decoded, put on the robot's clock, and given to perception, bridge and record.
+# Received data: decoded, put on the robot's clock, and passed to perception, bridge and recorder.
 
 
 USED = ("accepted", "initialized", "reacquired")
 
 
 class Link(MotorDevice, Protocol):
-    """Conversion of the bridge's commands for the other end of the wire: a motor controller or an autopilot."""
+    """Link to a motor controller or an autopilot; it encodes the bridge's commands and decodes received messages."""
 
     let_in: tuple[float, float] | None
-    """x, y of where the vehicle begins, world frame [m]; None: not given."""
+    """Initial x, y of the vehicle, world frame [m]; None: not given."""
     calibrate_depth: bool
     """True if the device calibrates its barometer, at the surface, before it arms."""
     highest: float
     """Greatest z of the goal or trajectory, world frame [m], for a device that measures depth by itself."""
     notes: list[str]
-    """Sentences for the user since they were last taken."""
+    """Sentences for the user since they were last read."""
 
     def feed(self, now: float, data: bytes) -> list[Message]:
-        """Messages that bytes complete, which came at a time [s]; never raises, whatever they are."""
+        """Return the messages completed by bytes that arrived at a time [s]; never raise an exception, for any
+        bytes."""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
-        """Frames to send at a time [s] for the bridge's command and state."""
+        """Return the frames to send at a time [s] for the bridge's command and state."""
 
 
 class Intake:
-    """Feeds one perception and one bridge. Nothing that arrives can raise."""
+    """Input stage of one perception and one bridge. No received data raise an exception."""
 
     def __init__(
         self,
@@ -177,13 +179,14 @@ class Intake:
         recorder: Recorder | None = None,
         link: Link | None = None,
     ) -> None:
-        """
+        """Set up the input stage.
+
         Args:
-            perception: Learns what the sensors say.
-            bridge: Watches whether they still speak.
-            counters: Counts it.
-            recorder: Takes it down.
-            link: Reads what comes; the vehicle's motor controller if None.
+            perception: Perception that processes sensor data.
+            bridge: Bridge that monitors the messages.
+            counters: Counters to update.
+            recorder: Recorder of every message, if any.
+            link: Link that decodes received bytes; that of the vehicle's motor controller if None.
         """
         vehicle = perception.vehicle
         self.link: Link = link or McuLink(vehicle.mcu.outputs, len(vehicle.actuators))
@@ -196,12 +199,12 @@ class Intake:
     def take(
         self, now: float, frames: Sequence[tuple[float, bytes]], pictures: Sequence[Picture] = ()
     ) -> None:
-        """Take in what has come.
+        """Process received data.
 
         Args:
             now: Robot's clock [s].
             frames: Datagrams from the motor controller, each with its time of arrival [s].
-            pictures: From the camera.
+            pictures: Pictures from the camera.
         """
         for arrival, data in frames:
             for message in self.link.feed(arrival, data):
@@ -248,9 +251,9 @@ FORGET_AFTER = 1.0
 
 
 class Runtime:
-    """Perception, pilot and bridge of one vehicle. Knows no clock and no wire: `step` is given both.
+    """Perception, pilot and bridge of one vehicle. Clock and connections are outside: `step` receives time and data.
 
-    Nothing that arrives can raise: bad data is counted. A pilot that fails stops the vehicle.
+    No received data raise an exception: invalid data are counted. A pilot that fails stops the vehicle.
     """
 
     def __init__(
@@ -265,39 +268,40 @@ class Runtime:
         recorder: Recorder | None = None,
         team: Team | None = None,
     ) -> None:
-        """
+        """Assemble the robot.
+
         Args:
-            vehicle: As its file has it.
-            perception: Estimates the state, of pictures, telemetry and position fixes.
-            pilot: Who steers.
-            guide: Where to; its time starts when the vehicle is armed.
+            vehicle: Vehicle.
+            perception: Estimator of the state from pictures, telemetry and position fixes.
+            pilot: Pilot that computes the thrusts.
+            guide: Motion to follow; its time starts when the vehicle is armed.
             arm: Arm once, as soon as the state is ready. False: thrusters never turn.
-            bridge: Otherwise than by default.
-            recorder: Takes down everything.
-            team: Hears of others and tells them of this vehicle; None: it is alone.
+            bridge: Bridge; the vehicle's default one if None.
+            recorder: Recorder of everything, if any.
+            team: Message exchange with other vehicles; None: there are none.
         """
         self.vehicle, self.pilot, self.guide = vehicle, pilot, guide
         self.perception = perception
         self.bridge = bridge or Bridge(vehicle)
         self.recorder, self.team = recorder, team
         self.told: list[bytes] = []
-        """Datagrams for the others of the last step."""
+        """Datagrams of the last step for the other vehicles."""
         self.counters = Counters()
         self.reading: Reading | None = None
-        """The latest."""
+        """Latest reading."""
         self.force = np.zeros(len(vehicle.thruster_names))
-        """Thrusts that were asked for last, as the bridge limited them [N], (n,)."""
+        """Last requested thrusts, as limited by the bridge [N], (n,)."""
         self.started = math.nan
-        """When the guide's time began [s]; NaN before."""
+        """Start of the guide's time [s]; NaN before."""
         self.refusal = ""
-        """Why arming was refused last; empty where it was not."""
+        """Reason why arming was last refused; empty if it was not."""
         self._arm, self._held_since = arm, math.inf
         self._ticks = Ticks()
         self.intake = Intake(self.perception, self.bridge, self.counters, recorder)
         self.attach(self.intake.link)
 
     def attach(self, link: Link) -> None:
-        """Set the link to the other end of the wire: the vehicle's motor controller by default."""
+        """Set the link to the device at the other end: the vehicle's motor controller by default."""
         self.link = self.intake.link = self.bridge.autopilot = link
         link.let_in = self.perception.let_in
 
@@ -308,16 +312,16 @@ class Runtime:
         pictures: Sequence[Picture] = (),
         heard: Sequence[bytes] = (),
     ) -> list[bytes]:
-        """One turn of the loop.
+        """Run one step of the loop.
 
         Args:
             now: Robot's clock [s].
             frames: Datagrams from the motor controller, each with its time of arrival [s].
-            pictures: From the camera.
-            heard: Datagrams from the others.
+            pictures: Pictures from the camera.
+            heard: Datagrams from the other vehicles.
 
         Returns:
-            Datagrams to send to the motor controller now; those for the others are `told`.
+            Datagrams to send to the motor controller now; those for the other vehicles are in `told`.
         """
         self.counters.steps += 1
         self.intake.take(now, frames, pictures)
@@ -346,7 +350,7 @@ class Runtime:
         self.counters.sent(now)
 
     def start(self, now: float) -> None:
-        """Let the guide's time begin. `now` is the time [s]."""
+        """Start the guide's time. `now` is the time [s]."""
         self.started = now
         self._ticks = Ticks(now)
         self.pilot.reset()
@@ -360,10 +364,10 @@ class Runtime:
 
         Args:
             now: Robot's clock [s].
-            pilot: Who steers from then on.
-            guide: Where to; its time starts when the vehicle is armed again.
+            pilot: New pilot.
+            guide: New motion to follow; its time starts when the vehicle is armed again.
             arm: Arm once, as soon as the state is ready.
-            recorder: Takes down everything from now on; nobody does if None.
+            recorder: New recorder; nothing is recorded if None.
         """
         self.bridge.disarm(now)
         self._record_events()
@@ -372,7 +376,7 @@ class Runtime:
         self.recorder = self.intake.recorder = recorder
 
     def stop(self, now: float, frames: int = 3) -> list[bytes]:
-        """Disarm; returns frames without thrust to send. `now` is the time [s]."""
+        """Disarm; return frames without thrust to send. `now` is the time [s]."""
         self._arm = False
         self.bridge.disarm(now)
         last = [self.link.encode(now, self.bridge.tick(now), self.bridge.state) for _ in range(frames)]
@@ -385,7 +389,7 @@ class Runtime:
         return math.nan if self.reading is None else self.reading.time - self.started
 
     def _begin(self, now: float, reading: Reading) -> None:
-        """Arm as soon as that is possible, once, and let the guide's time begin."""
+        """Arm as soon as that is possible, once, and start the guide's time."""
         if not math.isnan(self.started) or (self.pilot.needs_state and not reading.ready):
             return
         if self._arm:
@@ -397,7 +401,7 @@ class Runtime:
         self.start(now)
 
     def _unseen(self, now: float) -> str:
-        """Return the picture that the pilot needs and the robot lacks, or only has too old; empty for none."""
+        """Return which picture that the pilot needs is missing or too old; empty if none is."""
         for name in getattr(self.pilot, "pictures", ()):
             if name not in self.intake.pictures:
                 return f"no picture of {name} yet"
@@ -409,11 +413,11 @@ class Runtime:
         return ""
 
     def _exposed(self, name: str) -> float:
-        """When the latest picture of a sensor was taken, robot's clock [s]."""
+        """Return the time of exposure of a sensor's latest picture, robot's clock [s]."""
         return self.intake.pictures[name].time - self.vehicle.perception[name].latency
 
     def _decide(self, now: float, reading: Reading) -> None:
-        """Ask the pilot when it is its turn and it knows enough."""
+        """Let the pilot decide when it is due and has the state that it needs."""
         if math.isnan(self.started):
             return
         self._held_since = min(self._held_since, now) if self.bridge.state == "hold" else math.inf
@@ -422,7 +426,7 @@ class Runtime:
         if not due or self.bridge.state == "fault" or (self.pilot.needs_state and not reading.ready):
             return
         if now - self._held_since > FORGET_AFTER:
-            self.pilot.reset()  # its integral would grow against a vehicle that has no thrust
+            self.pilot.reset()  # its integral would grow while the vehicle has no thrust
         force = self._asked(now, reading)
         if force is None:
             return
@@ -442,7 +446,7 @@ class Runtime:
             )  # fmt: skip
 
     def _asked(self, now: float, reading: Reading) -> Array | None:
-        """Return the pilot's thrusts, or one number per channel; None, and the vehicle stopped, if it fails."""
+        """Return the pilot's thrusts, or one number per channel; if it fails, stop the vehicle and return None."""
         try:
             force = np.asarray(self.pilot.act(reading, self.guide, now - self.started), float)
         except (

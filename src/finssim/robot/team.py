@@ -1,7 +1,7 @@
-"""Exchange of estimates between vehicles: one datagram each, and tracks of the others from them.
+"""Exchange of estimates between vehicles, one per datagram, and the resulting tracks of the others.
 
-What is sent is the sender's name and its estimate: an acoustic modem, a radio on a float or a computer beside the pool
-carries it. What has not arrived is not known; how old it is, is.
+A datagram contains the sender's name and estimate; an acoustic modem, a radio on a float or a computer beside the pool
+transports it. Receivers know only what has arrived, with its age.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from finssim.robot.runtime import Ticks
 
 MAGIC = b"FST1"
 LAYOUT = struct.Struct("<4s32s14d")
-"""Magic, name in UTF-8 filled up with zeros, age [s], position [m], quaternion xyzw, nu [m/s, rad/s]; then CRC-32."""
+"""Magic, name in UTF-8 padded with zeros, age [s], position [m], quaternion xyzw, nu [m/s, rad/s]; then CRC-32."""
 CHECK = struct.Struct("<I")
 LONGEST_NAME = 32
-"""Bytes of a name in UTF-8."""
+"""Greatest length of a name in UTF-8 [bytes]."""
 OLDEST = 60.0
-"""A track may be this old when it is sent [s]."""
+"""Greatest age of a track when it is sent [s]."""
 FARTHEST = 1.0e5
-"""A position or velocity beyond this is none [m, m/s, rad/s]."""
+"""Greatest plausible position or velocity [m, m/s, rad/s]."""
 
 
 def encode_track(name: str, track: Track, now: float) -> bytes:
-    """A datagram.
+    """Return the datagram of a track.
 
     Args:
-        name: Whose track.
-        track: With the time at which it was measured.
+        name: Name of the vehicle.
+        track: Track with the time of its measurement.
         now: Sender's clock [s].
 
     Raises:
-        ValueError: The name takes more than `LONGEST_NAME` bytes, or none.
+        ValueError: The name is empty or longer than `LONGEST_NAME` bytes.
     """
     whose = name.encode("utf-8")
     if not 0 < len(whose) <= LONGEST_NAME:
@@ -51,11 +51,11 @@ def encode_track(name: str, track: Track, now: float) -> bytes:
 
 
 def decode_track(data: bytes, now: float) -> tuple[str, Track] | None:
-    """Return name and track of a received datagram; None if it is no such datagram, or impossible.
+    """Return name and track of a received datagram; None if it is invalid or implausible.
 
     Args:
         data: The datagram.
-        now: Receiver's clock [s]; the track's time is on it.
+        now: Receiver's clock [s], to which the track's time refers.
     """
     if len(data) != LAYOUT.size + CHECK.size or CHECK.unpack(data[LAYOUT.size :])[0] != zlib.crc32(
         data[: LAYOUT.size]
@@ -80,28 +80,29 @@ def decode_track(data: bytes, now: float) -> tuple[str, Track] | None:
 
 
 class Team:
-    """One vehicle's end of the wire.
+    """Message exchange of one vehicle with its team.
 
     Attributes:
-        name: Its own place in the task.
-        tracks: What has been heard of the others, by name: the newest that was measured.
-        refused: Datagrams that were none.
+        name: Role of this vehicle in the task.
+        tracks: Received tracks of the others, by name: the one with the newest measurement.
+        refused: Number of invalid datagrams.
     """
 
     def __init__(self, name: str, others: tuple[str, ...], *, period: float = 0.1, turn: float = 0.0) -> None:
-        """
+        """Set up the exchange.
+
         Args:
-            name: This vehicle's place in the task.
-            others: Names that are listened to: of the task's other vehicles, and of what else it goes to.
-            period: Between two messages of its own [s].
-            turn: When in the period it is its turn [s].
+            name: Role of this vehicle in the task.
+            others: Names to receive: the task's other vehicles, and other targets.
+            period: Time between two messages of this vehicle [s].
+            turn: Time of this vehicle's turn within the period [s].
         """
         self.name, self.tracks, self.refused = name, dict[str, Track](), 0
         self._others, self._period, self._turn = frozenset(others), period, turn
         self._ticks: Ticks | None = None
 
     def hear(self, now: float, datagrams: Sequence[bytes]) -> None:
-        """Take in what has come. `now` is the time [s]."""
+        """Process received datagrams. `now` is the time [s]."""
         for data in datagrams:
             heard = decode_track(data, now)
             if heard is None or heard[0] not in self._others:
@@ -115,7 +116,7 @@ class Team:
     def known(self, reading: Reading) -> Reading:
         """Return the reading with the tracks of the others; not ready before all have been received.
 
-        However old a message is, it stands, as in training: who is lost stops alone.
+        A message of any age remains valid, as in training: a vehicle that is lost stops alone.
         """
         missing = sorted(self._others - self.tracks.keys())
         reading = replace(reading, tracks=dict(self.tracks))
@@ -124,7 +125,7 @@ class Team:
         return replace(reading, ready=False, reason=f"nothing heard of {', '.join(missing)}")
 
     def tell(self, now: float, reading: Reading) -> list[bytes]:
-        """Return the datagrams to send now: none out of this vehicle's turn, or while its position is unknown.
+        """Return the datagrams to send now: none outside this vehicle's turn, or while its position is unknown.
 
         `now` is the time [s].
         """

@@ -1,6 +1,6 @@
-"""`finssim teleop`: a person drives, over the same bridge and with the same record as a controller.
+"""`finssim teleop`: manual driving, with the same bridge and the same record as a controller.
 
-Hands on a gamepad or a keyboard become a wrench by gears, a dead zone and a dead-man switch; presses arm, disarm and
+Inputs of a gamepad or a keyboard become a wrench by gears, a dead band and a dead-man switch; buttons arm, disarm and
 stop the vehicle, or hand over to a controller.
 """
 
@@ -40,52 +40,53 @@ GEARS: dict[Gear, tuple[float, float, float, float]] = {
     "cruise": (6.0, 4.0, 5.0, 0.8),
     "boost": (10.0, 7.0, 8.0, 1.2),
 }
-"""Full deflection of surge, sway, heave [N] and yaw [N m], as published."""
+"""Wrench at full deflection of surge, sway, heave [N] and yaw [N m], as published."""
 DEAD_BAND = 0.1
-"""Deflections below do nothing, those above count from it."""
+"""Deflection below which there is no output; larger ones are measured from it."""
 EXPO = 0.3
-"""Share of the cube in the answer to a deflection: small ones become finer, the full one stays."""
+"""Weight of the cubic term of the response: small deflections become finer, the full one is unchanged."""
 LOST = 0.5
-"""Without news of the device for so long it counts as lost [s]."""
+"""Time without input after which the device counts as lost [s]."""
 ARMING = 5.0
-"""A press of the arm button waits so long for an autopilot to get ready [s]."""
+"""Time for which a press of the arm button waits for an autopilot to become ready [s]."""
 
 
 class TeleopError(ValueError):
-    """A device for teleoperation is not there, or cannot be used."""
+    """A device for teleoperation is missing, or cannot be used."""
 
 
 @dataclass(frozen=True)
 class Hands:
-    """State of a device at one time. Axes are in [-1, 1]: forward, left, up, turn left."""
+    """State of an input device at one time. Axes are in [-1, 1]: forward, left, up, turn left."""
 
     surge: float = 0.0
     sway: float = 0.0
     heave: float = 0.0
     yaw: float = 0.0
     dead_man: bool = False
-    """True if the dead-man switch is held: without it there is no thrust."""
+    """True if the dead-man switch is held; otherwise there is no thrust."""
     precision: bool = False
     boost: bool = False
     arm: bool = False
-    """The button that arms and disarms is down."""
+    """True if the button that arms and disarms is pressed."""
     stop: bool = False
-    """The emergency stop is down."""
+    """True if the emergency stop is pressed."""
     acknowledge: bool = False
-    """The button that ends a fault is down."""
+    """True if the button that ends a fault is pressed."""
     mode: bool = False
-    """The button that hands over to the other pilot is down."""
+    """True if the button that hands over to the other pilot is pressed."""
     present: bool = True
     """True if the device is connected."""
 
     @property
     def gear(self) -> Gear:
-        """Precision before boost, for it is the careful one."""
+        """Selected gear; precision, the more careful one, takes precedence over boost."""
         return "precision" if self.precision else "boost" if self.boost else "cruise"
 
     @property
     def wrench(self) -> Array:
-        """Body frame [N, N m], (6,); zero without the dead-man switch, and while the emergency stop is down."""
+        """Commanded wrench, body frame [N, N m], (6,); zero without the dead-man switch, and with the emergency
+        stop."""
         if not self.dead_man or self.stop:
             return np.zeros(6)
         x, y, z, n = shaped(np.array([self.surge, self.sway, self.heave, self.yaw])) * GEARS[self.gear]
@@ -93,7 +94,8 @@ class Hands:
 
 
 def shaped(deflection: Array, dead_band: float = DEAD_BAND, expo: float = EXPO) -> Array:
-    """Answer to deflections: e d³ + (1 - e) d with d counted from the dead band, within [-1, 1]; NaN counts as none."""
+    """Return the response to deflections: e d³ + (1 - e) d with d from the dead band, within [-1, 1]; NaN counts as
+    0."""
     x = np.clip(np.nan_to_num(deflection, nan=0.0), -1.0, 1.0)
     beyond = np.maximum(np.abs(x) - dead_band, 0.0) / (1.0 - dead_band)
     return np.asarray(np.sign(x) * (expo * beyond**3 + (1.0 - expo) * beyond), float)
@@ -101,16 +103,16 @@ def shaped(deflection: Array, dead_band: float = DEAD_BAND, expo: float = EXPO) 
 
 @dataclass(frozen=True)
 class TeleopCommand:
-    """Command of a person now."""
+    """Current command of the operator."""
 
     wrench: Array = field(default_factory=lambda: np.zeros(6))
-    """Body frame [N, N m], (6,)."""
+    """Wrench, body frame [N, N m], (6,)."""
     gear: Gear = "cruise"
     stop: bool = False
     pressed: frozenset[str] = frozenset()
-    """Buttons that went down just now, of arm, acknowledge and mode: once for each press."""
+    """Buttons that were just pressed, of arm, acknowledge and mode: once for each press."""
     lost: bool = False
-    """The device is lost: disarm."""
+    """True if the device is lost: disarm."""
 
 
 class Device(Protocol):
@@ -121,39 +123,40 @@ class Device(Protocol):
 
 
 class Operator:
-    """A person at the controls of a running robot: reads a device at each turn of the loop and does what it shows.
+    """An operator of a running robot: reads a device in each step of the loop and executes its commands.
 
-    A vehicle is armed by a press of the arm button alone; an autopilot that has yet to get ready is waited for up to
-    `ARMING` seconds, or to the next press. A lost device, a released dead-man and the emergency stop each mean no
-    thrust; a lost device disarms, and its return arms nothing: the first look after the start or after a loss only
-    learns which buttons are down.
+    A vehicle is armed only by a press of the arm button; an autopilot that is not ready yet is waited for up to
+    `ARMING` seconds, or until the next press. A lost device, a released dead-man switch and the emergency stop each
+    mean no thrust; a lost device disarms, and its return arms nothing: the first reading after the start or after a
+    loss only determines which buttons are pressed.
     """
 
     def __init__(self, device: Device, swap: Callable[[], None] | None = None) -> None:
-        """
+        """Set the device.
+
         Args:
-            device: What the person holds.
-            swap: Hands over between person and controller, at a press; None: there is no controller.
+            device: The operator's input device.
+            swap: Function that switches between operator and controller; None: there is no controller.
         """
         self.device, self._swap = device, swap
         self.command = TeleopCommand()
-        """The latest."""
+        """Latest command."""
         self.message = ""
-        """What to tell the person: why arming was refused, or what is wrong."""
+        """Message to the operator: why arming was refused, or what is wrong."""
         self._before: Hands | None = None
         self._heard = self._arming = -math.inf
-        """When the device was last there, and until when an autopilot is waited for [s]."""
+        """Time of the device's last input, and end of the wait for an autopilot [s]."""
 
     def wrench(self) -> Array:
-        """The wanted wrench, body frame [N, N m], (6,); for `pilots.WrenchPilot`."""
+        """Return the requested wrench, body frame [N, N m], (6,); for `pilots.WrenchPilot`."""
         return self.command.wrench
 
     def deflection(self) -> Array:
-        """Surge, sway, heave and yaw as parts of the highest gear's [-], (4,); for `pilots.HelmPilot`."""
+        """Return surge, sway, heave and yaw as fractions of the highest gear [-], (4,); for `pilots.HelmPilot`."""
         return np.asarray(self.command.wrench[[0, 1, 2, 5]] / GEARS["boost"])
 
     def look(self, now: float) -> TeleopCommand:
-        """Return the person's command at a time [s]."""
+        """Return the operator's command at a time [s]."""
         hands, before = self.device.read(now), self._before
         if hands is not None and hands.present:
             self._heard = now
@@ -197,7 +200,7 @@ class Operator:
             self._swap()
 
 
-# A terminal's keyboard, also over ssh; the terminal is put back as it was.
+# A terminal's keyboard, also over ssh; the terminal's settings are restored.
 
 
 KEYBOARD_HELP = (
@@ -218,7 +221,7 @@ KEY_AXES = {
     "\x1b[D": ("yaw", 1.0),
     "\x1b[C": ("yaw", -1.0),
 }
-"""Key -> axis and deflection; the arrows drive and turn."""
+"""Key -> axis and deflection; the arrow keys drive and turn."""
 KEY_BUTTONS = {"\r": "arm", "\n": "arm", "x": "stop", "k": "acknowledge", "m": "mode"}
 GEAR_KEYS = {"1": "precision", "2": "cruise", "3": "boost"}
 
@@ -226,13 +229,13 @@ GEAR_KEYS = {"1": "precision", "2": "cruise", "3": "boost"}
 class Keys:
     """Keys that are held: a terminal reports presses and repeats, but no release.
 
-    A key counts as held for `hold` seconds after its last press, which has to be longer than the keyboard waits before
-    it repeats. That is the dead-man switch too: nobody at the keys, no thrust.
+    A key counts as held for `hold` seconds after its last press, which must be longer than the keyboard's repeat delay.
+    This is also the dead-man switch: without pressed keys there is no thrust.
     """
 
     def __init__(self, hold: float = 0.6) -> None:
         """Args:
-        hold: [s]
+        hold: Time for which a key counts as held after its last press [s].
         """
         if not 0.0 < hold <= 2.0:
             raise TeleopError(f"hold is {hold:g} s, expected above 0 and at most 2 s")
@@ -241,7 +244,7 @@ class Keys:
         self._gear = "cruise"
 
     def press(self, now: float, key: str) -> None:
-        """A key was pressed, or repeats; unknown keys do nothing. `now` is the time [s]."""
+        """Note that a key was pressed, or repeats; unknown keys have no effect. `now` is the time [s]."""
         key = key if len(key) > 1 else key.lower()
         if key in KEY_AXES:
             axis, deflection = KEY_AXES[key]
@@ -292,7 +295,7 @@ class Keyboard:
             import termios
             import tty
         except ImportError:
-            _windows_keyboard()  # nothing to set up: its console gives keys as they are pressed
+            _windows_keyboard()  # nothing to set up: its console reports keys as they are pressed
             return self
         self._before = termios.tcgetattr(self._descriptor)
         tty.setcbreak(self._descriptor)  # Ctrl-C still interrupts
@@ -308,10 +311,10 @@ class Keyboard:
         try:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
         except termios.error:
-            self._open = False  # the terminal is gone, and nothing is left to put back
+            self._open = False  # the terminal is gone, so there is nothing to restore
 
     def pressed(self) -> list[str]:
-        """Keys since the last call, arrows as their sequence of three characters; never waits."""
+        """Return the keys since the last call, arrows as their sequence of three characters; never waits."""
         if not self._before:
             return _windows_keys(_windows_keyboard())
         keys: list[str] = []
@@ -343,7 +346,7 @@ WINDOWS_ARROWS = {"H": "\x1b[A", "P": "\x1b[B", "M": "\x1b[C", "K": "\x1b[D"}
 
 
 def _windows_keyboard() -> Any:
-    """Return Windows' module of its console.
+    """Return Windows' console module.
 
     Raises:
         TeleopError: This system has neither that nor termios.
@@ -376,9 +379,9 @@ GAMEPAD_HELP = (
     "START arm, disarm | B emergency stop | Y end a fault | SELECT other pilot | Ctrl-C quit"
 )
 STICKS = {"left_x": 0, "left_y": 1, "left_trigger": 2, "right_x": 3, "right_trigger": 5}
-"""Axes of pads of the Xbox family, as Linux numbers them."""
+"""Axes of pads of the Xbox family, numbered as in Linux."""
 BUTTONS = {"stop": 1, "boost": 2, "acknowledge": 3, "dead_man": 4, "precision": 5, "mode": 6, "arm": 7}
-"""Their buttons."""
+"""Buttons of pads of the Xbox family."""
 AXIS_COUNT, BUTTON_COUNT = 1 + max(STICKS.values()), 1 + max(BUTTONS.values())
 """Least numbers of axes and buttons of a pad."""
 
@@ -403,15 +406,15 @@ class Pad:
         )
 
     def _pulled(self, axes: Sequence[float], axis: int) -> float:
-        """Return how far a trigger is pulled, [0, 1]; 0, which is half way, is shown until it is moved for the first
-        time."""
+        """Return how far a trigger is pulled, [0, 1]; until its first motion it reports 0, half way, which is
+        ignored."""
         if axes[axis] != 0.0:
             self._moved.add(axis)
         return (axes[axis] + 1.0) / 2.0 if axis in self._moved else 0.0
 
 
 class Gamepad:
-    """The first gamepad; one that is unplugged is lost, and found again when it comes back.
+    """The first gamepad; one that is unplugged is lost, and found again when it is reconnected.
 
     with Gamepad() as pad:
         hands = pad.read()
@@ -463,7 +466,7 @@ class Gamepad:
         try:
             axes = [float(self._device.get_axis(i)) for i in range(AXIS_COUNT)]
             return self._pad.hands(axes, [self._device.get_button(i) for i in range(BUTTON_COUNT)])
-        except self._pygame.error:  # it went between two events
+        except self._pygame.error:  # it was disconnected between two events
             self._device = None
             return Hands(present=False)
 
@@ -472,21 +475,21 @@ class Gamepad:
             self._device, self._pad = self._pygame.joystick.Joystick(0), Pad()
 
 
-# The drive.
+# Manual driving.
 
 
 SHOWN_EVERY = 0.2
-"""Between two lines on the terminal [s]."""
+"""Time between two updates of the status line on the terminal [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSettings:
-    """Settings of a drive by hand."""
+    """Settings of manual driving."""
 
     action: str | None = None
-    """(MODE) What the sticks or keys command: wrench6, a wrench of the thrusters; of a vehicle with fins also
-    surfaces, propellers and each fin by its effect on yaw and pitch, or course_pitch, speed, course and pitch
-    by the autopilot, while the state is known. By the vehicle if not given: surfaces if it has fins."""
+    """(MODE) Commands of the sticks or keys: wrench6, a wrench of the thrusters; for a vehicle with fins also surfaces,
+    propellers and each fin by its effect on yaw and pitch, or course_pitch, speed, course and pitch by the autopilot,
+    while the state is known. If not given: surfaces for a vehicle with fins, otherwise wrench6."""
     rate: Annotated[float, (20.0, 200.0)] = 60.0
     """Rate of the loop [Hz]."""
     duration: Annotated[float | None, (0.0, None)] = None
@@ -498,7 +501,7 @@ class Handover(NamedTuple):
 
     pilot: Pilot
     guide: Guide
-    """Where it steers to."""
+    """Guide of the controller."""
 
 
 def drive(
@@ -515,14 +518,14 @@ def drive(
     """Drive until the time is over or Ctrl-C; the vehicle starts disarmed, and ends with frames without thrust.
 
     Args:
-        vehicle: As its file has it.
-        device: In the person's hands.
-        connection: Runs the robot's software on its wires.
-        settings: What the person commands, the rate of the loop and its duration.
+        vehicle: Vehicle.
+        device: The operator's input device.
+        connection: Driver that runs the robot's software on its connections.
+        settings: Action mode of the operator, rate of the loop and duration.
         pool: Camera, water and frames; None: the vehicle is driven, and armed, without localization.
-        recorder: Takes down everything.
+        recorder: Recorder of everything, if any.
         handover: Controller to which the mode button hands over; None: there is none.
-        show: Called at every turn.
+        show: Called in every step.
     """
 
     def swap() -> None:
@@ -561,7 +564,7 @@ def drive(
 
 @dataclass(frozen=True, kw_only=True)
 class DriveWiring:
-    """Connection of the vehicle that is driven, and its overhead camera."""
+    """Connection of the driven vehicle, and its overhead camera."""
 
     robot: str = "pool"
     """(WIRE) Link to the motor controller: udp://HOST:PORT, serial:DEVICE, or pool (the virtual
@@ -578,7 +581,7 @@ class DriveWiring:
         """Return the pool of the file; None without one.
 
         Raises:
-            LocalizationError: The file cannot be used.
+            LocalizationError: The file is invalid.
             TeleopError: Pictures are requested without it.
         """
         if self.pool_file is not None:
@@ -640,7 +643,7 @@ def run(
 
 
 def _handover(policy: str | None, goal: str | None, vehicle: Vehicle, pool: Pool | None) -> Handover | None:
-    """Return the controller that the person hands over to, and where it steers to; None without one."""
+    """Return the controller to which the operator hands over, with its guide; None without one."""
     if policy is None:
         if goal is not None:
             raise TeleopError("--goal is where a controller steers to: give --policy, too, or omit it")

@@ -40,28 +40,28 @@ __all__ = [
 ]
 
 
-# The outermost loop of a robot in real time: the only place that reads a clock and waits.
+# The outermost loop of a robot in real time: only here a clock is read and time is waited for.
 
 
 LAST_FRAMES = 3
-"""Frames without thrust that a run ends with."""
+"""Number of frames without thrust at the end of a run."""
 COLLECT_EVERY = 1.0
-"""Time between two rounds of the garbage collector, which are made where there is time to spare [s]."""
+"""Time between two rounds of the garbage collector, which run only when there is slack [s]."""
 ENOUGH_SLACK = 0.004
-"""Time to spare for one [s]."""
+"""Slack required for a round [s]."""
 SWITCH = 0.001
-"""The longest that another thread keeps Python to itself [s]."""
+"""Longest time for which another thread may hold the interpreter [s]."""
 
 
 class Wires(NamedTuple):
-    """Open wires of a robot."""
+    """Open connections of a robot."""
 
     transport: Transport
-    """To the motor controller."""
+    """Transport to the motor controller."""
     pictures: PictureSource | None = None
-    """From the camera; None: there is none."""
+    """Pictures of the camera; None: there is none."""
     mates: Transport | None = None
-    """To what carries messages between vehicles; None: this one is alone."""
+    """Transport of messages between vehicles; None: there are no others."""
 
 
 def run_realtime(
@@ -75,34 +75,34 @@ def run_realtime(
     clock: Callable[[], float] = realtime.now,
     wait: Callable[[float], None] = realtime.wait,
 ) -> float:
-    """Run a robot on its wires until the time is over, `until` returns true, or Ctrl-C; then stop its thrusters.
+    """Run a robot on its connections until the time is over, `until` returns True, or Ctrl-C; then stop its thrusters.
 
-    Deadlines are multiples of the period since the start, so that nothing drifts. A step that is late is counted as an
-    overrun; the deadlines that it missed are left out.
+    Deadlines are multiples of the period since the start, so that they do not drift. A late step is counted as an
+    overrun; the deadlines that it missed are skipped.
 
     Args:
         runtime: The robot.
-        wires: Its open wires.
-        rate: Steps a second [Hz].
-        duration: How long [s].
-        until: Ends the run where it says so; asked after every step.
+        wires: Its open connections.
+        rate: Steps per second [Hz].
+        duration: Duration [s].
+        until: Called after every step; the run ends if it returns True.
         show: Called after every step.
         clock: The robot's clock [s].
-        wait: Waits so long [s].
+        wait: Function that waits for a time [s].
 
     Returns:
-        How long it ran [s].
+        Duration of the run [s].
     """
     transport, pictures, mates = wires
     period, turn = 1.0 / rate, 0
     with _calm(), interruptible() as interrupted:
-        now = start = collected = clock()  # after the garbage of the start, which takes its time
+        now = start = collected = clock()  # after garbage collection, which takes time
         try:
             while not interrupted() and (now := clock()) - start < duration:
                 frames = [(now, data) for data in transport.receive()]
                 heard = mates.receive() if mates is not None else ()
                 outgoing = runtime.step(now, frames, pictures.receive(now) if pictures else (), heard)
-                # Where the process stood still within the step, what it decided is old; the next step will see that.
+                # If the process was suspended within the step, its decision is outdated; the next step detects that.
                 if clock() - now < runtime.bridge.settings.command_timeout:
                     for data in outgoing:
                         transport.send(data)
@@ -131,7 +131,8 @@ def run_realtime(
 
 @contextmanager
 def _calm() -> Iterator[None]:
-    """Keep the garbage collector and other threads from holding up the loop; what was frozen before stays frozen."""
+    """Keep the garbage collector and other threads from delaying the loop; objects that were frozen before remain
+    frozen."""
     enabled, frozen, interval = gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()
@@ -167,15 +168,15 @@ class Wiring:
     lockstep: bool = False
     """Run in lock-step with finssim pool --lockstep, as fast as possible."""
     calibrate_depth: bool = False
-    """Calibrate an autopilot's barometer as soon as it is heard, with the vehicle at the surface: depth then counts
-    from there."""
+    """Calibrate an autopilot's barometer as soon as it is connected, with the vehicle at the surface: depth is then
+    measured from there."""
     messages: str = ""
     """(ADDRESS) Relay of messages between vehicles, such as finssim pool --task: HOST:PORT. With --team the default is
     the port of --robot plus five."""
 
 
 def link_of(robot: str, vehicle: Vehicle) -> Link:
-    """Return the other end of an address: an autopilot for `mavlink`, otherwise the vehicle's motor controller.
+    """Return the link of an address: to an autopilot for `mavlink`, otherwise to the vehicle's motor controller.
 
     Raises:
         LinkError, ControlError: pymavlink is missing, or the vehicle has no autopilot.
@@ -197,7 +198,8 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
 
 
 class RobotDriver(Protocol):
-    """Runs a robot on its connection, until the time is over or `until` returns true; returns the duration [s]."""
+    """Function that runs a robot on its connection until the time is over or `until` returns True, and returns the
+    duration [s]."""
 
     def __call__(
         self,
@@ -212,17 +214,17 @@ class RobotDriver(Protocol):
 
 @contextmanager
 def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[RobotDriver]:
-    """Everything open, for as long as it is needed: for one run, or for several one after the other.
+    """Open all connections for one run, or for several consecutive runs, and yield the driver of a run.
 
-    A later run goes on at the clock at which the one before ended, and is given nothing that came between them.
+    A later run continues at the clock of the end of the previous one, and receives nothing that arrived between them.
 
     Args:
-        wiring: What to open.
-        vehicle: Its tags are looked for.
-        pool: Its camera tells the size of pictures; None: there is no camera.
+        wiring: Connections to open.
+        vehicle: Vehicle with the tags to detect.
+        pool: Pool with the camera's image size; None: there is no camera.
 
     Raises:
-        LinkError, LockstepError: Something cannot be opened.
+        LinkError, LockstepError: A connection cannot be opened.
     """
     with ExitStack() as stack:
         if wiring.lockstep and wiring.messages:
@@ -270,7 +272,7 @@ def connected(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> Iterator[R
 
 
 def _check_clock(robot: str) -> None:
-    """Refuse a slowed clock for anything but a virtual pool on this machine, whose process reads the same clock."""
+    """Refuse a slowed clock except for a virtual pool on this machine, whose process uses the same clock."""
     rate = realtime.clock_rate()
     hosts = re.findall(r"(?:udp://|udpin:|udpout:|tcp:|dvl=)([^:?&]+)", robot)
     remote = [host for host in hosts if host != "localhost" and not host.startswith("127.")]
@@ -282,10 +284,10 @@ def _check_clock(robot: str) -> None:
 
 
 def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> PictureSource:
-    """The wire of pictures, with tags found beside the loop where a camera hangs over the pool.
+    """Return the source of pictures, with detection of tags in a separate thread if there is an overhead camera.
 
     Raises:
-        LinkError: It names no source, or the source cannot be opened.
+        LinkError: The address is invalid, or the source cannot be opened.
     """
     default = f"udp://{DEFAULT_CAMERA}" if wiring.robot == "pool" else "none"
     host, port = host_port(wiring.bind, "--bind")
@@ -297,7 +299,7 @@ def open_camera(wiring: Wiring, vehicle: Vehicle, pool: Pool | None) -> PictureS
 
 
 def _lockstep_address(wiring: Wiring) -> str:
-    """HOST:PORT of the pool."""
+    """Return HOST:PORT of the pool."""
     if wiring.bind != DEFAULT_BIND or wiring.pictures is not None:
         raise LinkError("in lock-step all comes over one connection: leave --bind and --pictures out")
     if wiring.robot in ("pool", "mavlink"):

@@ -1,1 +1,1 @@
-"""The wire to the motor controller: its frames as bytes, how they travel, and its clock against the robot's."""
+"""Links to the motor controller: encoding of frames, transports, and the comparison of its clock with the robot's."""

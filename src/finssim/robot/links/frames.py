@@ -1,4 +1,4 @@
-"""The frames of the motor controller's protocol: one table, which writes, reads and finds them in a stream of bytes.
+"""Frames of the motor controller's protocol: one table that encodes, decodes and finds them in a stream of bytes.
 
 Published layout of the FinsROV hardware bridge, all little endian; the CRC is CRC16-MODBUS of everything between the
 magic and itself.
@@ -21,18 +21,18 @@ import numpy.typing as npt
 
 from finssim.robot.messages import CommandEcho, NavigationAid, Telemetry, ThrusterCommand
 
-# Fields of a frame in the order of the wire: the one description that writes and reads them.
+# Fields of a frame in wire order: the only description, for both encoding and decoding.
 
 
 class LinkError(ValueError):
-    """An address or a message is refused; the text states what, where and what to do."""
+    """An address or a message is invalid; the text states what, where and what to do."""
 
 
 class Field(NamedTuple):
     """One entry of a frame; all are little endian."""
 
     name: str
-    """Attribute of the message, or of the frame alone where it has a `constant`."""
+    """Attribute of the message; with a `constant`, a name within the frame only."""
     code: str
     """Code of `struct`: ? B H I f."""
     meaning: str
@@ -40,13 +40,13 @@ class Field(NamedTuple):
     values: int = 1
     """Number of values; 0: one per motor output; `OTHERS`: one per actuator besides thrusters."""
     constant: int | None = None
-    """Value that is always sent; None: the message's."""
+    """Value that is always sent; None: that of the message."""
     order: tuple[int, ...] = ()
-    """Index in the message of each value on the wire; empty: as they are."""
+    """Index in the message of each value on the wire; empty: the same order."""
 
 
 OTHERS = -1
-"""`Field.values` of what has one value per actuator besides thrusters."""
+"""`Field.values` of a field with one value per actuator besides thrusters."""
 
 
 @dataclass(frozen=True)
@@ -55,25 +55,25 @@ class Layout:
 
     title: str
     message: type
-    """Type that it is decoded to."""
+    """Type of the decoded message."""
     magic: bytes
     header: tuple[Field, ...]
-    """A field `length` counts the bytes of the payload."""
+    """Header fields; a field `length` counts the bytes of the payload."""
     payload: tuple[Field, ...]
     tail: bytes = b""
     optional: str = ""
-    """Name of the last field if a frame may end before it; None is then decoded."""
+    """Name of the last field if a frame may end before it; its decoded value is then None."""
 
 
 class TelemetryLayout:
-    """A layout for one number of motor outputs and of other actuators, with or without its optional field: bytes of
-    known length."""
+    """A layout for given numbers of motor outputs and of other actuators, with or without its optional field, so that
+    its length is known."""
 
     def __init__(self, layout: Layout, outputs: int, others: int = 0, *, complete: bool = True) -> None:
         """Args:
         layout: The kind of frame.
-        outputs: Motor outputs of the vehicle.
-        others: Actuators of the vehicle besides thrusters.
+        outputs: Number of motor outputs of the vehicle.
+        others: Number of actuators of the vehicle besides thrusters.
         complete: False: without the optional field.
         """
         payload = layout.payload if complete else layout.payload[:-1]
@@ -90,7 +90,7 @@ class TelemetryLayout:
 
     @cached_property
     def prefix(self) -> bytes:
-        """Bytes with which every such frame begins: the magic and the constants right after it."""
+        """First bytes of every such frame: the magic and the constants directly after it."""
         body = b""
         for field in self.fields:
             if field.constant is None:
@@ -100,7 +100,7 @@ class TelemetryLayout:
 
     @cached_property
     def _places(self) -> tuple[tuple[str, int, int, tuple[int, ...]], ...]:
-        """Name, first value, one past the last (0: a single value) and order of what a message holds."""
+        """Name, first value, one past the last (0: a single value) and order of a message's fields."""
         places, at = [], 0
         for field in self.fields:
             count = self.counts[field.name]
@@ -112,7 +112,8 @@ class TelemetryLayout:
         return tuple(places)
 
     def encode(self, message: Any) -> bytes:
-        """Bytes of a message; raises LinkError for a number the wire has no room for, or that is not finite."""
+        """Return the bytes of a message; raise LinkError for a number that does not fit the field, or is not
+        finite."""
         numbers = self._numbers(message)
         try:
             if not math.isfinite(sum(numbers)):
@@ -125,7 +126,7 @@ class TelemetryLayout:
         return self.layout.magic + body + struct.pack("<H", crc16_modbus(body)) + self.layout.tail
 
     def _numbers(self, message: Any) -> list[Any]:
-        """Values of all fields in the order of the wire."""
+        """Return the values of all fields in wire order."""
         numbers: list[Any] = []
         for name, _, _, values, constant, order in self.fields:
             if constant is not None:
@@ -155,9 +156,10 @@ class TelemetryLayout:
                 )
 
     def decode(self, frame: bytes, at: int = 0) -> Any | None:
-        """Message of the frame that begins at `at`, its CRC already found right; None if a number is not finite."""
+        """Return the message of the frame that begins at `at`, whose CRC is correct; None if a number is not
+        finite."""
         values = self._body.unpack_from(frame, at + len(self.layout.magic))
-        # Single precision cannot overflow the sum, so it is finite where all of them are.
+        # Single precision cannot overflow the sum, so it is finite if all of them are.
         if not math.isfinite(sum(values)):
             return None
         decoded: dict[str, Any] = dict(self.absent)
@@ -172,8 +174,8 @@ class TelemetryLayout:
 
 @lru_cache(maxsize=64)
 def forms(layout: Layout, outputs: int, others: int = 0) -> tuple[TelemetryLayout, ...]:
-    """Every form a layout has for a number of motor outputs and of other actuators, the complete one first; none of
-    version 2 where there are no other actuators."""
+    """Return every form of a layout for given numbers of motor outputs and of other actuators, the complete one first;
+    none of version 2 without other actuators."""
     if not others and any(f.values == OTHERS for f in layout.payload):
         return ()
     complete = TelemetryLayout(layout, outputs, others)
@@ -182,9 +184,9 @@ def forms(layout: Layout, outputs: int, others: int = 0) -> tuple[TelemetryLayou
 
 @lru_cache(maxsize=64)
 def _crc_terms(length: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64], int]:
-    """Return the contribution of each byte of a message of that length to its CRC: 256 numbers per place in a row, the
-    start of each place in them, and the CRC of zeros alone. The CRC is linear: contributions are combined by exclusive
-    or."""
+    """Return the contribution of each byte of a message of that length to its CRC (256 numbers per position in a row),
+    the start of each position in them, and the CRC of zeros alone. The CRC is linear: contributions are combined by
+    exclusive or."""
     single = np.arange(256, dtype=np.uint16)
     for _ in range(8):
         single = np.where(single & 1, (single >> 1) ^ 0xA001, single >> 1).astype(np.uint16)
@@ -201,7 +203,8 @@ def _crc_terms(length: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int6
 
 
 def crc16_modbus(data: bytes) -> int:
-    """CRC16-MODBUS: polynomial x¹⁶ + x¹⁵ + x² + 1 reflected (0xA001), initial value 0xFFFF; 0x4B37 of "123456789"."""
+    """Return the CRC16-MODBUS: polynomial x¹⁶ + x¹⁵ + x² + 1 reflected (0xA001), initial value 0xFFFF; 0x4B37 for
+    "123456789"."""
     terms, position, of_zeros = _crc_terms(len(data))
     return of_zeros ^ int(np.bitwise_xor.reduce(terms[position + np.frombuffer(data, np.uint8)]))
 
@@ -211,11 +214,11 @@ class DebugConfig:
     """Messages that the host requests from the motor controller besides telemetry."""
 
     sequence: int
-    """Counts up, modulo 2¹⁶."""
+    """Counter, modulo 2¹⁶."""
     mask: int
     """Bit 0 (`DEBUG_ECHO`): a `CommandEcho` for commands."""
     decimation: int
-    """One echo for this many commands."""
+    """Number of commands per echo."""
 
 
 Message: TypeAlias = Telemetry | CommandEcho | NavigationAid | ThrusterCommand | DebugConfig
@@ -228,9 +231,9 @@ class StatusFlag(IntFlag):
     """Bits of `Telemetry.flags`; bits 16 to 23 are the low byte of the count of commands (`command_count`)."""
 
     COMMAND_RECEIVED = 1 << 24
-    """A command has come since the controller started."""
+    """A command was received since the controller started."""
     ECHO_ON = 1 << 25
-    """Echoes have been asked for."""
+    """Echoes were requested."""
     DIRECT_THRUSTERS = 1 << 26
     """The host's command drives the motors, enabled."""
     TARGET_RPM = 1 << 27
@@ -238,15 +241,15 @@ class StatusFlag(IntFlag):
     THROTTLE = 1 << 28
     """A throttle is not zero."""
     MOTOR_HANDLER = 1 << 29
-    """The motor loop has run."""
+    """The motor loop is running."""
     RPM_CONTROL = 1 << 30
     """Speeds are controlled, not throttles."""
     DIAGNOSTICS = 1 << 31
-    """Bits 16 to 30 mean something."""
+    """Bits 16 to 30 are valid."""
 
 
 class RejectFlag(IntFlag):
-    """Bits of `CommandEcho.reject_flags`: why a command does not turn the motors."""
+    """Bits of `CommandEcho.reject_flags`: reasons why a command does not turn the motors."""
 
     DISABLED = 2
     TIMEOUT = 4
@@ -254,7 +257,7 @@ class RejectFlag(IntFlag):
 
 
 def command_count(flags: int) -> int:
-    """Low byte of the count of commands that the controller has received, out of `Telemetry.flags`."""
+    """Return the low byte of the count of commands that the controller has received, from `Telemetry.flags`."""
     return (flags >> 16) & 0xFF
 
 
@@ -370,11 +373,12 @@ NAVIGATION = Layout(
     ),
 )
 LAYOUTS = (COMMAND, COMMAND_2, TELEMETRY, TELEMETRY_2, ECHO, NAVIGATION, DEBUG_CONFIG)
-"""Every kind of frame: commands and the last go to the motor controller, the others come from it."""
+"""Every kind of frame: commands and the last one go to the motor controller, the others come from it."""
 
 
 def encode_command(command: ThrusterCommand) -> bytes:
-    """Frame of a command, 5 + 4 n bytes for n motor outputs: 37 for eight; with m setpoints 9 + 4 (n + m), version 2.
+    """Return the frame of a command, 5 + 4 n bytes for n motor outputs: 37 for eight; with m setpoints 9 + 4 (n + m),
+    version 2.
 
     Raises:
         LinkError: A value is not finite or beyond [-1, 1].
@@ -389,8 +393,8 @@ def encode_command(command: ThrusterCommand) -> bytes:
 
 
 def encode_telemetry(telemetry: Telemetry) -> bytes:
-    """Return the frame of a snapshot, 66 + 4 n bytes, or 66 where `motor_rpm` is None; with m other actuators it is of
-    version 2, 66 + 4 (n + m).
+    """Return the frame of a telemetry message, 66 + 4 n bytes, or 66 if `motor_rpm` is None; with m other actuators it
+    is of version 2, 66 + 4 (n + m).
 
     Raises:
         LinkError: See `TelemetryLayout.encode`.
@@ -402,17 +406,17 @@ def encode_telemetry(telemetry: Telemetry) -> bytes:
 
 
 def encode_echo(echo: CommandEcho) -> bytes:
-    """Frame of an echo, 36 + 8 n bytes; raises LinkError as `TelemetryLayout.encode`."""
+    """Return the frame of an echo, 36 + 8 n bytes; raise LinkError as `TelemetryLayout.encode`."""
     return forms(ECHO, _outputs(echo.received))[0].encode(echo)
 
 
 def encode_navigation(aid: NavigationAid) -> bytes:
-    """Frame of a navigation aid, 35 bytes; raises LinkError as `TelemetryLayout.encode`."""
+    """Return the frame of a navigation aid, 35 bytes; raise LinkError as `TelemetryLayout.encode`."""
     return forms(NAVIGATION, 0)[0].encode(aid)
 
 
 def encode_debug_config(sequence: int, mask: int, decimation: int) -> bytes:
-    """Frame that asks for echoes: `mask` DEBUG_ECHO or 0, one echo for `decimation` commands; 18 bytes."""
+    """Return the frame that requests echoes: `mask` DEBUG_ECHO or 0, one echo for `decimation` commands; 18 bytes."""
     return forms(DEBUG_CONFIG, 0)[0].encode(DebugConfig(sequence, mask, decimation))
 
 
@@ -422,7 +426,7 @@ def _outputs(values: Sequence[float]) -> int:
     return len(values)
 
 
-# Frames from a stream of bytes: complete or in parts, with garbage between them, and never a wrong one.
+# Frames from a stream of bytes, which may be split or surrounded by garbage; invalid frames are never returned.
 
 
 HOST = (TELEMETRY, TELEMETRY_2, ECHO, NAVIGATION)
@@ -435,22 +439,22 @@ _HEADER = 6
 
 
 class Decoder:
-    """Turns what came over the wire into messages; keeps the beginning of a frame until its end has come.
+    """Decoder of received bytes; it stores the beginning of a frame until its end arrives.
 
-    A frame counts only with its magic, a known type, version and length, a right CRC and finite numbers. Where one of
-    the first three is wrong, the search goes on one byte further, so a true frame is found behind any garbage, at
-    the latest when the bytes that a false beginning announces (at most `longest`) have come.
+    A frame is accepted only with its magic, a known type, version and length, a correct CRC and finite numbers. If one
+    of the first three is wrong, the search continues one byte further, so a valid frame is found behind any garbage, at
+    the latest when the bytes that a false beginning announces (at most `longest`) have arrived.
 
     Note:
-        `counts` tells what was seen: `accepted` messages by class name; `bad_crc`, `bad_length`, `unknown_type` of
-        what looked like a beginning, `not_finite` frames, and `skipped_bytes` outside of frames with a right CRC.
+        `counts` has the numbers of `accepted` messages by class name; of `bad_crc`, `bad_length` and `unknown_type` of
+        apparent beginnings; of `not_finite` frames; and of `skipped_bytes` outside of frames with a correct CRC.
     """
 
     def __init__(self, kinds: Iterable[Layout] = HOST, outputs: int = 8, others: int = 0) -> None:
         """Args:
         kinds: Layouts to decode, `HOST` or `MCU`.
-        outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).
-        others: Actuators of the vehicle besides thrusters.
+        outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
+        others: Number of actuators of the vehicle besides thrusters.
         """
         self.accepted: Counter[str] = Counter()
         self.refused: Counter[str] = Counter(bad_crc=0, bad_length=0, unknown_type=0, not_finite=0)
@@ -465,11 +469,11 @@ class Decoder:
 
     @property
     def counts(self) -> dict[str, int | dict[str, int]]:
-        """Return the numbers of accepted and refused frames so far."""
+        """Numbers of accepted and refused frames so far."""
         return {"accepted": dict(self.accepted), **self.refused, "skipped_bytes": self.skipped_bytes}
 
     def feed(self, data: bytes) -> list[Message]:
-        """Messages that `data` completes, in the order of their bytes; never raises, whatever the bytes are."""
+        """Return the messages that `data` completes, in order; never raise an exception, for any bytes."""
         data, at = self._rest + data, 0
         messages: list[Message] = []
         while begin := self._magic.search(data, at):
@@ -496,7 +500,8 @@ class Decoder:
         return messages
 
     def _frame(self, data: bytes, at: int) -> TelemetryLayout | str | None:
-        """Return the frame that begins at a magic, why none does, or None while there are too few bytes to decide."""
+        """Return the layout of the frame at a magic, the reason why there is none, or None if more bytes are
+        needed."""
         form = self._plain.get(data[at])
         if form is None:
             prefix = data[at : at + _HEADER]
@@ -515,7 +520,8 @@ class Decoder:
 
 
 def _search(magics: Iterable[bytes]) -> re.Pattern[bytes]:
-    """Finds where a frame may begin: at a magic, or at a part of one where the bytes end."""
+    """Return a pattern that finds possible beginnings of frames: a magic, or its first part at the end of the
+    bytes."""
     parts = {
         re.escape(m) if len(m) == 1 else re.escape(m[:1]) + b"(?:" + re.escape(m[1:]) + rb"|\Z)"
         for m in magics
@@ -524,15 +530,15 @@ def _search(magics: Iterable[bytes]) -> re.Pattern[bytes]:
 
 
 class McuLink:
-    """The motor controller at the other end of a wire, as `Runtime` sees it: frames of thrusts out, telemetry in."""
+    """Link of `Runtime` to a motor controller: frames of thrusts out, telemetry in."""
 
     peer = "motor controller"
     watched: tuple[tuple[str, ...], ...] = (("gyro",), ("accel",))
 
     def __init__(self, outputs: int, others: int = 0) -> None:
         """Args:
-        outputs: Motor outputs of the vehicle (`vehicle.mcu.outputs`).
-        others: Actuators of the vehicle besides thrusters.
+        outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
+        others: Number of actuators of the vehicle besides thrusters.
         """
         self._decoder = Decoder(outputs=outputs, others=others)
         self.let_in: tuple[float, float] | None = None
@@ -540,11 +546,11 @@ class McuLink:
         self.notes: list[str] = []
 
     def feed(self, now: float, data: bytes) -> list[Message]:
-        """Messages that bytes complete, which came at a time [s]."""
+        """Return the messages completed by bytes that arrived at a time [s]."""
         return self._decoder.feed(data)
 
     def prepare(self, now: float) -> str:
-        """Return "": no device is between the bridge and the motors. `now` is the time [s]."""
+        """Return "": there is no device between the bridge and the motors. `now` is the time [s]."""
         return ""
 
     def alarm(self, now: float) -> str:
@@ -555,9 +561,9 @@ class McuLink:
         return ""
 
     def pause(self, now: float) -> str:
-        """Return "": it never asks for a pause. `now` is the time [s]."""
+        """Return "": a motor controller never requests a pause. `now` is the time [s]."""
         return ""
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
-        """Frames to send at a time [s]: the bridge's command, whatever its state."""
+        """Return the frames to send at a time [s]: the bridge's command, in any state."""
         return [encode_command(command)]

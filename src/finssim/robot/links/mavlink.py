@@ -1,8 +1,8 @@
-"""The link to an autopilot: ArduSub's MAVLink 2 for the robot's own messages, thrusts as the axes of its mixer.
+"""The link to an autopilot: ArduSub's MAVLink 2 as the robot's own messages, thrusts as the axes of its mixer.
 
-What goes out are the axes of MANUAL_CONTROL, or pulses of RC_CHANNELS_OVERRIDE where the firmware is older than 4.5 or
-its pilot gain less than the vehicle file's. The bridge stays in charge: the vehicle is armed only for a bridge that may
-be armed, and somebody else who arms, steers or changes the mode ends it; who steers by hand wins at once.
+Outputs are the axes of MANUAL_CONTROL, or pulses of RC_CHANNELS_OVERRIDE if the firmware is older than 4.5 or its pilot
+gain is less than the vehicle file's. The bridge stays in control: the vehicle is armed only if the bridge may arm, and
+another pilot who arms, steers or changes the mode ends it; manual steering takes precedence at once.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ MODES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 7: "CIRCLE", 9: "SURFACE", 16: "POSHOLD",
     19: "MANUAL", 20: "MOTOR_DETECT", 21: "SURFTRAK",
 }  # fmt: skip
-"""ArduSub's modes by the number in HEARTBEAT.custom_mode."""
+"""Names of ArduSub's modes by the number in HEARTBEAT.custom_mode."""
 MANUAL = 19
 VEHICLE, GROUND = (1, 1), 255
-"""System and component of the autopilot, and of a ground station that ArduSub takes a pilot from."""
+"""System and component of the autopilot, and system of a ground station that ArduSub accepts as pilot."""
 
 INTERVALS = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 0.2,
@@ -44,107 +44,109 @@ INTERVALS = {
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.05,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 0.2,
 }
-"""Message -> time between two that is asked for [s]. That of the inputs is no multiple of the usual
-period of axes: two pilots take turns, and a report in step with them would show one alone."""
+"""Requested interval of each message [s]. That of the inputs is no multiple of the usual
+period of axes: two pilots take turns, and a synchronous report would show only one of them."""
 SURFACES = ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
-"""Parameters with the pressure at the surface, of the first barometer and of the second."""
+"""Parameters with the pressure at the surface, of the first and of the second barometer."""
 PARAMETERS = ("JS_GAIN_DEFAULT", "JS_THR_GAIN", *SURFACES)
 
 MANUAL_PERIOD, HEARTBEAT_PERIOD, ASK_AGAIN = 0.03, 1.0, 0.5
-"""Between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
+"""Time between two frames of axes, two heartbeats, and two attempts at the same request [s]."""
 REQUEST_LASTS = 3.0
-"""Time for which a request to arm is still waited for, at neutral axes, before the autopilot is disarmed again [s]: a
-person presses a key twice, and `ros2 service call` takes some time."""
+"""Time after a request to arm before the autopilot is disarmed again, with neutral axes meanwhile [s]: an operator
+presses a key twice, and `ros2 service call` takes some time."""
 SELDOM, SMOOTH = 2.0, 0.2
-"""Mean time between two messages, part of that asked for, at which they come too seldom; how much the newest counts."""
+"""Ratio of the mean to the requested interval above which a message is too rare, and weight of the newest interval in
+the mean."""
 PATIENCE = 3.0
-"""Longest wait for version and parameters before arming [s]; without them axes go out as overrides."""
+"""Longest wait for version and parameters before arming [s]; without them, axes are sent as overrides."""
 HEARTBEAT_LOST = 3.0
 """Longest silence of the autopilot's heartbeat [s]."""
 REMEMBERED = 1.0
-"""Inputs that were sent so long ago may still be reported as received [s]."""
+"""Age up to which sent inputs may still be reported as received [s]."""
 STRANGE, STRANGERS, OF = 12.0, 2, 4
-"""Difference from every sent input at which an input is another pilot's [µs], and how many of the last reports confirm
-it: two pilots take turns."""
+"""Difference from every sent input above which an input is another pilot's [µs], and how many of how many last reports
+confirm it: two pilots take turns."""
 OTHERS = (
     "manual control from elsewhere, or our frames are lost: the autopilot receives other inputs than ours"
 )
 HEADING_PERIOD = 0.2
-"""Between headings that are taken from the autopilot's attitude [s]."""
+"""Time between two headings from the autopilot's attitude [s]."""
 DVL_FRESH = 1.0
-"""Age of a report of the Doppler log up to which the autopilot's own velocity is not used [s]."""
+"""Age of a DVL report up to which the autopilot's own velocity is not used [s]."""
 CRITICAL = 5
-"""HEARTBEAT.system_status of a failsafe."""
+"""HEARTBEAT.system_status from which the autopilot is in failsafe."""
 AIDED, PLACED, NOT_AIDED = 2, 8 | 16, 128
-"""EKF_STATUS_REPORT.flags: horizontal velocity is known; position is known, relative or absolute; position is held by
-assumption."""
+"""EKF_STATUS_REPORT.flags: horizontal velocity is known; position is known, relative or absolute; a constant position
+is assumed."""
 AIDED_LASTS = 1.0
-"""Age of the newest EKF_STATUS_REPORT up to which it counts [s]."""
+"""Age up to which the newest EKF_STATUS_REPORT is valid [s]."""
 PLACE_STD, SPEED_STD = 0.05, 0.03
-"""Standard deviations of the autopilot's position [m] and velocity [m/s], per axis: its filter follows 0.1 to 0.2 s
-late, at up to 0.3 m/s²."""
+"""Standard deviations of the autopilot's position [m] and velocity [m/s], per axis: its filter lags by 0.1 to 0.2 s, at
+up to 0.3 m/s²."""
 LEAP = 0.1
-"""Step of the autopilot's position, beyond its velocity, that is a reset of its filter [m]."""
+"""Step of the autopilot's position, beyond its velocity, that indicates a reset of its filter [m]."""
 TURN_WINDOW, TURN_LIMIT, TURN_OVER = 10.0, math.radians(4.0), math.radians(1.0)
-"""Span over which heading and gyroscope are compared [s], difference at which the autopilot turns its north, and the
-one below which it has stopped [rad]: an origin turns it by the declination in 20 s; a vehicle that speeds up and turns
-shows up to 3 degrees."""
+"""Time span over which heading and gyroscope are compared [s], difference from which the autopilot is rotating its
+north, and difference below which it has finished [rad]. Setting an origin rotates it by the declination in 20 s; a
+vehicle that accelerates and turns shows up to 3 degrees."""
 SCALE_ERROR = 0.05
-"""Part of a turn that the gyroscope may miss [-]: 3 % at 25 °C and 2 % by temperature (MPU-6000; newer ones 1 and 2 %);
-the autopilot's filter estimates its offset, not its scale."""
+"""Fraction of a turn that the gyroscope may miss [-]: 3 % at 25 °C and 2 % by temperature (MPU-6000; newer ones 1 and
+2 %); the autopilot's filter estimates its bias, not its scale."""
 ALIGNED = math.radians(1.0)
-"""Step of the heading between two messages that a vehicle that is not ours yet may make [rad]."""
+"""Largest step of the heading between two messages before the vehicle is armed by us, due to its motion [rad]."""
 SLOW_WINDOW, SLOWEST = 3.0, 0.8
-"""Span over which the autopilot's clock is compared with ours [s], and the least rate of it [-]."""
+"""Time span over which the autopilot's clock is compared with ours [s], and its least rate [-]."""
 ORIGIN_ASKED, ORIGIN_PERIODS = 0.5, (0.15, 1.0)
-"""Time for which the autopilot is asked for its origin before it has none, and between two questions before and after
+"""Time of asking for the autopilot's origin before it is taken to have none, and interval of requests before and after
 that [s]."""
 CALIBRATION_LASTS = 5.0
-"""Longest wait for the answer to a calibration of the barometer [s]."""
+"""Longest wait for the result of a barometer calibration [s]."""
 DEEPEST = 1e6
-"""A surface pressure beyond this is none [Pa]."""
+"""Greatest plausible surface pressure [Pa]."""
 SHALLOW = 3000.0
-"""Difference of the surface pressure from the standard atmosphere that weather explains [Pa]."""
+"""Difference of the surface pressure from the standard atmosphere that weather can explain [Pa]."""
 ACCELEROMETER_RANGE = 16000
-"""Greatest acceleration of the autopilots' instruments [mg]: of damaged frames one in 65 536 passes, and the estimator
-trusts it."""
+"""Greatest acceleration in the range of the autopilots' instruments [mg]: one in 65 536 damaged frames passes the
+checksum, and the estimator would use it."""
 STANDARD_ATMOSPHERE = 101325.0
-"""Pressure at the surface, until the autopilot reports its own [Pa]."""
+"""Pressure at the surface until the autopilot reports its own [Pa]."""
 G = 9.80665
 
 
 class MavlinkLink:
-    """One vehicle's autopilot, as the other end of a wire. Knows no clock and no wire; nothing that arrives can raise.
+    """Link to one vehicle's autopilot. It uses no clock and no transport; received data never raise an exception.
 
     Attributes:
-        counts: Messages by name, and `bad` for what is none.
+        counts: Numbers of messages by name, and `bad` for invalid ones.
         mode: Number of the autopilot's mode; None before its first heartbeat.
-        armed: Whether the autopilot is armed.
-        says: Its newest sentence of a severity that matters.
+        armed: True if the autopilot is armed.
+        says: Its newest text of at least warning severity.
         let_in: x, y of the vehicle when the autopilot first has a position, world frame [m]; None: its position is not
             used.
-        calibrate_depth: Whether the barometer is calibrated, with the vehicle at the surface, before any telemetry.
-        highest: Greatest z of what is to be followed, world frame [m]; -inf if it is not known.
-        notes: Sentences for the user since they were last taken.
+        calibrate_depth: True to calibrate the barometer, with the vehicle at the surface, before any telemetry.
+        highest: Greatest z of the guide, world frame [m]; -inf if unknown.
+        notes: Sentences for the user since they were last read.
     """
 
     peer = "autopilot"
-    # Its accelerations are rounded to milli-g, so a quiet instrument repeats them; attitude and rates are not.
+    # Its accelerations are rounded to milli-g, so a quiet instrument repeats them; attitude and rates do not repeat.
     watched: tuple[tuple[str, ...], ...] = (("quaternion", "gyro"),)
 
     def __init__(self, vehicle: Vehicle, *, key: bytes = b"") -> None:
-        """
+        """Set up the link.
+
         Args:
-            vehicle: With an `autopilot`; its IMU's axes are the autopilot's, forward, left, up.
-            key: Of 32 bytes: frames are signed, and unsigned ones refused. Empty: none are.
+            vehicle: Vehicle with an `autopilot`; its IMU's axes are the autopilot's, forward, left, up.
+            key: Signing key of 32 bytes: frames are signed, and unsigned ones refused. Empty: no signing.
 
         Raises:
-            ControlError: It has no autopilot, or thrusters without `esc`.
-            LinkError: A key of another length.
+            ControlError: The vehicle has no autopilot, or thrusters without `esc`.
+            LinkError: The key has another length.
         """
         self._mixer, self._motors, self.vehicle = Mixer.of(vehicle), MotorMap.from_vehicle(vehicle), vehicle
         imu, log = vehicle.sensors.imu, vehicle.sensors.dvl
-        # The autopilot's velocity is that of the body; ours is as the vehicle's log would read it.
+        # The autopilot's velocity is that of the body; ours is that of the vehicle's DVL.
         self._R_lb = quat_to_matrix(log.orientation).T if log else np.eye(3)
         self._lever = log.position if log else np.zeros(3)
         if imu is not None and abs(imu.orientation[3]) < 1.0 - 1e-6:
@@ -196,7 +198,7 @@ class MavlinkLink:
         self._last_place: tuple[float, Any] | None = None
         self._origin, self._turn_began = "", -math.inf
         self._critical = ""
-        # Of the autopilot's north against that of the start: by how much it has turned, and what is compared.
+        # Rotation of the autopilot's north relative to that of the start, and data for the comparison.
         self._north = self._first_north = 0.0
         self._ahead = False  # world x is the heading of the start
         self._turns, self._turning, self._spun = deque[tuple[float, float, float]](), False, 0.0
@@ -218,13 +220,14 @@ class MavlinkLink:
         self._strange: deque[bool] = deque(maxlen=OF)
         self._manual_at = self._heartbeat_at = -math.inf
 
-    # -- what comes in ----------------------------------------------------------------------------------------
+    # -- inputs -----------------------------------------------------------------------------------------------------
 
     def feed(self, now: float, data: bytes) -> list[Message]:
-        """Messages that bytes complete: MAVLink, or a line of a Water Linked log, which begins with a brace.
+        """Return the messages completed by received bytes: MAVLink, or a line of a Water Linked DVL, which begins with
+        a brace.
 
         Args:
-            now: When they came [s].
+            now: Time of arrival [s].
             data: A datagram, a piece of a stream, or a line.
         """
         if data[:1] == b"{":
@@ -236,7 +239,7 @@ class MavlinkLink:
         completed: list[Message] = []
         try:
             messages = self._wire.parse_buffer(data) or []
-        except Exception:  # pymavlink raises whatever it stumbles over
+        except Exception:  # pymavlink raises various exceptions for invalid data
             self.counts["bad"] += 1
             return completed
         for message in messages:
@@ -267,11 +270,11 @@ class MavlinkLink:
         return []
 
     def _attitude(self, now: float, m: Any) -> list[Message]:
-        """A snapshot, with the newest specific force and pressure; and now and then the heading."""
+        """Return telemetry with the newest specific force and pressure, and at intervals the heading."""
         values = (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
         if self._accel is None or not all(map(math.isfinite, (*values, self._pressure))):
             return []
-        if m.time_boot_ms < self._boot_ms - 1000:  # it restarted: what was agreed with it is forgotten
+        if m.time_boot_ms < self._boot_ms - 1000:  # it restarted: the state of its requests is discarded
             self._asked.clear()
             self._seen.clear()
             self._gap.clear()
@@ -281,12 +284,12 @@ class MavlinkLink:
         if not self._begun and not all((self._knows_surface(now), self._knows_origin(now))):
             return []
         if not self._begun and self._origin == "none":
-            # Its north is magnetic and may turn: world x is the vehicle's heading instead.
+            # Its north is magnetic and may rotate: world x is the vehicle's initial heading instead.
             self._north = self._first_north = float(m.yaw)
             self._ahead = True
             self.notes.append("the autopilot has no origin: world x is where the vehicle points now")
         self._begun = True
-        if m.time_boot_ms == self._boot_ms:  # the same sample again refreshes nothing
+        if m.time_boot_ms == self._boot_ms:  # a repeated sample is not new data
             return []
         step = 0.001 * (m.time_boot_ms - self._boot_ms)
         self._boot_ms = max(self._boot_ms, m.time_boot_ms)
@@ -319,19 +322,20 @@ class MavlinkLink:
         return messages
 
     def _knows_surface(self, now: float) -> bool:
-        """Return whether depth will not step any more: its surface is known, or the autopilot does not answer."""
+        """Return whether depth will have no further step: its surface pressure is known, or the autopilot does not
+        answer."""
         if self.calibrate_depth and not self._calibrated:
             return False
         return set(SURFACES) <= self._parameters.keys() or now - self._first(now, "surface") > PATIENCE
 
     def _knows_origin(self, now: float) -> bool:
-        """Return whether it is known that the autopilot has an origin, or that it has none."""
+        """Return whether it is known if the autopilot has an origin."""
         if not self._origin and now - self._first(now, "origin") > ORIGIN_ASKED:
             self._origin = "none"
         return bool(self._origin)
 
     def _watch_clock(self, now: float, boot: float) -> None:
-        """Keep pairs of our time and the autopilot's [s] over `SLOW_WINDOW`."""
+        """Store pairs of our time and the autopilot's [s] over `SLOW_WINDOW`."""
         self._clocks.append((now, boot))
         while now - self._clocks[0][0] > SLOW_WINDOW:
             self._clocks.popleft()
@@ -341,7 +345,7 @@ class MavlinkLink:
         self.notes.append("the autopilot turns its north: an origin was set, or its heading was reset")
 
     def _global_origin(self, now: float, m: Any) -> list[Message]:
-        """An origin that was not there before turns the heading from magnetic to true north."""
+        """Process an origin; a new one rotates the heading from magnetic to true north."""
         if self._origin == "none" and math.isfinite(self._boot_ms):
             self._turn_begins(0.001 * self._boot_ms)
         self._origin = "set"
@@ -349,7 +353,7 @@ class MavlinkLink:
 
     @property
     def clock_rate(self) -> float:
-        """Rate of the autopilot's clock over ours [-]; NaN while it is not known."""
+        """Rate of the autopilot's clock relative to ours [-]; NaN while unknown."""
         if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < 0.5 * SLOW_WINDOW:
             return math.nan
         (a, x), (b, y) = self._clocks[0], self._clocks[-1]
@@ -358,9 +362,9 @@ class MavlinkLink:
     def _watch_north(self, m: Any, step: float) -> None:
         """Compare the heading with the integrated rates.
 
-        A turn of the autopilot's north is waited for before arming, and taken out of the heading afterwards: the world
-        frame is that of the arming; of the start, if world x is the heading there. A vehicle that spins shows
-        `SCALE_ERROR` of what it turned, which is none.
+        A rotation of the autopilot's north is waited for before arming, and removed from the heading afterwards: the
+        world frame is that of the arming, or that of the start if world x is the initial heading. For a vehicle that
+        spins, a difference of `SCALE_ERROR` of its rotation does not count.
         """
         if not 0.0 < step < 0.5:
             self._turns.clear()
@@ -405,13 +409,13 @@ class MavlinkLink:
         return []
 
     def _age(self, now: float, boot_ms: float) -> float:
-        """Time since the autopilot stamped a message, less the least delay of the wire [s]."""
+        """Return the time since the autopilot stamped a message, minus the least delay of the link [s]."""
         return (
             min(max(now - 0.001 * boot_ms - self._soonest, 0.0), 1.0) if math.isfinite(self._soonest) else 0.0
         )
 
     def _inputs(self, now: float, m: Any) -> list[Message]:
-        """Return a message if the inputs that the autopilot received are another pilot's."""
+        """Compare the inputs that the autopilot received with the sent ones, to detect another pilot."""
         if not self._sent or now - self._sent[-1][0] > REMEMBERED:
             return []
         inputs = np.array([getattr(m, f"chan{i}_raw") for i in range(1, 7)], float)
@@ -423,9 +427,9 @@ class MavlinkLink:
         return []
 
     def _place(self, now: float, m: Any) -> list[Message]:
-        """Return the autopilot's own velocity and position, where it has them and no Doppler log reports.
+        """Return the autopilot's own velocity and position, if it has them and no DVL reports.
 
-        The position is relative: it begins at `let_in`, and a reset of the autopilot's filter does not move it.
+        The position is relative: it begins at `let_in`, and a reset of the autopilot's filter does not change it.
         """
         known = now - self._aided_at < AIDED_LASTS and all(
             map(math.isfinite, (m.vx, m.vy, m.vz, m.x, m.y, m.z))
@@ -442,7 +446,7 @@ class MavlinkLink:
         if self.let_in is None or now - self._placed_at > AIDED_LASTS:
             return found
         time = 0.001 * m.time_boot_ms
-        if self._last_place is None:  # the first after a gap continues where the last one was
+        if self._last_place is None:  # the first one after a gap continues from the last one
             self._shift = (np.array([*self.let_in, 0.0]) if self._world is None else self._world) - p
         else:
             before, old = self._last_place
@@ -468,7 +472,7 @@ class MavlinkLink:
         if math.isfinite(m.param_value):
             self._parameters[m.param_id] = float(m.param_value)
         if m.param_id.endswith("_GND_PRESS") and 5e4 < m.param_value < DEEPEST:
-            # The second barometer is the Bar30 where there are two; the first of a vehicle that has one.
+            # If there are two barometers, the second is the Bar30; otherwise it is the first.
             first = "BARO2_GND_PRESS" not in self._parameters or m.param_id == "BARO2_GND_PRESS"
             self._surface = float(m.param_value) if first else self._surface
             if first and abs(self._surface - STANDARD_ATMOSPHERE) > SHALLOW:
@@ -480,7 +484,7 @@ class MavlinkLink:
 
     @property
     def depth_offset(self) -> float:
-        """Depth of the place where the barometer was calibrated, by the standard atmosphere [m]."""
+        """Depth at which the barometer was calibrated, by the standard atmosphere [m]."""
         weight = self.vehicle.water.density * self.vehicle.water.gravity
         return (self._surface - STANDARD_ATMOSPHERE) / weight
 
@@ -517,13 +521,15 @@ class MavlinkLink:
             self._critical = self.says if m.severity <= mavlink.MAV_SEVERITY_CRITICAL else self._critical
         return []
 
-    # -- what is asked of it ----------------------------------------------------------------------------------
+    # -- arming and monitoring --------------------------------------------------------------------------------------
 
     def prepare(self, now: float) -> str:
-        """Bring the autopilot to where commands count: mode MANUAL, armed. Call it only to arm.
+        """Bring the autopilot to a state that accepts commands: mode MANUAL, armed. Call only when about to arm.
+
+        `now` is the time [s].
 
         Returns:
-            "" once it is; until then in a sentence what is waited for.
+            "" once it is ready; until then a sentence that states what is missing.
         """
         if now - self._alive > HEARTBEAT_LOST:
             return "the autopilot has sent no heartbeat yet"
@@ -544,9 +550,9 @@ class MavlinkLink:
                 "waiting for the autopilot's velocity: it needs a Doppler log for half a minute, and an origin; or "
                 "connect to the log with ?dvl=HOST"
             )
-        if now - self._released < ASK_AGAIN:  # its heartbeats may be older than what was asked
+        if now - self._released < ASK_AGAIN:  # its heartbeats may be older than the request
             return "waiting for it to disarm first"
-        if now - self._wanted > ASK_AGAIN:  # a new attempt: what ended the last one is history
+        if now - self._wanted > ASK_AGAIN:  # a new attempt: the result of the last one is discarded
             self._others, self._refused = False, ""
             self._strange.clear()
         self._wanted = now
@@ -562,7 +568,7 @@ class MavlinkLink:
         return ""
 
     def pause(self, now: float) -> str:
-        """Return why no thrust may be given now, though nothing is lost; "" otherwise. `now` is the time [s]."""
+        """Return why thrust is temporarily not possible; "" otherwise. `now` is the time [s]."""
         if self.calibrate_depth and not self._calibrated:
             return "waiting for the calibration of the barometer, at the surface"
         if self._turning:
@@ -574,8 +580,7 @@ class MavlinkLink:
         return ""
 
     def alarm(self, now: float) -> str:
-        """Return why the vehicle is no longer under our control, in a sentence; "" while it is. Called while it is
-        armed.
+        """Return in a sentence why the armed vehicle is no longer under our control; "" while it is.
 
         `now` is the time [s].
         """
@@ -594,15 +599,15 @@ class MavlinkLink:
             return f"the autopilot's mode was changed to {_mode(self.mode)}"
         return ""
 
-    # -- what goes out ----------------------------------------------------------------------------------------
+    # -- outputs ----------------------------------------------------------------------------------------------------
 
     def encode(self, now: float, command: ThrusterCommand, state: str) -> list[bytes]:
-        """Frames to send now: axes while we steer, and what has to be asked.
+        """Return the frames to send now: axes while we are in control, and requests.
 
         Args:
             now: [s]
-            command: Of the bridge.
-            state: Of the bridge; disarmed and fault disarm the autopilot, if it was armed for us.
+            command: Command of the bridge.
+            state: State of the bridge; disarmed and fault disarm the autopilot if it was armed by us.
         """
         frames: list[bytes] = []
         if now - self._heartbeat_at >= HEARTBEAT_PERIOD - 1e-6:
@@ -636,14 +641,14 @@ class MavlinkLink:
         return frames
 
     def _axes(self, now: float, command: ThrusterCommand) -> bytes:
-        """The frame of axes whose thrusts come nearest to a command's."""
+        """Return the frame of axes with the thrusts closest to those of a command."""
         demand = np.zeros(6)
         if command.enable:
             speeds = self._motors.canonical_rpm(np.array(command.normalised)) * self._motors.full_scale
             demand = self._mixer.demands(self._motors.force(speeds))
         gain = self._mixer.autopilot.gain
         roll, pitch, yaw, throttle, forward, lateral = np.clip(demand, -gain, gain).tolist()
-        # As the autopilot's inputs: pitch, roll, throttle, yaw, forward, lateral.
+        # In the order of the autopilot's inputs: pitch, roll, throttle, yaw, forward, lateral.
         current_gain = (
             self._gain if math.isfinite(self._gain) else self._parameters.get("JS_GAIN_DEFAULT", 0.0)
         )
@@ -664,10 +669,10 @@ class MavlinkLink:
         return self._pack(message)
 
     def _questions(self, now: float) -> list[bytes]:
-        """Requests whose answers have not come, each now and then."""
+        """Return repeated requests whose answers have not arrived."""
         frames: list[bytes] = []
         for message, interval in INTERVALS.items():
-            # Another ground station may ask for its own rates: what comes too seldom is asked for again.
+            # Another ground station may request its own rates: messages that are too rare are requested again.
             gap = max(self._gap.get(message, math.inf), now - self._seen.get(message, -math.inf))
             if gap > SELDOM * interval:
                 ask = self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message), 1e6 * interval)
@@ -689,7 +694,7 @@ class MavlinkLink:
         return frames
 
     def _first(self, now: float, key: str) -> float:
-        """When this was looked at first [s]."""
+        """Return the time of the first call with this key [s]."""
         return self._asked.setdefault(("first", key), now)
 
     def _ask(self, now: float, key: Any, period: float, message: Any) -> list[bytes]:

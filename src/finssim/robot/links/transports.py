@@ -19,29 +19,30 @@ from urllib.parse import parse_qs, urlsplit
 
 from finssim.robot.links.frames import LinkError
 
-# The wire as UDP datagrams, to and from one peer alone.
+# UDP datagrams, to and from one peer only.
 
 
 Address = tuple[str, int]
 
 _LOG = logging.getLogger("finssim.robot.links")
 _DATAGRAM = 2048
-"""Bytes of the longest datagram of a motor controller."""
+"""Greatest length of a motor controller's datagram [bytes]."""
 _DATAGRAMS_AT_ONCE = 1024
-"""Datagrams taken by one call, so that a flood cannot hold the loop up."""
+"""Greatest number of datagrams per call, so that a flood cannot block the loop."""
 _SILENT = 5.0
-"""Silence after which a peer that was not named counts as gone [s]."""
+"""Silence after which a peer without a configured address counts as gone [s]."""
 _NAMED = 64
 """Greatest number of refused senders that are counted separately; further ones are counted together."""
 
 
 class UdpTransport:
-    """Datagrams with one peer; those of any other address or port are refused, counted and named once in the log.
+    """Datagrams of one peer; those of any other address or port are refused, counted and logged once.
 
-    The peer may be the first who sends a datagram that begins as it has to; after a silence another takes its place.
+    Without a configured peer, the first sender of a datagram with a valid first byte becomes the peer; after a silence
+    another sender can replace it.
 
     Note:
-        `refused` counts by sender, `send_errors` the frames that could not leave (nobody listens, network down).
+        `refused` counts by sender, `send_errors` the frames that could not be sent (no receiver, network down).
     """
 
     def __init__(
@@ -55,15 +56,15 @@ class UdpTransport:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Args:
-            bind: Address and port of this end; port 0 takes a free one (see `address`).
-            peer: Host and port of the other end; the name is looked up once. None: who sends first.
-            longest: Bytes taken of a datagram; a longer one is cut, and its checksum no longer fits.
-            buffer: Asked of the system for what has not been read yet [bytes]; its own choice if 0.
-            greeting: First bytes of which a datagram must have one, for its sender to become the peer.
-            clock: Tells how long the peer was silent [s].
+            bind: Local address and port; port 0 selects a free one (see `address`).
+            peer: Host and port of the other end; the name is resolved once. None: the first sender.
+            longest: Bytes read of a datagram; a longer one is truncated, and its checksum no longer matches.
+            buffer: Requested size of the system's receive buffer [bytes]; the system's default if 0.
+            greeting: Valid first bytes of the datagram of an unconfigured peer.
+            clock: Clock for the peer's silence [s].
 
         Raises:
-            LinkError: An address cannot be found, bound, or reached from `bind`.
+            LinkError: An address cannot be resolved, bound, or reached from `bind`.
         """
         self.peer = None if peer is None else resolved(peer)
         self._greeting, self._clock, self._heard = greeting if peer is None else b"", clock, -math.inf
@@ -87,7 +88,7 @@ class UdpTransport:
         self.address: Address = self._socket.getsockname()
 
     def send(self, data: bytes) -> None:
-        """Send one datagram to the peer; one that cannot leave is counted."""
+        """Send one datagram to the peer; one that cannot be sent is counted."""
         if self.peer is None:
             self.send_errors += 1
             return
@@ -101,7 +102,7 @@ class UdpTransport:
                 _LOG.warning("nothing leaves for %s: %s", _name(self.peer), problem)
 
     def receive(self, wait: float = 0.0) -> list[bytes]:
-        """Datagrams of the peer, oldest first; at most 1024 are looked at in one call.
+        """Return the datagrams of the peer, oldest first; at most 1024 are read in one call.
 
         Args:
             wait: Longest time to wait for one [s].
@@ -151,14 +152,14 @@ class UdpTransport:
         self._socket.close()
 
     def describe(self) -> str:
-        """Both ends, and what went wrong so far."""
+        """Return both addresses and the errors so far."""
         text = f"udp {_name(self.address)} to {_name(self.peer) if self.peer is not None else 'nobody yet'}"
         text += f", {self.send_errors} frames could not leave" if self.send_errors else ""
         return text + (f", {sum(self.refused.values())} datagrams of others refused" if self.refused else "")
 
 
 def resolved(address: Address) -> Address:
-    """IPv4 address of a host name."""
+    """Return the IPv4 address of a host name."""
     try:
         (*_, endpoint), *_ = socket.getaddrinfo(*address, family=socket.AF_INET, type=socket.SOCK_DGRAM)
     except OSError as problem:
@@ -172,15 +173,15 @@ def _name(address: Address) -> str:
     return f"{address[0]}:{address[1]}"
 
 
-# A port for several clients.
+# A server port for several clients.
 
 
 State = TypeVar("State")
-"""State of a client that a server keeps."""
+"""State of a client on the server."""
 
 
 def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
-    """A socket of a kind (`socket.SOCK_...`) with an address, host and port; port 0 takes a free one.
+    """Return a socket of a kind (`socket.SOCK_...`) bound to host and port; port 0 selects a free one.
 
     Raises:
         LinkError: The address cannot be bound.
@@ -199,23 +200,23 @@ def bound_socket(kind: int, address: tuple[str, int]) -> socket.socket:
 
 
 class TcpServer(Generic[State]):
-    """A port at which several clients listen and talk. No call waits, and a client that does not read is let go.
+    """A port for several clients. No call waits, and a client that does not read is disconnected.
 
     Attributes:
-        clients: Who is connected, with what is remembered of each.
-        address: Where they connect.
+        clients: Connected clients, each with its state.
+        address: Address of the server.
     """
 
     def __init__(self, address: Address, state: Callable[[], State], *, backlog: int = 8) -> None:
         """Listen.
 
         Args:
-            address: Host and port; port 0 takes a free one.
-            state: Makes what is remembered of a client.
-            backlog: Clients at a time; others are turned away.
+            address: Host and port; port 0 selects a free one.
+            state: Creates the state of a client.
+            backlog: Greatest number of clients; further ones are refused.
 
         Raises:
-            LinkError: It cannot be bound.
+            LinkError: The address cannot be bound.
         """
         self.clients: dict[socket.socket, State] = {}
         self._state, self._most = state, backlog
@@ -225,7 +226,7 @@ class TcpServer(Generic[State]):
         self.address: Address = self._listener.getsockname()
 
     def receive(self) -> list[tuple[socket.socket, State, bytes]]:
-        """Let new clients in and dead ones go; what has come, by client."""
+        """Accept new clients and drop closed ones; return the received data by client."""
         with suppress(OSError):
             while True:
                 client, _ = self._listener.accept()
@@ -250,7 +251,7 @@ class TcpServer(Generic[State]):
         return received
 
     def send(self, data: bytes, client: socket.socket) -> None:
-        """Send to one client, if it is still there."""
+        """Send to one client, if it is still connected."""
         try:
             if client in self.clients and client.send(data) < len(data):
                 self._leave(client)
@@ -258,7 +259,7 @@ class TcpServer(Generic[State]):
             self._leave(client)
 
     def close(self) -> None:
-        """Let everyone go and stop listening."""
+        """Disconnect all clients and stop listening."""
         for client in list(self.clients):
             self._leave(client)
         self._listener.close()
@@ -268,18 +269,18 @@ class TcpServer(Generic[State]):
         client.close()
 
 
-# The wire as a serial line, which may be unplugged and plugged in again.
+# A serial line, which may be unplugged and plugged in again.
 
 
 _BYTES_AT_ONCE = 65536
-"""Bytes taken by one call."""
+"""Greatest number of bytes per call."""
 
 
 class SerialTransport:
-    """8N1 without flow control, opened for this program alone; a lost device is tried again every second.
+    """8N1 without flow control, opened exclusively; a lost device is reopened every second.
 
     Note:
-        `send_errors` counts frames that found no line, `reconnects` how often it came back.
+        `send_errors` counts frames without a connection, `reconnects` how often it was restored.
     """
 
     def __init__(
@@ -291,10 +292,10 @@ class SerialTransport:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Args:
-            device: Path or name as the operating system has it.
-            baud: Bits a second.
+            device: Path or name in the operating system.
+            baud: Bits per second.
             retry: Time between attempts to open a lost device [s].
-            clock: Tells the time for it [s].
+            clock: Clock for the attempts [s].
 
         Raises:
             LinkError: The device cannot be opened now.
@@ -314,7 +315,7 @@ class SerialTransport:
             ) from None
 
     def send(self, data: bytes) -> None:
-        """Write one frame; without a line, or on one that is stuck, it is counted and dropped."""
+        """Write one frame; without a connection, or if the line is blocked, it is counted and dropped."""
         if not self._ready():
             self.send_errors += 1
             return
@@ -328,7 +329,7 @@ class SerialTransport:
             self._lose(problem)
 
     def receive(self) -> list[bytes]:
-        """Return the received bytes, as one piece or none; open a lost device again when it is time."""
+        """Return the received bytes, as one piece or none; reopen a lost device when an attempt is due."""
         if not self._ready():
             return []
         try:
@@ -344,12 +345,12 @@ class SerialTransport:
         self._drop()
 
     def describe(self) -> str:
-        """Device, speed and whether it is there."""
+        """Return device, speed and state of the connection."""
         state = "closed" if self._closed else "connected" if self._port else "not connected"
         return f"serial {self.device} at {self.baud} baud, {state}"
 
     def _ready(self) -> bool:
-        """Return whether there is a line, after an attempt to open it if one is due."""
+        """Return whether the device is open, after an attempt to open it if one is due."""
         now = self._clock()
         if self._port is None and not self._closed and now >= self._next_try:
             self._next_try = now + self.retry
@@ -362,7 +363,7 @@ class SerialTransport:
         return self._port is not None
 
     def _forget_waiting(self) -> None:
-        """Drop what a stuck line has not taken: by the time that it moves again those commands are old."""
+        """Drop bytes that a blocked line has not accepted: those commands would be outdated later."""
         self.send_errors += 1
         try:
             self._port.reset_output_buffer()
@@ -394,7 +395,7 @@ def _opened(device: str, baud: int) -> Any:
 
 
 def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
-    """Return the exceptions of a lost device: `termios.error` is no OSError, and other systems have none."""
+    """Return the exceptions of a lost device: `termios.error` is not an OSError, and some systems have no termios."""
     try:
         from termios import error
     except ImportError:
@@ -403,36 +404,37 @@ def _problems(*more: type[Exception]) -> tuple[type[Exception], ...]:
 
 
 def _written(port: Any, data: bytes) -> int:
-    """Return the number of accepted bytes; pyserial's own `write` waits on POSIX, whatever its timeout."""
+    """Return the number of accepted bytes; pyserial's own `write` waits on POSIX, even with a timeout of 0."""
     return os.write(port.fileno(), data) if os.name == "posix" else int(port.write(data))
 
 
-# The wire as a TCP connection to a server, which may go and come back.
+# A TCP connection to a server, which may be lost and restored.
 
 
 _SILENCE, _RETRY, _PATIENCE = 5.0, 1.0, 3.0
-"""Silence after which a server counts as gone (an unplugged cable ends no connection); time between attempts to reach
-it; longest duration of an attempt [s]."""
+"""Silence after which a server counts as gone (an unplugged cable does not end a connection); time between attempts to
+connect; longest duration of an attempt [s]."""
 _MOST_AT_ONCE = 1 << 18
-"""Bytes taken by one call, so that a flood cannot hold the loop up."""
+"""Greatest number of bytes per call, so that a flood cannot block the loop."""
 
 
 class TcpTransport:
-    """The connection to a server; a lost one is tried again every second, without waiting.
+    """Connection to a server; a lost one is restored by attempts every second, without waiting.
 
     Attributes:
-        connected: Whether it is there now.
-        connections: How often it was reached.
+        connected: True if it is connected now.
+        connections: Number of connections so far.
     """
 
     title = "tcp"
     """Name of the other end in messages."""
 
     def __init__(self, peer: Address, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """
+        """Resolve the address; the first call of `receive` or `send` connects.
+
         Args:
-            peer: Host and port; a name is looked up once, now.
-            clock: Tells the time between attempts [s].
+            peer: Host and port; a name is resolved once, now.
+            clock: Clock for the attempts [s].
 
         Raises:
             LinkError: There is no such host.
@@ -447,7 +449,7 @@ class TcpTransport:
         return [data] if data else []
 
     def receive(self) -> list[bytes]:
-        """Return what was received since the last call, oldest first."""
+        """Return the data received since the last call, oldest first."""
         if not self._ready():
             return []
         assert self._socket is not None  # it is ready
@@ -468,7 +470,7 @@ class TcpTransport:
         return pieces
 
     def send(self, data: bytes) -> None:
-        """Send bytes; what cannot be sent completely is counted."""
+        """Send bytes; incomplete sends are counted."""
         try:
             if not self._ready() or self._socket is None or self._socket.send(data) < len(data):
                 self.send_errors += 1
@@ -481,12 +483,12 @@ class TcpTransport:
         self._drop()
 
     def describe(self) -> str:
-        """Return the address of the other end and whether it is connected."""
+        """Return the address of the other end and the state of the connection."""
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
         return f"{self.title} at {_name(self.peer)}, {state}"
 
     def _ready(self) -> bool:
-        """Return whether there is a connection, after the next step of making one."""
+        """Return whether it is connected, after the next step of connecting."""
         now = self._clock()
         if self._socket is None and not self._closed and now >= self._next_try:
             self._next_try, self._since = now + _RETRY, now
@@ -522,23 +524,23 @@ class TcpTransport:
 
 
 class _Beside:
-    """A wire, and another that only listens: an autopilot's and its Doppler log's."""
+    """A transport, and a second one that is only read: that of an autopilot and that of its DVL."""
 
     def __init__(self, wire: Transport, listening: Transport) -> None:
         self._wires = (wire, listening)
         self.send = wire.send
 
     def receive(self) -> list[bytes]:
-        """Return what was received over both."""
+        """Return the data received over both."""
         return [data for wire in self._wires for data in wire.receive()]
 
     def close(self) -> None:
-        """Let go of both."""
+        """Close both."""
         for wire in self._wires:
             wire.close()
 
     def describe(self) -> str:
-        """Both."""
+        """Return the descriptions of both."""
         return "; ".join(wire.describe() for wire in self._wires)
 
 
@@ -549,19 +551,19 @@ class MavlinkAddress:
     kind: str
     where: str
     dvl: str = ""
-    """HOST or HOST:PORT of a Water Linked log; empty: none."""
+    """HOST or HOST:PORT of a Water Linked DVL; empty: none."""
     key: bytes = b""
-    """Key of signing; empty: none."""
+    """Signing key; empty: none."""
 
     DEFAULT = "udpin:127.0.0.1:14550"
-    """Addresses to which the autopilot of a virtual pool on this machine sends, and of its log."""
+    """Address to which the autopilot of a virtual pool on this machine sends."""
 
     @classmethod
     def of(cls, address: str) -> MavlinkAddress:
-        """The address in its parts.
+        """Return the parsed address.
 
         Raises:
-            LinkError: It is none, or the key cannot be read.
+            LinkError: The address is invalid, or the key cannot be read.
         """
         rest, _, query = address.removeprefix("mavlink").removeprefix("://").partition("?")
         kind, _, target = (rest or cls.DEFAULT).partition(":")
@@ -582,7 +584,7 @@ class MavlinkAddress:
         return cls(kind, target, options.get("dvl", "" if rest else "127.0.0.1"), key)
 
     def open(self) -> Transport:
-        """Return the wire, together with the log's.
+        """Return the transport, together with that of the DVL.
 
         Raises:
             LinkError: It cannot be opened.
@@ -610,68 +612,68 @@ class MavlinkAddress:
 
 
 DEFAULT_BIND = "127.0.0.1:54321"
-"""Address of the robot's own end."""
+"""Local address of the robot."""
 
 
 class Transport(Protocol):
-    """One end of the wire. No call blocks, and none raises for what happens on the wire."""
+    """One end of a link. No call blocks, and no event on the link raises an exception."""
 
     def send(self, data: bytes) -> None:
-        """Put a frame on the wire; one that cannot leave is counted and forgotten, never kept for later."""
+        """Send a frame; one that cannot be sent is counted and dropped, never sent later."""
 
     def receive(self) -> list[bytes]:
-        """Everything that has come since the last call: datagrams, or pieces of a stream."""
+        """Return everything received since the last call: datagrams, or pieces of a stream."""
 
     def close(self) -> None:
-        """Let go of the wire; what is sent afterwards goes nowhere."""
+        """Close the link; later frames are dropped."""
 
     def describe(self) -> str:
-        """The wire and how it fares, in a few words."""
+        """Return the address and the state of the link, in a few words."""
 
 
 class MemoryTransport:
-    """One of two ends in one process; what waits beyond 4096 frames pushes out the oldest, as a socket loses some."""
+    """One of two ends in one process; beyond 4096 waiting frames the oldest is dropped, as by a socket."""
 
     def __init__(self, inbox: deque[bytes], outbox: deque[bytes]) -> None:
         self._inbox, self._outbox, self._open = inbox, outbox, True
 
     def send(self, data: bytes) -> None:
-        """Lay the frame before the other end."""
+        """Append the frame to the queue of the other end."""
         if self._open:
             self._outbox.append(bytes(data))
 
     def receive(self) -> list[bytes]:
-        """Return what the other end has sent, oldest first."""
+        """Return the frames from the other end, oldest first."""
         received = list(self._inbox) if self._open else []
         self._inbox.clear()
         return received
 
     def close(self) -> None:
-        """Stop taking and giving."""
+        """Stop sending and receiving."""
         self._open = False
 
     def describe(self) -> str:
-        """Return that it is in memory, open or closed."""
+        """Return the description: in memory, open or closed."""
         return "in memory" if self._open else "in memory, closed"
 
 
 def memory_pair() -> tuple[MemoryTransport, MemoryTransport]:
-    """Two ends: what goes in at one comes out at the other."""
+    """Return two connected ends."""
     first: deque[bytes] = deque(maxlen=4096)
     other: deque[bytes] = deque(maxlen=4096)
     return MemoryTransport(first, other), MemoryTransport(other, first)
 
 
 def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
-    """The wire that an address names.
+    """Open the transport of an address.
 
     Args:
-        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", or of
-            an autopilot, as `MavlinkAddress` has it.
-        bind: "ADDRESS:PORT" of this end, for UDP.
+        address: "udp://HOST:PORT" of the motor controller, "serial:DEVICE" or "serial:DEVICE?baud=57600", or that of
+            an autopilot, see `MavlinkAddress`.
+        bind: Local "ADDRESS:PORT", for UDP.
 
     Raises:
-        LinkError: It names no wire, or the wire cannot be opened.
+        LinkError: The address is invalid, or the transport cannot be opened.
     """
     kind, _, rest = address.partition(":")
     if kind == "udp" and rest.startswith("//"):
@@ -688,7 +690,7 @@ def open_transport(address: str, bind: str = DEFAULT_BIND) -> Transport:
 
 
 def host_port(text: str, label: str) -> tuple[str, int]:
-    """Host and port of "HOST:PORT"; raises LinkError that begins with `label`."""
+    """Return host and port of "HOST:PORT"; raise a LinkError that begins with `label` if it is invalid."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
         raise LinkError(f"{label}: {text!r} is no HOST:PORT: give for example 127.0.0.1:58766")

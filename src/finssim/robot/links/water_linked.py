@@ -1,8 +1,8 @@
-"""Water Linked A50 and A125 Doppler logs: JSON lines over TCP, as their makers publish them (json_v1 to json_v3.2).
+"""Water Linked A50 and A125 DVLs: JSON lines over TCP in the manufacturer's published formats (json_v1 to json_v3.2).
 
-`DvlClient` brings lines from a log and `decode_line` reads them. For a log that is simulated `encode_velocity` and
-`DeadReckoning` write reports, `DvlServer` sends them and performs a driver's commands, and `serve_about` is its web
-page. The log's axes on the wire are x forward, y right, z down.
+`DvlClient` receives lines from a DVL and `decode_line` decodes them. For a simulated DVL, `encode_velocity` and
+`DeadReckoning` create reports, `DvlServer` sends them and executes a client's commands, and `serve_about` is its web
+page. The DVL's axes on the wire are x forward, y right, z down.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ __all__ = [
 ]  # fmt: skip
 
 PORT = 16171
-"""TCP port of a log."""
+"""TCP port of a DVL."""
 
 _FORMAT, _UNTIMED = "json_v3.2", ("json_v1", "json_v2")
 _FASTEST, _OLDEST, _HIGHEST = 10.0, 5.0, 300.0
-"""Speed [m/s], age [s] and altitude [m] beyond what either log can report."""
+"""Greatest speed [m/s], age [s] and altitude [m] that either DVL can report."""
 _MICROSECONDS = 1e17
-"""Times beyond are no Unix times [us]."""
+"""Greatest plausible Unix time [µs]."""
 _LONGEST_LINE = 1 << 16
-"""A report has about 1 kB [bytes]."""
+"""Greatest length of a line [bytes]; a report has about 1 kB."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,23 @@ class DvlVelocity(NavigationAid):
     """A velocity over the floor, with the other values of its report."""
 
     altitude: float
-    """Distance to the floor along the log's z axis [m]; NaN if not reported."""
+    """Distance to the floor along the DVL's z axis [m]; NaN if not reported."""
     fom: float
-    """Figure of merit, the log's own estimate of the error [m/s]; NaN if not reported."""
+    """Figure of merit, the DVL's own estimate of the error [m/s]; NaN if not reported."""
 
 
 def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity | None:
-    """Read one line of a log. Whatever it holds, nothing is raised.
+    """Decode one line of a DVL; never raise an exception, for any content.
 
     Args:
         line: One JSON object.
-        counts: Counts what comes: `velocity` for those returned, and `velocity without times` for those of firmware
+        counts: Counters by kind: `velocity` for returned ones, and `velocity without times` for those of firmware
             before json_v3; `no bottom lock`, `implausible`, `not a report`; other reports, such as `position_local` and
             `response`, under their type.
 
     Returns:
-        Velocity over the floor in our axes of the log (x forward, y left, z up), with the age that the log's own clock
-        gives it, 0 s where the firmware sends no times; None for everything else, and for a velocity through the water.
+        Velocity over the floor in our axes of the DVL (x forward, y left, z up), with its age by the DVL's own clock,
+        or 0 s if the firmware sends no times; None for everything else, and for a velocity through the water.
     """
     counts = Counter() if counts is None else counts
     report = _object(line)
@@ -94,7 +94,7 @@ def decode_line(line: bytes, counts: Counter[str] | None = None) -> DvlVelocity 
 
 
 def _object(line: bytes) -> dict[str, Any]:
-    """The JSON object in a line; empty if there is none."""
+    """Return the JSON object in a line; empty if there is none."""
     try:
         value = json.loads(line)
     except (ValueError, RecursionError):
@@ -103,13 +103,13 @@ def _object(line: bytes) -> dict[str, Any]:
 
 
 def _number(value: Any, lowest: float, highest: float) -> float:
-    """A number as it came; NaN for anything else, and for one out of range."""
+    """Return a number within its range; NaN for anything else."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and lowest <= value <= highest else math.nan
 
 
 BEAM_ANGLE = math.radians(22.5)
-"""Angle of the four beams from the log's z axis [rad]."""
+"""Angle of the four beams from the DVL's z axis [rad]."""
 _AZIMUTHS = np.radians([135.0, -135.0, -45.0, 45.0])
 """Azimuths of beams 0 to 3, from x towards y [rad]."""
 _ACROSS = math.tan(BEAM_ANGLE) * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=1)
@@ -127,15 +127,15 @@ def encode_velocity(
     interval: float,
     std: Sequence[float] = (2e-4, 2e-4, 1e-4),
 ) -> bytes:
-    """A velocity-and-transducer report, as a log sends it.
+    """Return a velocity-and-transducer report in the DVL's format.
 
     Args:
-        velocity: Over the floor, our axes of the log [m/s], (3,); None without bottom lock.
-        altitude: Distance to the floor along the log's z axis [m].
-        measured: When the floor reflected it, Unix time [s].
-        sent: When the report leaves, Unix time [s].
-        interval: Since the last report [s].
-        std: Standard deviation per axis that the log believes in [m/s], (3,).
+        velocity: Over the floor, our axes of the DVL [m/s], (3,); None without bottom lock.
+        altitude: Distance to the floor along the DVL's z axis [m].
+        measured: Time of the reflection by the floor, Unix time [s].
+        sent: Time of sending, Unix time [s].
+        interval: Time since the last report [s].
+        std: Standard deviation per axis that the DVL reports [m/s], (3,).
 
     Returns:
         The line with its newline.
@@ -165,9 +165,9 @@ def encode_velocity(
 
 
 class DeadReckoning:
-    """Position of a log by its own velocities and attitude, as `position_local` reports.
+    """Position of a DVL from its own velocities and attitude, as reported in `position_local`.
 
-    Its axes are those of the log at the last reset: x forward, y right, z down; `DvlServer` turns reports into them.
+    Its axes are those of the DVL at the last reset: x forward, y right, z down; `DvlServer` transforms reports to them.
     """
 
     def __init__(self) -> None:
@@ -177,12 +177,13 @@ class DeadReckoning:
     def take(
         self, time: float, velocity: npt.ArrayLike | None, quaternion: npt.ArrayLike, stamp: float
     ) -> list[bytes]:
-        """Take a velocity, and return a report where one is due, else nothing.
+        """Integrate a velocity, and return a report if one is due, otherwise nothing.
 
         Args:
-            time: When it was measured [s].
-            velocity: Over the floor, our axes of the log [m/s], (3,); None without bottom lock: the position waits.
-            quaternion: The log's axes to the world, x y z w, (4,).
+            time: Time of measurement [s].
+            velocity: Over the floor, our axes of the DVL [m/s], (3,); None without bottom lock: the position is
+                constant.
+            quaternion: The DVL's axes to the world, x y z w, (4,).
             stamp: Unix time of the report [s].
         """
         if velocity is not None and 0.0 < time - self._time < LONGEST_STEP:
@@ -200,7 +201,7 @@ class DeadReckoning:
 
 
 LOCAL_PERIOD, LONGEST_STEP, LOCAL_STD = 0.2, 1.0, 0.01
-"""Between two reports of the position [s], longest time over which a velocity is integrated [s], and the reported
+"""Time between two reports of the position [s], longest time over which a velocity is integrated [s], and the reported
 standard deviation [m]."""
 
 
@@ -209,13 +210,13 @@ def _line(value: dict[str, Any]) -> bytes:
 
 
 class _Lines:
-    """Complete lines of a stream of bytes; one that grows beyond `_LONGEST_LINE` is dropped."""
+    """Assembler of complete lines from a stream of bytes; a line longer than `_LONGEST_LINE` is dropped."""
 
     def __init__(self) -> None:
         self._rest, self._skipping = b"", False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that these bytes end, without their newlines."""
+        """Return the lines that these bytes complete, without their newlines."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if self._skipping and lines:
             del lines[0]
@@ -226,16 +227,17 @@ class _Lines:
 
 
 class DvlClient(TcpTransport):
-    """The connection to a log, a `Transport` of complete lines."""
+    """Connection to a DVL, a `Transport` of complete lines."""
 
     title = "Water Linked DVL"
 
     def __init__(self, host: str, port: int = PORT, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """
+        """Resolve the address.
+
         Args:
-            host: Name or IPv4 address; a name is looked up once, now.
+            host: Name or IPv4 address; a name is resolved once, now.
             port: TCP port.
-            clock: Tells the time between attempts [s].
+            clock: Clock for the attempts to connect [s].
 
         Raises:
             LinkError: There is no such host.
@@ -251,23 +253,23 @@ class DvlClient(TcpTransport):
 
 
 class DvlServer:
-    """A log's TCP server: reports to everyone who is connected, and answers to commands. No call waits.
+    """TCP server of a simulated DVL: reports to all connected clients, and responses to commands. No call waits.
 
     Attributes:
-        address: Where it listens.
-        settings: As `get_config` gives them. The speed of sound scales velocities and distances, over 1475 m/s; the
-            mounting offset turns velocities; without acoustics there are none. The others have no effect.
+        address: Address of the server.
+        settings: Settings as in `get_config`. The speed of sound scales velocities and distances, relative to 1475 m/s;
+            the mounting offset rotates velocities; without acoustics there are none. The others have no effect.
     """
 
     def __init__(self, address: Address = ("127.0.0.1", PORT)) -> None:
         """Listen.
 
         Args:
-            address: Host and port, reached from this machine alone by default; port 0 takes a free one (see
+            address: Host and port, by default reachable only from this machine; port 0 selects a free one (see
                 `address`).
 
         Raises:
-            LinkError: It cannot be bound.
+            LinkError: The address cannot be bound.
         """
         self.settings = {name: value for name, (value, _) in SETTINGS.items()}
         self._newest: dict[str, Any] = {}
@@ -276,13 +278,13 @@ class DvlServer:
         self.address: Address = self._server.address
 
     def poll(self) -> None:
-        """Let new clients in and answer their commands; call it often."""
+        """Accept new clients and respond to commands; call it often."""
         for client, lines, data in self._server.receive():
             for line in lines.feed(data):
                 self._server.send(_line(self._answer(_object(line))), client)
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Perform a command and return its response."""
+        """Execute a command and return its response."""
         command = request.get("command")
         error, result = "", None
         if command == "get_config":
@@ -303,7 +305,7 @@ class DvlServer:
         }
 
     def _set(self, wanted: Any) -> str:
-        """Take settings, all or none; return what is wrong with them."""
+        """Apply settings, all or none; return what is wrong with them."""
         if not isinstance(wanted, dict) or not wanted:
             return "expected parameters: an object of settings"
         for name, value in wanted.items():
@@ -315,7 +317,7 @@ class DvlServer:
         return ""
 
     def _as_set(self, line: bytes) -> bytes:
-        """Return a report as the settings and the last reset have it; empty where there is none."""
+        """Return a report modified by the settings and the last reset; empty if there is none."""
         sound, turn = float(self.settings["speed_of_sound"]), float(self.settings["mounting_rotation_offset"])
         report = _object(line)
         if report.get("type") == "position_local":
@@ -340,7 +342,7 @@ class DvlServer:
         """Send a report to every client.
 
         Args:
-            line: With its newline. A client that does not read is let go.
+            line: Report with its newline. A client that does not read is disconnected.
         """
         self.poll()
         report = self._as_set(line) if line[:1] == b"{" else line
@@ -348,12 +350,12 @@ class DvlServer:
             self._server.send(report, client)
 
     def close(self) -> None:
-        """Let everyone go and stop listening."""
+        """Disconnect all clients and stop listening."""
         self._server.close()
 
 
 def _since(report: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
-    """Return a local position counted from an earlier one, in the axes that the log had there."""
+    """Return a local position relative to an earlier one, in the DVL's axes at that time."""
     yaw = math.radians(start["yaw"])
     x, y = report["x"] - start["x"], report["y"] - start["y"]
     return report | {
@@ -382,20 +384,20 @@ SETTINGS: dict[str, tuple[Any, Callable[[Any], bool]]] = {
     "range_mode": ("auto", lambda value: isinstance(value, str) and bool(_RANGE_MODE.fullmatch(value))),
     "periodic_cycling_enabled": (True, _truth),
 }
-"""Settings of a log, their values at first, and what they may be."""
+"""Settings of a DVL: initial values, and functions that validate new ones."""
 
 
 def serve_about(address: Address) -> ThreadingHTTPServer:
-    """Start the log's web page in a thread: `/api/v1/about` and `/api/v1/about/status`, by which BlueOS finds a log.
+    """Start the DVL's web page in a thread: `/api/v1/about` and `/api/v1/about/status`, by which BlueOS finds a DVL.
 
     Args:
-        address: Host and port; a real log has port 80; port 0 takes a free one (`server_address`).
+        address: Host and port; a real DVL has port 80; port 0 selects a free one (`server_address`).
 
     Returns:
         The server; `shutdown` and `server_close` end it.
 
     Raises:
-        LinkError: It cannot be bound.
+        LinkError: The address cannot be bound.
     """
     pages = {
         "/api/v1/about": {
