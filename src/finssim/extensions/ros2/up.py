@@ -33,6 +33,7 @@ from finssim.vehicles.defaults import vehicle_at
 
 if TYPE_CHECKING:
     from finssim.extensions.ros2.nodes.remote import Watcher
+    from finssim.vehicles import Vehicle
 
 __all__ = [
     "GRAPHS",
@@ -367,54 +368,26 @@ def plan_of(
     """
     if graph not in GRAPHS:
         raise Ros2Error(f"unknown graph '{graph}'; available: {', '.join(GRAPHS)}")
-    o, several = options, options.names.team is not None
-    world, wiring, pace, stated = o.simulated, o.wiring, o.pace, o.values()
-    names = (
-        [name.strip() for name in o.names.team.split(",")] if o.names.team is not None else [o.names.vehicle]
-    )
+    o, several, stated = options, options.names.team is not None, options.values()
+    names: list[str | None] = [o.names.vehicle]
+    if o.names.team is not None:
+        names = [name.strip() for name in o.names.team.split(",")]
     _check(graph, o)
-    blind = (
-        o.site == "open-water"
-        or world.firmware == "ardusub"
-        or "none" in (str(wiring.pool_file), world.camera)
-    )
-    if (
-        graph == "robot" and not blind and wiring.pool_file is None and pool_file is not None
-    ):  # our own, unwritten
+    blind = _blind(o)
+    if graph == "robot" and not blind and o.wiring.pool_file is None and pool_file is not None:
         raise Ros2Error("a robot needs its pool file: give --pool-file, or none without a camera")
-    simulated = graph == "sim" or pace.lockstep or pace.real_time_factor is not None
-    camera = world.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
-    file = None if pool_file is None else str(pool_file)
-    factor = 0.0 if pace.lockstep and pace.real_time_factor is None else pace.real_time_factor
-    common: dict[str, Any] = {
-        **stated,
-        "use_sim_time": simulated or None,
-        "lockstep": pace.lockstep or None,
-        "pool_since": since if graph == "pool" and not blind else None,
-        "real_time_factor": factor,
-        "pool_file": "none" if blind else file,
-        "need_reading": False if o.teleop else None,
-        "device": o.teleop,
-        "other": o.mission.policy
-        if o.mission.policy is None or o.mission.policy.startswith("pid")
-        else "policy",
-    }
+    file = "none" if blind else None if pool_file is None else str(pool_file)
+    common = {**stated, **_common(graph, o, since), "pool_file": file}
+    shares = {name: _share(name, stated[name], len(names)) for name in SHARED}
     nodes: list[GraphNode] = []
     namespaces: list[str] = []
-    shares = {name: _share(name, stated[name], len(names)) for name in SHARED}
     for i, name in enumerate(names):
         vehicle = vehicle_at(o.site or "pool", load_vehicle(name or "finsrov"))
-        if world.firmware == "ardusub":
-            Mixer.of(vehicle)  # refuses a vehicle without an autopilot
         own = {key: texts[i] for key, texts in shares.items()}
-        if name is not None and (own["goal"] is not None or own["trajectory"] is not None):
-            check_reachable(guide_of(own["goal"], own["trajectory"]), vehicle)
-        if own["let_in"] is not None:
-            place_of(own["let_in"])  # refuses what is none
+        _check_vehicle(o, vehicle, own if name is not None else {"let_in": own["let_in"]})
         namespace = f"robot_{i + 1}" if several else o.names.namespace or vehicle.name.replace("-", "_")
         namespaces.append(namespace)
         prefix = f"{namespace}/" if several or o.names.namespace else None
-        record = o.record and str(Path(o.record) / f"{namespace}.mcap" if several else o.record)
         values = {
             **common,
             **own,
@@ -422,35 +395,85 @@ def plan_of(
             "vehicle": name,
             "number": i or None,
             "frame_prefix": o.names.frame_prefix or prefix,
-            "record": record,
+            "record": o.record and str(Path(o.record) / f"{namespace}.mcap" if several else o.record),
             "mode": "error-state" if own["let_in"] is not None else None,
         }
         for node in _members(graph, o, blind):
-            given = values
+            given, below = values, namespace
             if node in WORLDS:
                 if i:
                     continue  # one for all
                 given = {
                     **values,
-                    "use_sim_time": None,
-                    "bind": wiring.bind,
-                    "camera": "none" if blind else camera,
+                    **_world_values(o, blind, file),
+                    "frame_prefix": None if several else prefix,
                 }
-                given |= {"pool_file": None if blind else file, "frame_prefix": None if several else prefix}
-                given["truth"] = None if world.truth is None else str(world.truth)
-                given["water"] = None if world.water is None else str(world.water)
+                below = "team" if several else namespace
             elif node == "recorder" and (graph == "sim" or blind):
                 given = {**values, "pool_file": None}
-            below = "team" if several and node in WORLDS else namespace
             takes = f"{EVERYWHERE} {TAKES[node]}".split()
             nodes.append(
                 GraphNode(node, below, {key: given[key] for key in takes if given.get(key) is not None})
             )
-    if pace.lockstep:
+    if o.pace.lockstep:
         waits = " ".join(one.full_name for one in nodes if one.node not in WORLDS)
         for one in nodes:
             one.parameters.update({"waits_for": waits} if one.node in WORLDS else {})
     return GraphPlan(graph, tuple(nodes), tuple(namespaces))
+
+
+def _blind(o: Options) -> bool:
+    """Return True if no camera locates the vehicles."""
+    world = o.simulated
+    without = "none" in (str(o.wiring.pool_file), world.camera)
+    return without or o.site == "open-water" or world.firmware == "ardusub"
+
+
+def _common(graph: str, o: Options, since: float | None) -> dict[str, Any]:
+    """Return the parameters that all nodes of a graph share; `since` as in `plan_of`, time of day [s]."""
+    pace, policy = o.pace, o.mission.policy
+    own_gains = policy is None or policy.startswith("pid")
+    simulated = graph == "sim" or pace.lockstep or pace.real_time_factor is not None
+    return {
+        "use_sim_time": simulated or None,
+        "lockstep": pace.lockstep or None,
+        "pool_since": since if graph == "pool" and not _blind(o) else None,
+        "real_time_factor": 0.0 if pace.lockstep and pace.real_time_factor is None else pace.real_time_factor,
+        "need_reading": False if o.teleop else None,
+        "device": o.teleop,
+        "other": policy if own_gains else "policy",
+    }
+
+
+def _world_values(o: Options, blind: bool, file: str | None) -> dict[str, Any]:
+    """Return the parameters that only a simulated world has; `file` is the pool file that it writes."""
+    world = o.simulated
+    camera = world.camera or (None if o.site is None else "corners" if o.site == "tank" else "pictures")
+    return {
+        "use_sim_time": None,
+        "bind": o.wiring.bind,
+        "camera": "none" if blind else camera,
+        "pool_file": None if blind else file,
+        "truth": None if world.truth is None else str(world.truth),
+        "water": None if world.water is None else str(world.water),
+    }
+
+
+def _check_vehicle(o: Options, vehicle: Vehicle, own: Mapping[str, str | None]) -> None:
+    """Refuse a goal, a trajectory or an initial position that this vehicle cannot use.
+
+    Args:
+        o: Options of the graph.
+        vehicle: The vehicle.
+        own: Its `goal`, `trajectory` and `let_in`, where given.
+    """
+    if o.simulated.firmware == "ardusub":
+        Mixer.of(vehicle)  # refuses a vehicle without an autopilot
+    goal, trajectory, let_in = own.get("goal"), own.get("trajectory"), own.get("let_in")
+    if goal is not None or trajectory is not None:
+        check_reachable(guide_of(goal, trajectory), vehicle)
+    if let_in is not None:
+        place_of(let_in)
 
 
 def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
