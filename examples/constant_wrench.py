@@ -1,4 +1,4 @@
-"""Push a vehicle forward and to the left for ten seconds, and read where it went."""
+"""Apply a constant wrench forward and in yaw for ten seconds, and print the resulting position."""
 
 from finssim.control import Allocator
 from finssim.sim import Simulator

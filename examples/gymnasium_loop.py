@@ -1,4 +1,4 @@
-"""Station keeping in Gymnasium's form, driven by six lines of feedback instead of a learner."""
+"""Station keeping in a Gymnasium environment, with six lines of feedback control instead of a learner."""
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,7 @@ while not ended:
     sine_of_yaw_error, yaw_rate = observation[4], observation[14]
     force = 1.5 * offset - 1.0 * velocity
     yaw = 0.3 * sine_of_yaw_error - 0.3 * yaw_rate
-    action = np.clip([*force, yaw], -1.0, 1.0).astype(np.float32)  # parts of each axis' wrench limit
+    action = np.clip([*force, yaw], -1.0, 1.0).astype(np.float32)  # fractions of each axis' wrench limit
     observation, reward, terminated, truncated, info = env.step(action)
     ended = terminated or truncated
 

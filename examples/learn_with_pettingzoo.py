@@ -1,4 +1,4 @@
-"""Random search over eight feedback gains learns to reach a pose, in one world of PettingZoo's form."""
+"""Random search over eight feedback gains that reach a pose, in one world of a PettingZoo environment."""
 
 import numpy as np
 
@@ -10,14 +10,15 @@ env = PettingZooEnv(task_named("t1", time_limit=6.0), vehicle="finsrov", action=
 
 
 def act(gains: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Parts of the wrench limits in surge, sway, heave and yaw from error and velocity on the same axis."""
+    """Return fractions of the wrench limits in surge, sway, heave and yaw from error and velocity of the same
+    axis."""
     error = [*(3.0 * seen[:3]), seen[4]]  # body frame [m], sine of the yaw error
     velocity = [*seen[9:12], seen[14]]  # body frame [m/s], [rad/s]
     return np.clip(gains[0] * error + gains[1] * velocity, -1.0, 1.0).astype(np.float32)
 
 
 def episode(gains: np.ndarray, seed: int) -> float:
-    """Mean reward of a step; every agent of the task acts by the same gains."""
+    """Return the mean reward per step; every agent of the task acts with the same gains."""
     observations, _ = env.reset(seed=seed)
     rewards = []
     while env.agents:
@@ -27,7 +28,7 @@ def episode(gains: np.ndarray, seed: int) -> float:
 
 
 def score(gains: np.ndarray) -> float:
-    """Mean over ten episodes that are not learnt from."""
+    """Return the mean over ten episodes that are not used for learning."""
     return float(np.mean([episode(gains, 10_000 + k) for k in range(10)]))
 
 
@@ -35,7 +36,7 @@ rng, gains = np.random.default_rng(1), np.zeros((2, 4))
 before = score(gains)
 for turn in range(TURNS):
     tries = rng.normal(size=(TRIES, 2, 4))
-    # Both sides of a try see the same episode: their difference is the gains', not the goal's.
+    # Both sides of a perturbation play the same episode, so that their difference is due to the gains alone.
     returns = np.array(
         [[episode(gains + side * 0.5 * t, TRIES * turn + k) for side in (1, -1)] for k, t in enumerate(tries)]
     )

@@ -1,4 +1,4 @@
-"""PPO of RSL-RL learns to hold a pose, in some ten seconds."""
+"""Train RSL-RL's PPO to hold a pose, in about ten seconds."""
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
@@ -31,7 +31,8 @@ runner = OnPolicyRunner(worlds, settings)
 
 
 def held() -> float:
-    """Share of 64 new episodes that end with the pose held for ten seconds, without action noise."""
+    """Return the success rate in 64 new episodes, without action noise: the pose is held for ten seconds at
+    the end."""
     trial, policy = RslRlVecEnv("t1", worlds=64, vehicle="finsrov", seed=2), runner.get_inference_policy()
     observation = trial.get_observations()
     with torch.inference_mode():

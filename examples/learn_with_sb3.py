@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3 learns to hold a pose, in some ten seconds."""
+"""Train Stable-Baselines3's PPO to hold a pose, in about ten seconds."""
 
 import torch
 from stable_baselines3 import PPO
@@ -23,7 +23,8 @@ model = PPO(
 
 
 def held() -> float:
-    """Share of 64 new episodes that end with the pose held for ten seconds, without action noise."""
+    """Return the success rate in 64 new episodes, without action noise: the pose is held for ten seconds at
+    the end."""
     trial = Sb3VecEnv("t1", worlds=64, vehicle="finsrov", seed=2)
     observation = trial.reset()
     for _ in range(200):

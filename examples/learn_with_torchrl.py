@@ -1,4 +1,4 @@
-"""PPO of TorchRL learns to hold a pose, in less than twenty seconds."""
+"""Train TorchRL's PPO to hold a pose, in less than twenty seconds."""
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -18,12 +18,12 @@ seen, acts = worlds.observation_spec["observation"].shape[-1], worlds.action_spe
 
 
 def layers(outputs: int) -> nn.Sequential:
-    """A small network."""
+    """Return a small network."""
     return nn.Sequential(nn.Linear(seen, 64), nn.ELU(), nn.Linear(64, 64), nn.ELU(), nn.Linear(64, outputs))
 
 
 class Gaussian(nn.Module):
-    """Mean from the observation, one standard deviation for all of them."""
+    """Gaussian policy: a mean that depends on the observation, and one standard deviation per action."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,7 +49,8 @@ schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=RO
 
 
 def held() -> float:
-    """Share of 64 new episodes that end with the pose held for ten seconds, without action noise."""
+    """Return the success rate in 64 new episodes, without action noise: the pose is held for ten seconds at
+    the end."""
     trial = TorchRlEnv("t1", worlds=64, vehicle="finsrov", seed=2)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         trial.rollout(200, actor, break_when_any_done=False)

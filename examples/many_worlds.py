@@ -10,7 +10,7 @@ rng = np.random.default_rng(seed=1)
 simulator = Simulator("finsrov", worlds=WORLDS, water=Water(current=(0.1, 0.0, 0.0), depth=5.0))
 simulator.place(position=(0.0, 0.0, -1.0))
 
-# Parameters are arrays by world and vehicle, so randomising one is writing an array.
+# Parameters are arrays indexed by world and vehicle; to randomise one, write to its array.
 damping = simulator.plant.D1.numpy()
 damping[:, 0] *= rng.uniform(0.8, 1.2, size=(WORLDS, 1, 1))
 simulator.plant.D1.assign(damping)

@@ -1,4 +1,4 @@
-"""A task of one's own in Warp: keep a depth that is drawn in every episode."""
+"""A task of your own in Warp: keep a depth that is drawn in every episode."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -22,37 +22,37 @@ from finssim.tasks import (
 
 @wp.func
 def way_up(arrays: TaskArrays, w: int) -> float:
-    """Return the distance up to the depth [m]; observations come from what is *measured*, `arrays.position`."""
+    """Return the distance up to the depth [m]; observations use the *measured* state, `arrays.position`."""
     return arrays.goal_position[w][2] - arrays.position[w, 0][2]
 
 
 @wp.func
 def heave(arrays: TaskArrays, w: int) -> float:
-    """Velocity along the body's z axis [m/s]."""
+    """Return the velocity along the body's z axis [m/s]."""
     return arrays.velocity[w, 0][2]
 
 
 @wp.func
 def error(state: State, arrays: TaskArrays, w: int) -> float:
-    """Distance to the depth [m]: the truth is what counts, `state.position`."""
+    """Return the distance to the depth [m]; rewards and success use the true state, `state.position`."""
     return wp.abs(arrays.goal_position[w][2] - state.position[w, 0][2])
 
 
 @wp.func
 def near(state: State, arrays: TaskArrays, w: int) -> float:
-    """A slope that does not vanish at the depth."""
+    """Return a reward whose slope does not vanish at the depth."""
     return wp.exp(-error(state, arrays, w) / 0.1)
 
 
 @wp.func
 def there(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """Within the tolerance of success; `p` holds the task's settings."""
+    """Return True within the tolerance of success; `p` contains the task's settings."""
     return error(state, arrays, w) < p.tolerance
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Draw the start of an episode, from the episode's key and the world alone."""
+    """Draw the start of an episode, which depends only on the episode's key and the world."""
     rng = wp.rand_init(key, w)
     arrays.goal_position[w] = wp.vec3(0.0, 0.0, -wp.randf(rng, 0.3, p.deepest))
     place_at_rest(state, w, 0, wp.vec3(0.0, 0.0, -wp.randf(rng, 0.3, p.deepest)), 0.0)
@@ -60,7 +60,7 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class KeepDepth(Task):
-    """Settings, and the terms of which the task is made."""
+    """Settings and terms of the task."""
 
     succeeds: ClassVar[str] = "held"
     name: str = "keep-depth"
@@ -73,7 +73,7 @@ class KeepDepth(Task):
     hold: float = 5.0
 
     def terms(self) -> Terms:
-        """Rewards with their weights, and the rest."""
+        """Return the rewards with their weights, the start and the success condition."""
         return Terms(
             start=start,
             rewards=(

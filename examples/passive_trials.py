@@ -21,11 +21,11 @@ MOCAP = ("", "x", "y", "z", "qx", "qy", "qz", "qw")
 IMU = ("", "", "", "", "", "p", "q", "r")
 
 HINSDALE = Path(__file__).parents[1] / "tests" / "data" / "hinsdale"
-"""Recordings of a BlueROV2 that was let go by hand."""
+"""Recordings of a BlueROV2 that was released by hand."""
 
 
 def read(folder: Path, name: str) -> Trial:
-    """A trial of one pair of tables on the union of their times."""
+    """Return a trial from a pair of tables, on the union of their times."""
     tables = {
         part: np.genfromtxt(folder / f"{name}_{part}.csv", delimiter=",", skip_header=1)
         for part in ("mocap", "imu")
@@ -41,7 +41,7 @@ def read(folder: Path, name: str) -> Trial:
 
 
 def draw(curves: list[Curve], path: Path) -> None:
-    """Measured and fitted motion of every decay."""
+    """Draw the measured and the fitted motion of every decay."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 2.4 * len(curves)), layout="constrained")
@@ -57,7 +57,7 @@ def draw(curves: list[Curve], path: Path) -> None:
 
 
 def main() -> None:
-    """Print what each trial determines, with the file of a BlueROV2 Heavy for what it does not."""
+    """Print what each trial identifies; the other numbers are those of the BlueROV2 Heavy file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=HINSDALE)
     parser.add_argument("--picture", type=Path)

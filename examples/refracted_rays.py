@@ -17,7 +17,8 @@ FLOOR = 0.0
 
 
 def draw(path: str) -> None:
-    """A side view (y = 0): rays through the water, straight lines beside them, and the error that those make."""
+    """Draw a side view (y = 0): refracted rays, straight lines beside them, and the resulting error on the
+    floor."""
     import matplotlib
 
     matplotlib.use("Agg")

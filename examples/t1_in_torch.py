@@ -1,4 +1,5 @@
-"""Station keeping (T1) in plain torch: the same numbers as `finssim.tasks.StationKeeping`, which is in Warp."""
+"""Station keeping (T1) in plain torch, with the same results as `finssim.tasks.StationKeeping`, which is in
+Warp."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ class TorchStationKeeping(TorchTask):
     weights: station_keeping.Reward = field(default_factory=station_keeping.Reward)
 
     def reset(self, w: Worlds) -> Start:
-        """Goal and start drawn from boxes; the goal is level."""
+        """Draw goal and start from boxes; the goal is level."""
         a = w.uniform((-self.tilt, -self.tilt, -math.pi), (self.tilt, self.tilt, math.pi))
         most = (*[self.speed] * 3, *[self.rate] * 3)
         return Start(
@@ -50,7 +51,7 @@ class TorchStationKeeping(TorchTask):
         )
 
     def observe(self, w: Worlds) -> Sequence[Tensor]:
-        """The 16 numbers of T1."""
+        """Return the 16 numbers of T1's observation."""
         offset = rot.rotate_inverse(w.quaternion, w.goal_position - w.position)
         R = rot.matrix(self.turn(w))
         return (
@@ -62,7 +63,7 @@ class TorchStationKeeping(TorchTask):
         )
 
     def reward(self, w: Worlds) -> Tensor:
-        """See `station_keeping.Reward`."""
+        """Return the reward; see `station_keeping.Reward`."""
         r = self.weights
         e = torch.linalg.vector_norm(w.goal_position - w.position, dim=1)
         theta = rot.angle(self.turn(w))
@@ -79,26 +80,26 @@ class TorchStationKeeping(TorchTask):
         )
 
     def terminated(self, w: Worlds) -> Tensor:
-        """Outside the pool."""
+        """Return True outside the pool."""
         x, y, z = w.position.unbind(1)
         return (
             (x.abs() > self.bounds[0]) | (y.abs() > self.bounds[1]) | (z > self.ceiling) | (z < -self.depth)
         )
 
     def inside(self, w: Worlds) -> Tensor:
-        """Every axis and the heading within the tolerance."""
+        """Return True if every axis and the heading are within the tolerance."""
         off = (w.goal_position - w.position).abs().amax(dim=1)
         turn = rot.wrapped(rot.heading(w.goal_quaternion) - rot.heading(w.quaternion)).abs()
         return (off <= self.tolerance) & (turn <= self.yaw_tolerance)
 
     def turn(self, w: Worlds) -> Tensor:
-        """Rotation of the goal relative to the body, (worlds, 4)."""
+        """Return the rotation of the goal relative to the body, (worlds, 4)."""
         return rot.multiply(rot.conjugate(w.quaternion), w.goal_quaternion)
 
 
 if __name__ == "__main__":
     environment = finssim.make(TorchStationKeeping(), worlds=64, seed=1)
-    pid = baseline("t1", "pid", "finsrov")  # it sees the same numbers
+    pid = baseline("t1", "pid", "finsrov")  # it has the same observation
     memory, observation = pid.reset(64), environment.reset()
     for _ in range(round(environment.task.time_limit / environment.task.control_step)):
         action, memory = pid.act(memory, observation)

@@ -1,8 +1,8 @@
-"""Locate a moving vehicle through rippling water: pictures, detections, poses, fusion, and how far each is off.
+"""Locate a moving vehicle through rippling water: pictures, detections, poses and fusion, with the error of each.
 
     python examples/through_the_water.py
 
-An overhead camera looks at FinsROV on an ellipse, 0.45 m deep. Its tags are drawn as the camera sees them, found in
+An overhead camera observes FinsROV on an ellipse, 0.45 m deep. Its tags are rendered through the water, detected in
 each picture, located by refraction with a pressure sensor and an IMU of ordinary quality, and fused. Needs the extra
 "vision".
 """
@@ -43,19 +43,20 @@ from finssim.sim import overhead_camera
 from finssim.vehicles import load_vehicle
 
 DURATION, PERIOD = 8.0, 24.0
-"""Length of the run and of one round [s]."""
+"""Duration of the run and of one round of the ellipse [s]."""
 Z, TURN = -0.45, 2.0 * math.pi / PERIOD
 
 
 def motion(t: float) -> tuple[NDArray[np.float64], float, float, float]:
-    """Position (z = 0 on the surface) [m], roll, pitch, yaw [rad]: along an ellipse, nose forward, rocking a little."""
+    """Return position (z = 0 on the surface) [m] and roll, pitch, yaw [rad] on an ellipse, nose forward,
+    rocking slightly."""
     x, y = 0.9 * math.cos(TURN * t), 0.5 * math.sin(TURN * t)
     yaw = math.atan2(0.5 * math.cos(TURN * t), -0.9 * math.sin(TURN * t))
     return np.array([x, y, Z]), 0.05 * math.sin(3.0 * t), 0.04 * math.cos(2.3 * t), yaw
 
 
 def main() -> None:
-    """Run it."""
+    """Run the example."""
     start_warp()
     random = np.random.default_rng(1)
     vehicle = load_vehicle("finsrov")
@@ -121,7 +122,7 @@ def main() -> None:
 
 
 def off(x: float, y: float, heading: float, position: NDArray[np.float64], yaw: float) -> tuple[float, float]:
-    """Horizontal distance [m] and turn [rad] from the truth."""
+    """Return the horizontal distance [m] and the yaw error [rad] from the truth."""
     return math.hypot(x - position[0], y - position[1]), float(wrap_angle(heading - yaw))
 
 

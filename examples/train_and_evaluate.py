@@ -1,6 +1,6 @@
-"""Train for some ten seconds, then try the policy in water and on motors it has not seen, beside a PID.
+"""Train for about ten seconds, then evaluate the policy beside a PID in water that it was not trained in.
 
-A full training takes twice as long and holds closer: `python train_and_evaluate.py 1300000`.
+A full training takes twice as long and is more precise: `python train_and_evaluate.py 1300000`.
 """
 
 import sys

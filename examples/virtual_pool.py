@@ -1,9 +1,9 @@
-"""Run the robot's whole software against a virtual pool, and compare its estimate with the truth.
+"""Run the robot's complete software against a virtual pool, and compare its estimate with the truth.
 
     python examples/virtual_pool.py
 
-Both take turns, as fast as they compute. The pool's vehicle, water and camera are drawn around the file: no controller
-has seen them. Needs the extra "vision".
+Robot and pool step alternately, as fast as they compute. The pool's vehicle, water and camera are drawn around the
+vehicle file, and no controller was tuned on them. Needs the extra "vision".
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SEED, DURATION = 7, 20.0
 
 
 def main() -> None:
-    """Keep a station for a while."""
+    """Hold a station for a while."""
     start_warp()
     vehicle = load_vehicle("finsrov")
     true_camera, calibrated_camera, settings = camera_of(vehicle, SEED, "realistic")

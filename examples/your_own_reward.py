@@ -1,4 +1,4 @@
-"""A task with other settings: gentler starts, a smaller pool and a reward that thinks more of quiet motors."""
+"""Change the settings of a task: gentler starts, and a reward with a higher weight on quiet motors."""
 
 from dataclasses import replace
 

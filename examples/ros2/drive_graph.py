@@ -1,6 +1,6 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
 """Drive the vehicles of a running ROS 2 graph by topics alone: arm, a goal, a path, teleoperation, disarm; a team also
-exchanges messages. Exit status 1: a step was not done in its time.
+exchanges messages. Exit status 1: a step was not completed in time.
 
 finssim ros2 up pool --camera corners --lockstep
 python examples/ros2/drive_graph.py finsrov
@@ -31,11 +31,11 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Bool, Header, String
 
 SILENT = 120.0
-"""Longest wait for the next time of /clock [s]."""
+"""Longest wait for the next message of /clock [s]."""
 
 
 class Vehicle:
-    """Newest messages of a vehicle, and publishers to it."""
+    """Latest messages of a vehicle, and publishers to it."""
 
     def __init__(self, node, name):
         self.name, self.odometry, self.state, self.command = name, None, None, None
@@ -68,16 +68,16 @@ class Vehicle:
 
     @property
     def speed(self):
-        """Speed ahead [m/s]."""
+        """Forward speed [m/s]."""
         return self.odometry.twist.twist.linear.x
 
     def is_in(self, state):
-        """Return whether the bridge is in a state."""
+        """Return True if the bridge is in the given state."""
         return self.state is not None and self.state.state == state
 
 
 class Driver(Node):
-    """Lets the graph take one step of /clock after the other, and gives the vehicles their orders."""
+    """Node that advances the graph step by step of /clock, and commands the vehicles."""
 
     def __init__(self, names, context=None):
         super().__init__("driver", context=context)
@@ -91,7 +91,7 @@ class Driver(Node):
         self.stamp, self.now = message.clock, message.clock.sec + 1e-9 * message.clock.nanosec
 
     def step(self):
-        """Report that this node is done with the present time, and wait for the next one."""
+        """Report that this node has finished the present time step, and wait for the next one."""
         before, begun, reported = self.now, time.monotonic(), 0.0
         while self.now == before:
             if time.monotonic() - begun > SILENT:
@@ -102,7 +102,8 @@ class Driver(Node):
             self.loop.spin_once(timeout_sec=0.1)
 
     def until(self, what, holds, longest, each=lambda vehicle: None):
-        """Step until a condition holds for every vehicle, or leave after so long [s]; `each` acts at every step."""
+        """Step until a condition holds for every vehicle, or exit after `longest` seconds; `each` is called
+        at every step."""
         end = self.now + longest
         while not all(holds(vehicle) for vehicle in self.vehicles):
             if self.now > end:
@@ -115,7 +116,7 @@ class Driver(Node):
 
 
 def pose(place, seconds=0.0):
-    """A level pose in the map at a time after the first one [s]."""
+    """Return a level pose in the map frame; `seconds` is its time after the first one [s]."""
     message = PoseStamped()
     message.header.frame_id = "map"
     message.header.stamp.sec, message.header.stamp.nanosec = int(seconds), int(seconds % 1.0 * 1e9)
@@ -125,7 +126,7 @@ def pose(place, seconds=0.0):
 
 
 def drive(driver):
-    """Give the orders, and leave when one is not followed; return what `talk` returns."""
+    """Command the vehicles, and exit if a command is not followed; return the result of `talk`."""
 
     def arm(vehicle):
         if vehicle.is_in(ThrusterState.DISARMED) and round(60.0 * driver.now) % 60 == 0:
@@ -161,7 +162,7 @@ def drive(driver):
 
 
 def talk(driver, period=0.05, count=20):
-    """Let every vehicle send numbered messages; print and return how late they come [s], by receiver."""
+    """Let every vehicle send numbered messages; print and return their delays [s], by receiver."""
     sent, late = {}, {}
     for number in range(count):
         for v in driver.vehicles:

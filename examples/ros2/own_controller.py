@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Your own controller as a ROS 2 node: it holds a place by odometry, and asks each thruster for its thrust.
+"""A controller of your own as a ROS 2 node: it holds a position by odometry, and commands the thrust of each thruster.
 
 finssim ros2 up sim --vehicle bluerov2_heavy --policy none --arm --lockstep
 python examples/ros2/own_controller.py
@@ -47,7 +47,7 @@ class OwnController(Node):
         header = Header(stamp=odometry.header.stamp, frame_id="base_link")
         command = ThrusterCommand(header=header, source="own", names=self.names, force=thrust.tolist())
         self.out.publish(command)
-        # In lock-step, time continues when every node has reported that it is done with the present step.
+        # In lock-step, time advances when every node has reported that it has finished the present step.
         self.done.publish(Header(stamp=header.stamp, frame_id=self.get_fully_qualified_name()))
 
 

@@ -21,7 +21,7 @@ import rclpy
 from rclpy.qos import qos_profile_sensor_data
 
 DISCOVERY = 2.0
-"""Time in which the other nodes are found [s]."""
+"""Time allowed for discovering the other nodes [s]."""
 
 
 def type_of(name):
@@ -40,7 +40,7 @@ def fill(message, values):
 
 
 def wait(node, seconds):
-    """Let a node work for some time [s]."""
+    """Spin a node for a while [s]."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=0.1)

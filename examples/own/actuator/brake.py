@@ -1,4 +1,5 @@
-"""An actuator of your own: a drogue on a winch, whose drag along the hull grows with the line that is out."""
+"""An actuator of your own: a drogue on a winch, whose drag along the hull grows with the length of line paid
+out."""
 
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
@@ -15,7 +16,7 @@ class Brake(Actuator):
     """Section of a vehicle file under `actuators:`; lag, rate, travel and play are keys of every kind."""
 
     position: Vector3
-    """Where it pulls, from the body origin, body frame [m], (3,)."""
+    """Point of action of the force, from the body origin, body frame [m], (3,)."""
     size: Positive
     """Drag area of the open drogue [m²]."""
 

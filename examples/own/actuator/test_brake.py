@@ -1,4 +1,4 @@
-"""Laws of the brake: nothing when closed or at rest, no power from the water, drag in proportion to its value."""
+"""Laws of the brake: zero when closed or at rest, dissipative, and proportional to its value."""
 
 import numpy as np
 from brake import BRAKE
@@ -14,7 +14,7 @@ NU = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 6))
 
 
 def wrench(nu, value):
-    """Return what the actuator adds to the wrench on a vehicle at velocities, body frame, (n, 6) [N, N m]."""
+    """Return the wrench that the actuator adds on a vehicle at velocities `nu`, body frame, (n, 6) [N, N m]."""
     plain = fs.load_vehicle("bluerov2")
     section = {"kind": "brake", "position": [-0.3, 0.0, 0.0], "size": 0.05, "minimum": 0.0, "maximum": 1.0}
     vehicle = plain.replace({"actuators": {"brake": section}})

@@ -1,4 +1,4 @@
-"""A controller of your own, evaluated beside ours: `finssim evaluate own_agent.py:Homing --task t1`."""
+"""A controller of your own, evaluated beside a PID: `finssim evaluate own_agent.py:Homing --task t1`."""
 
 from typing import Any
 
@@ -11,23 +11,23 @@ from finssim.tasks import Task
 
 
 class Homing:
-    """A spring to the goal and a damper, in position alone, as parts of the wrench limits; it keeps no memory."""
+    """Proportional and derivative control of position, in fractions of the wrench limits, without memory."""
 
     name, action, wrench_scale, period = "homing", "wrench6", 1.0, 0.1
 
     def __init__(self, vehicle: fs.Vehicle, task: Task) -> None:
-        """Take what is known of the vehicle and the task."""
+        """Store the limits of the vehicle."""
         self.limits = np.asarray(vehicle.wrench_limits)[:3]
 
     def reset(self, n: int) -> Any:
-        """Return the memory before the first of n episodes' actions."""
+        """Return the memory at the start of n episodes."""
         return None
 
     def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[np.ndarray, Any]:
-        """Return the actions, (n, 6), and the memory after.
+        """Return the actions, (n, 6), and the memory for the next call.
 
         Args:
-            memory: What the last call returned.
+            memory: Memory that the last call returned.
             reading: `position` [m], `quaternion` (xyzw) and `nu` [m/s, rad/s], a row for each world.
             goal: `position` [m] and `quaternion` of each world.
         """
@@ -37,7 +37,7 @@ class Homing:
         return action, memory
 
     def describe(self) -> dict[str, Any]:
-        """Return what a result says of it."""
+        """Return the description that results contain."""
         return {"name": self.name, "kind": "own", "action": self.action, "period_s": self.period}
 
 

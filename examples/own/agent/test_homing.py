@@ -1,4 +1,4 @@
-"""Laws of the controller: rest at the goal, limits, worlds that do not know of each other."""
+"""Laws of the controller: zero action at the goal, actions within limits, independent worlds."""
 
 import numpy as np
 from homing import Homing

@@ -29,7 +29,7 @@ PingerParameters = parameters_of(Pinger)
 
 @wp.struct
 class PingerArrays:
-    """Readings by (world, vehicle), and samples that have not arrived, which have one more index."""
+    """Readings by (world, vehicle), and the ring of samples in transit, which has one more index."""
 
     range: wp.array2d(dtype=float)  # [m]
     ring: wp.array3d(dtype=float)
@@ -39,7 +39,7 @@ class PingerArrays:
 def measure_range(
     truth: SampledState, p: PingerParameters, pinger: PingerArrays, w: int, v: int, slot: int
 ) -> bool:
-    """Write one sample into its slot; return False where there is none."""
+    """Write one sample to its slot; return False if there is none."""
     point = truth.position + wp.quat_rotate(truth.quaternion, p.position)
     pinger.ring[w, v, slot] = wp.length(point) + p.noise_std * normal(truth.key, WHITE)
     return True
@@ -47,7 +47,7 @@ def measure_range(
 
 @wp.func
 def display_range(p: PingerParameters, pinger: PingerArrays, w: int, v: int, slot: int):
-    """Copy a sample that arrives to the readings."""
+    """Copy an arriving sample to the readings."""
     pinger.range[w, v] = pinger.ring[w, v, slot]
 
 

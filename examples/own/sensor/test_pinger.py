@@ -1,4 +1,4 @@
-"""Laws of the pinger: the truth without noise, equal readings for equal seeds, noise as its section says."""
+"""Laws of the pinger: the true range without noise, equal readings for equal seeds, and the configured noise."""
 
 import numpy as np
 from pinger import PingerBatch

@@ -1,4 +1,4 @@
-"""A study of your own: how well a controller of the catalogue holds in currents, over seeds, with an interval."""
+"""A study of your own: the precision of a catalogue controller in currents, over seeds, with an interval."""
 
 import json
 import sys
@@ -13,11 +13,11 @@ SEEDS, PLANTS = (1, 2, 3), ("nominal", "current")
 
 
 def study(out: Path, trials: int = 8) -> dict[str, dict[str, Any]]:
-    """Evaluate, keep every seed's result as it is made, and continue where an earlier call stopped.
+    """Evaluate, store the result of every seed as soon as it is computed, and continue an interrupted call.
 
     Args:
         out: Directory of one JSON file for each plant and seed.
-        trials: In each plant.
+        trials: Number of trials in each plant.
 
     Returns:
         Plant -> mean position error and its 95 % interval over the seeds [m].

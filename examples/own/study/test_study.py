@@ -1,4 +1,4 @@
-"""The study repeats itself: what was made is kept, and equal seeds give equal results."""
+"""Laws of the study: existing results are kept, and equal seeds give equal results."""
 
 import study as module
 

@@ -1,4 +1,4 @@
-"""A task of one's own in plain torch: keep a depth that is drawn in every episode."""
+"""A task of your own in plain torch: keep a depth that is drawn in every episode."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from finssim.tasks import Environment, ObservationPart, Start, TorchTask, Worlds
 
 @dataclass(frozen=True, kw_only=True)
 class KeepDepth(TorchTask):
-    """Come to a depth from any other and stay there, within 5 cm."""
+    """Reach a depth and hold it within 5 cm."""
 
     name: str = "keep-depth"
     observation: tuple[ObservationPart, ...] = (
@@ -22,25 +22,26 @@ class KeepDepth(TorchTask):
     deepest: float = 0.8
 
     def reset(self, w: Worlds) -> Start:
-        """Draw a depth to keep, and another to start from."""
+        """Draw the depth to keep, and the depth at the start."""
         low, high = (0.0, 0.0, -self.deepest), (0.0, 0.0, -0.3)
         return Start(position=w.uniform(low, high), goal_position=w.uniform(low, high))
 
     def observe(self, w: Worlds) -> Sequence[Tensor]:
-        """A tensor for each part, in its unit; `w.position` is what is measured here."""
+        """Return a tensor for each part, in its unit; `w.position` is the measured position here."""
         return self.way(w), w.velocity[:, 2]
 
     def reward(self, w: Worlds) -> Tensor:
-        """A slope that does not vanish at the depth, one everywhere, and cheap thrusts; here of the truth."""
+        """Return a reward with a slope near the depth and one far from it, less the effort; `w.position` is
+        the truth here."""
         error = self.way(w).abs()
         return torch.exp(-error / 0.1) - error - 0.05 * w.action.square().mean(dim=1)
 
     def inside(self, w: Worlds) -> Tensor:
-        """Success is to stay here for `hold` seconds."""
+        """Return True within the tolerance; success is to stay there for `hold` seconds."""
         return self.way(w).abs() < 0.05
 
     def terminated(self, w: Worlds) -> Tensor:
-        """Return where the vehicle is out of the water, which is a failure."""
+        """Return True if the vehicle is out of the water, which is a failure."""
         return w.position[:, 2] > 0.3
 
     def way(self, w: Worlds) -> Tensor:

@@ -1,4 +1,4 @@
-"""The task is sound: equal seeds are equal, no world knows of another, no episode of the one before."""
+"""Laws of the task: equal seeds give equal results, and worlds and episodes are independent."""
 
 from keep_depth import KeepDepth
 
@@ -6,5 +6,5 @@ from finssim.tasks import check_task
 
 
 def test_the_task_is_sound():
-    """Random actions find no mistake in observation, reward, start and end."""
+    """Random actions reveal no mistake in observation, reward, start and end."""
     check_task(KeepDepth())

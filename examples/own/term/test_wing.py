@@ -1,4 +1,4 @@
-"""Laws of the wing: nothing at rest, nothing without parameters, no power from the water."""
+"""Laws of the wing: zero at rest and without parameters, and dissipative."""
 
 import numpy as np
 from wing import WING
@@ -15,7 +15,7 @@ NU = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 6))
 
 
 def wrench(nu, **parameters):
-    """Return what the term adds to the wrench on a vehicle at velocities, body frame, (n, 6) [N, N m]."""
+    """Return the wrench that the term adds on a vehicle at velocities `nu`, body frame, (n, 6) [N, N m]."""
     plain = fs.load_vehicle("bluerov2")
     vehicle = plain.replace({"hydrodynamics.calibrated.wing": parameters})
     gained = fs.acceleration(vehicle, DEEP, nu) - fs.acceleration(plain, DEEP, nu)

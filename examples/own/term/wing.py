@@ -1,4 +1,4 @@
-"""A hydrodynamic term of one's own: a wing that lifts with the speed ahead and damps pitch."""
+"""A hydrodynamic term of your own: a wing whose lift grows with the forward speed, and which damps pitch."""
 
 import numpy as np
 import warp as wp
@@ -26,13 +26,13 @@ def wing_wrench(nu_r: vec6, lift: float, moment: float) -> vec6:
 
 @wp.func
 def wing_slope(nu_r: vec6, lift: float, moment: float) -> vec6:
-    """-dZ/dw and -dM/dq: what of it acts as damping, for the integrator to take implicitly."""
+    """Return -dZ/dw and -dM/dq: the damping part of the term, which the integrator takes implicitly."""
     speed = wp.abs(nu_r[0])
     return vec6(0.0, 0.0, lift * speed, 0.0, wp.max(moment, 0.0) * speed, 0.0)
 
 
 def check_wing(wing: Wing) -> tuple[bool, str]:
-    """Yield the findings that `finssim vehicles show` lists among the checks."""
+    """Return whether the section passes, and the text of the check that `finssim vehicles show` prints."""
     return (
         wing.lift < 500.0,
         f"lift {wing.lift:g} N s²/m², expected < 500: the wing would be larger than the vehicle",
