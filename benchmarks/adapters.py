@@ -1,8 +1,8 @@
 """Overhead of each learning library's interface over the batched step: `python benchmarks/adapters.py [--json FILE]`.
 
-Worlds, task and actions are the same, episodes end at different times, and rounds of the raw step and of the adapter's
-alternate, so that the ratio depends little on what else the machine does: the median of the rounds' ratios. PettingZoo
-and Gymnasium's `Env` step one world, and are compared with one.
+Worlds, task and actions are the same, episodes end at different times, and rounds of the raw step and of the adapter
+alternate, so that the median of the rounds' ratios depends little on other load. PettingZoo and Gymnasium's `Env` step
+one world, and are compared with one world.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ROUNDS, STEPS = 20, 20
 
 
 def raw(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """The batched step itself."""
+    """Return the step of the batched environment itself."""
     return lambda: environment.step(action)
 
 
 def gymnasium_vector(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """Gymnasium's `VectorEnv`."""
+    """Return the step of Gymnasium's `VectorEnv`."""
     from finssim.learning.gymnasium_env import VectorEnv
 
     env = VectorEnv(task=environment)
@@ -38,7 +38,7 @@ def gymnasium_vector(environment: Environment, action: np.ndarray) -> Callable[[
 
 
 def sb3(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """Stable-Baselines3's `VecEnv`."""
+    """Return the step of Stable-Baselines3's `VecEnv`."""
     from finssim.learning.sb3 import Sb3VecEnv
 
     env = Sb3VecEnv(environment)
@@ -47,7 +47,7 @@ def sb3(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
 
 
 def torchrl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """TorchRL's `EnvBase`, the step with the reset of what ended."""
+    """Return the step of TorchRL's `EnvBase`, including the reset of finished episodes."""
     import torch
 
     from finssim.learning.torchrl_env import TorchRlEnv
@@ -65,7 +65,7 @@ def torchrl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
 
 
 def rsl_rl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """RSL-RL's `VecEnv`."""
+    """Return the step of RSL-RL's `VecEnv`."""
     import torch
 
     from finssim.learning.rsl_rl_env import RslRlVecEnv
@@ -75,7 +75,7 @@ def rsl_rl(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
 
 
 def gymnasium_single(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """Gymnasium's `Env`: one world, reset where it ends."""
+    """Return the step of Gymnasium's `Env`: one world, reset when its episode ends."""
     from finssim.learning.gymnasium_env import Env
 
     env = Env(environment)
@@ -89,7 +89,7 @@ def gymnasium_single(environment: Environment, action: np.ndarray) -> Callable[[
 
 
 def pettingzoo(environment: Environment, action: np.ndarray) -> Callable[[], Any]:
-    """PettingZoo's `ParallelEnv`: one world, reset where it ends."""
+    """Return the step of PettingZoo's `ParallelEnv`: one world, reset when its episode ends."""
     from finssim.learning.pettingzoo_env import PettingZooEnv
 
     env = PettingZooEnv(environment)
@@ -110,7 +110,7 @@ SINGLE = (gymnasium_single, pettingzoo)
 
 
 def seconds(step: Callable[[], Any]) -> float:
-    """Time of one step [s]."""
+    """Measure the time of one step [s]."""
     start = time.perf_counter()
     for _ in range(STEPS):
         step()
@@ -120,7 +120,7 @@ def seconds(step: Callable[[], Any]) -> float:
 def compare(
     adapter: Callable[..., Callable[[], Any]], task: str, worlds: int, single: bool
 ) -> dict[str, float]:
-    """Steps per second of the raw step and of the adapter's, and the ratio of their times."""
+    """Measure steps per second of the raw step and of the adapter, and the ratio of their times."""
     both = []
     for kind in (raw, adapter):
         environment = finssim.make(task, worlds=worlds, seed=1, auto_reset=not single)
@@ -133,7 +133,7 @@ def compare(
         seconds(step)
     times = []
     for turn in range(ROUNDS):
-        # Who comes first alternates too: the processor's clock falls within a pair.
+        # The order alternates too, since the processor's clock falls within a pair.
         order = (0, 1) if turn % 2 else (1, 0)
         took = {k: seconds(both[k]) for k in order}
         times.append((took[0], took[1]))
@@ -145,7 +145,7 @@ def compare(
 
 
 def main() -> None:
-    """Print the figures; with --json write them."""
+    """Print the figures; write them with --json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="t1")
     parser.add_argument("--worlds", type=int, default=4096)

@@ -1,7 +1,7 @@
-"""Speed of the physics behind ArduSub's SITL, with a client that does no physics: `python benchmarks/ardusub_sitl.py`.
+"""Speed of the physics server for ArduSub's SITL with a client without physics: `python benchmarks/ardusub_sitl.py`.
 
-Lock-step: frames as fast as both go. Real time: 400 frames a second, and what the server's processor has left. The
-server is a process of its own; its time is counted from its first frame.
+Lock-step: frames as fast as both processes allow. Real time: 400 frames per second, and the processor time that the
+server needs. The server is a separate process; its time is counted from its first frame.
 """
 
 import argparse
@@ -21,7 +21,8 @@ PULSES = (1400, 1400, 1600, 1600, 1550, 1550, 1550, 1550, *[1500] * 8)
 
 
 def serve(wire, dvl: bool, duration: float) -> None:
-    """In the server's process: tell the address, serve, tell the processor's time and the frames."""
+    """Run in the server's process: send the address, serve, then send the processor time and the number of
+    frames."""
     log = DvlServer(("127.0.0.1", 0)) if dvl else None
     tank = RectangularPool(length=2000.0, width=2000.0, depth=20.0)
     world = SitlWorld(
@@ -35,7 +36,8 @@ def serve(wire, dvl: bool, duration: float) -> None:
 
 
 def measure(duration: float, *, paced: bool, dvl: bool) -> tuple[float, float, dict[str, int]]:
-    """Wall time and the server's processor time for so many simulated seconds, and what it counted."""
+    """Measure wall time and the server's processor time for a simulated duration [s], and return its
+    counters."""
     ours, theirs = multiprocessing.Pipe()
     process = multiprocessing.Process(target=serve, args=(theirs, dvl, duration))
     process.start()

@@ -1,17 +1,17 @@
-"""Calibration of drawn plants from logs as people have them: is it better than the catalogue's file, and honest?
+"""Accuracy and interval coverage of calibrations of drawn plants from logs such as users have.
 
     python benchmarks/calibration_draws.py [--draws 50] [--first 0] [--json FILE] [--passive] [--unequal 0.05]
 
-Every draw is a BlueROV2 Heavy with coefficients of its own, driven by sticks, one axis a trial, recorded at 5 Hz:
-pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up to
-0.1 s, a tether that pulls with up to 2 N in one direction of the world, a stiffness that the file does not know,
-horizontal thrusters and centres of gravity up to 5 cm from where the file has them, and in every second draw no roll or
-pitch. Fitted on the lowest level, compared on two higher ones; intervals against the truth. The plant itself replays
-these trials no better than its tether, noise and clock allow; a file that does as well by chance leaves nothing to
-gain. With --json, every finished draw is written to the file, and draws that it already has are not repeated. With
---passive, five spins and five coasts of every draw instead, let go without thrust: measured at 20, 5 or 1 Hz, pulled
-at a little, with centres as in the file and the inertia given. With --unequal, the thrust of every thruster is
-multiplied by a number of its own, 1 with that standard deviation.
+Every draw is a BlueROV2 Heavy with its own coefficients, driven by stick commands, one axis per trial, recorded at
+5 Hz: pulses without a battery voltage (thrust 0.65 to 1.1 of the table's), motion that leads or lags the pulses by up
+to 0.1 s, a tether that pulls with up to 2 N in one direction of the world, a stiffness that differs from the file's,
+horizontal thrusters and centres of gravity up to 5 cm from their positions in the file, and in every second draw no
+roll or pitch. The lowest level is fitted, and the two higher ones are replayed; intervals are compared with the truth.
+The plant itself replays these trials no better than tether, noise and clock allow; where the file is as good by chance,
+there is nothing to gain. With --json, every finished draw is written to the file, and draws in it are not repeated.
+With --passive, each draw consists of five spins and five coasts that are released without thrust: measured at 20, 5 or
+1 Hz, with a slight pull, centres as in the file, and known inertia. With --unequal, the thrust of every thruster is
+multiplied by its own factor, 1 with the given standard deviation.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from finssim.vehicles import AXES, Vehicle, load_vehicle
 
 FITTED = ("surge", "sway", "heave", "yaw")
 LEVELS = (0.15, 0.25, 0.4)
-"""Of the vehicle's wrench limits; the first is fitted."""
+"""Levels as fractions of the vehicle's wrench limits; the first is fitted."""
 RATE, SECONDS = 50.0, 26.0
 NOISE = NoiseProfile(
     velocity_std=0.01, gyro_std=0.01, attitude_std=0.003, yaw_std=0.003, position_std=0.003, depth_std=0.01
@@ -48,15 +48,16 @@ SET = "hydrodynamics.calibrated"
 PLACE = 0.05
 """Largest distance of a thruster's height or a centre from the file's [m]."""
 GAIN = 1.2
-"""NRMSE of the file over that of the plant itself from which there is something to gain."""
+"""Ratio of the file's NRMSE to that of the plant itself from which there is something to gain [-]."""
 
 
 def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float, np.ndarray]:
-    """A plant, its thrust over the file's, and the tether's force on it [N], world frame, (3,)."""
+    """Draw a plant, the ratio of its thrust to the file's, and the tether's force on it [N], world frame,
+    (3,)."""
     chosen = vehicle.hydrodynamics["calibrated"]
     size = lambda std: np.exp(std * rng.standard_normal(6))  # noqa: E731
     mass = np.diag(chosen.added_mass) * size(0.35)
-    # The file says zero of some dampings; every real axis has some of both.
+    # The file has zero for some damping coefficients; every real axis has both linear and quadratic damping.
     typical = np.array([20.0, 25.0, 30.0, 0.3, 0.5, 0.3])
     linear = 0.4 * typical * size(0.6)
     quadratic = np.diag(chosen.quadratic_damping) * size(0.4)
@@ -80,7 +81,7 @@ def drawn(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Vehicle, float, n
 
 
 def pulling(force: np.ndarray) -> Callable[[Simulator], None]:
-    """What pulls at every vehicle with a force [N], (3,), in the world frame."""
+    """Return a function that applies a force [N], (3,), in the world frame, to every vehicle."""
 
     def pull(simulator: Simulator) -> None:
         q = simulator.numpy("quaternion")[:, 0]
@@ -91,12 +92,12 @@ def pulling(force: np.ndarray) -> Callable[[Simulator], None]:
 
 
 def horizontal(vehicle: Vehicle) -> list:
-    """The thrusters that push sideways, with their names."""
+    """Return the horizontal thrusters with their names."""
     return [(name, t) for name, t in vehicle.thrusters.items() if abs(t.axis[2]) < 0.5]
 
 
 def sticks(axis: str, level: float, vehicle: Vehicle, rng: np.random.Generator, name: str) -> Programme:
-    """Steps of random length and height to both sides, with a pause here and there."""
+    """Return a programme of steps of random duration and height in both directions, with occasional pauses."""
     n = round(SECONDS * RATE)
     tau, t = np.zeros((n, 6)), 0.0
     i = AXES.index(axis)
@@ -110,7 +111,8 @@ def sticks(axis: str, level: float, vehicle: Vehicle, rng: np.random.Generator, 
 
 
 def logged(trial: Trial, lead: float, tilt: bool) -> Trial:
-    """At 5 Hz, the motion on a clock of its own, without the header's help."""
+    """Return a trial as logged at 5 Hz, with a separate clock of the motion, and without information in its
+    header."""
     every, shift = 10, round(lead * RATE)
     rows = np.arange(10, len(trial.t) - 10, every)
     names = ["u", "v", "w", "p", "q", "r", "x", "y", "z"]
@@ -122,11 +124,11 @@ def logged(trial: Trial, lead: float, tilt: bool) -> Trial:
 
 
 def draw(seed: int, unequal: float = 0.0) -> dict[str, object]:
-    """One plant: scores of both files by axis, and each interval with its truth.
+    """Fit one plant; return the scores of both files by axis, and each interval with the true value.
 
     Args:
-        seed: Of the plant, its trials and its noise.
-        unequal: Standard deviation of the thrusts of single thrusters, as a part of their own [-].
+        seed: Seed of the plant, its trials and their noise.
+        unequal: Relative standard deviation of the thrusts of single thrusters [-].
     """
     rng = np.random.default_rng([7, seed])
     vehicle = load_vehicle("bluerov2_heavy")
@@ -178,13 +180,14 @@ def draw(seed: int, unequal: float = 0.0) -> dict[str, object]:
 
 
 RELEASES, PUSHED = 5, 4.0
-"""Trials of each axis without thrust, and the time of the push before them [s]."""
+"""Number of trials of each axis without thrust, and the duration of the push before each [s]."""
 TUGS = np.array([0.2, 0.2, 0.2, 0.0, 0.0, 0.03])
-"""Standard deviation of what pulls, anew for each release [N, N m]."""
+"""Standard deviation of the external pull, drawn for each release [N, N m]."""
 
 
 def draw_released(seed: int) -> dict[str, object]:
-    """One plant, let go after a spin and after a run ahead: each interval with its truth, and what is written."""
+    """Fit one plant that is released after a spin and after a surge run; return each interval with the
+    true value, and the parameters that were written."""
     rng = np.random.default_rng([8, seed])
     vehicle = load_vehicle("bluerov2_heavy")
     plant, _, _ = drawn(vehicle, rng)
@@ -287,7 +290,7 @@ def main() -> None:
 
 
 def report_scores(rows: list[dict]) -> None:
-    """Draws that are better on every axis."""
+    """Print the number of draws that are better on every axis."""
     found = np.array(
         [
             [[r["scores"][w].get(a, math.nan) for a in FITTED] for w in ("calibrated", "file", "truth")]
@@ -313,7 +316,7 @@ def report_scores(rows: list[dict]) -> None:
 
 
 def report_intervals(rows: list[dict]) -> None:
-    """How often drag is written, and how often intervals hold the truth."""
+    """Print how often drag is written, and how often intervals contain the true value."""
     for axis in sorted({axis for r in rows for axis in r.get("written", {})}):
         print(
             f"  {axis}: drag written in {np.mean([r['written'][axis] for r in rows]):.0%} of {len(rows)} draws"

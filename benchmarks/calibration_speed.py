@@ -1,7 +1,7 @@
-"""Wall time of calibrating four axes on 32 trials of 15 s: `python benchmarks/calibration_speed.py [--json FILE]`.
+"""Wall time of calibrating four axes from 32 trials of 15 s: `python benchmarks/calibration_speed.py [--json FILE]`.
 
-Measured: the call in this process, a second time when everything is compiled, and the whole command `finssim calibrate
-hydrodynamics` in a process of its own.
+Measured are the call in this process, the same call when everything is compiled, and the command `finssim calibrate
+hydrodynamics` in its own process.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TRIALS = 32
 
 
 def make_trials() -> list[Trial]:
-    """32 trials: four levels on four axes in both directions, each brought to 15 s."""
+    """Simulate 32 trials: four levels on four axes in both directions, each 15 s long."""
     vehicle = load_vehicle("finsrov")
     limits = dict(zip(AXES.split(","), vehicle.wrench_limits[[0, 1, 2, 5]], strict=True))
     levels = {axis: [share * limit for share in (0.2, 0.4, 0.6, 0.8)] for axis, limit in limits.items()}
@@ -40,7 +40,7 @@ def make_trials() -> list[Trial]:
 
 
 def _of_length(p: Programme) -> Programme:
-    """The programme cut, or extended without thrust, to `DURATION`."""
+    """Cut a programme to `DURATION`, or extend it without thrust."""
     n = round(DURATION * p.rate)
     missing = max(0, n - len(p.phase))
     return Programme(
@@ -53,7 +53,7 @@ def _of_length(p: Programme) -> Programme:
 
 
 def main() -> None:
-    """Measure, print, write JSON."""
+    """Measure, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()

@@ -1,12 +1,12 @@
-"""False alarms of `trials check` on correct random logs, and how many logs with one known fault it notices.
+"""False alarms of `trials check` on correct random logs, and its detection rate on logs with one known fault.
 
     python benchmarks/check_alarms.py [--logs 1000] [--faulty 100] [--out alarms.jsonl]
 
 A log is a run of a random catalogue vehicle whose plant differs from its file, pushed along random axes at 0.5 to 60 %
-of its wrench limits or drifting without thrust. The simulator moves it, and sensors of random noise, rate and choice of
-columns measure it. No remark may refuse such a log or ask for care, except for what is true of it (`TRUE`). The first
-logs are then spoilt by one fault at a time; a fault counts as noticed where a remark appears that the correct log does
-not have. Results are kept by log in the file, and the next call continues there.
+of its wrench limits or drifting without thrust. The simulator moves it, and sensors with random noise, rate and
+columns measure it. No finding may refuse such a log or ask for care, except those that are true of it (`TRUE`). The
+first logs are then corrupted by one fault at a time; a fault counts as detected if a finding appears that the correct
+log does not have. Results are stored by log in the file, and the next call continues there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ VEHICLES = ("bluerov2", "bluerov2_einarsson", "bluerov2_heavy", "bluerov2_heavy_
 TRUE = {"slow", "saturated", "in_dead_zone", "command_beyond", "nothing_excited", "nothing_measured", "voltage_missing",
         "pulses_dead", "inputs_zero", }  # fmt: skip
 GROUP = 10
-"""Logs of one vehicle that are simulated together."""
+"""Number of logs of one vehicle that are simulated together."""
 COMMAND_RATE = 50.0
 RATES = (5.0, 10.0, 20.0, 25.0, 50.0, 100.0)
 GROUPS = {
@@ -48,7 +48,8 @@ PLANTS = ("M_A", "D1", "D2", "gain")
 
 
 def programme(vehicle: Vehicle, rng: np.random.Generator, name: str) -> Programme:
-    """Pushes of random length, height and sign, or sums of sines, along one to three axes; often with a coast."""
+    """Return a programme of pushes of random duration, height and sign, or sums of sines, along one to three
+    axes; often with a coast."""
     seconds = float(rng.uniform(10.0, 40.0))
     n = round(seconds * COMMAND_RATE)
     tau, t = np.zeros((n, 6)), np.arange(n) / COMMAND_RATE
@@ -71,7 +72,8 @@ def programme(vehicle: Vehicle, rng: np.random.Generator, name: str) -> Programm
 
 
 def noise(rng: np.random.Generator) -> NoiseProfile:
-    """Standard deviations over a wide range; half of the time the vehicle's own IMU and pressure sensor."""
+    """Draw standard deviations over a wide range, or, half of the time, take those of the vehicle's IMU and
+    pressure sensor."""
     spread = {
         "velocity_std": (0.001, 0.05), "attitude_std": (0.0005, 0.03), "yaw_std": (0.001, 0.06),
         "position_std": (0.001, 0.05), "depth_std": (0.001, 0.05), "gyro_std": (0.0005, 0.05), "accel_std": (0.01, 0.5),
@@ -82,7 +84,7 @@ def noise(rng: np.random.Generator) -> NoiseProfile:
 
 
 def plants(vehicle: Vehicle, worlds: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Added mass, damping and thrust of each world's plant: the file's, times a random factor."""
+    """Draw added mass, damping and thrust of each world's plant: the file's, times a random factor."""
     truth = Simulator(vehicle, worlds=1).plant.fields
     drawn = {}
     for name in PLANTS:
@@ -93,7 +95,7 @@ def plants(vehicle: Vehicle, worlds: int, rng: np.random.Generator) -> dict[str,
 
 
 def world(recording: Recording, w: int) -> Recording:
-    """The recording of one world."""
+    """Return the recording of one world."""
     parts = {f.name: getattr(recording, f.name)[:, w : w + 1] for f in fields(recording) if f.name != "step"}
     return replace(recording, **parts)
 
@@ -101,7 +103,7 @@ def world(recording: Recording, w: int) -> Recording:
 def measured(
     recording: Recording, plan: Programme, vehicle: Vehicle, rng: np.random.Generator, seed: int
 ) -> Trial:
-    """A log as random equipment writes it: columns, rates, inputs."""
+    """Return a log as random equipment would write it: columns, rates, inputs."""
     rate = float(rng.choice(RATES))
     chosen = {group: columns for group, columns in GROUPS.items() if rng.random() < 0.75}
     if not {"velocity", "position", "rates"} & chosen.keys():
@@ -123,7 +125,7 @@ def measured(
     quiet = np.abs(plan.tau_desired).max(axis=1) > 0.0
     last = float(np.flatnonzero(quiet)[-1]) / COMMAND_RATE + 1.5 if quiet.any() else 0.0
     trial = replace(trial, channels=channels, header=header, phase=None)
-    if trial.t[-1] - last > 4.0 and rng.random() < 0.5:  # the drift after the pushes, by itself
+    if trial.t[-1] - last > 4.0 and rng.random() < 0.5:  # the drift after the pushes alone
         rows = trial.t > last
         kept = {c: v[rows] for c, v in channels.items() if not c.startswith(kind) and not c.startswith("tau")}
         trial = replace(trial, t=trial.t[rows], channels=kept, header=Header(passive=True))
@@ -131,7 +133,7 @@ def measured(
 
 
 def logs(group: int) -> tuple[Vehicle, list[Trial]]:
-    """The correct logs of one group."""
+    """Return the correct logs of one group."""
     rng = np.random.default_rng([32, group])
     vehicle = load_vehicle(VEHICLES[group % len(VEHICLES)])
     plans = [programme(vehicle, rng, f"log_{group * GROUP + k}") for k in range(GROUP)]
@@ -146,7 +148,7 @@ def times(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def later(t: np.ndarray, seconds: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Values as they stand in a log whose stream has stamps that are too late."""
+    """Return a function that shifts values as late stamps of a stream do."""
 
     def shifted(y: np.ndarray) -> np.ndarray:
         known = np.isfinite(y)
@@ -157,7 +159,7 @@ def later(t: np.ndarray, seconds: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def faults(trial: Trial) -> dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]]:
-    """Fault -> column -> what it does to it; only where the log has the columns."""
+    """Return fault -> column -> function that corrupts it, for the columns that the log has."""
     turn, deg = times(-1.0), times(57.29578)
     wanted: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {}
     for name in (*"uvwpqr", "roll", "pitch", "yaw", "ax", "ay", "az", "x", "y", "z", "depth"):
@@ -184,7 +186,7 @@ def faults(trial: Trial) -> dict[str, dict[str, Callable[[np.ndarray], np.ndarra
 
 
 def alarms(trial: Trial, vehicle: Vehicle) -> list[str]:
-    """Remarks that refuse the log or ask for care, except what is true of a correct one."""
+    """Return findings that refuse the log or ask for care, except those that are true of a correct log."""
     (report,) = check_trials([trial], vehicle)
     return [
         f"{f.severity}: {f.code}: {f}" for f in report.findings if f.severity != "note" and f.code not in TRUE
@@ -192,7 +194,7 @@ def alarms(trial: Trial, vehicle: Vehicle) -> list[str]:
 
 
 def examine(group: int, logged: int, faulty: int) -> list[dict]:
-    """Alarms of each correct log of a group, and for the first logs which faults were noticed."""
+    """Return the alarms of each correct log of a group, and for the first logs the detected faults."""
     vehicle, trials = logs(group)
     rows = []
     for k, trial in enumerate(trials):
@@ -241,7 +243,7 @@ def main() -> None:
 
 
 def report(rows: list[dict]) -> None:
-    """False alarms by remark, and the share of each fault that was noticed."""
+    """Print false alarms by finding, and the detection rate of each fault."""
     bad = [row for row in rows if row["alarms"]]
     print(f"\nfalse alarms: {len(bad)} of {len(rows)} correct logs ({len(bad) / len(rows):.2%})")
     refused = [row for row in bad if any(text.startswith("refused") for text in row["alarms"])]

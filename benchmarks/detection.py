@@ -1,11 +1,11 @@
-"""How well and how fast tags are found: `python benchmarks/detection.py [accuracy] [speed] [--json FILE] [--count 60]`.
+"""Accuracy and speed of tag detection: `python benchmarks/detection.py [accuracy] [speed] [--json FILE] [--count 60]`.
 
 Parts:
-    accuracy  every refinement on drawn tags whose corners are known: share found, bias, error
-    speed     processor time on pictures of 1280x720 with two tags: the whole picture, and regions around the tags
+    accuracy  every refinement on rendered tags with known corners: detection rate, bias, error
+    speed     processor time on pictures of 1280x720 with two tags: the full picture, and regions around the tags
 
-Drawn are tags of 20 to 45 px at random places, turns and tilts, blurred, with noise of 2.5 gray levels and a white
-margin of 0.78 cells. Run alone, with OMP_NUM_THREADS=1.
+The rendered tags have edges of 20 to 45 px, random positions, rotations and tilts, blur, noise of 2.5 gray levels and a
+white margin of 0.78 cells. Run alone, with OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MARGIN = 0.78
 
 
 def main() -> None:
-    """Run the parts that were asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", default=["accuracy", "speed"])
     parser.add_argument("--count", type=int, default=60)
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def accuracy(count: int) -> list[dict[str, Any]]:
-    """Rows of share found and errors."""
+    """Return rows of detection rate and errors."""
     rows = []
     print(f"{'family':17} {'edge':>4} {'blur':>4}  {'refine':9} found   rms  |bias|  outward [px]")
     for family in ("tag25h9", "tag36h11", "tagStandard41h12"):
@@ -77,7 +77,7 @@ def accuracy(count: int) -> list[dict[str, Any]]:
 def drawn(
     family: str, edge: float, blur: float, count: int
 ) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.uint8]]]:
-    """Tag, true corners and picture."""
+    """Yield tag, true corners and picture."""
     rng = np.random.default_rng(7)
     side = round(2 * edge + 60)
     for k in range(count):
@@ -94,7 +94,8 @@ def drawn(
 
 
 def measured(way: Detector, pictures: list[tuple[int, Any, Any]]) -> dict[str, float]:
-    """Share found, root mean square error per axis, largest mean error of an axis, mean error outward [px]."""
+    """Return detection rate, root mean square error per axis, largest mean error of an axis, and mean outward
+    error [px]."""
     missed, outward = [], []
     for tag, ring, picture in pictures:
         for found in way.detect(picture):
@@ -115,21 +116,21 @@ def measured(way: Detector, pictures: list[tuple[int, Any, Any]]) -> dict[str, f
 
 @dataclass
 class Counting:
-    """A detector that counts the pixels that it searches."""
+    """Detector that counts the pixels that it searches."""
 
     detector: Detector
     pixels: int = 0
     pictures: int = 0
 
     def detect(self, image: NDArray[np.uint8], region: Region | None = None) -> list[Detection]:
-        """Search a picture, or a part of it."""
+        """Search a picture, or a region of it."""
         left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
         self.pixels += image[max(top, 0) : bottom, max(left, 0) : right].size
         return self.detector.detect(image, region)
 
 
 def speed() -> list[dict[str, Any]]:
-    """Processor time per picture, the best of several rounds [ms]."""
+    """Measure the processor time per picture, the best of several rounds [ms]."""
     rows = []
     pictures = [moving(k) for k in range(8)]
     print(f"{'refine':9} whole [ms]  regions [ms]  ratio  pixels searched")
@@ -154,7 +155,7 @@ def speed() -> list[dict[str, Any]]:
 
 
 def moving(k: int) -> NDArray[np.uint8]:
-    """A picture of 1280x720 with noise, tiles and the two tags of a vehicle on its way."""
+    """Return a picture of 1280x720 with noise, tiles and the two tags of a moving vehicle."""
     rings = {
         tag: pose_corners(36.0, centre=(500 + 5 * k + shift, 330 + 3 * k), turn=0.4 + 0.02 * k)
         for tag, shift in ((15, 0.0), (16, 60.0))
@@ -167,7 +168,7 @@ def moving(k: int) -> NDArray[np.uint8]:
 
 
 def best(work: Callable[[], Any], rounds: int = 7) -> float:
-    """Least processor time of a piece of work [ms]."""
+    """Return the least processor time of a call [ms]."""
     times = []
     for _ in range(rounds):
         start = time.process_time()

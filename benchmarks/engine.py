@@ -42,7 +42,7 @@ MUJOCO_BODY = """<mujoco><option timestep="0.01" integrator="Euler"/><worldbody>
 
 
 def best_rate(step: Callable[[], object], work: float, finish: Callable[[], object] = lambda: None) -> float:
-    """Return the work done per second of wall time in the best of several rounds, which take `SECONDS` in total.
+    """Return the work per second of wall time in the best of several rounds, which last `SECONDS` in total.
 
     Args:
         step: Function that is timed; called often enough to fill the time.
@@ -100,7 +100,7 @@ def faces_rate(worlds: int = 1024) -> float:
 
 
 def mujoco_rate() -> float | None:
-    """Measure steps per second of MuJoCo with one free body; None where it is not installed."""
+    """Measure steps per second of MuJoCo with one free body; None if it is not installed."""
     try:
         import mujoco
     except ImportError:

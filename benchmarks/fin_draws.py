@@ -1,12 +1,12 @@
-"""Identification of drawn vehicles with fins from the manoeuvres of their autopilot: how near, and how honest?
+"""Accuracy and interval coverage of fits of drawn vehicles with fins, from manoeuvres under their autopilot.
 
     python benchmarks/fin_draws.py [--vehicle remus100] [--draws 10] [--first 0] [--json FILE]
 
-Every draw is the vehicle with an added mass and a drag of its own and another slope of the lift of its fins (factors
-of about 1.2 either way), run through the manoeuvres by the autopilot of its file, and measured with the noise and bias
-of its own gyroscopes, a velocity to 1 cm/s (DVL) and an attitude to 5 mrad. The fit starts from the file. A draw that
-the autopilot does not hold is left out and counted. With --json, every finished draw is written to the file, and draws
-that it already has are not repeated.
+Every draw is the vehicle with its own added mass, drag and lift slope of the fins (factors of about 1.2 in either
+direction), run through the manoeuvres by the autopilot of its file, and measured with noise and bias of its
+gyroscopes, a velocity to 1 cm/s (DVL) and an attitude to 5 mrad. The fit starts from the file. Draws that the
+autopilot cannot stabilise are omitted and counted. With --json, every finished draw is written to the file, and draws
+in it are not repeated.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FITTED = ("surge", "sway", "heave", "pitch", "yaw")
 RATE = 20.0
 """Rows of the trials [Hz]."""
 LIMIT = 0.1
-"""Relative error that is asked for."""
+"""Required relative error [-]."""
 
 
 def draw(vehicle: Vehicle, number: int) -> dict:
-    """One draw: parameter -> truth, estimate and interval."""
+    """Fit one draw; return parameter -> true value, estimate and interval."""
     start = time.process_time()
     truth, slope = drawn_body(vehicle, number)
     try:
@@ -58,7 +58,7 @@ def draw(vehicle: Vehicle, number: int) -> dict:
 
 
 def summary(draws: list[dict]) -> None:
-    """Print how near and how honest the estimates are."""
+    """Print errors and interval coverage of the estimates."""
     lost = [d["draw"] for d in draws if "lost" in d]
     print(f"not held by the autopilot: {lost or 'none'}")
     draws = [d for d in draws if "lost" not in d]
@@ -78,7 +78,7 @@ def summary(draws: list[dict]) -> None:
 
 
 def main() -> None:
-    """Run the draws that are missing."""
+    """Run the missing draws."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,8 +1,8 @@
-"""Time the estimator takes for a sample: `python benchmarks/fusion.py [--json FILE]`.
+"""Processor time of the estimator per sample: `python benchmarks/fusion.py [--json FILE]`.
 
-A minute of IMU at 100 Hz, depth at 20 Hz and a camera at 30 Hz whose fixes come 60 ms after their exposure, so that
-each of them runs some eight later samples again; then a prediction of the state 10 ms ahead. Medians of processor time,
-which other load disturbs less than the clock's, and the share of one core that the live estimator would take.
+A minute of IMU at 100 Hz, depth at 20 Hz and a camera at 30 Hz whose fixes arrive 60 ms after exposure, so that each
+fix repeats about eight later samples; then a prediction of the state 10 ms ahead. Reported are medians of processor
+time, which other load disturbs less than wall time, and the fraction of one core that the live estimator needs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RATES = {"imu": 100.0, "depth": 20.0, "vision": 30.0}
 
 
 def samples(*, tilt: bool) -> list[Sample]:
-    """A vehicle that circles, level; with or without roll and pitch from the IMU."""
+    """Return the samples of a level vehicle on a circle, with or without roll and pitch from the IMU."""
     rng = np.random.default_rng(0)
     found: list[Sample] = []
     for t in np.arange(0.0, DURATION, 1.0 / RATES["imu"]):
@@ -45,7 +45,7 @@ def samples(*, tilt: bool) -> list[Sample]:
 
 
 def measure(mode: str, *, tilt: bool) -> dict[str, float]:
-    """Microseconds of a sample of each stream and of a prediction, and the share of a core [%]."""
+    """Measure microseconds per sample of each stream and per prediction, and the fraction of a core [%]."""
     estimator, took = Estimator(mode=mode), {name: [] for name in (*RATES, "predict")}
     for sample in samples(tilt=tilt):
         took[sample.stream].append(_timed(lambda s=sample: estimator.add(s)))
@@ -64,7 +64,7 @@ def _timed(call: Callable[[], Any]) -> float:
 
 
 def main() -> None:
-    """Measure, print, write JSON."""
+    """Measure, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()

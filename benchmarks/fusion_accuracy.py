@@ -1,7 +1,7 @@
-"""How far the fusion is off: `python benchmarks/fusion_accuracy.py [--seeds N]`.
+"""Accuracy of the fusion: `python benchmarks/fusion_accuracy.py [--seeds N]`.
 
-Simulated streams whose path is known exactly, in both modes, with what can go wrong with them; and recordings of a real
-BlueROV2, its gyro at 20 Hz with one heading a second against motion capture at the full rate.
+Simulated streams with an exactly known path and typical faults, in both modes; and recordings of a real BlueROV2, with
+its gyro at 20 Hz and one heading per second, compared with motion capture at the full rate.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ interface: {height: 1.0}
 
 
 def scenario(name: str, seed: int) -> list:
-    """The samples of a scenario."""
+    """Return the samples of a scenario."""
     samples, rng = streams(24.0, seed=seed), np.random.default_rng(100 + seed)
     if name == SCENARIOS[1]:
         return with_flips(with_outliers(samples, 0.05, rng), 0.05, rng)
@@ -67,7 +67,7 @@ def scenario(name: str, seed: int) -> list:
 
 
 def figures(name: str, mode: str, seeds: int) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     place, speed, turn = [], [], []
     for seed in range(seeds):
         found = run(Estimator(Settings(), SITE, mode=mode), scenario(name, seed), TIMES)
@@ -100,7 +100,7 @@ def main() -> None:
 
 
 def recorded(scratch: Path, trial: str) -> str:
-    """Figures of one recording."""
+    """Return the figures of one recording."""
     (scratch / "pool.yaml").write_text(POOL)
     folder, t, heading = hinsdale(scratch / trial, trial)
     vehicle = load_vehicle("finsrov")

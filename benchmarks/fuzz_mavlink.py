@@ -1,13 +1,13 @@
-"""MAVLink frames and Doppler log lines that nobody meant to send, to both ends of the robot's wire.
+"""Fuzz both ends of the robot's link with corrupted MAVLink frames and Doppler log lines.
 
     python benchmarks/fuzz_mavlink.py [--frames 1000000] [--lines 100000] [--seed 1]
 
-Half of the frames are spoiled on the line (bits turned over, bytes lost or put in, the checksum as it was), half have
-other payloads and the right checksum. The emulated autopilot takes those of ground stations, spoiled arming commands
-among them; the robot's link those of an autopilot, and lines of a log, while nobody asks for arming.
+Half of the frames are corrupted on the line (bits flipped, bytes lost or inserted, the checksum unchanged), half have
+other payloads and the right checksum. The emulated autopilot receives frames of ground stations, among them corrupted
+arming commands; the robot's link receives frames of an autopilot and lines of a log, while arming is not requested.
 
-Counted, and the exit status unless both are 0: exceptions, and armings; the link's are commands that it sends to arm,
-to change the mode, or axes.
+Exceptions and armings are counted, and the exit status is 0 only if there are none; armings of the link are commands
+that it sends to arm, to change the mode, or axes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ARMING = (
     mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 1.0, 21196.0, 0.0, 0.0, 0, 0, 0.0),
     mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 1 << 6),
 )
-"""Frames that arm a vehicle as they are."""
+"""Unmodified frames that arm a vehicle."""
 HARMLESS = (
     mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3),
     mavlink.MAVLink_manual_control_message(1, 1000, -1000, 500, 300, 0, s=100, t=-100),
@@ -92,12 +92,13 @@ TELEMETRY = (
     mavlink.MAVLink_servo_output_raw_message(10, 0, *[1600] * 16),
     mavlink.MAVLink_sys_status_message(1, 1, 1, 100, 15000, 100, 90, 0, 0, 0, 0, 0, 0),
 )  # fmt: skip
-"""What an autopilot sends."""
+"""Frames that an autopilot sends."""
 AUTOPILOT = mavlink.MAVLink(None, 1, 1)
 
 
 def damaged(message, rng, sender=GROUND):
-    """A frame that the line has spoiled: bits turned over, bytes lost or put in, the checksum as it was."""
+    """Return a frame that was corrupted on the line: bits flipped, bytes lost or inserted, the checksum
+    unchanged."""
     frame = bytearray(message.pack(sender))
     how = rng.random()
     if how < 0.7:
@@ -113,7 +114,7 @@ def damaged(message, rng, sender=GROUND):
 
 
 def forged(message, rng, sender=GROUND):
-    """A frame with other content and the right checksum, that does not mean to arm."""
+    """Return a frame with other content and the right checksum that does not request arming."""
     frame = bytearray(message.pack(sender))
     kind, start, end = type(message), 10, len(frame) - 2
     if rng.random() < 0.2:
@@ -130,7 +131,7 @@ def forged(message, rng, sender=GROUND):
 
 
 def fuzz_firmware(count, seed=1):
-    """Frames sent, by how they were made, exceptions and armings."""
+    """Return the numbers of frames by kind, of exceptions and of armings."""
     rng, counts, now = random.Random(seed), Counter(exceptions=0, armed=0), 0.0
     firmware_spec = SPEC.firmware.model_copy(update={"reboot_time": 0.0})
     firmware = ArduSub(HEAVY, SPEC.model_copy(update={"firmware": firmware_spec}))
@@ -160,7 +161,7 @@ NUMBERS = (b"NaN", b"-1e999", b"1e308", b"null", b"[[]]", b'"1"', b"true", b"-0"
 
 
 def damaged_line(rng):
-    """A line of a log with bytes changed, or numbers that are none."""
+    """Return a line of a log with changed bytes or invalid numbers."""
     line = bytearray(REPORT)
     if rng.random() < 0.5:
         line = bytearray(
@@ -175,7 +176,8 @@ def damaged_line(rng):
 
 
 def fuzz_link(frames, lines, seed=1):
-    """Frames and lines fed, by how they were made, exceptions, and commands and axes sent that nobody asked for."""
+    """Return the numbers of frames and lines by kind, of exceptions, and of commands and axes that were sent
+    without request."""
     rng, counts, now = random.Random(seed), Counter(exceptions=0, armed=0), 0.0
     link, outside = MavlinkLink(vehicle_at("tank", HEAVY, navigation=True)), mavlink.MAVLink(None)
     link.feed(0.0, TELEMETRY[0].pack(AUTOPILOT))

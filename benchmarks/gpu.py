@@ -1,7 +1,7 @@
-"""Everything that a GPU does, in one script of a few minutes: `python benchmarks/gpu.py --device cuda --out gpu`.
+"""All rates on a GPU, in one script of a few minutes: `python benchmarks/gpu.py --device cuda --out gpu`.
 
 Rates of physics, tasks, learners, cameras and sonars, memory by worlds, and the difference between the results of the
-device and of the processor. What is not installed is left out by name.
+device and of the processor. Figures whose package is not installed are listed as missing.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from finssim.tasks import task_named
 from finssim.tasks.catalogue import numeric_tasks
 
 SECONDS, ROUNDS = 1.0, 3
-"""Time for a figure [s], and its rounds; the best counts."""
+"""Time for a figure [s], and number of rounds; the best counts."""
 PHYSICS_WORLDS, TASK_WORLDS, CAMERA_WORLDS, LEARNER_WORLDS = 2**19, 2**17, 2048, 2**14
-"""Worlds at full scale; on another scale in proportion."""
+"""Worlds at full scale; other scales are proportional."""
 MOST_WORLDS = 2**22
-"""Most worlds whose memory is measured."""
+"""Largest number of worlds whose memory is measured."""
 COMPARED_WORLDS, COMPARED_TIME = 64, 5.0
 """Worlds, and time, over which a device is compared with the processor [s]."""
 TOLERANCES = {"position": 1e-4, "observation": 1e-3, "recording": 1e-3}
@@ -94,7 +94,7 @@ def task_rate(name: str, worlds: int, device: str, seconds: float) -> float:
 
 
 def learner_of(name: str, task: str, worlds: int, device: str, **changes: Any) -> Any:
-    """Return a learner at the start of an endless training. `changes` are of its settings."""
+    """Return a learner at the start of an unlimited training; `changes` are changed settings."""
     kind, chosen = learner_named(name), task_named(task)
     settings = replace(kind.settings(chosen, worlds=worlds, steps=10**9, device=device), **changes)
     environment = finssim.make(chosen, worlds=worlds, seed=1, observe="training", device=device)
@@ -104,7 +104,7 @@ def learner_of(name: str, task: str, worlds: int, device: str, **changes: Any) -
 def learner_rate(name: str, task: str, worlds: int, device: str, seconds: float, **changes: Any) -> float:
     """Return environment steps per second of training, rollouts and updates included."""
     learner = learner_of(name, task, worlds, device, **changes)
-    for _ in range(COMPARED_UPDATES):  # recordings are made
+    for _ in range(COMPARED_UPDATES):  # record CUDA graphs before the measurement
         learner.update()
     before, began = learner.steps, time.perf_counter()
     while time.perf_counter() - began < seconds:
@@ -140,7 +140,7 @@ def ping_rate(worlds: int, device: str, seconds: float) -> float:
 
 
 def device_memory(worlds: int, device: str) -> float | None:
-    """Return the memory that T1 takes on the device [MB]; None on a processor, or where it is too little."""
+    """Return the memory that T1 needs on the device [MB]; None on a processor, or if memory is insufficient."""
     if not device.startswith("cuda"):
         return None
     chosen = wp.get_device(device)
@@ -155,7 +155,8 @@ def device_memory(worlds: int, device: str) -> float | None:
 
 
 def differences(device: str) -> dict[str, float]:
-    """Return how far results of a device are from the processor's after `COMPARED_TIME`, see `TOLERANCES`."""
+    """Return the differences between results of the device and of the processor after `COMPARED_TIME`; see
+    `TOLERANCES`."""
     ends = {}
     for where in ("cpu", device):
         simulator = _thrusting("calibrated", COMPARED_WORLDS, where)
@@ -178,7 +179,7 @@ def differences(device: str) -> dict[str, float]:
 
 
 def _thrusting(model: str, worlds: int, device: str) -> Simulator:
-    """Return a simulator of deep vehicles under constant random thrusts."""
+    """Return a simulator of deeply submerged vehicles under constant random thrusts."""
     simulator = Simulator(
         "finsrov", worlds=worlds, hydrodynamics=model, control_step=0.04, substeps=4, device=device
     )

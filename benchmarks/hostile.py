@@ -1,20 +1,21 @@
-"""Files and numbers that no program of ours wrote: thousands of broken ones are given to the real commands.
+"""Robustness against corrupted input: thousands of broken files and numbers are given to the real commands.
 
     python benchmarks/hostile.py [--inputs 5000] [--first 0] [--seed 1] [--only KIND,KIND] [--keep FOLDER]
                                  [--seeds FOLDER]
 
-Inputs are numbered, and each depends on the seed and its number alone, so that a long run can be done in parts: with
-`--first` it continues, with `--seeds` it finds the whole files that an earlier part made.
+Inputs are numbered, and each depends only on the seed and its number, so that a long run can be split into parts:
+`--first` continues it, and `--seeds` reuses the valid files that an earlier part made.
 
 One file of every kind that a command reads is made by the commands themselves or taken from `tests/data`. Each input is
-a copy of one of them with one to three changes: bytes flipped, cut out, doubled or put in; a number that is huge, tiny,
-negative, NaN, a word or 5000 digits long; a value that is another kind of thing, deep, an alias of itself or a bomb of
-aliases; a name that is a path or looks like markup; a column or key that is missing or twice; a file that is empty, all
-zeros or cut; or, with whole files, such a number on the command line. The commands run in a worker, which is started
-anew when an input takes more than 10 s of processor time, its own and that of the processes that it started.
+a copy of one of them with one to three changes: bytes flipped, removed, duplicated or inserted; a number that is huge,
+tiny, negative, NaN, a word or 5000 digits long; a value of another type, nested deeply, an alias of itself or an
+exponential expansion of aliases; a name that is a path or looks like markup; a column or key that is missing or
+duplicated; a file that is empty, all zeros or truncated; or, with valid files, such a number on the command line. The
+commands run in a worker, which is restarted when an input takes more than 10 s of processor time, including that of
+its child processes.
 
-Counted, and the exit status unless all are 0: inputs that end in a traceback, that hang, that write outside their
-output folder or into their input, and those of `REFUSED` that are accepted.
+Inputs are counted that end in a traceback, that hang, that write outside their output folder or into their input, and
+those of `REFUSED` that are accepted; the exit status is 0 only if there are none.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "tests" / "data"
 LIMIT = 10.0
-"""Longest that a command may work for one input, processor time [s]."""
+"""Largest processor time of a command for one input [s]."""
 PATIENCE = 30.0
-"""Times as long may pass by the clock, where the machine does other things too or the worker waits for nothing."""
+"""Ratio of the largest wall time to `LIMIT`, for a busy machine or a worker that waits indefinitely [-]."""
 WARM_UP = 120.0
-"""The same of unchanged files, which may have kernels compiled [s]."""
+"""Limit for unchanged files, which may compile kernels [s]."""
 MEMORY = 12 << 30
-"""That a worker may take [bytes]."""
+"""Largest memory of a worker [bytes]."""
 PARAMETERS = "@parameters"
-"""Stands for the reader of ROS parameter files: the nodes that call it run until they are ended."""
+"""Placeholder for the reader of ROS parameter files, since the nodes that call it run until they are stopped."""
 
 FINSROV = ROOT / "src" / "finssim" / "vehicles" / "catalogue" / "finsrov.yaml"
 
@@ -110,27 +111,28 @@ interface: {height: 1.0}
     "map.yaml": "vehicle: bluerov2_heavy\npassive: true\nfiles:\n  \"*_imu.csv\":\n    time: time_secs\n"
     "    columns: {p: x_angvel, q: y_angvel, r: z_angvel, ax: x_linacc, ay: y_linacc, az: z_linacc}\n",
 }  # fmt: skip
-"""Files that are written by hand, as their pages show them."""
+"""Files that are written by hand, as the docs show them."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file and the commands that read it."""
+    """Kind of file, and the commands that read it."""
 
     name: str
     file: str
-    """Path or pattern below the folder of seeds; in a folder of several files the one that is changed."""
+    """Path or pattern below the folder of valid files; in a folder of several files, the file that is
+    changed."""
     commands: tuple[str, ...]
-    """`{}` is the file, or the folder that it is in where `folder`; `OUT` an output, `SEEDS` the whole files."""
+    """Commands: `{}` is the file, or its folder with `folder`; `OUT` is an output, `SEEDS` the valid files."""
     folder: int = 0
-    """How many folders above the file make up the input."""
+    """Number of levels above the file of the folder that is the input."""
     inside: bool = False
-    """Whether the input is an earlier output, which the command goes on with."""
+    """True if the input is an earlier output that the command continues."""
     weight: int = 1
 
 
 def kinds() -> list[Kind]:
-    """All of them."""
+    """Return all kinds of files."""
     camera = "--pool SEEDS/pool.yaml"
     located = f"{camera} --vehicle finsrov --out OUT/rows.csv"
     fitted = "--survey SEEDS/pool-survey.yaml --camera SEEDS/camera.yaml --out OUT/pool.yaml"
@@ -275,7 +277,7 @@ REFUSED = (
 """Commands that must be refused: a log in mm/s, a policy with limits of 1e9 N or a period without end, ..."""
 
 
-# Changes of an input. Each takes the bytes and a generator, and returns other bytes.
+# Changes of an input. Each is a function of the bytes and a generator that returns other bytes.
 
 NUMBERS = (
     "0", "-0.0", "-1", "1", "1e-300", "1e300", "-1e300", "1e12", "-1e9", "1e19", "nan", ".nan", "inf", "-inf", ".inf",
@@ -300,13 +302,13 @@ Change = Callable[[bytes, random.Random], bytes]
 
 
 def _spot(data: bytes, rng: random.Random) -> tuple[int, int]:
-    """A short stretch anywhere."""
+    """Return a short random range of bytes."""
     a = rng.randrange(len(data) + 1)
     return a, min(len(data), a + rng.choice((1, 1, 2, 4, 8, 64, 1000)))
 
 
 def flipped(data: bytes, rng: random.Random) -> bytes:
-    """One bit."""
+    """Flip one bit."""
     if not data:
         return data
     made = bytearray(data)
@@ -315,36 +317,36 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
 
 
 def written_over(data: bytes, rng: random.Random) -> bytes:
-    """A stretch of other bytes."""
+    """Overwrite a range."""
     a, b = _spot(data, rng)
     return data[:a] + rng.choice((rng.randbytes(b - a), b"\0" * (b - a), b"\xff" * (b - a))) + data[b:]
 
 
 def cut_out(data: bytes, rng: random.Random) -> bytes:
-    """A stretch is missing."""
+    """Remove a range."""
     a, b = _spot(data, rng)
     return data[:a] + data[b:]
 
 
 def doubled(data: bytes, rng: random.Random) -> bytes:
-    """A stretch comes twice."""
+    """Duplicate a range."""
     a, b = _spot(data, rng)
     return data[:b] + data[a:b] + data[b:]
 
 
 def cut_off(data: bytes, rng: random.Random) -> bytes:
-    """The end is missing."""
+    """Truncate the end."""
     return data[: rng.randrange(len(data) + 1)]
 
 
 def nothing(data: bytes, rng: random.Random) -> bytes:
-    """Empty, zeros, spaces, or something else altogether."""
+    """Replace everything by nothing, zeros, spaces, or unrelated content."""
     zeros, noise = bytes(len(data)), rng.randbytes(len(data) % 5000)
     return rng.choice((b"", zeros, b" \n", b"\xff\xfe" + data, noise, b"[" * 100_000))
 
 
 def length_field(data: bytes, rng: random.Random) -> bytes:
-    """A number of two, four or eight bytes becomes huge or negative, as a length in a binary file."""
+    """Replace two, four or eight bytes by a huge or negative number, as in a length field of a binary file."""
     size = rng.choice((2, 4, 8))
     if len(data) < size:
         return data
@@ -363,7 +365,7 @@ def _text(change: Callable[[str, random.Random], str]) -> Change:
 
 
 def _at(text: str, pattern: str, words: tuple[str, ...], rng: random.Random) -> str:
-    """One match of a pattern becomes one of some words."""
+    """Replace one match of a pattern by one of several words."""
     found = list(re.finditer(pattern, text, re.MULTILINE))
     if not found:
         return text + rng.choice(words)
@@ -373,25 +375,25 @@ def _at(text: str, pattern: str, words: tuple[str, ...], rng: random.Random) -> 
 
 @_text
 def number(text: str, rng: random.Random) -> str:
-    """A number becomes another."""
+    """Replace a number by another."""
     return _at(text, r"(?<![\w.])[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?(?![\w.])", NUMBERS, rng)
 
 
 @_text
 def name(text: str, rng: random.Random) -> str:
-    """A word becomes another name."""
+    """Replace a word by another name."""
     return _at(text, r"(?<![\w.])[A-Za-z][\w.-]*", NAMES, rng)
 
 
 @_text
 def value(text: str, rng: random.Random) -> str:
-    """What stands behind a key, or in brackets, becomes something else."""
+    """Replace the value of a key, or the content of brackets."""
     return _at(text, r"(?<=: )(?:\[[^\]\n]*\]|\{[^}\n]*\}|[^,{}\[\]\n#]+)", VALUES, rng)
 
 
 @_text
 def line(text: str, rng: random.Random) -> str:
-    """A line is missing, comes twice, changes its place or its depth."""
+    """Remove, duplicate, move or indent a line."""
     lines = text.splitlines(keepends=True) or [""]
     i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
     taken = lines.pop(i)
@@ -403,7 +405,8 @@ def line(text: str, rng: random.Random) -> str:
 
 @_text
 def column(text: str, rng: random.Random) -> str:
-    """A column of a table is a thousand times as large, constant, missing, doubled or without numbers."""
+    """Scale a column of a table by a thousand, make it constant, remove or duplicate it, or replace its
+    numbers."""
     rows = [line.split(",") for line in text.splitlines()]
     if not rows or not rows[0]:
         return text
@@ -431,7 +434,7 @@ BINARY = {".stl", ".png", ".jpg", ".mcap", ".BIN", ".tlog", ".db3", ".bag", ".on
 
 
 def changed(data: bytes, suffix: str, rng: random.Random) -> tuple[bytes, str]:
-    """A broken copy, and what was done to it."""
+    """Return a corrupted copy, and a description of the changes."""
     if suffix in BINARY:
         of: tuple[Change, ...] = BYTES
     else:
@@ -446,15 +449,15 @@ def changed(data: bytes, suffix: str, rng: random.Random) -> tuple[bytes, str]:
     return data, " ".join(done)
 
 
-# Whole files.
+# Valid files.
 
 
 def make(folder: Path, run: Callable[..., None]) -> None:
-    """Make a file of every kind.
+    """Make a valid file of every kind.
 
     Args:
-        folder: Where to; it is the working directory.
-        run: Runs a command, and refuses to go on where it does not end well.
+        folder: Output folder, which is the working directory.
+        run: Runs a command, and raises an error if it fails.
     """
     for file, text in MADE.items():
         (folder / file).parent.mkdir(exist_ok=True)
@@ -506,7 +509,7 @@ def make(folder: Path, run: Callable[..., None]) -> None:
 
 
 def _pictures(folder: Path) -> None:
-    """A texture, and a picture of tags."""
+    """Write a texture, and a picture of tags."""
     import cv2
     import numpy as np
 
@@ -523,7 +526,7 @@ def _pictures(folder: Path) -> None:
 
 
 def _wrongly_accepted(folder: Path) -> None:
-    """Whole files that say what cannot be, for `REFUSED`."""
+    """Write well-formed files with impossible content, for `REFUSED`."""
     import pandas
 
     shutil.copytree(folder / "trials", folder / "mm")
@@ -543,7 +546,7 @@ def _wrongly_accepted(folder: Path) -> None:
 
 
 def _what_a_camera_saw(folder: Path) -> None:
-    """A survey of points below the water, and a vehicle that swims in a circle."""
+    """Write a survey of points below the water, and detections of a vehicle that moves in a circle."""
     import numpy as np
 
     from finssim.core.optics import Interface, Lens, project
@@ -596,7 +599,7 @@ def _what_a_camera_saw(folder: Path) -> None:
 
 
 def _bags(folder: Path) -> None:
-    """The same second of odometry as a bag in SQLite, in MCAP, and of ROS 1."""
+    """Write the same second of odometry as a bag in SQLite, in MCAP, and of ROS 1."""
     import numpy as np
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -646,29 +649,29 @@ def _plant(path: Path) -> None:
     draw_plant(load_vehicle("finsrov"), 1).write(path)
 
 
-# Running.
+# Running the commands.
 
 
 @dataclass
 class Outcome:
-    """What became of an input."""
+    """Result of a command for an input."""
 
     end: str
-    """`0`, `2`, ... the exit status; `traceback`, `hang` or `killed`."""
+    """Exit status such as `0` or `2`; or `traceback`, `hang` or `killed`."""
     seconds: float
     text: str = ""
-    """The last line of its error."""
+    """Last line of its error output."""
     outside: tuple[str, ...] = ()
-    """What it wrote where it may not."""
+    """Files that it wrote outside its output folder."""
 
     @property
     def bad(self) -> bool:
-        """Whether it is a fault of ours."""
+        """Return True if the result is a defect of FinsSim."""
         return self.end in ("traceback", "hang", "killed") or bool(self.outside)
 
 
 class _Watch:
-    """Hears of every file that Python opens to write, moves or removes."""
+    """Audit hook that records every file that Python opens for writing, moves or removes."""
 
     def __init__(self, allowed: tuple[str, ...]) -> None:
         self.allowed = allowed
@@ -689,7 +692,7 @@ class _Watch:
         elif event in ("os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.chmod"):
             path = arguments[0]
             if event in ("os.remove", "os.rmdir") and arguments[1] != -1:
-                return  # named in an open folder, as `shutil.rmtree` does with one of its own
+                return  # relative to an open folder, as `shutil.rmtree` does inside its folder
         else:
             return
         if isinstance(path, str | bytes | os.PathLike):
@@ -699,7 +702,7 @@ class _Watch:
 
 
 def _work(connection: Any, scratch: Path) -> None:
-    """The worker: runs command lines until the connection ends."""
+    """Run command lines in the worker until the connection ends."""
     os.environ.update(OMP_NUM_THREADS="1", TMPDIR=str(scratch / "tmp"), MPLBACKEND="Agg", COLUMNS="120")
     os.environ["MPLCONFIGDIR"] = str(scratch / "matplotlib")
     tempfile.tempdir = None
@@ -752,7 +755,7 @@ def _run(words: list[str]) -> int:
 
 
 class Runner:
-    """Runs commands in a worker that is replaced when it hangs or dies."""
+    """Runner of commands in a worker that is replaced when it hangs or dies."""
 
     def __init__(self, scratch: Path) -> None:
         self.scratch = scratch
@@ -763,13 +766,13 @@ class Runner:
     def __call__(
         self, words: list[str], folder: Path, *, limit: float = LIMIT, free: bool = False
     ) -> Outcome:
-        """Run one.
+        """Run a command.
 
         Args:
-            words: The command line.
+            words: Words of the command line.
             folder: Working directory.
-            limit: Longest that it may take [s].
-            free: It may write anywhere.
+            limit: Largest processor time [s].
+            free: True if it may write anywhere.
         """
         if self._worker is None:
             context = multiprocessing.get_context("spawn")
@@ -792,7 +795,7 @@ class Runner:
             return Outcome("killed", 0.0, "the worker died")
 
     def _processor_time(self) -> float:
-        """Time that the worker and the processes that it waited for have used of the processor [s]."""
+        """Return the processor time of the worker and of the child processes for which it has waited [s]."""
         words = Path(f"/proc/{self._worker.pid}/stat").read_text().rpartition(")")[2].split()
         return sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
 
@@ -805,7 +808,7 @@ class Runner:
 
 
 def place_input(kind: Kind, seeds: Path, scratch: Path) -> tuple[Path, Path]:
-    """A fresh copy of a whole input; the path for the command, and of the file to change."""
+    """Copy a valid input; return the path for the command, and that of the file to change."""
     for name in ("in", "out", "tmp"):
         shutil.rmtree(scratch / name, ignore_errors=True)
         (scratch / name).mkdir()
@@ -822,7 +825,7 @@ def place_input(kind: Kind, seeds: Path, scratch: Path) -> tuple[Path, Path]:
 def words_of(
     command: str, file: Path, scratch: Path, seeds: Path, rng: random.Random | None = None
 ) -> list[str]:
-    """A command's words for an input; numbers are drawn where there is a generator."""
+    """Return the words of a command for an input; numbers are drawn if a generator is given."""
     places = {"{}": str(file), "OUT": str(scratch / "out"), "IN/": f"{scratch / 'in'}/", "SEEDS": str(seeds)}
     words = [functools.reduce(lambda w, m: w.replace(m, places[m]), places, word) for word in command.split()]
     return [re.sub("NUMBER", lambda _: rng.choice(NUMBERS) if rng else "1", word) for word in words]
@@ -831,7 +834,7 @@ def words_of(
 def cases(
     inputs: int, seed: int, only: Sequence[str], first: int = 0
 ) -> Iterator[tuple[int, Kind, str, random.Random]]:
-    """Numbers, kinds and commands by turns, each with a generator of its own."""
+    """Yield numbers, kinds and commands in turn, each with its own generator."""
     pairs = [
         (k, c) for k in kinds() if not only or k.name in only for c in k.commands for _ in range(k.weight)
     ]
@@ -849,7 +852,7 @@ def fuzz(
     keep: Path | None = None,
     first: int = 0,
 ) -> list[tuple[str, Outcome]]:
-    """Give every input to its command; those that ended badly, with the command and what was done to the file."""
+    """Give every input to its command; return the failures, with command and changes of the file."""
     bad, ends, begin = [], Counter[str](), time.monotonic()
     for i, kind, command, rng in cases(inputs, seed, only, first):
         given, file = place_input(kind, seeds, run.scratch)
@@ -873,7 +876,7 @@ def fuzz(
 
 
 def main() -> int:
-    """Fuzz, print, and tell by the exit status."""
+    """Fuzz, print, and return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

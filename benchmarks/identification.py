@@ -1,13 +1,13 @@
-"""How well hydrodynamics are identified from synthetic trials whose truth is known.
+"""Accuracy of identified hydrodynamics, from synthetic trials with known truth.
 
     python benchmarks/identification.py [PART ...] [--vehicle finsrov] [--repetitions 5] [--json FILE]
 
 Parts:
-    coverage    published levels, 50 Hz, the vehicle's sensors: errors, and how often a 95 % interval holds the truth
+    coverage    published levels, 50 Hz, the vehicle's sensors: errors, and coverage of 95 % intervals
     slow        5 Hz, wrench and velocity alone
     replay      half of the trials fitted, the other half replayed
-    dive        a weak dive (10 and 20 % of the limits), then the one that its fit designs, or the same once more
-    published   trials simulated with FinsROV's published raw fits, and what its published noise lets anyone tell
+    dive        a weak dive (10 and 20 % of the limits), then the dive that its fit designs, or the first one repeated
+    published   trials simulated with FinsROV's published raw fits, and what the published noise permits
 
 The fits start from a file whose hydrodynamics are wrong by a factor of two.
 """
@@ -39,7 +39,7 @@ from finssim.vehicles.vehicle import moved_to_origin
 FOUR = "surge,sway,heave,yaw"
 
 CHUNK = 10
-"""Repetitions whose noise is drawn together."""
+"""Number of repetitions whose noise is drawn together."""
 
 RAW_FITS = {
     "surge": (27.1447, 39.0736, 0.0),
@@ -47,11 +47,12 @@ RAW_FITS = {
     "heave": (35.4644, 80.0968, 483.087),
     "yaw": (0.8369, 0.3003, 0.4776),
 }
-"""m_eff, d1, d2 of FinsROV's used fits, before anybody edited them."""
+"""m_eff, d1, d2 of FinsROV's fits before any manual change."""
 
 
 def blind(vehicle: Vehicle) -> Vehicle:
-    """The vehicle with hydrodynamics that nobody measured: added mass halved, damping doubled or half quadratic."""
+    """Return the vehicle with wrong hydrodynamics: added mass halved, damping doubled or half of it
+    quadratic."""
     chosen = vehicle.hydrodynamics["calibrated"]
     d1, d2 = chosen.linear_damping, chosen.quadratic_damping
     return vehicle.replace(
@@ -64,7 +65,7 @@ def blind(vehicle: Vehicle) -> Vehicle:
 
 
 def truth(vehicle: Vehicle) -> dict[str, float]:
-    """True value of every parameter that a fit may name, for a plant that is the vehicle's file."""
+    """Return the true value of every parameter that a fit may name, for a plant equal to the vehicle's file."""
     chosen = vehicle.hydrodynamics["calibrated"]
     mass = moved_to_origin(vehicle.mass_matrix(), -vehicle.body.center_of_gravity)
     arm = vehicle.body.center_of_buoyancy[2] - vehicle.body.center_of_gravity[2]
@@ -82,7 +83,7 @@ def truth(vehicle: Vehicle) -> dict[str, float]:
 
 @dataclasses.dataclass
 class Row:
-    """One parameter over all repetitions."""
+    """Statistics of one parameter over all repetitions."""
 
     name: str
     true: float
@@ -94,7 +95,7 @@ class Row:
     note: str = ""
 
     def add(self, e: Estimate) -> None:
-        """Take one repetition's estimate."""
+        """Add the estimate of one repetition."""
         self.identifiable.append(e.identifiable)
         self.note = e.note or self.note
         if math.isfinite(e.estimate):
@@ -105,7 +106,7 @@ class Row:
             self.half_widths.append(0.5 * (high - low))
 
     def figures(self) -> dict[str, Any]:
-        """What is reported; errors in per cent of the truth where that is not 0."""
+        """Return the reported figures; errors are in per cent of the truth unless that is 0."""
         x = np.array(self.estimates)
         size = abs(self.true)
         relative = 100.0 / size if size > 0.0 else math.nan
@@ -128,7 +129,7 @@ def _mean(x: NDArray[np.float64]) -> float:
 
 
 def collect(fits: Iterable[Fit], true: dict[str, float]) -> dict[str, dict[str, Any]]:
-    """Figures of every parameter whose truth is known."""
+    """Return the figures of every parameter with a known truth."""
     rows: dict[str, Row] = {}
     for fit in fits:
         for name, e in fit.estimates.items():
@@ -138,7 +139,7 @@ def collect(fits: Iterable[Fit], true: dict[str, float]) -> dict[str, dict[str, 
 
 
 def copies(recording: Recording, count: int) -> Recording:
-    """The same motion in `count` times as many worlds."""
+    """Repeat a motion in `count` times as many worlds."""
     fields = {f.name: getattr(recording, f.name) for f in dataclasses.fields(recording) if f.name != "step"}
     tiled = {name: np.tile(value, (1, count, 1)) for name, value in fields.items()}
     return Recording(step=recording.step, **tiled)
@@ -147,7 +148,7 @@ def copies(recording: Recording, count: int) -> Recording:
 def measured_again(
     recording: Recording, plan: Sequence[Programme], vehicle: Vehicle, count: int, **arguments: Any
 ) -> Iterable[list[Trial]]:
-    """The trials of one motion, `count` times with other noise."""
+    """Yield the trials of one motion, `count` times with other noise."""
     for first in range(0, count, CHUNK):
         n = min(CHUNK, count - first)
         trials = trials_of(copies(recording, n), list(plan) * n, vehicle, seed=1000 + first, **arguments)
@@ -158,7 +159,7 @@ def measured_again(
 def coverage(
     vehicle: Vehicle, axes: str, repetitions: int, *, repeats: int = 1, **arguments: Any
 ) -> dict[str, Any]:
-    """Errors and coverage over repetitions of the noise."""
+    """Return errors and coverage over repetitions of the noise."""
     plan = programmes(axes, vehicle, repeats=repeats)
     recording = record(plan, vehicle, seed=1)
     guess = blind(vehicle)
@@ -175,7 +176,7 @@ def coverage(
 
 
 def held_out(vehicle: Vehicle, axes: str) -> dict[str, Any]:
-    """NRMSE of replaying trials at validation levels with what was fitted to the published ones."""
+    """Return the NRMSE of replayed trials at validation levels, with the fit of the published levels."""
     fitted = simulate_programme(programmes(axes, vehicle), vehicle, seed=1)
     kept = simulate_programme(programmes(axes, vehicle, kind="validation"), vehicle, seed=2)
     guess = blind(vehicle)
@@ -185,7 +186,8 @@ def held_out(vehicle: Vehicle, axes: str) -> dict[str, Any]:
 
 
 def second_dive(vehicle: Vehicle, axes: str, seed: int) -> dict[str, Any]:
-    """Widths of the intervals after a second dive that the first designed, over those after the first one again."""
+    """Return the ratio of interval widths: after a second dive that the first one designed, over a repeated
+    first dive."""
     chosen = _without_pulses(axes, vehicle).split(",")
     limit = dict(zip(AXES, vehicle.wrench_limits.tolist(), strict=True))
     plan = programmes(
@@ -212,7 +214,7 @@ def second_dive(vehicle: Vehicle, axes: str, seed: int) -> dict[str, Any]:
 
 
 def raw_fits(vehicle: Vehicle) -> Vehicle:
-    """FinsROV with the raw fits of its own identification."""
+    """Return FinsROV with the raw fits of its own identification."""
     changes: dict[str, float] = {}
     for axis, (m_eff, d1, d2) in RAW_FITS.items():
         i = AXES.index(axis)
@@ -223,7 +225,7 @@ def raw_fits(vehicle: Vehicle) -> Vehicle:
 
 
 def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
-    """One line for each parameter."""
+    """Print one line for each parameter."""
     print(f"\n{title}")
     heads = ("parameter", "true", "mean", "worst %", "bias %", "spread", "±95 %", "cover %", "ident %")
     print("  {:<20}{:>11}{:>11}{:>9}{:>8}{:>10}{:>10}{:>9}{:>9}".format(*heads))
@@ -240,7 +242,7 @@ def print_parameters(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Run the parts asked for, print tables, write JSON."""
+    """Run the requested parts, print tables, and write JSON."""
     parts = ("coverage", "slow", "replay", "dive", "published")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help="which parts; all if none")
@@ -297,7 +299,7 @@ def run(part: str, vehicle: Vehicle, given: argparse.Namespace) -> Any:
 
 
 def _without_pulses(axes: str, vehicle: Vehicle) -> str:
-    """Roll and pitch ring at more than 1 Hz, which 5 Hz cannot follow."""
+    """Return the axes without roll and pitch, which oscillate at more than 1 Hz and are not resolved at 5 Hz."""
     chosen = vehicle.controlled_axes if axes == "all" else axes.split(",")
     return ",".join(a for a in chosen if a not in ("roll", "pitch"))
 

@@ -1,8 +1,8 @@
-"""What a training costs and what it comes to: `python benchmarks/learning.py [ROW ...] [--json FILE]`.
+"""Cost and result of trainings: `python benchmarks/learning.py [ROW ...] [--json FILE]`.
 
-Every training is `finssim train` in a process of its own, on one processor, from its start to the written policy, in
-processor-seconds of that process and its children. Beside them stands T1 with PPO of Stable-Baselines3 in the same run:
-on another machine the ratio holds where the seconds do not. The policy is then tried with `finssim evaluate`.
+Every training is `finssim train` in its own process, on one processor, from its start to the written policy, measured
+in processor-seconds of that process and its children. T1 with PPO of Stable-Baselines3 runs beside them: on another
+machine the ratio is comparable, the seconds are not. The policy is then evaluated with `finssim evaluate`.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ PLANT = {"title": "another vehicle in every trial (ranges pool)", "ranges": "poo
 
 @dataclass(frozen=True)
 class Row:
-    """A training and its trials."""
+    """Training and its evaluation."""
 
     task: str
     seeds: tuple[int, ...]
     train: tuple[str, ...] = ()
-    """More words for `finssim train`."""
+    """Further options of `finssim train`."""
     evaluate: tuple[str, ...] = ()
-    """More words for `finssim evaluate`."""
+    """Further options of `finssim evaluate`."""
 
 
 ROWS = {
@@ -62,7 +62,7 @@ def main() -> None:
         plant = Path(folder) / "pool-ranges.yaml"
         plant.write_text(yaml.safe_dump(PLANT))
         warm = ["train", "t1", "--steps", "4096", "--out", f"{folder}/warm"]
-        measured([*COMMAND, *warm], environment)  # kernels are compiled once on a machine
+        measured([*COMMAND, *warm], environment)  # compile the kernels before the measurement
         for name, row in rows.items():
             results[name] = [
                 run(row, seed, Path(folder) / f"{name}-{seed}", plant, environment) for seed in row.seeds
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def run(row: Row, seed: int, folder: Path, plant: Path, environment: dict[str, str]) -> dict[str, float]:
-    """Train and try; cost, and what `evaluate` says of all trials."""
+    """Train and evaluate; return the cost, and the metrics of `evaluate` over all trials."""
     train = ["train", row.task, "--seed", str(seed), "--out", str(folder), *row.train]
     processor, wall = measured([*COMMAND, *train], environment)
     words = [str(plant) if word == "PLANT" else word for word in row.evaluate]
@@ -106,7 +106,7 @@ def run(row: Row, seed: int, folder: Path, plant: Path, environment: dict[str, s
 
 
 def measured(command: list[str], environment: dict[str, str]) -> tuple[float, float]:
-    """Processor and wall time of a command [s]."""
+    """Measure processor and wall time of a command [s]."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run(command, check=True, capture_output=True, env=environment)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

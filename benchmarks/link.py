@@ -1,8 +1,9 @@
-"""Time a frame takes to be written and read: `python benchmarks/link.py [--json FILE]`.
+"""Processor time of writing and reading a frame: `python benchmarks/link.py [--json FILE]`.
 
-Telemetry of 98 bytes and commands of 37, whole, and telemetry in the pieces of a serial line; beside each the ratio to
-unpacking the same bytes with `struct` alone, in the same run. Best of many rounds of processor time, which other load
-disturbs least, and the share of one core that 100 frames of telemetry and 60 commands a second take.
+Telemetry of 98 bytes and commands of 37 bytes, complete, and telemetry in the fragments of a serial line; beside each
+the ratio to unpacking the same bytes with `struct` alone, in the same run. Reported are the best of many rounds of
+processor time, which other load disturbs least, and the fraction of one core for 100 telemetry frames and 60 commands
+per second.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ COMMAND = ThrusterCommand(True, (0.0, 0.125, -0.25, 0.5, -0.5, 0.75, -1.0, 1.0))
 
 
 def microseconds(call: Callable[[], object]) -> float:
-    """Of one call, the best of the rounds."""
+    """Return the time of one call, the best of the rounds [µs]."""
     best = float("inf")
     for _ in range(ROUNDS):
         began = time.process_time()
@@ -45,7 +46,7 @@ def microseconds(call: Callable[[], object]) -> float:
 
 
 def measure() -> dict[str, float]:
-    """Microseconds by what is done, ratios to `struct` alone, and the share of a core [%]."""
+    """Measure microseconds by operation, ratios to `struct` alone, and the fraction of a core [%]."""
     telemetry, command = encode_telemetry(TELEMETRY), encode_command(COMMAND)
     alone = struct.Struct("<2sBBHHI12fI8fH")
     host, line, mcu, clock = Decoder(), Decoder(), Decoder(MCU), ClockMap()

@@ -1,9 +1,10 @@
 """Cost of the stack in lock-step: `python benchmarks/lockstep.py [corners] [pictures] [--seconds 30] [--profile]`.
 
-Plays station P02 of T1 against a realistic pool: motor controller, instruments, camera and plant below the wire;
-decoder, localization, fusion, PID (or `--controller DIR` of a policy), bridge and encoder above it. Processor time of
-all threads per vehicle second, robot and pool apart, the best quarter of the vehicle's seconds, beside a fixed loop of
-Python and NumPy that is timed in the same run: on a busy machine the ratios hold where the milliseconds do not.
+Plays setpoint P02 of T1 against a realistic pool: motor controller, instruments, camera and plant in the pool;
+decoder, localization, fusion, PID (or `--controller DIR` of a policy), bridge and encoder on the robot. Reported is the
+processor time of all threads per simulated second, for robot and pool separately, in the best quarter of the simulated
+seconds, beside a fixed loop of Python and NumPy in the same run: on a busy machine the ratios are comparable, the
+milliseconds are not.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from finssim.robot.runtime import Runtime
 from finssim.vehicles import load_vehicle
 
 GOALS = {"corners": 20.0, "pictures": 4.0}
-"""Vehicle seconds in a second of one core, at least."""
+"""Least simulated seconds per second of one core."""
 RATE = 60
 
 
@@ -80,7 +81,7 @@ class Stack:
         self._steps, self._sent = 0, []
 
     def second(self) -> tuple[float, float]:
-        """Let a vehicle second pass; processor time of robot and pool [s]."""
+        """Run for one simulated second; return the processor time of robot and pool [s]."""
         robot = pool = 0.0
         for _ in range(RATE):
             self._steps += 1
@@ -94,7 +95,7 @@ class Stack:
 
 
 def reference() -> float:
-    """Processor time of a fixed loop: small arrays, floats and calls, as in a robot's step [s]."""
+    """Measure the processor time of a fixed loop of small arrays, floats and calls, as in a robot's step [s]."""
     began = time.process_time()
     A, x, total = np.eye(6) * 0.99, np.ones(6), 0.0
     for k in range(4000):
@@ -105,9 +106,9 @@ def reference() -> float:
 
 
 def measure(mode: str, seconds: int, controller: str) -> dict[str, Any]:
-    """Play, and print the cost of a vehicle second."""
+    """Run, and print the cost of a simulated second."""
     stack = Stack(mode, controller)
-    for _ in range(4):  # until it is armed and the camera follows
+    for _ in range(4):  # until it is armed and the camera tracks it
         stack.second()
     rows = np.array([(*stack.second(), reference()) for _ in range(seconds)])
     best = np.sort(rows, axis=0)[: max(1, seconds // 4)].mean(axis=0)
@@ -133,7 +134,7 @@ def measure(mode: str, seconds: int, controller: str) -> dict[str, Any]:
 
 
 def profile(mode: str, seconds: int, controller: str) -> None:
-    """Print the functions in which the time is spent."""
+    """Print the functions that take the most time."""
     stack = Stack(mode, controller)
     for _ in range(4):
         stack.second()

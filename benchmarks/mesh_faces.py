@@ -1,4 +1,4 @@
-"""How many hull faces per second the mesh drag visits, wholly submerged: `python benchmarks/mesh_faces.py [device]`."""
+"""Hull faces per second of the mesh drag, completely submerged: `python benchmarks/mesh_faces.py [device]`."""
 
 import argparse
 import json
@@ -49,7 +49,7 @@ def faces_per_second(
 
 
 def displacement_faces_per_second(device: str = "cpu", worlds: int = 1024, seconds: float = 1.0) -> float:
-    """Faces per second of `mesh_displacement` with the hull partly out of the water."""
+    """Return faces per second of `mesh_displacement` with the hull partly out of the water."""
     hull = hull_mesh([parametric_hull((0.5, 0.4, 0.3), 0.035)], device)
     buoyancy = wp.empty(worlds, dtype=wp.vec4, device=device)
     command = wp.launch(
@@ -59,7 +59,7 @@ def displacement_faces_per_second(device: str = "cpu", worlds: int = 1024, secon
 
 
 def _best(launch, seconds: float, device: str) -> float:
-    """Shortest time of one launch [s]."""
+    """Return the shortest time of one launch [s]."""
     launch()
     best, end = float("inf"), time.perf_counter() + seconds
     while time.perf_counter() < end:

@@ -1,13 +1,13 @@
-"""Do the tests notice a wrong sign, bound or condition? Changes the source in 80 places, one at a time, and tests it.
+"""Mutation test: do the tests notice a wrong sign, bound or condition? Changes the source in 80 places, one at a time.
 
     python benchmarks/mutants.py [--count 80] [--seed 2] [--packages a,b] [--out FILE] [--checkout FOLDER] [--list]
 
 A place is a sum, difference, product, comparison, boolean operator or number in a function of `src/finssim`, drawn in
-turn from the packages. It is changed in a copy of the package, on which the tests of the same name run and, where these
+turn from the packages. It is changed in a copy of the package, on which the tests of the same name run and, if these
 pass, those of the same folder (`physics/damping.py`: `tests/physics/test_damping.py`, then the quick tests of
-`tests/physics`, then its slow ones). A function that none of them calls is not counted: another place is drawn.
-`--checkout` takes the tests of another revision, to compare the two on the same changes. Results go to `--out` one by
-one, and a run with the same seed continues after those in the file; `--again` tests the survivors in it once more.
+`tests/physics`, then its slow ones). A function that no test calls is not counted: another place is drawn.
+`--checkout` uses the tests of another revision, to compare the two on the same changes. Results are appended to
+`--out`, and a run with the same seed continues after those in the file; `--again` tests its survivors once more.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "finssim"
 PACKAGES = "physics,control,localization,calibration,learning,robot"
-"""Where changes are drawn, in turn."""
+"""Packages in which places are drawn, in turn."""
 SWAPS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Add: ("+", "-"),
     ast.Sub: ("-", "+"),
@@ -45,14 +45,14 @@ SWAPS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Or: ("or", "and"),
 }
 LONGEST = 1800
-"""Of one run of tests, after which they count as failed [s]."""
+"""Longest run of tests, after which they count as failed [s]."""
 LONGEST_TEST = 300
-"""Of one test, after which it counts as failed [s]."""
+"""Longest single test, after which it counts as failed [s]."""
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: file below `src/finssim`, line and column of the text that is exchanged."""
+    """Mutant: file below `src/finssim`, line and column of the replaced text."""
 
     path: str
     line: int
@@ -62,7 +62,7 @@ class Mutant:
 
 
 def mutants(path: Path) -> Iterator[Mutant]:
-    """Every change of a file's functions; docstrings, annotations and messages stay."""
+    """Yield every mutant of a file's functions; docstrings, annotations and messages are not changed."""
     lines = path.read_text(encoding="utf-8").splitlines()
     name = path.relative_to(SOURCE).as_posix()
     tree = ast.parse("\n".join(lines))
@@ -104,12 +104,12 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 
 def is_text(node: ast.AST) -> bool:
-    """A string, of which neither sums nor products are arithmetic."""
+    """Return True for a string, whose sums and products are not arithmetic."""
     return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
 
 
 def drawn(seed: int, packages: list[str]) -> Iterator[Mutant]:
-    """Changes in turn from every package."""
+    """Yield mutants in turn from every package."""
     rng = random.Random(seed)
     pools = {}
     for package in packages:
@@ -122,7 +122,8 @@ def drawn(seed: int, packages: list[str]) -> Iterator[Mutant]:
 
 
 def tests_of(path: str, checkout: Path) -> list[tuple[str, ...]]:
-    """The tests beside a module: of its name if there are any, then of its folder or the nearest above."""
+    """Return the tests of a module: those of its name if there are any, then those of its folder or the
+    nearest one above."""
     folder = (checkout / "tests" / path).parent
     while not folder.is_dir():
         folder = folder.parent
@@ -133,7 +134,7 @@ def tests_of(path: str, checkout: Path) -> list[tuple[str, ...]]:
 
 
 class Copy:
-    """A copy of the package that is changed, tested and put right again."""
+    """Copy of the package that is changed, tested and restored."""
 
     def __init__(self, folder: Path, checkout: Path) -> None:
         self.source, self.kernels, self.checkout = folder / "src", folder / "kernels", checkout
@@ -141,7 +142,7 @@ class Copy:
         shutil.copytree(SOURCE, self.source / "finssim", ignore=shutil.ignore_patterns("__pycache__"))
 
     def failing(self, mutant: Mutant, text: str) -> tuple[str, ...] | None:
-        """The tests that fail where a file has another text, of those that pass on the original."""
+        """Return the tests that fail with another text of a file, of those that pass on the original."""
         file = self.source / "finssim" / mutant.path
         original = file.read_text(encoding="utf-8")
         for tests in tests_of(mutant.path, self.checkout):
@@ -159,7 +160,7 @@ class Copy:
     def _passes(self, tests: tuple[str, ...]) -> bool:
         environment = os.environ | {
             "PYTHONPATH": str(self.source),
-            "PYTHONDONTWRITEBYTECODE": "1",  # a change within a second would be taken for the original
+            "PYTHONDONTWRITEBYTECODE": "1",  # a change within the same second would be taken for the original
             "WARP_CACHE_PATH": str(self.kernels),
         }
         words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
@@ -174,7 +175,7 @@ class Copy:
 
 
 def changed(mutant: Mutant) -> str:
-    """The file's text with the change."""
+    """Return the file's text with the change."""
     lines = (SOURCE / mutant.path).read_text(encoding="utf-8").splitlines(keepends=True)
     line = lines[mutant.line - 1]
     before, after = line[: mutant.column], line[mutant.column + len(mutant.before) :]
@@ -183,7 +184,7 @@ def changed(mutant: Mutant) -> str:
 
 
 def refusing(mutant: Mutant) -> str:
-    """The file's text with an error at the beginning of the function that holds the change."""
+    """Return the file's text with an error at the beginning of the function that contains the change."""
     text = (SOURCE / mutant.path).read_text(encoding="utf-8")
     holders = [
         n
@@ -198,7 +199,7 @@ def refusing(mutant: Mutant) -> str:
 
 
 def main() -> None:
-    """Print each change with what became of it, and the sum."""
+    """Print each mutant with its result, and the totals."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--count", type=int, default=80)
     parser.add_argument("--seed", type=int, default=2)
@@ -236,13 +237,13 @@ def main() -> None:
 
 
 def name_of(mutant: Mutant) -> str:
-    """Where a change is, what it is, and the line that it is in."""
+    """Return position, kind and line of a mutant."""
     line = (SOURCE / mutant.path).read_text(encoding="utf-8").splitlines()[mutant.line - 1].strip()
     return f"{mutant.path}:{mutant.line}: {mutant.before} -> {mutant.after} in `{line}`"
 
 
 def tried(copy: Copy, mutant: Mutant) -> dict[str, str]:
-    """Test a change: caught, survived or not called, and by which tests it was caught."""
+    """Test a mutant: caught, survived or not called, and the tests that caught it."""
     tests = copy.failing(mutant, changed(mutant))
     if tests is not None:
         return {"result": "caught", "by": " ".join(tests)}

@@ -1,6 +1,6 @@
-"""What a look through the water costs: `python benchmarks/optics.py`.
+"""Cost of projection through the water: `python benchmarks/optics.py`.
 
-Microseconds per call and per point on one core, the best of many, and the ratio to cv2.projectPoints (which knows no
+Microseconds per call and per point on one core, the best of many, and the ratio to cv2.projectPoints (which has no
 water) in the same run.
 """
 
@@ -27,7 +27,7 @@ WATER = Interface.water(0.96)
 
 
 def best(call, seconds: float = 0.5) -> float:
-    """Least time of a call [us], over batches of calls for so many seconds."""
+    """Return the least time of a call [µs], over batches of calls for a number of seconds."""
     call()
     start = time.perf_counter()
     call()
@@ -42,7 +42,7 @@ def best(call, seconds: float = 0.5) -> float:
 
 
 def measure(count: int) -> dict[str, float]:
-    """Times of each way for so many points [us per call]."""
+    """Measure the time of each function for a number of points [µs per call]."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-1.0, 1.0, (count, 2)), rng.uniform(0.0, 0.9, (count, 1))], axis=-1)
     pixels, zero = project(CAMERA, WATER, points).pixels, np.zeros(3)
@@ -57,7 +57,7 @@ def measure(count: int) -> dict[str, float]:
 
 
 def every_derivative(points: np.ndarray) -> list[np.ndarray]:
-    """Derivatives of pixels by point, pose, plane, index and lens."""
+    """Return the derivatives of pixels by point, pose, plane, index and lens."""
     found = projection_jacobians(CAMERA, WATER, points)
     return [found.point, found.pose, found.interface, found.index, found.lens]
 

@@ -1,7 +1,7 @@
-"""Wall time of drawing 1280x720 pictures on one core: `python benchmarks/overhead_camera.py [--json FILE]`.
+"""Wall time of rendering 1280x720 pictures on one core: `python benchmarks/overhead_camera.py [--json FILE]`.
 
-The published camera above 1 m of water, two tags of 9.3 cm: the complete picture and the neighbourhood of the tags,
-still and rippling. Each is the best of many, since other programs disturb a clock.
+The published camera above 1 m of water, two tags of 9.3 cm: the full picture and the neighbourhood of the tags, with a
+still and a rippling surface. Each figure is the best of many, since other load disturbs wall time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TAGS = tuple(
 
 
 def published_scene() -> Scene:
-    """The published camera and water."""
+    """Return the published camera and water."""
     camera = Camera(
         LENS, np.array([0.032897, -0.167178, 2.171935]), ORIENTATION / np.linalg.norm(ORIENTATION)
     )
@@ -61,7 +61,7 @@ def published_scene() -> Scene:
 
 
 def best(draw: Callable[[int], object], repetitions: int) -> float:
-    """Least time of a call [s]; the first compiles and does not count."""
+    """Return the least time of a call [s]; the first call compiles and does not count."""
     draw(0)
     times = []
     for i in range(repetitions):
@@ -72,7 +72,7 @@ def best(draw: Callable[[int], object], repetitions: int) -> float:
 
 
 def measure(scene: Scene, device: str) -> dict[str, float]:
-    """Times of one kind of surface [s], and pixels of the neighbourhood."""
+    """Measure the times of one kind of surface [s], and count the pixels of the neighbourhood."""
     camera = OverheadCamera(scene, device=device)
     return {
         "complete": best(lambda i: camera.render(tags=TAGS, time=i / 30), 5),
@@ -82,7 +82,7 @@ def measure(scene: Scene, device: str) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print, write JSON."""
+    """Measure, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")

@@ -1,4 +1,4 @@
-"""What a task in plain torch costs beside the same task in Warp: station keeping, steps of all worlds in a second.
+"""Cost of a task in plain torch compared with the same task in Warp: station keeping, steps of all worlds per second.
 
 python benchmarks/own_tasks.py --worlds 256 4096
 """
@@ -21,7 +21,7 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "t1_in_torch.py"
 
 
 def rate(task: str | Task, worlds: int, device: str, seconds: float) -> float:
-    """Steps of all worlds in a second, episodes of all ages, random actions; the best of three."""
+    """Return steps of all worlds per second, with episodes of all ages and random actions; the best of three."""
     env = finssim.make(task, worlds=worlds, device=device, seed=1)
     limit = round(env.task.time_limit / env.task.control_step)
     rng = np.random.default_rng(0)

@@ -28,7 +28,7 @@ SECONDS = 0.2
 
 
 def positions(name: str, integrator: str, substeps: int, worlds: int = 256) -> np.ndarray:
-    """Where the vehicles are after 2 s of random commands, (worlds, 3) [m]."""
+    """Return the positions of the vehicles after 2 s of random commands, (worlds, 3) [m]."""
     random = np.random.default_rng(0)
     simulator = Simulator(name, worlds=worlds, substeps=substeps, integrator=integrator, threads=1)
     lower, upper = simulator.vehicles[0].force_limits
@@ -41,7 +41,7 @@ def positions(name: str, integrator: str, substeps: int, worlds: int = 256) -> n
 
 
 def accuracy() -> None:
-    """Print the root of the mean square error and the largest one, by vehicle and scheme."""
+    """Print the root mean square error and the largest error, by vehicle and scheme."""
     print("position error after 2 s [mm], RMS / largest")
     for name in VEHICLES:
         exact = positions(name, "rk4", 100)
@@ -53,7 +53,7 @@ def accuracy() -> None:
 
 
 def processor_time(step: Callable[[], object]) -> float:
-    """Processor-seconds of one call, the best of `ROUNDS`."""
+    """Return the processor-seconds of one call, the best of `ROUNDS`."""
     step()
     start = time.process_time()
     step()
@@ -68,7 +68,7 @@ def processor_time(step: Callable[[], object]) -> float:
 
 
 def speed() -> None:
-    """Print nanoseconds of a step of one vehicle, and how many fit into a step of MuJoCo's body."""
+    """Print nanoseconds per step of one vehicle, and the ratio to a step of MuJoCo's body."""
     model = mujoco.MjModel.from_xml_string(MUJOCO_BODY)
     data = mujoco.MjData(model)
     body = processor_time(lambda: [mujoco.mj_step(model, data) for _ in range(1000)]) / 1000.0

@@ -29,17 +29,17 @@ from finssim.localization.poses.methods import METHODS
 from finssim.vehicles import load_vehicle
 
 LIMIT = 500.0
-"""What the constrained fit may take [µs]."""
+"""Largest time of the constrained fit [µs]."""
 
 
 def best(call: Callable[[], object], number: int) -> float:
-    """Least time of a call [µs]."""
+    """Return the least time of a call [µs]."""
     call()
     return 1e6 * min(timeit.repeat(call, number=number, repeat=60)) / number
 
 
 def main() -> None:
-    """Measure, print, write JSON."""
+    """Measure, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()

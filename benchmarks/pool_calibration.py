@@ -1,9 +1,9 @@
-"""How exactly a pool's camera and water are found, and whether the 95 % intervals hold: many simulated surveys.
+"""Accuracy of a pool's camera and water, and coverage of the 95 % intervals, in many simulated surveys.
 
     python benchmarks/pool_calibration.py [--draws 100] [--case NAME ...]
 
-Each draw has its own water (index 1.333 ± 0.003, level within 0.2 degrees), survey (2 mm, tags turned by 0.5 degrees),
-pixels (0.25 px) and tape (2 mm): what the fit is told, it is told truly.
+Each draw has its own water (index 1.333 ± 0.003, level within 0.2 degrees), survey (2 mm, tags rotated by 0.5 degrees),
+pixels (0.25 px) and tape (2 mm); the fit knows these deviations.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FIT = ("pose", "height", "tilt", "index")
 
 @dataclass(frozen=True)
 class Case:
-    """One way to survey a pool."""
+    """Method of surveying a pool."""
 
     heights: tuple[float, ...] = (0.0,)
     locations: int = 85
@@ -58,7 +58,7 @@ CASES = {
 
 
 def draw(case: Case, rng: np.random.Generator) -> tuple[Camera, Interface, Observations, PoolFitSettings]:
-    """One pool with its survey, and what its owner knows."""
+    """Draw one pool with its survey, and the settings of its fit."""
     index = 1.333 + 0.003 * rng.standard_normal()
     if case.window is not None:
         return _tank(case, rng, index)
@@ -118,7 +118,7 @@ def _seen(
     plane: Interface,
     count: int,
 ) -> Observations:
-    """The first places that are wholly in the picture, (N, K, 3)."""
+    """Return the first points that are completely in the picture, (N, K, 3)."""
     middle = nominal.mean(axis=1, keepdims=True)
     arm = np.cross(np.array([0.0, 0.0, 1.0]), nominal - middle)
     true = nominal + survey * rng.standard_normal((len(nominal), 1, 3))
@@ -142,7 +142,7 @@ def _seen(
 
 
 def errors(fit: PoolFit, camera: Camera, plane: Interface) -> dict[str, tuple[float, float]]:
-    """Estimate minus truth, and half the interval, of each parameter that the truth has."""
+    """Return estimate minus truth, and half the interval, of each parameter with a known truth."""
     surface = fit.settings.surface
     truth = {f"camera_{axis}": float(camera.position[k]) for k, axis in enumerate("xyz")}
     clearance = float(plane.normal @ camera.position + plane.offset)

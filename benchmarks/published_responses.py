@@ -1,4 +1,5 @@
-"""Simulated steady speeds and those that the vehicle's authors measured: `python benchmarks/published_responses.py`."""
+"""Simulated steady speeds beside those measured by the vehicle's authors: `python
+benchmarks/published_responses.py`."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ PUBLISHED = Path(__file__).parent / "published"
 DURATION = 6.0
 """Length of each run [s]: eight of the slowest time constants, but too short for added mass to turn a straight run."""
 AGREES = 0.15
-"""Largest relative difference at which a simulated speed agrees with the measured one."""
+"""Largest relative difference at which a simulated speed counts as equal to the measured one [-]."""
 
 
 class ValidationError(ValueError):

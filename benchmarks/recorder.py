@@ -1,8 +1,8 @@
-"""Time the recorder takes from the control loop: `python benchmarks/recorder.py [--json FILE]`.
+"""Time that the recorder takes in the control loop: `python benchmarks/recorder.py [--json FILE]`.
 
-Processor time of the calling thread for each message, the best of several rounds, while the writing thread puts them on
-disk; beside it the time of an Imu through the writer of the `mcap` package in the same thread, and their ratio, which
-depends little on the machine.
+Processor time of the calling thread for each message, the best of several rounds, while the writing thread stores them
+on disk; beside it the time of an Imu through the writer of the `mcap` package in the same thread, and their ratio,
+which depends little on the machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ READING = Reading(0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6),
 
 
 def microseconds(call: Callable[[int], None], messages: int = 1) -> float:
-    """Processor time of this thread for a message [µs], the best round."""
+    """Return the processor time of this thread per message [µs], the best round."""
     best = float("inf")
     for turn in range(ROUNDS):
         start = time.thread_time()
@@ -43,7 +43,7 @@ def microseconds(call: Callable[[int], None], messages: int = 1) -> float:
 
 
 def measure(folder: Path) -> dict[str, float]:
-    """Microseconds a message, by what is recorded."""
+    """Measure microseconds per message, by kind."""
     vehicle = load_vehicle("finsrov")
     make, picture = Messages(vehicle), np.zeros((480, 640), np.uint8)
     imu, odometry = TOPICS["imu"].type, TOPICS["odometry"].type
@@ -62,7 +62,7 @@ def measure(folder: Path) -> dict[str, float]:
 
 
 def _library(make: Messages, kind: str) -> float:
-    """The same Imu through the writer of the `mcap` package."""
+    """Measure the same Imu through the writer of the `mcap` package [µs]."""
     from mcap.writer import CompressionType, Writer
 
     writer = Writer(BytesIO(), compression=CompressionType.LZ4)

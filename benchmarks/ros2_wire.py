@@ -1,7 +1,7 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""What one message costs on the built-in ROS 2 wire: python benchmarks/ros2_wire.py
+"""Cost of one message on the built-in ROS 2 wire: python benchmarks/ros2_wire.py
 
-Prints times of publishing to a subscription of the same process, and how they compare with what NumPy needs to copy
+Prints times of publishing to a subscription of the same process, and their ratio to the time in which NumPy copies
 the same number of bytes, which depends less on the machine.
 """
 
@@ -26,7 +26,7 @@ from sensor_msgs.msg import Image
 
 
 def best(call, count, rounds=7):
-    """Median time of a call in the best of several rounds [µs]."""
+    """Return the median time of a call in the best of several rounds [µs]."""
     medians = []
     for _ in range(rounds):
         times = []
@@ -39,7 +39,7 @@ def best(call, count, rounds=7):
 
 
 def round_trip(node, publisher, message, arrived, count):
-    """Median time from publishing to the callback [µs], both in this process."""
+    """Return the median time from publishing to the callback [µs], both in this process."""
     times = []
     for _ in range(count):
         seen, began = len(arrived), time.perf_counter()

@@ -3,11 +3,11 @@
     python benchmarks/steering.py TASK --plants SEED [--vehicle remus100] [--plant beyond_cruise] [--trials 200]
         [--seeds 1,2,3,4,5] [--steps N] [--init NAME] [--set NAME=VALUE] [--out DIR] [--json FILE]
 
-Every policy is `finssim train TASK --randomize cruise --seed S`; one that --out already holds, trained with the same
-options, is used again. All controllers meet the same plants and starts, those of `finssim evaluate --seed SEED`.
-Intervals hold 95 % of 2000 redrawn figures: each redraws learner seeds and plants with replacement, of a policy and the
-baseline the same plants. `less error` is the baseline's error less the policy's, in the plants where both have one.
-`fast` is the baseline with action 1 for its speed, the fastest that the autopilot is asked for.
+Every policy is `finssim train TASK --randomize cruise --seed S`; a policy in --out with the same options is reused. All
+controllers have the same plants and starts, those of `finssim evaluate --seed SEED`. Intervals contain 95 % of 2000
+resampled figures: each resamples learner seeds and plants with replacement, with the same plants for policy and
+baseline. `less error` is the baseline's error minus the policy's, in the plants where both have one. `fast` is the
+baseline with action 1 for its speed, the highest speed of the autopilot.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ Array = NDArray[np.float64]
 
 
 class Fast(BaselineAgent):
-    """The baseline of a task, as fast as the autopilot can be asked to be."""
+    """Baseline of a task at the highest speed of the autopilot."""
 
     def __init__(self, vehicle: Vehicle, task: Task) -> None:
         super().__init__(next(iter(task.baselines)), vehicle, task)
 
     def act(self, memory: Any, reading: Any, goal: Any) -> Any:
-        """Actions as of the baseline, with 1 for the speed."""
+        """Return the actions of the baseline, with 1 for the speed."""
         action, memory = super().act(memory, reading, goal)
         return np.column_stack([np.ones_like(action[:, :1]), action[:, 1:]]), memory
 
 
 def tried(controller: str, given: argparse.Namespace) -> dict[str, Array]:
-    """Success [-] and error [m] of a controller in every plant, (plants,); an error that there is not is NaN."""
+    """Return success [-] and error [m] of a controller in every plant, (plants,); a missing error is NaN."""
     settings = TrialSettings(trials=given.trials, seed=given.plants)
     found = evaluate_controller(
         controller,
@@ -63,7 +63,7 @@ def tried(controller: str, given: argparse.Namespace) -> dict[str, Array]:
 
 
 def figure(values: Array) -> dict[str, Any]:
-    """Mean of values (seeds, plants), and its interval over both."""
+    """Return the mean of values (seeds, plants), and its interval over both."""
 
     def redraw(random: np.random.Generator) -> Any:
         seeds, plants = (random.integers(n, size=n) for n in values.shape)
@@ -73,7 +73,7 @@ def figure(values: Array) -> dict[str, Any]:
 
 
 def trained(given: argparse.Namespace, seed: int) -> tuple[str, float]:
-    """Folder of the policy of a seed, and what its training took [processor-s], 0 if it was there."""
+    """Return the folder of the policy of a seed, and the cost of its training [processor-s], 0 if it existed."""
     asked = json.dumps([given.vehicle, given.steps, given.init, given.set])
     folder = given.out / f"{given.task}-{seed}-{zlib.crc32(asked.encode()):08x}"
     before = time.process_time()
@@ -91,7 +91,7 @@ def trained(given: argparse.Namespace, seed: int) -> tuple[str, float]:
 
 
 def main() -> None:
-    """Train what is missing, try everyone, print and write."""
+    """Train missing policies, evaluate all controllers, print, and write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

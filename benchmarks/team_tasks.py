@@ -1,11 +1,11 @@
-"""Agent-steps a second of tasks with several vehicles: `python benchmarks/team_tasks.py [TASK ...] [--worlds N]`.
+"""Agent-steps per second of tasks with several vehicles: `python benchmarks/team_tasks.py [TASK ...] [--worlds N]`.
 
-Each agent's action counts as one step. Actions are drawn beforehand and lie in the environment's own array, as a
-learner on the same device leaves them; physics, allocation, script, rewards, observations and resets are included.
+Each agent's action counts as one step. Actions are drawn beforehand and are in the environment's own array, as after a
+learner on the same device; physics, allocation, script, rewards, observations and resets are included.
 
-    best, median   of several rounds, by the clock: run alone
+    best, median   of several rounds, by wall time: run alone
     per_core       by processor time, which other load disturbs least
-    vehicles       steps of all simulated vehicles, the scripted ones too, in the best round
+    vehicles       steps of all simulated vehicles, including scripted ones, in the best round
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ROUNDS, SECONDS = 5, 2.0
 
 
 def measure(task: str, worlds: int, device: str, threads: int | None) -> dict[str, float]:
-    """Steps of all agents together in a second; the names are the module's."""
+    """Return the steps of all agents per second, under the names in the module's docstring."""
     environment = make(task, worlds=worlds, device=device, threads=threads)
     rng = np.random.default_rng(0)
     size = environment.agents * environment.action_size
@@ -54,7 +54,7 @@ def measure(task: str, worlds: int, device: str, threads: int | None) -> dict[st
 
 
 def main() -> None:
-    """Measure, print, write JSON."""
+    """Measure, print, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=["pursuit", "team-pursuit", "formation"], metavar="TASK")
     parser.add_argument("--worlds", type=int, default=4096)

@@ -1,11 +1,12 @@
-"""The pool in figures: `python benchmarks/virtual_pool.py [plants] [speed] [memory] [--seeds 20] [--json FILE]`.
+"""Speed and memory of the virtual pool: `python benchmarks/virtual_pool.py [plants] [speed] [memory] [--seeds N]`.
 
 Parts:
     plants  steady speed of drawn plants along one axis, over the file's, at 0.1, 0.3 and 0.7 of full power
-    speed   processor time of a vehicle second: 60 exchanges and 20 commands a second, truth file, no camera
+    speed   processor time of a simulated second: 60 exchanges and 20 commands per second, truth file, no camera
     memory  resident memory after 10 s and after 20 min
 
-In `plants` a guide rail leaves one axis free, without current and tether. Run alone, with OMP_NUM_THREADS=1.
+In `plants` a guide rail leaves one axis free, without current and tether. Run alone, with OMP_NUM_THREADS=1. `--json
+FILE` writes the figures.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def plants(seeds: int) -> dict[str, Any]:
-    """Mean, least and most of steady speed over the file's, by severity, power and axis."""
+    """Return mean, least and greatest ratio of steady speed to the file's, by severity, power and axis."""
     table: dict[str, Any] = {}
     for severity in ("realistic", "hard"):
         specs = [draw_plant(FINSROV, seed, severity) for seed in range(seeds)]
@@ -65,7 +66,8 @@ def plants(seeds: int) -> dict[str, Any]:
 
 
 def steady_ratio(spec: PlantSpec, axis: int, power: float) -> float:
-    """Steady speed along one axis over the one at which the file's damping balances the wrench."""
+    """Return the ratio of the steady speed along one axis to that at which the file's damping balances the
+    wrench."""
     hydro = FINSROV.hydrodynamics["calibrated"]
     d1, d2 = hydro.linear_damping[axis, axis], hydro.quadratic_damping[axis, axis]
     wrench = power * FINSROV.wrench_limits[axis]
@@ -79,7 +81,7 @@ def steady_ratio(spec: PlantSpec, axis: int, power: float) -> float:
     speeds = []
     for _ in range(1600):
         plant.advance()
-        # The rail's forces change no momentum along the axis.
+        # The rail's forces do not change momentum along the axis.
         plant.nu[:] = (M @ plant.nu)[axis] / M[axis, axis] * np.eye(6)[axis]
         plant.quaternion[:] = (0.0, 0.0, 0.0, 1.0)
         speeds.append(float(plant.nu[axis]))
@@ -87,14 +89,14 @@ def steady_ratio(spec: PlantSpec, axis: int, power: float) -> float:
 
 
 def live(pool: VirtualPool, duration: float) -> None:
-    """Let a pool go on with a robot that drives ahead."""
+    """Run a pool while a robot drives ahead."""
     first = round(60.0 * pool.time) + 1
     for i in range(first, first + round(60.0 * duration)):
         pool.exchange(i / 60.0, [SURGE] if i % 3 == 0 else [])
 
 
 def speed() -> dict[str, float]:
-    """Milliseconds of processor time for a vehicle second, the best of 15 runs of 2 s, by severity."""
+    """Return milliseconds of processor time per simulated second, the best of 15 runs of 2 s, by severity."""
     best = {}
     with tempfile.TemporaryDirectory() as directory:
         for severity in ("nominal", "realistic", "hard"):
@@ -112,7 +114,7 @@ def speed() -> dict[str, float]:
 
 
 def memory() -> list[float]:
-    """Resident memory after 10 s and 20 min of the vehicle's time [MiB]."""
+    """Return the resident memory after 10 s and 20 min of simulated time [MiB]."""
     pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
     sizes = []
     for duration in (10.0, 1190.0):

@@ -1,13 +1,13 @@
-"""Check that public docstrings state unit, shape and frame of the numbers that functions take, return and keep.
+"""Check that public docstrings state unit, shape and frame of the numbers that functions take, return and store.
 
-    python tools/check_docstrings.py    what is missing; exit status 1 where there is any
+    python tools/check_docstrings.py    lists what is missing; exit status 1 if anything is
 
-A parameter, a return value or a field is judged by its annotated type. A real number, or an array of real numbers, has
-a unit in brackets, such as [m/s], or is called what has none, such as a share; or the text names the documented
-function or class whose numbers they are. Quaternions have none by their type. An array that a function takes has a
-shape, such as (n, 3), and a quantity with a direction a frame. What is read is the entry under `Args:` or `Returns:`,
-the docstring or comment of the field, and where there is none the docstring of the function or class. Whole numbers
-are counts, indices and seeds.
+A parameter, a return value or a field is judged by its annotated type. A real number, or an array of real numbers,
+needs a unit in brackets, such as [m/s], or a name without unit, such as a share; or the text refers to the documented
+function or class whose numbers they are. Quaternions have none by their type. An array parameter needs a shape, such
+as (n, 3), and a quantity with a direction a frame. The checked text is the entry under `Args:` or `Returns:`, the
+docstring or comment of the field, and if there is none the docstring of the function or class. Integers are counts,
+indices and seeds.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ QUANTITIES = DIRECTED | set(
 )
 """Names of quantities whose shape must be stated where they are arrays."""
 NAMED = {"quaternion", "orientation", "rotation", "pixel", "pixels", "mask"}
-"""Names that state a unit, or that there is none."""
+"""Names that imply a unit, or that there is none."""
 REAL = re.compile(r"float(16|32|64)?|floating|(vec|mat)\d*[df]?|transform")
 VECTORS = re.compile(r"(vec|mat|quat)\d*[df]?")
 ARRAYS = {"NDArray", "ndarray", "ArrayLike", "Tensor", "array", "array2d", "array3d", "array4d"}
 SEVERAL = set("Mapping Sequence Iterable Iterator tuple list dict str Any Annotated Optional".split())
-"""Types of which nothing is known of the numbers in them."""
+"""Container types that do not determine the type of the numbers in them."""
 UNIT = re.compile(
     r"\[[^\]\n]*\]|\bunits?\b|\bpixels?\b|\bin (metres|seconds|radians|degrees)\b", re.IGNORECASE
 )
@@ -73,7 +73,7 @@ def tree_of(module: str) -> ast.Module | None:
 
 @cache
 def definitions(module: str) -> dict[str, ast.expr | tuple[str, str]]:
-    """Return name -> expression of what a module assigns, or module and name of what it imports."""
+    """Return name -> expression that a module assigns, or module and name that it imports."""
     tree = tree_of(module)
     known: dict[str, ast.expr | tuple[str, str]] = {}
     for node in [] if tree is None else ast.walk(tree):
@@ -136,7 +136,7 @@ def entry(text: str, name: str) -> str | None:
 
 
 def missing(function: ast.FunctionDef, module: str = "", about: str = "") -> Iterator[str]:
-    """Yield what the docstring of a function does not state.
+    """Yield the properties that the docstring of a function does not state.
 
     Args:
         function: The function.
@@ -182,7 +182,7 @@ def missing_of_fields(kind: ast.ClassDef, module: str = "") -> Iterator[str]:
 
 
 def lacking(tree: ast.Module, module: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield what is missing for each public function, class and method of a module."""
+    """Yield the missing properties of each public function, class and method of a module."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
             yield node.name, list(missing(node, module))
@@ -192,7 +192,7 @@ def lacking(tree: ast.Module, module: str) -> Iterator[tuple[str, list[str]]]:
                 if isinstance(own, ast.FunctionDef) and "setter" in "".join(
                     map(ast.unparse, own.decorator_list)
                 ):
-                    continue  # its property has the docstring
+                    continue  # the docstring belongs to its property
                 made = isinstance(own, ast.FunctionDef) and own.name == "__init__"
                 if isinstance(own, ast.FunctionDef) and (made or not own.name.startswith("_")):
                     about = ast.get_docstring(node) or "" if made else ""
@@ -200,7 +200,7 @@ def lacking(tree: ast.Module, module: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def found() -> dict[str, list[str]]:
-    """Return what is missing, by function or class."""
+    """Return the missing properties, by function or class."""
     out = {}
     files = [(path, ROOT / "src") for path in sorted((ROOT / "src").rglob("*.py"))]
     for path, source in [*files, *((path, ROOT) for path in sorted((ROOT / "studies").rglob("*.py")))]:
@@ -216,7 +216,7 @@ def found() -> dict[str, list[str]]:
 
 
 def main() -> int:
-    """Return exit status 1 where something is missing."""
+    """Return exit status 1 if anything is missing."""
     lacks = found()
     for name, what in lacks.items():
         print(f"{name}: its docstring does not state: {', '.join(what)}")
