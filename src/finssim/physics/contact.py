@@ -1,4 +1,4 @@
-"""Walls and floor of the pool, as a penalty on the corners of the vehicle's envelope."""
+"""Contact with the walls and floor of the pool: penalty forces on the corners of the vehicle's envelope."""
 
 # mypy: disable-error-code="arg-type,call-overload,index,no-any-return,operator"
 
@@ -8,12 +8,12 @@ from finssim.physics.lanes import sum_in_lanes
 from finssim.physics.types import angular, join, linear, vec6
 
 CORNERS = 8
-"""Corners of the envelope box."""
+"""Number of corners of the envelope box."""
 
 
 @wp.struct
 class PoolWalls:
-    """A rectangular pool centred on the world's z axis, and how hard its walls are."""
+    """Rectangular pool, centred on the world's z axis, and the contact parameters of its walls."""
 
     present: int
     half_length: float  # half extent along world x [m]
@@ -28,16 +28,18 @@ class PoolWalls:
 def penalty_force(
     penetration: float, v: wp.vec3, n: wp.vec3, stiffness: float, damping: float, friction: float, slip: float
 ) -> wp.vec3:
-    """Force of a surface on a point behind it: spring, damper against approach, and friction that never pulls.
+    """Return the contact force of a surface on a point: spring, damping against approach, and Coulomb friction.
+
+    The normal force is never attractive.
 
     Args:
-        penetration: Depth of the point behind the surface [m]; no force unless positive.
+        penetration: Depth of the point behind the surface [m]; the force is zero unless it is positive.
         v: Velocity of the point [m/s].
         n: Unit normal of the surface, out of the solid, in the same axes.
         stiffness: [N/m].
         damping: [N s/m].
         friction: Coulomb coefficient [-].
-        slip: Speed below which friction is linear, so that it stays dissipative and has no step at rest [m/s].
+        slip: Speed below which friction is linear, so that it is dissipative and continuous at rest [m/s].
 
     Returns:
         Force on the point, in the same axes [N].
@@ -52,10 +54,10 @@ def penalty_force(
 
 @wp.func
 def wall_force(penetration: float, v: wp.vec3, n: wp.vec3, walls: PoolWalls) -> wp.vec3:
-    """Force of one wall on one corner: spring, damper against approach, and friction that never pulls.
+    """Return the contact force of one wall on one corner, see `penalty_force`.
 
     Args:
-        penetration: Depth of the corner behind the wall [m]; no force unless positive.
+        penetration: Depth of the corner behind the wall [m]; the force is zero unless it is positive.
         v: Velocity of the corner, world frame [m/s].
         n: Unit normal of the wall, into the water, world frame.
         walls: Stiffness, damping and friction.
@@ -75,11 +77,11 @@ def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
         half_size: Half extents of the envelope about the body origin, body axes [m].
-        reach: [m]; 0 asks whether it touches.
+        reach: Distance [m]; 0 tests for contact.
     """
     if walls.present == 0:
         return False
-    # Half extents of the turned box along the world's axes: most vehicles near a wall still do not touch it.
+    # Half extents of the rotated box along the world's axes: most vehicles near a wall do not touch it.
     R = wp.quat_to_matrix(q)
     extent = wp.vec3(
         wp.dot(wp.abs(R[0]), half_size), wp.dot(wp.abs(R[1]), half_size), wp.dot(wp.abs(R[2]), half_size)
@@ -95,7 +97,7 @@ def walls_within(walls: PoolWalls, position: wp.vec3, q: wp.quat, half_size: wp.
 def corner_wrench(
     i: int, walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3
 ) -> vec6:
-    """`contact_wrench` of corner i of the box, 0 to 7, body frame [N, N m]; arguments in the same frames and units."""
+    """Return `contact_wrench` of corner i of the box, 0 to 7, body frame [N, N m]; same arguments."""
     R = wp.quat_to_matrix(q)
     sx = 1.0 - 2.0 * float(i & 1)
     sy = 1.0 - 2.0 * float((i >> 1) & 1)
@@ -114,9 +116,9 @@ def corner_wrench(
 
 @wp.func
 def corners_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
-    """`contact_wrench` of a box that touches something, body frame [N, N m]; arguments in the same frames and units."""
+    """Return `contact_wrench` of a box that touches a wall, body frame [N, N m]; same arguments."""
     tau = vec6()
-    # A variable, so that the loop is not unrolled: contact is rare, its code need not be near.
+    # A variable, so that the loop is not unrolled: contact is rare and would make the code longer for every vehicle.
     corners = int(CORNERS)
     for i in range(corners):
         tau += corner_wrench(i, walls, position, q, nu, half_size)
@@ -128,7 +130,7 @@ sum_in_lanes(corners_wrench, corner_wrench, few=CORNERS)
 
 @wp.func
 def contact_wrench(walls: PoolWalls, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3) -> vec6:
-    """Wrench of walls and floor on the eight corners of the vehicle's envelope box.
+    """Return the wrench of walls and floor on the eight corners of the vehicle's envelope box.
 
     Args:
         walls: The pool.

@@ -7,7 +7,7 @@ from finssim.physics.types import angular, join, linear, mat66, vec6
 
 @wp.func
 def damping_wrench(nu_r: vec6, D1: mat66, D2: mat66) -> vec6:
-    """Damping wrench on a submerged body, about the point where the coefficients hold.
+    """Return the damping wrench on a submerged body, about the point at which the coefficients hold.
 
     tau_D = -[D1 + D2 diag(|nu_r|)] nu_r            (paper, eq. 2; its Du is `finssim.physics.terms.surge_damping`)
 
@@ -24,13 +24,13 @@ def damping_wrench(nu_r: vec6, D1: mat66, D2: mat66) -> vec6:
 
 @wp.func
 def twist_at(nu: vec6, r: wp.vec3) -> vec6:
-    """Twist at a point r of the body from the twist at its origin, body frame: [v + ω × r; ω]."""
+    """Return the twist at a point r of the body from the twist at its origin, body frame: [v + ω × r; ω]."""
     omega = angular(nu)
     return join(linear(nu) + wp.cross(omega, r), omega)
 
 
 @wp.func
 def wrench_from(tau: vec6, r: wp.vec3) -> vec6:
-    """Wrench about the body origin from the wrench about a point r, body frame: [F; K + r × F]."""
+    """Return the wrench about the body origin from the wrench about a point r, body frame: [F; K + r × F]."""
     force = linear(tau)
     return join(force, angular(tau) + wp.cross(r, force))

@@ -1,6 +1,6 @@
-"""A funnel that a vehicle can enter: a block with a cone and a tube bored into it, as a penalty on the hull.
+"""Funnel that a vehicle can enter: a block with a conical and a cylindrical bore, with penalty forces on the hull.
 
-Dock axes: the origin is the middle of the throat, where cone and tube meet; x points into the tube.
+Dock axes: the origin is the centre of the throat, where cone and tube meet; x points into the tube.
 """
 
 # mypy: disable-error-code="arg-type,call-overload,index,no-any-return,operator,return-value,valid-type"
@@ -11,12 +11,13 @@ from finssim.physics.contact import penalty_force
 from finssim.physics.types import angular, join, linear, vec6
 
 HULL_POINTS = 21
-"""Points that touch: the nose, and the four corners of the envelope's section at five places along it."""
+"""Number of contact points of a hull: the nose, and the four corners of the envelope's cross-section at five
+stations."""
 
 
 @wp.struct
 class Funnel:
-    """One funnel in every world; all have the same shape."""
+    """One funnel in every world; all funnels have the same shape."""
 
     mouth_radius: float  # [m]
     throat_radius: float  # [m]
@@ -36,14 +37,15 @@ class Funnel:
 
 @wp.func
 def funnel_depth(funnel: Funnel, x: wp.vec3) -> wp.vec4:
-    """Nearest face of the block to a point inside it.
+    """Return the nearest face of the block to a point inside it.
 
     Args:
-        funnel: Its shape.
+        funnel: Shape of the funnel.
         x: The point, dock axes [m].
 
     Returns:
-        Normal of the face, out of the block, and the point's depth behind it [m]: zero, and no normal, outside.
+        Normal of the face, out of the block, and the point's depth behind it [m]; all zero for a point outside the
+        block.
     """
     r = wp.length(wp.vec2(x[1], x[2]))
     ahead = x[0] + funnel.cone_length
@@ -58,7 +60,7 @@ def funnel_depth(funnel: Funnel, x: wp.vec3) -> wp.vec4:
     beyond_wall = r - funnel.throat_radius
     beyond_cone = (beyond_wall + slope * x[0]) / stretch
     axis = wp.vec3(1.0, 0.0, 0.0)
-    # The bore first: the block fills what is outside tube and cone both, and behind the tube's end.
+    # First the bore: the solid is outside both tube and cone, and behind the tube's end.
     depth = wp.min(beyond_wall, beyond_cone)
     n = wp.where(beyond_cone < beyond_wall, -(radial + slope * axis) / stretch, -radial)
     if beyond_end > 0.0:
@@ -81,7 +83,8 @@ def funnel_depth(funnel: Funnel, x: wp.vec3) -> wp.vec4:
 
 @wp.func
 def hull_point(i: int, half_size: wp.vec3) -> wp.vec3:
-    """Point i of the hull, body frame [m]: 0 the nose, then four corners at the front, and so on to the back."""
+    """Return point i of the hull, body frame [m]: 0 is the nose, 1 to 4 are the front corners, and so on to the
+    stern."""
     if i == 0:
         return wp.vec3(half_size[0], 0.0, 0.0)
     k = i - 1
@@ -93,14 +96,14 @@ def hull_point(i: int, half_size: wp.vec3) -> wp.vec3:
 
 @wp.func
 def funnel_within(funnel: Funnel, w: int, position: wp.vec3, half_size: wp.vec3, reach: float) -> bool:
-    """Return whether the ball around the funnel of a world and the one around the vehicle are nearer than `reach` [m].
+    """Return whether the bounding spheres of a world's funnel and of the vehicle are nearer to each other than `reach`.
 
     Args:
-        funnel: Shapes, and poses by world.
-        w: Which world.
+        funnel: Shape, and poses by world.
+        w: Index of the world.
         position: Body origin, world frame [m].
         half_size: Half extents of the envelope about the body origin, body axes [m].
-        reach: [m].
+        reach: Distance [m].
     """
     long = 0.5 * (funnel.cone_length + funnel.tube_length + funnel.back)
     middle = wp.quat_rotate(funnel.quaternion[w], wp.vec3(long - funnel.cone_length, 0.0, 0.0))
@@ -112,18 +115,18 @@ def funnel_within(funnel: Funnel, w: int, position: wp.vec3, half_size: wp.vec3,
 def funnel_wrench(
     funnel: Funnel, w: int, position: wp.vec3, q: wp.quat, nu: vec6, half_size: wp.vec3
 ) -> vec6:
-    """Wrench of the funnel of a world on a vehicle's hull.
+    """Return the wrench of a world's funnel on a vehicle's hull.
 
     Args:
-        funnel: Shapes, and poses by world.
-        w: Which world.
+        funnel: Shape, and poses by world.
+        w: Index of the world.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
         nu: Twist, body frame [m/s, rad/s].
         half_size: Half extents of the envelope about the body origin, body axes [m].
 
     Returns:
-        Wrench about the body origin, body frame [N, N m]; its force is what the block gives altogether.
+        Wrench about the body origin, body frame [N, N m]; its force is the total contact force of the block.
     """
     if not funnel_within(funnel, w, position, half_size, 0.0):
         return vec6()

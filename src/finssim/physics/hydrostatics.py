@@ -1,4 +1,4 @@
-"""Gravity and buoyancy about separate centres, with a smooth free surface."""
+"""Weight and buoyancy with separate centres, and a smooth free surface."""
 
 # mypy: disable-error-code="arg-type"
 
@@ -9,7 +9,7 @@ from finssim.physics.types import join, vec6
 
 @wp.struct
 class WaterWrench:
-    """Result of a hydrodynamic model: its wrench, and how far the vehicle is in the water."""
+    """Result of a hydrodynamic model: its wrench, and the submerged part of the vehicle."""
 
     tau: vec6  # about the body origin, body frame [N, N m]
     displaced: float  # mass of water [kg]
@@ -19,7 +19,7 @@ class WaterWrench:
 
 @wp.struct
 class Afloat:
-    """Pose and motion of a vehicle, as a hydrodynamic model takes them."""
+    """Pose and motion of a vehicle: the input of a hydrodynamic model."""
 
     position: wp.vec3  # body origin, world frame [m]
     q: wp.quat  # attitude, body to world
@@ -30,10 +30,10 @@ class Afloat:
 
 @wp.func
 def submerged_fraction(height: float, half_height: float) -> float:
-    """Part of the displaced volume that is under water.
+    """Return the submerged fraction of the displaced volume.
 
-    A cubic step from 1 (centre of buoyancy deeper than half_height) to 0 (higher than half_height): it and its
-    derivative are continuous, and it depends on height alone, so buoyancy keeps a potential.
+    It is a cubic step from 1 (centre of buoyancy deeper than half_height) to 0 (higher than half_height). The step and
+    its derivative are continuous and depend on height alone, so buoyancy is conservative.
 
     Args:
         height: Height of the centre of buoyancy above the local water surface [m].
@@ -48,14 +48,14 @@ def submerged_fraction(height: float, half_height: float) -> float:
 
 @wp.func
 def submersion_rate(height: float, half_height: float, climb: float) -> float:
-    """Rate of `submerged_fraction` [1/s] while the height grows at `climb` [m/s]."""
+    """Return the rate of `submerged_fraction` [1/s] while the height grows at `climb` [m/s]."""
     s = wp.clamp(0.5 - 0.5 * height / half_height, 0.0, 1.0)
     return -3.0 * s * (1.0 - s) * climb / half_height
 
 
 @wp.func
 def hydrostatic_wrench(weight: float, buoyancy: float, r_g: wp.vec3, r_b: wp.vec3, up: wp.vec3) -> vec6:
-    """Weight and buoyancy wrench about the body origin.
+    """Return the wrench of weight and buoyancy about the body origin.
 
     tau_H = [(B - W) k ;  (B r_b - W r_g) × k]                          (Fossen 2021, eq. 4.5, z up)
 

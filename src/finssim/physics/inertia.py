@@ -9,7 +9,7 @@ from finssim.physics.types import angular, join, linear, mat66, mat66d, vec6, ve
 
 @wp.func
 def coriolis_wrench(momentum: vec6, nu: vec6) -> vec6:
-    """Coriolis and centripetal wrench C(nu) nu of any symmetric 6x6 inertia.
+    """Return the Coriolis and centripetal wrench C(nu) nu of any symmetric 6x6 inertia.
 
     C(nu) nu = [ω × p ;  v × p + ω × h],   [p; h] = M nu      (Kirchhoff; Fossen 2021, theorem 3.2)
 
@@ -27,7 +27,7 @@ def coriolis_wrench(momentum: vec6, nu: vec6) -> vec6:
 
 @wp.func
 def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) -> vec6:
-    """Momentum M_RB nu about the body origin.
+    """Return the momentum M_RB nu about the body origin.
 
     Args:
         mass: Dry mass [kg].
@@ -45,7 +45,7 @@ def rigid_body_momentum(mass: float, r_g: wp.vec3, inertia: wp.mat33, nu: vec6) 
 
 @wp.func
 def symmetric_inertia(x: vec9) -> wp.mat33:
-    """Matrix of the last six numbers of x [kg m²]: xx, yy, zz, xy, xz, yz."""
+    """Return the symmetric matrix of the last six numbers of x [kg m²]: xx, yy, zz, xy, xz, yz."""
     return wp.mat33(x[3], x[6], x[7], x[6], x[4], x[8], x[7], x[8], x[5])
 
 
@@ -59,21 +59,21 @@ def water_acceleration_wrench(
     omega: wp.vec3,
     displaced: float,
 ) -> vec6:
-    """Wrench of accelerating water on a body: M_A d(nu_c)/dt and the Froude-Krylov force.
+    """Return the wrench of accelerating water on a body: M_A d(nu_c)/dt and the Froude-Krylov force.
 
     M_A [a_x - ω × v_c; 0] + [m_w a_c; r_b × m_w a_c],  a_x = (∂/∂t + x_dot·∇) v_c,  a_c = (∂/∂t + v_c·∇) v_c
 
-    The second part is the pressure gradient that accelerates the water itself: with it a neutral body at rest in the
-    water keeps moving with it, whatever its added mass.
+    The second part is the pressure gradient that accelerates the water itself: because of it, a neutrally buoyant body
+    at rest relative to the water stays at rest relative to it, whatever its added mass.
 
     Args:
         M_A: Added mass about the body origin [kg, kg m, kg m²].
         r_b: Centre of buoyancy, body frame [m].
         water_b: Velocity of the water v_c, body frame [m/s].
-        passing: Rate of the water's velocity where the body is, as it moves: a_x, body frame [m/s²].
+        passing: Rate of the water's velocity at the moving body: a_x, body frame [m/s²].
         flowing: Acceleration of the water a_c, body frame [m/s²].
         omega: Angular velocity of the body, body frame [rad/s].
-        displaced: Mass of the water displaced, m_w [kg].
+        displaced: Mass of the displaced water, m_w [kg].
 
     Returns:
         Wrench about the body origin, body frame [N, N m].
@@ -84,9 +84,9 @@ def water_acceleration_wrench(
 
 @wp.func
 def invert_spd(M: mat66) -> mat66:
-    """Inverse of a symmetric positive definite 6x6 matrix, by Gauss-Jordan in float64.
+    """Return the inverse of a symmetric positive definite 6x6 matrix, by Gauss-Jordan elimination in float64.
 
-    Pivoting is not needed for a positive definite matrix; float64 keeps six digits of the result for the condition
+    A positive definite matrix needs no pivoting. With float64, six digits of the result are correct at the condition
     numbers of real vehicles (up to 1e8).
     """
     A = mat66d()
@@ -116,9 +116,9 @@ def invert_spd(M: mat66) -> mat66:
 
 @wp.func
 def solve_spd(M: mat66, b: vec6) -> vec6:
-    """x with M x = b for a symmetric positive definite M, by elimination in float64; see `invert_spd`.
+    """Return x with M x = b for a symmetric positive definite M, by elimination in float64; see `invert_spd`.
 
-    The unit of x is that of b over that of M.
+    The unit of x is the unit of b divided by the unit of M.
     """
     A = mat66d()
     x = vec6d()
@@ -126,7 +126,7 @@ def solve_spd(M: mat66, b: vec6) -> vec6:
         x[i] = wp.float64(b[i])
         for j in range(6):
             A[i, j] = wp.float64(M[i, j])
-    # Loops of constant length, which Warp unrolls: conditions on their counters cost nothing.
+    # Warp unrolls loops of constant length, so conditions on their counters have no cost.
     pivots = vec6d()
     for k in range(6):
         pivot = wp.float64(1.0) / A[k, k]

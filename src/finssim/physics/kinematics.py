@@ -9,7 +9,7 @@ from finssim.physics.types import angular, linear, vec6
 
 @wp.func
 def quaternion_rate(q: wp.quat, omega: wp.vec3) -> wp.quat:
-    """Rate of the body-to-world quaternion.
+    """Return the rate of the body-to-world quaternion.
 
     q_dot = 1/2 q ⊗ (omega, 0)
 
@@ -25,7 +25,7 @@ def quaternion_rate(q: wp.quat, omega: wp.vec3) -> wp.quat:
 
 @wp.func
 def rotate_by(q: wp.quat, omega: wp.vec3, h: float) -> wp.quat:
-    """Attitude after turning at a constant body rate for a time h: q ⊗ exp(h omega / 2), exactly.
+    """Return the attitude after rotation at a constant body rate for a time h: q ⊗ exp(h omega / 2), exactly.
 
     Args:
         q: Attitude, body to world, xyzw, unit length.
@@ -33,11 +33,11 @@ def rotate_by(q: wp.quat, omega: wp.vec3, h: float) -> wp.quat:
         h: Time [s].
 
     Returns:
-        The new attitude, of unit length to rounding: normalise it now and then.
+        The new attitude, of unit length up to rounding: normalise it from time to time.
     """
     half = 0.5 * h * omega
     s2 = wp.dot(half, half)
-    # sin(a)/a and cos(a) by series: exact to float32 rounding up to a = 1 (115° a step).
+    # sin(a)/a and cos(a) as series: exact to float32 rounding up to a = 1 (115° per step).
     s4 = s2 * s2
     sinc = (1.0 - s2 * (1.0 / 6.0)) + s4 * ((1.0 / 120.0) - s2 * (1.0 / 5040.0) + s4 * (1.0 / 362880.0))
     cosine = (1.0 - s2 * 0.5) + s4 * (
@@ -62,7 +62,7 @@ def up_in_body(q: wp.quat) -> wp.vec3:
 
 @wp.func
 def position_rate(q: wp.quat, nu: vec6) -> wp.vec3:
-    """Velocity of the body origin in the world frame [m/s], from the body-frame twist nu."""
+    """Return the velocity of the body origin in the world frame [m/s], from the body-frame twist nu."""
     v = linear(nu)
     i = wp.vec3(q[0], q[1], q[2])
     t = 2.0 * wp.cross(i, v)
@@ -71,5 +71,6 @@ def position_rate(q: wp.quat, nu: vec6) -> wp.vec3:
 
 @wp.func
 def point_velocity(nu: vec6, r: wp.vec3) -> wp.vec3:
-    """Velocity of a point fixed in the body, v + omega × r, body frame [m/s]; r from the body origin [m]."""
+    """Return the velocity of a point fixed in the body, v + omega × r, body frame [m/s]; r is relative to the
+    origin [m]."""
     return linear(nu) + wp.cross(angular(nu), r)

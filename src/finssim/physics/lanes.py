@@ -1,14 +1,14 @@
-"""Eight worlds in a register: C++ for a block of worlds, traced from the very functions that a kernel runs for one.
+"""Vectorized C++ for blocks of eight worlds, traced from the Warp functions that a kernel runs for one world.
 
-A compiler that sees one world at a time fills one place of eight in a processor's registers. So the Warp functions of
-a step are called here once, from plain Python, with *lane numbers* in place of floats: each operation writes a line of
-C++ that does it for eight worlds at once. There is one source of the equations, and no second one.
+A compiler that sees one world at a time fills one of eight lanes of a processor's vector register. This module
+therefore calls the Warp functions of a step once, from plain Python, with *lane numbers* in place of floats. Each
+operation then writes a line of C++ that computes it for eight worlds at once. The equations have a single source.
 
-Where a function branches, the trace follows both ways, and each world takes the results of its own: at a wall, at the
-surface. What only another way than the example's (a submerged vehicle in open water) needs is computed if a world of
-the block goes it; blocks are made of worlds that went the same ways in the last step. A world that goes a way which
-cannot be traced is left to the kernel for one world. So what happens in a world depends on that world alone, whoever
-shares its block.
+Where a function branches, for example at a wall or at the surface, the trace follows both branches, and each world uses
+the result of its own branch. Code for another branch than that of the example, a submerged vehicle in open water, runs
+only if a world of the block needs it. A block therefore consists of worlds that took the same branches in the last
+step. A world whose branch cannot be traced is computed by the kernel for one world. The result of a world thus depends
+on this world alone, never on the others in its block.
 """
 
 # mypy: disable-error-code="no-any-return"
@@ -28,11 +28,11 @@ import numpy as np
 import warp as wp
 
 LANES = 8
-"""Worlds in a block."""
+"""Number of worlds in a block."""
 GROUP = 1024
-"""Worlds that are sorted into blocks by the ways that they went in the last step."""
+"""Number of worlds that are sorted into blocks by their branches in the last step."""
 WAYS = 5
-"""Ways aside, of the first of which a world's own are remembered."""
+"""Number of branches, in the order of the trace, by which worlds are sorted into blocks."""
 
 
 class LaneError(TypeError):
@@ -40,10 +40,10 @@ class LaneError(TypeError):
 
 
 class Lane:
-    """A number in each of a block's worlds, with an example of it, whose way through branches is followed first.
+    """One number in each world of a block, with an example value whose branches are traced first.
 
     Attributes:
-        kind: F (float32), D (float64), I (int32) or M (a truth).
+        kind: F (float32), D (float64), I (int32) or M (boolean mask).
     """
 
     __hash__ = None  # type: ignore[assignment]
@@ -118,18 +118,19 @@ class Lane:
         return self._with(other, "!=", lambda a, b: a != b, "M")
 
     def __bool__(self) -> bool:
-        """A branch: both ways in turn where the trace explores, else the example's, where other worlds leave."""
+        """Return the truth of a branch: both values in turn while exploring; else that of the example, and other
+        worlds leave."""
         truth = self if self.kind == "M" else self != 0
         return self.trace.decide(truth) if isinstance(truth, Lane) else bool(truth)
 
     def __index__(self) -> int:
-        """A number of passes: the example's; worlds with another leave."""
+        """Return the example's number of loop passes; worlds with another number leave the block."""
         self.trace.require(self == self.example)
         return int(self.example)
 
 
 def _is(x: Any, value: float) -> bool:
-    """Return whether x is that constant: times or plus it, nothing need be computed."""
+    """Return whether x is that constant, so that adding or multiplying it needs no code."""
     return isinstance(x, float | int) and x == value
 
 
@@ -138,13 +139,13 @@ def _divide(a: Any, b: Any) -> Any:
 
 
 class LaneRow:
-    """A vector, quaternion or matrix of lane numbers and constants, row by row."""
+    """Vector, quaternion or matrix of lane numbers and constants, row by row."""
 
     def __init__(self, shape: tuple[int, ...], numbers: Sequence[Any], quaternion: bool = False) -> None:
         self.shape, self.numbers, self.quaternion = shape, list(numbers), quaternion
 
     def like(self, numbers: Sequence[Any]) -> LaneRow:
-        """Other numbers in the same shape."""
+        """Return a row of the same shape with other numbers."""
         return LaneRow(self.shape, numbers, self.quaternion)
 
     def _index(self, index: Any) -> int:
@@ -206,7 +207,7 @@ def _sum(terms: Sequence[Any]) -> Any:
 
 
 class _Path:
-    """Answers to the branches of one run of a function."""
+    """Truth values at the branches in one run of a function."""
 
     def __init__(self, answers: Sequence[bool]) -> None:
         self.given = list(answers)
@@ -214,22 +215,22 @@ class _Path:
 
 
 BRANCHES = 8
-"""Branches of a function on one way through it."""
+"""Largest number of branches in one run of a function."""
 SHORT = 24
-"""Lines below which another way is computed for every block, whether a world goes it or not."""
+"""Number of lines up to which another branch is computed for every block, even if no world needs it."""
 
 
 class Trace:
-    """Lines of C++, as the functions that are called with its lane numbers write them.
+    """Lines of C++ written by functions that are called with lane numbers of the trace.
 
-    A line stands outside the loop over substeps if all that it needs does.
+    A line stands outside the loop over substeps if all its operands do.
 
     Attributes:
-        sections: Lines before the loop, in it, after it.
-        level: Section of the lines that need nothing.
-        active: Traces that follow branches both ways: each call of a function runs once for every way through it,
-            and worlds take the result of theirs. What only some ways need is computed where a world of the block goes
-            one of them.
+        sections: Lines before, in and after the loop.
+        level: Section of lines without operands.
+        active: Traces that follow both sides of branches. Each call of a function runs once for every combination of
+            branches, and each world uses the result of its own. Code that only some combinations need runs if a world
+            of the block takes one of them.
     """
 
     active: ClassVar[list[Trace]] = []
@@ -243,20 +244,20 @@ class Trace:
         self._path: _Path | None = None
         self._world_by_world = False
         self.written = 0
-        """Assignments to `WorldArray`s."""
+        """Number of assignments to `WorldArray`s."""
         self.arrays: dict[str, WorldArray] = {}
-        """Those that have been used, by name in C++."""
+        """The arrays in use, by name in C++."""
         self.outside: dict[str, None] = {}
-        """Declarations before the loop over blocks."""
+        """Declarations before the loop over blocks, in the order of insertion."""
 
     @property
     def aside(self) -> bool:
-        """Return whether the lines are those of another way than the example's."""
+        """Return whether the lines belong to another branch than that of the example."""
         return bool(self._aside)
 
     @contextmanager
     def exploration(self) -> Iterator[None]:
-        """Follow branches both ways meanwhile."""
+        """Follow both sides of branches inside the context."""
         Trace.active.append(self)
         try:
             yield
@@ -264,15 +265,15 @@ class Trace:
             Trace.active.pop()
 
     def symbol(self, kind: str, name: str, example: Any) -> Lane:
-        """A lane number that the C++ around the trace declares."""
+        """Return a lane number that the C++ around the trace declares."""
         return Lane(self, kind, name, example, self.level)
 
     def place(self, level: int) -> list[str]:
-        """Return the lines of a section, or of the way that is followed aside."""
+        """Return the lines of a section, or those of the other branch that is being traced."""
         return self._aside[-1][1] if self._aside else self.sections[level]
 
     def line(self, kind: str, expression: str, example: Any, level: int | None = None) -> Lane:
-        """A lane number by its C++ expression; the same one for the same expression in the same section."""
+        """Return the lane number of a C++ expression; equal expressions in a section share one lane number."""
         level = self.level if level is None else level
         key = (kind, expression, level)
         if key not in self._known:
@@ -282,18 +283,19 @@ class Trace:
         return self._known[key]
 
     def once(self, statement: str, level: int) -> None:
-        """Write a statement, unless it is there."""
+        """Write a statement, unless it is already present."""
         if (statement, level) not in self._known:
             self._known[statement, level] = True
             self.place(level).append(statement)
 
     def assume(self, truth: Lane, value: bool) -> None:
-        """Take a truth to be known from now on."""
+        """Treat a lane number as a known truth value from now on."""
         key = next(key for key, lane in self._known.items() if lane is truth)
         self._known[key] = value
 
     def apply(self, kind: str, form: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """An operation on lane numbers and constants; of constants alone, the constant that it gives."""
+        """Return the result of an operation on lane numbers and constants; a constant if all arguments are
+        constants."""
         lanes = [a for a in arguments if isinstance(a, Lane)]
         example = function(*(a.example if isinstance(a, Lane) else a for a in arguments))
         if not lanes:
@@ -303,7 +305,8 @@ class Trace:
         return self.line(kind, form.format(*operands), example, max(a.level for a in lanes))
 
     def require(self, truth: Any) -> None:
-        """Leave the worlds to the kernel for one in which this is not as in the example."""
+        """Remove the worlds in which this truth differs from the example from the block; the kernel for one world
+        computes them."""
         if isinstance(truth, Lane):
             elsewhere = "".join(f" | ~{mask.name}" for mask, _ in self._aside)
             self._keep(f"{'' if truth.example else '~'}{truth.name}{elsewhere}", truth.level)
@@ -314,12 +317,12 @@ class Trace:
         self.place(level).append(f"ok &= {truth};")
 
     def size(self, name: str, value: int) -> int:
-        """Return a number that all worlds share: it is what it is here, or they all leave."""
+        """Return a number that all worlds share; if it differs at run time, all worlds leave the block."""
         self.once(f"if ({name} != {value}) return 0;", 0)
         return value
 
     def decide(self, truth: Lane) -> bool:
-        """Return which way the run that is traced goes."""
+        """Return the truth value of a branch in the run that is being traced."""
         if self._path is None:
             self.require(truth)
             return bool(truth.example)
@@ -334,7 +337,7 @@ class Trace:
         return answer
 
     def call(self, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
-        """Call a function: once for every way through it, or if it writes into arrays the example's way alone."""
+        """Call a function once for every combination of branches; only for the example's if it writes into arrays."""
         key = (function, *(_signature(a) for a in arguments))
         if key in self._known:
             return _mapped(lambda x: x, self._known[key])
@@ -345,7 +348,8 @@ class Trace:
         return _mapped(lambda x: x, result)
 
     def sum_over(self, function: Callable[..., Any], first: Lane, end: Lane, arguments: Sequence[Any]) -> Any:
-        """Sum a function over its first argument in a loop of C++, whose ends all worlds of the block share."""
+        """Sum a function over its first argument in a C++ loop; the loop's limits are the same in all worlds of the
+        block."""
         lines: list[str] = []
         ends = [_shared(number) for number in (first, end)]
         known, self._known = self._known, self._known.new_child()
@@ -366,9 +370,9 @@ class Trace:
         return each.like([Lane(self, "F", name, 0.0, self.level) for name in names])
 
     def world_by_world(self, function: Callable[..., Any], count: int, arguments: Sequence[Any]) -> Any:
-        """Sum a function over its first argument, 0 to count - 1, for one world after the other in all lanes.
+        """Sum a function over its first argument, 0 to count - 1, in the lanes, for one world after another.
 
-        It is computed for the worlds that go the way that is followed aside.
+        The sum is computed only in the worlds that take the branch being traced.
         """
         if count > LANES or not self._aside:
             return _row_sum([function(i, *arguments) for i in range(count)])
@@ -419,7 +423,7 @@ class Trace:
             for truth, _ in taken:
                 self.require(truth)
             return result
-        # Of several branches the first counts: its other way is chosen last.
+        # The first of several branches is outermost: its other side is chosen last.
         for i in reversed(range(len(answers), len(taken))):
             truth, answer = taken[i]
             mask = self.apply("M", "(~{})", lambda a: not a, truth) if answer else truth
@@ -435,7 +439,8 @@ class Trace:
         answers: list[bool],
         result: Any,
     ) -> Any:
-        """Return the result, and for the worlds of the mask that of the way with other answers."""
+        """Return the result, replaced in the worlds of the mask by the result with other truth values at the
+        branches."""
         depth, lines = len(self._aside), list[str]()
         known, path, self._known = self._known, self._path, self._known.new_child()
         self._aside.append((mask, lines))
@@ -482,7 +487,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _alike(a: Any, b: Any) -> tuple[str, list[str]]:
-    """Return the kind that two numbers have in common, and their words in C++."""
+    """Return the common kind of two numbers, and their expressions in C++."""
     kind = next((x.kind for x in (a, b) if isinstance(x, Lane)), "")
     if not kind:
         kind = "M" if isinstance(a, bool) else "F" if isinstance(a, float) or isinstance(b, float) else "I"
@@ -490,7 +495,7 @@ def _alike(a: Any, b: Any) -> tuple[str, list[str]]:
 
 
 def _mapped(function: Callable[..., Any], first: Any, *others: Any) -> Any:
-    """Return a result of the same form, with a function of its numbers, and of those of others of its form."""
+    """Return a result of the same structure, with a function applied to its numbers and those of the other results."""
     if isinstance(first, SimpleNamespace):
         rest = [vars(other) for other in others]
         return SimpleNamespace(
@@ -533,7 +538,7 @@ def _constant(kind: str, value: Any) -> str:
 
 
 def _each(form: str, function: Callable[..., Any], kind: str = "F") -> Callable[..., Any]:
-    """A function of numbers, or of rows number by number."""
+    """Return a function that applies to numbers, or to rows number by number."""
 
     def apply(*arguments: Any) -> Any:
         first = next((a for a in arguments if isinstance(a, LaneRow)), None)
@@ -550,7 +555,7 @@ def _each(form: str, function: Callable[..., Any], kind: str = "F") -> Callable[
 
 
 class _Library:
-    """Functions of Warp that the traced code uses, on lane numbers, with Warp's formulas."""
+    """Warp's functions that traced code uses, for lane numbers, with Warp's formulas."""
 
     abs = staticmethod(_each("absolute({})", abs))
     sqrt = staticmethod(_each("root({})", lambda x: math.sqrt(max(x, 0.0))))
@@ -672,7 +677,7 @@ class _Library:
 
 
 def zero_of(kind: Any) -> Any:
-    """Zero of a scalar, vector or matrix type of Warp."""
+    """Return the zero of a scalar, vector or matrix type of Warp."""
     if kind in (float, wp.float32, wp.float64):
         return 0.0
     if kind in (int, wp.int32):
@@ -686,7 +691,7 @@ def zero_of(kind: Any) -> Any:
 
 
 class _Struct:
-    """A struct type, whose call makes one of zeros."""
+    """Struct type; a call creates a struct of zeros."""
 
     def __init__(self, struct: Any) -> None:
         self.fields = struct.cls.__annotations__
@@ -696,7 +701,7 @@ class _Struct:
 
 
 class _LaneType:
-    """A vector or matrix type, whose call makes one."""
+    """Vector or matrix type; a call creates a value."""
 
     def __init__(self, kind: Any) -> None:
         self.kind = kind
@@ -732,12 +737,13 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {}
 
 
 def sum_in_lanes(function: Any, term: Any, few: int = 0) -> None:
-    """Declare that a Warp function is the sum of another over an index, its additional first argument.
+    """Declare that a Warp function is the sum of another function over an index, which is its additional first
+    argument.
 
     Args:
-        function: Its first two arguments are the first index and the one after the last, unless there are few.
-        term: The other one.
-        few: How many indices, from 0 on, if they are few and the sum is one that few worlds need.
+        function: The sum; without `few`, its first two arguments are the first index and the end of the range.
+        term: The function that is summed.
+        few: Number of indices, from 0 on, for short sums that are needed in few worlds; else 0.
     """
 
     def traced(*arguments: Any) -> Any:
@@ -750,7 +756,7 @@ def sum_in_lanes(function: Any, term: Any, few: int = 0) -> None:
 
 
 def lane_function(function: Any) -> Callable[..., Any]:
-    """The Python of a Warp function, with Warp's own functions and types exchanged for those of lane numbers."""
+    """Return the Python of a Warp function, with Warp's functions and types replaced by those for lane numbers."""
     if function in _FUNCTIONS:
         return _FUNCTIONS[function]
     python = function.func
@@ -761,7 +767,7 @@ def lane_function(function: Any) -> Callable[..., Any]:
     def traced(*arguments: Any) -> Any:
         if Trace.active:
             return Trace.active[-1].call(plain, arguments)
-        # Warp passes vectors by value: what a function writes into one, its caller does not see.
+        # Warp passes vectors by value: the caller does not see assignments to their elements.
         return plain(*(a.like(a.numbers) if isinstance(a, LaneRow) else a for a in arguments))
 
     _FUNCTIONS[function] = traced
@@ -784,12 +790,13 @@ def _exchanged(value: Any) -> Any:
 
 
 class StructArray:
-    """An array of structs by (world, vehicle): what is read is loaded once, what is assigned is stored in the end."""
+    """Array of structs by (world, vehicle): fields are loaded once, and assigned fields are stored at the end."""
 
     def __init__(
         self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any], shared: bool = False
     ) -> None:
-        """Take its name in C++, its type, examples of fields (1 otherwise), and whether worlds may share it."""
+        """Set the name in C++, the type, examples of fields (1 by default), and whether worlds may share the
+        struct."""
         layout = np.dtype(struct.numpy_dtype())
         if layout.itemsize < 4 * LANES:
             raise LaneError(f"{name} has {layout.itemsize // 4} numbers, expected at least {LANES}")
@@ -821,12 +828,12 @@ class StructArray:
         return row if isinstance(value, LaneRow) else row.numbers[0]
 
     def _place(self, index: int) -> str:
-        """C++ of the number at that index of the struct, read with its seven neighbours."""
+        """Return the C++ of the number at that index of the struct, which is read together with seven neighbours."""
         first = min(LANES * (index // LANES), self._size - LANES)
         name = f"{self._name}_{first}"
         statement = f"fetch({self._name}_at, {4 * first}, {name});"
         if self._shared and (f"F {name}[LANES];" in self._trace.outside or not self._trace.aside):
-            # What all worlds share is read for the first block of a group.
+            # Data that all worlds share are read for the first block of a group.
             self._trace.outside[f"F {name}[LANES];"] = None
             self._trace.once(f"if (first == 0 || {self._name}_at.world != 0) {statement}", 0)
         else:
@@ -839,7 +846,7 @@ class StructArray:
             self._assigned[offset // 4 + i] = _word(number)
 
     def stores(self) -> list[str]:
-        """Return the C++ that stores assigned numbers, eight neighbours together where possible."""
+        """Return the C++ that stores assigned numbers, in groups of eight neighbours where possible."""
         lines, assigned = [], dict(sorted(self._assigned.items()))
         while assigned:
             first = next(iter(assigned))
@@ -856,10 +863,10 @@ class StructArray:
 
 
 class NumberArray(StructArray):
-    """An array of numbers by three indices, world, vehicle and a number that is known, of which at least eight."""
+    """Array of numbers by world, vehicle and a constant index; its last axis has at least eight elements."""
 
     def __init__(self, trace: Trace, name: str, size: int) -> None:
-        """Take its name in C++ and the size of the last axis."""
+        """Set the name in C++ and the size of the last axis."""
         self.__dict__.update(_trace=trace, _name=name, _size=size, _assigned={}, _shared=False)
 
     def __getitem__(self, index: Any) -> Any:
@@ -867,10 +874,10 @@ class NumberArray(StructArray):
 
 
 class VectorArray:
-    """An array of vectors by three indices, two of which are world and vehicle, and the other a lane number."""
+    """Array of vectors by three indices: world, vehicle and a lane number."""
 
     def __init__(self, trace: Trace, name: str, kind: Any, slot: int) -> None:
-        """Take its name in C++, its type, and which index the lane number is."""
+        """Set the name in C++, the type, and the position of the lane number among the indices."""
         self._trace, self._name, self._size, self._slot = trace, name, math.prod(kind._shape_), slot
         self._written: list[tuple[Lane, LaneRow]] = []
 
@@ -890,7 +897,7 @@ class VectorArray:
         self._written.append((slot, value))
 
     def stores(self) -> list[str]:
-        """C++ that writes what was assigned; pieces of eight may overlap."""
+        """Return the C++ that stores assigned vectors; groups of eight numbers may overlap."""
         starts = sorted({*range(0, self._size - LANES + 1, LANES), self._size - LANES})
         return [
             f"put_at({self._name}_at, {slot.name}, {4 * first}, "
@@ -901,7 +908,7 @@ class VectorArray:
 
 
 class Untraced:
-    """Anything that the functions for several worlds cannot use: a world that needs it leaves its block."""
+    """Object that functions for several worlds cannot use: a world that needs it leaves its block."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -911,12 +918,12 @@ class Untraced:
 
 
 class UniformStruct:
-    """A struct that all worlds share."""
+    """Struct that all worlds share."""
 
     def __init__(
         self, trace: Trace, name: str, struct: Any, examples: Mapping[str, Any], **known: Any
     ) -> None:
-        """Take its name in C++, its type, examples of fields, which are 1 otherwise, and what is known of it."""
+        """Set the name in C++, the type, examples of fields (1 by default), and known fields."""
         self._trace, self._name, self._fields, self._examples, self._known = (
             trace,
             name,
@@ -936,10 +943,10 @@ class UniformStruct:
 
 
 class WorldStruct:
-    """A struct of arrays whose first index is the world, and of numbers that all worlds share."""
+    """Struct of arrays whose first index is the world, and of numbers that all worlds share."""
 
     def __init__(self, trace: Trace, name: str, actual: Any, examples: Mapping[str, Any]) -> None:
-        """Take its name in C++, one that is used, for sizes, and examples of numbers, which are 1 otherwise."""
+        """Set the name in C++, an instance that provides the sizes, and examples of numbers (1 by default)."""
         self._trace, self._name, self._actual, self._examples = trace, name, actual, examples
 
     def __getattr__(self, field: str) -> Any:
@@ -962,10 +969,11 @@ class WorldStruct:
 
 
 class WorldArray:
-    """An array by world, whose other indices are known."""
+    """Array by world; its other indices are constants."""
 
     def __init__(self, trace: Trace, name: str, kind: Any, actual: Any, example: float) -> None:
-        """Take its name in C++, its elements' type, one that is used, for its shape, and an example of a number."""
+        """Set the name in C++, the type of the elements, an array that provides the shape, and an example of a
+        number."""
         self._trace, self._name, self._kind, self._actual, self._example = trace, name, kind, actual, example
         self._now: dict[tuple[tuple[int, ...], int], Any] = {}
         if getattr(kind, "_wp_scalar_type_", kind) not in (float, int, wp.float32, wp.int32):
@@ -975,13 +983,13 @@ class WorldArray:
 
     @property
     def shape(self) -> dict[int, int]:
-        """Sizes after the first."""
+        """Return the sizes of the axes after the first, by axis."""
         return {
             i: self._trace.size(f"{self._name}.shape[{i}]", n) for i, n in enumerate(self._actual.shape) if i
         }
 
     def _row(self, index: Any) -> tuple[tuple[int, ...], int | None]:
-        """Return the indices of a row of numbers, and which of its numbers is meant; of a vector None: all."""
+        """Return the indices of a row of numbers, and the index within it; None means all numbers of a vector."""
         others = index[1:] if isinstance(index, tuple) else ()
         if not all(isinstance(i, int) for i in others):
             raise LaneError(f"an index of {self._name} differs between worlds")
@@ -1022,7 +1030,7 @@ class WorldArray:
             self._now[row, k] = number
 
     def stores(self) -> list[str]:
-        """C++ that writes what was assigned, neighbours together."""
+        """Return the C++ that stores assigned numbers, neighbours together."""
         lines, kind = [], "I" if isinstance(zero_of(self._kind), int) else "F"
         words = {
             key: f"(F){x.name if isinstance(x, Lane) else _constant(kind, x)}"
@@ -1042,7 +1050,7 @@ class WorldArray:
 
 
 def _shared(index: Any) -> str:
-    """Return the C++ of an index that all worlds of a block share: those with another than the first's leave."""
+    """Return the C++ of an index that all worlds of a block share; worlds with another index than the first leave."""
     if not isinstance(index, Lane):
         return str(index)
     if index.name != "all_i(index)":
@@ -1053,10 +1061,10 @@ def _shared(index: Any) -> str:
 
 
 class SharedStruct:
-    """A struct of arrays that all worlds share, by one index."""
+    """Struct of arrays that all worlds share, with one index."""
 
     def __init__(self, trace: Trace, name: str, struct: Any) -> None:
-        """Take its name in C++ and its type."""
+        """Set the name in C++ and the type."""
         self._trace, self._name, self._struct = trace, name, struct
 
     def __getattr__(self, field: str) -> Any:
@@ -1079,10 +1087,10 @@ class _SharedArray:
 
 
 class LaneLoop:
-    """Variables that a C++ loop carries from one pass to the next: a struct of lane numbers."""
+    """Struct of lane numbers that a C++ loop carries from one pass to the next."""
 
     def __init__(self, trace: Trace, name: str, start: SimpleNamespace) -> None:
-        """Begin with what section 0 has computed."""
+        """Initialise the variables with values computed in section 0."""
         self._trace, self._name, self._start = trace, name, start
         for word, number in zip(self._operands(), _numbers(start), strict=True):
             trace.sections[0].append(f"F {word} = {_word(number)};")
@@ -1091,7 +1099,7 @@ class LaneLoop:
         return [f"{self._name}_{i}" for i in range(len(_numbers(self._start)))]
 
     def value(self) -> SimpleNamespace:
-        """The struct, in the section that is being written."""
+        """Return the struct, in the section that is being written."""
         examples = [n.example if isinstance(n, Lane) else n for n in _numbers(self._start)]
         lanes = iter(
             [self._trace.symbol("F", word, x) for word, x in zip(self._operands(), examples, strict=True)]
@@ -1106,7 +1114,7 @@ class LaneLoop:
         )
 
     def carry(self, value: SimpleNamespace) -> None:
-        """End the loop's pass with other numbers."""
+        """Set the values for the next pass of the loop."""
         for word, number in zip(self._operands(), _numbers(value), strict=True):
             if _word(number) != word:
                 self._trace.sections[1].append(f"const F {word}_next = {_word(number)};")
@@ -1126,15 +1134,15 @@ def _numbers(struct: SimpleNamespace) -> list[Any]:
 def group_source(
     trace: Trace, arrays: Sequence[StructArray | VectorArray], declarations: str, loop: str, way: str
 ) -> str:
-    """The text of a native function that takes a group of worlds from `w` on, `count` of them, through the trace.
+    """Return the text of a native function that computes the trace for a group of `count` worlds from `w` on.
 
     Args:
-        trace: Its lines.
-        arrays: What it reads and writes.
-        declarations: C++ of the symbols, and of the place NAME_at of each array.
+        trace: Lines of the function.
+        arrays: Arrays that it reads and writes.
+        declarations: C++ of the symbols, and of the pointer NAME_at of each array.
         loop: Head of the C++ loop around section 1.
-        way: C++ of the number that says which ways `world` of the group went, by bit, in the last step. It is written
-            again; -1 leaves the world as it was. On it depends who shares a block, and nothing else.
+        way: C++ of the number whose bits are the branches that `world` of the group took in the last step. The function
+            updates it; -1 means that the world is not computed. It determines only which worlds share a block.
     """
     lines = [
         FLOATS,
@@ -1156,10 +1164,11 @@ def group_source(
 
 
 def world_source(trace: Trace, truth: Any) -> str:
-    """The text of a native function that takes `count` worlds from `w` on through a trace that writes by world.
+    """Return the text of a native function that computes a trace, which writes by world, for `count` worlds from `w`
+    on.
 
-    Its value says by bit which worlds are done, the others are as they were; and, LANES bits further, for which of
-    these a truth holds.
+    The low bits of the function's value are the worlds that are done; all other worlds are unchanged. The bits from
+    LANES on are those of them for which a truth holds.
     """
     lines = [
         "const int last = count - 1; int at[LANES]; for (int l = 0; l < LANES; ++l) at[l] = l < last ? l : last;",
@@ -1185,7 +1194,7 @@ const int last = (count - first < LANES ? count - first : LANES) - 1;
 int at[LANES];
 for (int l = 0; l < LANES; ++l) at[l] = order[first + (l < last ? l : last)];
 """
-"""Sorts the group by counting, and begins the loop over its blocks."""
+"""C++ that sorts the group by counting, and begins the loop over its blocks."""
 
 FLOATS = "typedef float F __attribute__((vector_size(4 * LANES)));"
 PREAMBLE = """
@@ -1299,4 +1308,4 @@ const auto keep = [&](const auto& a, auto y) {
     else for (int l = 0; l <= last; ++l) if (ok[l]) __builtin_memcpy(p + l * a.strides[0], (const char*)&y + 4 * l, 4);
 };
 """
-"""Types and functions of the traced lines; a lambda may occur within a function, as in a native function's text."""
+"""Types and functions of the traced lines, as lambdas, which are allowed inside the text of a native function."""

@@ -1,4 +1,4 @@
-"""The physical parameters of a simulated vehicle, as one Warp struct; kernels take them by (world, vehicle)."""
+"""Physical parameters of a simulated vehicle in one Warp struct; kernels index them by (world, vehicle)."""
 
 # mypy: disable-error-code="no-untyped-call,return-value,index,misc,no-untyped-def,operator"
 # mypy: disable-error-code="untyped-decorator,valid-type"
@@ -11,7 +11,7 @@ from finssim.physics.types import MAX_THRUSTERS, mat66, mat68, vec6, vec8
 
 @wp.struct
 class VehicleParameters:
-    """Parameters of one vehicle of one world. Randomisation writes them; nothing is ever recompiled."""
+    """Parameters of one vehicle in one world. Randomisation changes their values without recompilation."""
 
     mass: float  # [kg]
     r_g: wp.vec3  # centre of gravity, body frame [m]
@@ -23,30 +23,30 @@ class VehicleParameters:
     M_A: mat66  # added mass about the body origin [kg, kg m, kg m²]
     M_inv: mat66  # inverse of M_RB + M_A [1/kg, 1/(kg m), 1/(kg m²)]
     G: mat68  # M_inv B: thruster forces to acceleration, submerged [1/kg, 1/(kg m)]
-    r_m: wp.vec3  # point about which inertia is nearly diagonal, body frame [m], kept by `refresh_plant`
-    relax: vec6  # relaxation of a substep per slope of the damping [s/kg, s/(kg m²)], kept by `refresh_plant`
-    relax_1: vec6  # what linear damping adds to the relaxation of a substep [-], kept by `refresh_plant`
-    relax_2: vec6  # what quadratic damping adds to it, per speed on the same axis [s/m, s/rad]
-    relax_v: vec6  # what damping away from the origin adds, per linear speed [s/m]
-    r_h: wp.vec3  # point where the damping coefficients hold, body frame [m]
+    r_m: wp.vec3  # point about which inertia is nearly diagonal, body frame [m], computed by `refresh_plant`
+    relax: vec6  # relaxation of a substep per slope of the damping [s/kg, s/(kg m²)], computed by `refresh_plant`
+    relax_1: vec6  # contribution of linear damping to the relaxation [-], computed by `refresh_plant`
+    relax_2: vec6  # contribution of quadratic damping, per speed on the same axis [s/m, s/rad]
+    relax_v: vec6  # contribution of damping away from the origin, per linear speed [s/m]
+    r_h: wp.vec3  # point at which the damping coefficients hold, body frame [m]
     D1: mat66  # linear damping at r_h [N s/m, N s, N m s]
     D2: mat66  # quadratic damping at r_h [N s²/m², N s²/m, N s², N m s²]
     form_drag: float  # form drag coefficient of the mesh model [-]
     skin_drag: float  # skin drag coefficient of the mesh model [-]
-    hull: int  # which hull mesh, for the mesh model
+    hull: int  # index of the hull mesh, for the mesh model
     B: mat68  # thruster forces to the wrench about the body origin [-, m]
     force_min: vec8  # [N]
     force_max: vec8  # [N]
-    dead_minus: vec8  # commands between dead_minus and dead_plus give nothing [N]
+    dead_minus: vec8  # commands between dead_minus and dead_plus have no effect [N]
     dead_plus: vec8  # [N]
-    play: vec8  # a target no farther than this does not move the actuator, in its unit
-    gain: vec8  # ratio of delivered to nominal thrust; 0 is a dead thruster
+    play: vec8  # smallest difference from the target that moves the actuator, in its unit
+    gain: vec8  # ratio of delivered to nominal thrust; 0 for a failed thruster
     time_constant: vec8  # [s]
     slew: vec8  # [N/s] or, for a speed lag, [rad/s²]
-    alpha: vec8  # share 1 - exp(-substep / time_constant), kept by `refresh_plant`
-    beta: vec8  # the same share for the mean over a substep, kept by `refresh_plant`
+    alpha: vec8  # fraction 1 - exp(-substep / time_constant), computed by `refresh_plant`
+    beta: vec8  # the same fraction for the mean over a substep, computed by `refresh_plant`
     delay: float  # command delay [s]
-    speed_lag: int  # 1: lag and slew act on propeller speed, 0: on force
+    speed_lag: int  # 1: lag and slew limit act on propeller speed, 0: on force
     c_plus: vec8  # [N s²/rad²]
     c_minus: vec8  # [N s²/rad²]
 
@@ -55,13 +55,13 @@ class VehicleParameters:
 class VehicleCommand:
     """Thruster commands and external wrench of one vehicle."""
 
-    thrust: vec8  # commanded thruster force [N]; of other actuators the commanded value [rad, m³ or m]
+    thrust: vec8  # commanded thruster force [N]; commanded value of other actuators [rad, m³ or m]
     disturbance: vec6  # extra wrench about the body origin, body frame [N, N m]
 
 
 @wp.func
 def mass_matrix(mass: float, r_g: wp.vec3, inertia: wp.mat33, M_A: mat66) -> mat66:
-    """M_RB + M_A about the body origin                                          (Fossen 2021, eq. 3.49)
+    """Return the mass matrix M_RB + M_A about the body origin                      (Fossen 2021, eq. 3.49)
 
     Args:
         mass: [kg].
@@ -85,10 +85,10 @@ def mass_matrix(mass: float, r_g: wp.vec3, inertia: wp.mat33, M_A: mat66) -> mat
 
 
 RELAXATION = 0.6
-"""Weight c of the damping that a substep of the midpoint rule takes implicitly (see `finssim.sim.midpoint`)."""
+"""Weight c of implicit damping in a substep of the midpoint rule (see `finssim.sim.midpoint`)."""
 
 DERIVED = ("M_inv", "G", "r_m", "relax", "relax_1", "relax_2", "relax_v", "alpha", "beta")
-"""Fields of `VehicleParameters` that `refresh_plant` writes."""
+"""Fields of `VehicleParameters` that `refresh_plant` computes."""
 
 
 @wp.kernel(enable_backward=False)
@@ -97,13 +97,13 @@ def refresh_plant(
 ):
     """Update the derived parameters in the worlds where mask is not 0.
 
-    The lag makes alpha = 1 - exp(-h/T) of its way in a substep; its mean has made beta = 1 - alpha T/h of it.
-    Without a lag, T = 0, forces are samples of what is linear between them: alpha = 1, beta = 1/2.
+    In a substep the lag removes the fraction alpha = 1 - exp(-h/T) of the difference; averaged over the substep it
+    removes beta = 1 - alpha T/h. Without a lag, T = 0, forces are linear between their samples: alpha = 1, beta = 1/2.
 
     Args:
         plant: Parameters.
         substep: Physics step h [s].
-        mask: Which worlds, by world.
+        mask: Not 0 in the worlds to update, by world.
         world_offset: First world of this launch.
     """
     i, v = wp.tid()
@@ -123,7 +123,7 @@ def refresh_plant(
         if tau[k] > 0.0:
             x = substep / tau[k]
             alpha[k] = 1.0 - wp.exp(-x)
-            # Below x = 0.05 the difference loses digits to its series x/2 - x²/6 + x³/24.
+            # Below x = 0.05 the difference is less accurate than its series x/2 - x²/6 + x³/24.
             beta[k] = wp.where(x > 0.05, 1.0 - alpha[k] / x, x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))
     plant[w, v].alpha = alpha
     plant[w, v].beta = beta
@@ -144,9 +144,9 @@ def refresh_plant(
 
 @wp.func
 def inertia_center(M: mat66) -> wp.vec3:
-    """Return the point about which a 6x6 inertia M [kg, kg m, kg m²] hardly couples translation with turning [m].
+    """Return the point about which a 6x6 inertia M [kg, kg m, kg m²] hardly couples translation and rotation [m].
 
-    It is the mean of the two axes' points.
+    It is the mean of the points of the two axes.
     """
     return 0.5 * wp.vec3(
         M[1, 5] / M[1, 1] - M[2, 4] / M[2, 2],
@@ -157,9 +157,9 @@ def inertia_center(M: mat66) -> wp.vec3:
 
 @wp.func
 def diagonal_at_origin(d: vec6, r: wp.vec3) -> vec6:
-    """Diagonal of Hᵀ diag(d) H: of a matrix that holds at the point r, about the origin.
+    """Return the diagonal of Hᵀ diag(d) H: of a matrix that is diagonal at the point r, about the origin.
 
-    The unit is that of d, and r is in [m].
+    Its unit is that of d; r is in [m].
     """
     x = r[0] * r[0]
     y = r[1] * r[1]
@@ -169,7 +169,7 @@ def diagonal_at_origin(d: vec6, r: wp.vec3) -> vec6:
 
 @wp.func
 def twist_shift(r: wp.vec3) -> mat66:
-    """H with nu(at r) = H nu(at the origin): [[1, -S(r)], [0, 1]]."""
+    """Return H with nu(at r) = H nu(at the origin): [[1, -S(r)], [0, 1]]."""
     H = wp.identity(n=6, dtype=float)
     S = wp.skew(r)
     for i in range(3):

@@ -1,7 +1,8 @@
-"""Solids in the water, as a penalty on points and spheres of the vehicle's hull.
+"""Contact with solids in the water: penalty forces on points and spheres of the vehicle's hull.
 
-The hull is the eight corners of its envelope box, as a pool's walls meet them, and spheres within it, a tenth of the
-least half extent inside its faces: flat solids meet the corners alone, and thin ones do not pass between them.
+The hull consists of the eight corners of its envelope box, as for contact with pool walls, and of spheres inside the
+box, whose surfaces lie a tenth of the least half extent inside its faces. Flat solids touch only the corners, and thin
+solids cannot pass between them.
 """
 
 # mypy: disable-error-code="arg-type,attr-defined,call-overload,index,no-any-return"
@@ -14,39 +15,39 @@ from finssim.physics.types import angular, join, linear, vec6
 
 BOX, SPHERE, CAPSULE, CYLINDER, PLANE, MESH, HEIGHTFIELD = (wp.constant(k) for k in range(7))
 FARTHEST = wp.constant(1.0e3)
-"""Free water is not looked for beyond [m]."""
+"""Greatest distance at which solids are searched [m]."""
 NEIGHBOURS = 32
-"""Solids near a vehicle that are remembered; where there are more, all of the world are looked at."""
+"""Largest number of nearby solids in a vehicle's list; with more, all solids of the world are tested."""
 
 
 @wp.struct
 class Solids:
-    """Solids of one kind each in every world, whose poses and sizes differ."""
+    """Solids of every world: the kinds are the same in all worlds, poses and sizes differ."""
 
     kind: wp.array(dtype=int)  # BOX ... HEIGHTFIELD
     size: wp.array(dtype=wp.vec3)  # half extents; radius and half length [m]; of a mesh: 1 if closed
-    bound: wp.array(dtype=float)  # radius of the ball around its origin that holds it [m]
-    mesh: wp.array(dtype=wp.uint64)  # of meshes
-    heights: wp.array2d(dtype=float)  # of the heightfield: z by (y, x) [m]
+    bound: wp.array(dtype=float)  # radius of the bounding sphere around its origin [m]
+    mesh: wp.array(dtype=wp.uint64)  # mesh identifiers
+    heights: wp.array2d(dtype=float)  # heights of the heightfield: z by (y, x) [m]
     gentle: float  # cosine of the heightfield's steepest slope
-    shape: wp.array(dtype=int)  # index of each among the poses
+    shape: wp.array(dtype=int)  # index of each solid in `pose` and `scale`
     pose: wp.array2d(dtype=wp.transform)  # to world [m], by (world, shape)
-    scale: wp.array2d(dtype=float)  # factor on its size, by (world, shape)
-    draws: wp.array(dtype=int)  # changes with the poses of a world
-    drawn: wp.array2d(dtype=int)  # at the last look around, by (world, vehicle)
-    near: wp.array3d(dtype=int)  # which solids were near at that look, by (world, vehicle, NEIGHBOURS)
-    count: wp.array2d(dtype=int)  # how many there were
-    reach: wp.array2d(dtype=float)  # how far the vehicle may have come from there without meeting others [m]
+    scale: wp.array2d(dtype=float)  # factor on the size, by (world, shape)
+    draws: wp.array(dtype=int)  # number that changes with the poses of a world
+    drawn: wp.array2d(dtype=int)  # its value at the last search, by (world, vehicle)
+    near: wp.array3d(dtype=int)  # indices of the solids near at that search, by (world, vehicle, NEIGHBOURS)
+    count: wp.array2d(dtype=int)  # number of these
+    reach: wp.array2d(dtype=float)  # distance from the searched position up to which the list is complete [m]
     stiffness: float  # per point or sphere of the hull [N/m]
     damping: float  # per point, against approach only [N s/m]
     friction: float  # Coulomb coefficient [-]
-    step: float  # longest step in which contacts are integrated [s]
+    step: float  # longest integration step during contact [s]
     force: wp.array2d(dtype=float)  # greatest contact force on a vehicle in the last control step [N]
 
 
 @wp.func
 def box_distance(x: wp.vec3, half: wp.vec3) -> wp.vec4:
-    """Normal and signed distance of a box.
+    """Return the normal and signed distance of a box.
 
     Args:
         x: A point, box axes [m].
@@ -71,9 +72,7 @@ def box_distance(x: wp.vec3, half: wp.vec3) -> wp.vec4:
 
 @wp.func
 def ball_distance(x: wp.vec3, radius: float) -> wp.vec4:
-    """Normal and signed distance of a sphere about the origin; see `box_distance`.
-
-    Both in [m], as the arguments.
+    """Return the normal and signed distance [m] of a sphere about the origin; see `box_distance`.
 
     Args:
         x: A point [m].
@@ -86,9 +85,7 @@ def ball_distance(x: wp.vec3, radius: float) -> wp.vec4:
 
 @wp.func
 def cylinder_distance(x: wp.vec3, radius: float, half: float) -> wp.vec4:
-    """Normal and signed distance of a cylinder along z; see `box_distance`.
-
-    Both in [m], as the arguments.
+    """Return the normal and signed distance [m] of a cylinder along z; see `box_distance`.
 
     Args:
         x: A point, cylinder axes [m].
@@ -97,7 +94,7 @@ def cylinder_distance(x: wp.vec3, radius: float, half: float) -> wp.vec4:
     """
     r = wp.length(wp.vec2(x[0], x[1]))
     radial = wp.vec3(x[0], x[1], 0.0) / wp.max(r, 1.0e-9)
-    # In the half plane of its axis and the point, it is a box.
+    # In the half plane through its axis and the point, the cylinder is a box.
     flat = box_distance(wp.vec3(r, 0.0, x[2]), wp.vec3(radius, 1.0e6, half))
     n = flat[0] * radial + wp.vec3(0.0, 0.0, flat[2])
     return wp.vec4(n[0], n[1], n[2], flat[3])
@@ -105,23 +102,24 @@ def cylinder_distance(x: wp.vec3, radius: float, half: float) -> wp.vec4:
 
 @wp.func
 def heightfield_depth(solids: Solids, size: wp.vec3, x: wp.vec3, radius: float) -> wp.vec4:
-    """Normal of a heightfield and how far a sphere is in it: h - z of its lowest point, over the normal's z.
+    """Return the normal of a heightfield and the depth of a sphere in it: h - z of its lowest point, over the normal's
+    z.
 
-    The spring ½ k (h - z)² then has the force k depth n exactly: it gives back what it takes on any slope.
+    The potential ½ k (h - z)² then has exactly the force k depth n: contact conserves energy on any slope.
 
     Args:
-        solids: Its heights.
+        solids: Solids with the heights.
         size: Half extents along x and y [m].
         x: Centre of the sphere, heightfield axes [m].
         radius: [m].
 
     Returns:
-        Normal, and the depth [m]; above the heights less than the distance, and negative.
+        Normal, and depth [m]; above the ground it is negative, with a magnitude below the distance.
     """
     columns = solids.heights.shape[1]
     rows = solids.heights.shape[0]
     if wp.abs(x[0]) > size[0] or wp.abs(x[1]) > size[1]:
-        # The ground is not touched from the side; contact begins at its edge.
+        # The ground has no contact from the side; contact begins at its edge.
         beyond = wp.max(wp.abs(x[0]) - size[0], wp.abs(x[1]) - size[1])
         return wp.vec4(0.0, 0.0, 1.0, -wp.max(beyond, 1.0e-6))
     per_x = float(columns - 1) / (2.0 * size[0])
@@ -132,7 +130,7 @@ def heightfield_depth(solids: Solids, size: wp.vec3, x: wp.vec3, radius: float) 
     j = wp.min(int(v), rows - 2)
     fx = u - float(i)
     fy = v - float(j)
-    # Triangles as the ray caster has them: the diagonal goes from the least x and y to the greatest.
+    # The same triangles as in the ray caster: the diagonal runs from the least x and y to the greatest.
     low = solids.heights[j, i]
     high = solids.heights[j + 1, i + 1]
     side = solids.heights[j, i + 1]
@@ -151,18 +149,18 @@ def heightfield_depth(solids: Solids, size: wp.vec3, x: wp.vec3, radius: float) 
 
 @wp.func
 def solid_depth(solids: Solids, k: int, x: wp.vec3, radius: float, reach: float) -> wp.vec4:
-    """Normal of a solid and how far a sphere is in it.
+    """Return the normal of a solid and the depth of a sphere in it.
 
     Args:
-        solids: Their sizes.
-        k: Which.
+        solids: All solids.
+        k: Index of the solid.
         x: Centre of the sphere, axes of the solid [m].
-        radius: Of the sphere; 0 for a point [m].
-        reach: How far from its surface a mesh is looked for [m].
+        radius: Radius of the sphere; 0 for a point [m].
+        reach: Greatest distance at which the surface of a mesh is searched [m].
 
     Returns:
-        Normal out of the solid, axes of the solid, and the depth of the sphere's deepest point [m]: outside minus the
-        distance or less.
+        Normal out of the solid, axes of the solid, and the depth of the sphere's deepest point [m]; outside it is
+        negative, with a magnitude of at most the distance.
     """
     kind = solids.kind[k]
     size = solids.size[k]
@@ -195,15 +193,15 @@ def solid_depth(solids: Solids, k: int, x: wp.vec3, radius: float, reach: float)
 
 @wp.func
 def scaled_depth(solids: Solids, k: int, scale: float, x: wp.vec3, radius: float, reach: float) -> wp.vec4:
-    """`solid_depth` of a solid drawn `scale` times as large: lengths are divided by it, and the depth multiplied.
+    """Return `solid_depth` of a solid that is enlarged by the factor `scale`.
 
     Args:
-        solids: Their sizes.
-        k: Which.
+        solids: All solids.
+        k: Index of the solid.
         scale: Factor on its size [-].
         x: Centre of the sphere, axes of the solid [m].
-        radius: Of the sphere [m].
-        reach: How far from its surface a mesh is looked for [m].
+        radius: Radius of the sphere [m].
+        reach: Greatest distance at which the surface of a mesh is searched [m].
     """
     face = solid_depth(solids, k, x / scale, radius / scale, reach / scale)
     return wp.vec4(face[0], face[1], face[2], scale * face[3])
@@ -222,10 +220,11 @@ def spheres_along(half: float, least: float) -> int:
 
 @wp.func
 def hull_sphere(i: int, half_size: wp.vec3) -> wp.vec4:
-    """Centre, body frame, and radius of part i of the hull [m]: 0 to 7 the corners, of radius 0, then spheres.
+    """Return centre, body frame, and radius of part i of the hull [m]: 0 to 7 are corners of radius 0, then spheres
+    follow.
 
     Args:
-        i: Which, below 8 and the product of `spheres_along` of the three axes.
+        i: Index of the part, less than 8 plus the product of `spheres_along` of the three axes.
         half_size: Half extents of the envelope about the body origin, body axes [m].
     """
     if i < 8:
@@ -250,10 +249,10 @@ def solids_within(clearing: wp.vec4, position: wp.vec3, half_size: wp.vec3, reac
     """Return whether a solid may be nearer to the vehicle's envelope than `reach`.
 
     Args:
-        clearing: A ball of free water: its centre, world frame, and its radius [m].
+        clearing: Ball of free water: its centre, world frame, and its radius [m].
         position: Body origin, world frame [m].
         half_size: Half extents of the envelope about the body origin, body axes [m].
-        reach: [m].
+        reach: Distance [m].
     """
     away = position - wp.vec3(clearing[0], clearing[1], clearing[2])
     return wp.length(away) + wp.length(half_size) + reach > clearing[3]
@@ -261,14 +260,14 @@ def solids_within(clearing: wp.vec4, position: wp.vec3, half_size: wp.vec3, reac
 
 @wp.func
 def free_water(solids: Solids, w: int, v: int, position: wp.vec3, around: float) -> float:
-    """Radius of a ball of free water about a vehicle [m]: no solid of the world begins within it. Notes the near ones.
+    """Return the radius of the largest ball of free water around a vehicle [m], and store the list of nearby solids.
 
     Args:
         solids: All solids.
-        w: Which world.
-        v: Which vehicle.
+        w: Index of the world.
+        v: Index of the vehicle.
         position: Body origin, world frame [m].
-        around: Radius within which near ones are noted [m].
+        around: Radius within which a solid is nearby [m].
     """
     free = float(FARTHEST)
     count = int(0)
@@ -299,13 +298,13 @@ def solids_wrench(
     nu: vec6,
     half_size: wp.vec3,
 ) -> vec6:
-    """Wrench of the solids of a world on a vehicle's hull.
+    """Return the wrench of the solids of a world on a vehicle's hull.
 
     Args:
         solids: All solids.
-        clearing: A ball of free water: its centre and radius [m]; see `solids_within`.
-        w: Which world.
-        v: Which vehicle.
+        clearing: Ball of free water: its centre and radius [m]; see `solids_within`.
+        w: Index of the world.
+        v: Index of the vehicle.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
         nu: Twist, body frame [m/s, rad/s].
@@ -347,7 +346,7 @@ def solids_wrench(
                     face = scaled_depth(solids, k, scale, origin + R * r, part[3], 2.0 * around)
                     if face[3] > 0.0:
                         n = wp.vec3(face[0], face[1], face[2])
-                        r = r - part[3] * (wp.transpose(R) * n)  # where the sphere touches
+                        r = r - part[3] * (wp.transpose(R) * n)  # contact point of the sphere
                         v_s = R * (velocity + wp.cross(omega, r))
                         f = wp.transpose(R) * penalty_force(
                             face[3], v_s, n, solids.stiffness, solids.damping, solids.friction, 0.01

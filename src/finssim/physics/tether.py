@@ -11,26 +11,26 @@ from finssim.physics.types import join, vec6
 class Tether:
     """The tether of one vehicle; a diameter of 0 means none."""
 
-    anchor: wp.vec3  # where it enters the water, world frame [m]
+    anchor: wp.vec3  # point where it enters the water, world frame [m]
     attachment: wp.vec3  # on the vehicle, body frame [m]
     diameter: float  # [m]
     drag_coefficient: float  # of a cylinder across the flow [-]
-    wet_weight: float  # weight in water per length [N/m]; negative floats
+    wet_weight: float  # weight in water per length [N/m]; negative for a buoyant tether
 
 
 @wp.func
 def tether_wrench(
     tether: Tether, density: float, position: wp.vec3, q: wp.quat, nu: vec6, water: wp.vec3
 ) -> vec6:
-    """Wrench of the tether on the vehicle: the vehicle's share of the cross-flow drag, and half the wet weight.
+    """Return the wrench of the tether on the vehicle: its part of the cross-flow drag, and half the wet weight.
 
-    The tether is a straight line of length L whose velocity across itself grows linearly from 0 at the anchor to v_n at
-    the vehicle. Its drag per length, ½ ρ C d |v_n s| v_n s at the fraction s, is carried by both ends; by moments the
-    vehicle carries ∫ ½ ρ C d |v_n| v_n s² · s L ds = ρ C d L |v_n| v_n / 8.
+    The tether is a straight line of length L whose transverse velocity grows linearly from 0 at the anchor to v_n at
+    the vehicle. Its drag per length, ½ ρ C d |v_n s| v_n s at the fraction s, is carried by both ends. From the balance
+    of moments, the vehicle carries ∫ ½ ρ C d |v_n| v_n s² · s L ds = ρ C d L |v_n| v_n / 8.
 
     Args:
         tether: Its geometry and coefficients.
-        density: Of the water [kg/m³].
+        density: Density of the water [kg/m³].
         position: Body origin, world frame [m].
         q: Attitude, body to world.
         nu: Twist, body frame [m/s, rad/s].

@@ -1,4 +1,4 @@
-"""Moving water: uniform, sheared and drifting currents, linear waves at finite depth, and the surface itself."""
+"""Moving water: uniform, sheared and drifting currents, linear waves at finite depth, and the free surface."""
 
 # mypy: disable-error-code="assignment,no-untyped-def,operator,untyped-decorator,valid-type"
 
@@ -17,19 +17,19 @@ class WaterArrays:
     gravity: float  # [m/s²]
     depth: float  # still water depth [m], for the wave dispersion
     n_waves: int
-    moving: int  # 0: still water everywhere, nothing below is read
+    moving: int  # 0: still water everywhere, nothing below is used
     current: wp.array(dtype=wp.vec3)  # at the still surface, world frame [m/s]
     shear: wp.array(dtype=wp.vec3)  # d(current)/dz, world frame [1/s]
     drift: wp.array(dtype=wp.vec3)  # slow random part of the current at the start of the step [m/s]
-    drift_rate: wp.array(dtype=wp.vec3)  # its rate during the step [m/s²]
+    drift_rate: wp.array(dtype=wp.vec3)  # its rate of change during the step [m/s²]
     drift_std: wp.array(dtype=wp.vec3)  # standard deviation of the drift, world frame [m/s]
     drift_time: wp.array(dtype=float)  # correlation time [s]
     profile_depth: wp.array(
         dtype=float
     )  # depths of the current profile, ascending [m]; none without a profile
-    profile_time: wp.array(dtype=float)  # its times since the reset, ascending [s]
+    profile_time: wp.array(dtype=float)  # times of the current profile since the reset, ascending [s]
     profile: wp.array2d(dtype=wp.vec3)  # current by time and depth, world frame [m/s]
-    profile_turn: wp.array(dtype=wp.vec2)  # factor on it and turn of it, as factor (cos, sin), by world [-]
+    profile_turn: wp.array(dtype=wp.vec2)  # scale and rotation of the profile, scale (cos, sin), by world [-]
     wave_amplitude: wp.array2d(dtype=float)  # [m]
     wave_number: wp.array2d(dtype=float)  # k [rad/m]
     wave_frequency: wp.array2d(dtype=float)  # omega [rad/s], from the dispersion relation
@@ -39,7 +39,7 @@ class WaterArrays:
 
 @wp.struct
 class Flow:
-    """Water around one vehicle: what it does and where its surface is."""
+    """Water at one vehicle: its motion and its surface."""
 
     velocity: wp.vec3  # world frame [m/s]
     acceleration: wp.vec3  # local acceleration, world frame [m/s²]
@@ -49,7 +49,7 @@ class Flow:
 
 
 def dispersion(wave_number: ArrayLike, depth: float, gravity: float = 9.81) -> NDArray[np.float64]:
-    """Angular frequency of a linear wave, ω = sqrt(g k tanh(k h)).
+    """Return the angular frequency of a linear wave, ω = sqrt(g k tanh(k h)).
 
     Args:
         wave_number: k = 2π / wavelength [rad/m], any shape.
@@ -64,7 +64,7 @@ def dispersion(wave_number: ArrayLike, depth: float, gravity: float = 9.81) -> N
 
 
 def wave_number(frequency: ArrayLike, depth: float, gravity: float = 9.81) -> NDArray[np.float64]:
-    """Wave number that solves the dispersion relation ω² = g k tanh(k h), by Newton's method.
+    """Return the wave number that solves the dispersion relation ω² = g k tanh(k h), by Newton's method.
 
     Args:
         frequency: ω [rad/s], positive, of any shape (...,).
@@ -94,7 +94,8 @@ class ProfileFlow:
 
 @wp.func
 def segment(grid: wp.array(dtype=float), x: float) -> int:
-    """Return the index of the segment of an ascending grid of two points or more that holds x, in the grid's unit."""
+    """Return the index of the segment that contains x in an ascending grid of at least two points, in the grid's
+    unit."""
     i = int(0)
     for r in range(1, grid.shape[0] - 1):
         if x >= grid[r]:
@@ -104,7 +105,7 @@ def segment(grid: wp.array(dtype=float), x: float) -> int:
 
 @wp.func
 def profile_at(water: WaterArrays, world: int, depth: float, t: float) -> ProfileFlow:
-    """Current of the profile, linear between its depths [m] and times [s], and constant beyond them."""
+    """Return the current of the profile, linear between its depths [m] and times [s], and constant beyond them."""
     out = ProfileFlow()
     i = int(0)
     j = int(0)
@@ -143,22 +144,22 @@ def profile_at(water: WaterArrays, world: int, depth: float, t: float) -> Profil
 
 @wp.func
 def flow_at(water: WaterArrays, world: int, position: wp.vec3, t: float, t_step: float) -> Flow:
-    """Water velocity, acceleration, gradient and surface at a point.
+    """Return velocity, acceleration, gradient and surface of the water at a point.
 
     Linear (Airy) waves of amplitude A, θ = k·x - ωt + φ, at depth h:
     η = A cos θ,  u = A ω cosh k(z+h) / sinh kh cos θ,  w = A ω sinh k(z+h) / sinh kh sin θ.
-    Above the still surface the orbital motion is that of z = 0. The acceleration is the local one, ∂v/∂t, as linear
-    wave theory has it.
+    Above the still surface the orbital motion is that of z = 0. The acceleration is the local one, ∂v/∂t, as in linear
+    wave theory.
 
     Args:
         water: Water of all worlds.
         world: Index of the world.
-        position: Where, world frame [m].
+        position: Point, world frame [m].
         t: Time since the world was reset [s].
-        t_step: Part of t since the start of the control step [s]; the drifting current is linear within a step.
+        t_step: Time since the start of the control step [s]; the drifting current is linear within a step.
 
     Returns:
-        The flow there, world frame.
+        The flow at the point, world frame.
     """
     flow = Flow()
     flow.normal = wp.vec3(0.0, 0.0, 1.0)
@@ -223,7 +224,7 @@ def advance_drift(
     episode: wp.array(dtype=int),
     world_offset: int,
 ):
-    """Draw the drifting current of the coming control step: a Gauss-Markov process, exact for its sampling.
+    """Draw the drifting current of the next control step: a Gauss-Markov process, discretized exactly.
 
     d(0) = σ N(0, 1),  d(t + T) = a d(t) + sqrt(1 - a²) σ N(0, 1),  a = exp(-T / time)
 

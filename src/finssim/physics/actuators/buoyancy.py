@@ -1,4 +1,4 @@
-"""A buoyancy engine: a volume of water that is displaced or taken in at one place."""
+"""Buoyancy engine: a volume of water that is displaced or taken in at one point."""
 
 # mypy: disable-error-code="arg-type,no-any-return,valid-type"
 
@@ -12,7 +12,7 @@ from finssim.vehicles.part import Vector3
 
 
 class BuoyancyEngine(Actuator):
-    """Section of a buoyancy engine, piston or ballast tank; its value is the volume beyond that of the body [m³]."""
+    """Section of a buoyancy engine, piston or ballast tank; its value is the volume in addition to the body's [m³]."""
 
     position: Vector3
     """Centre of the volume, from the body origin, body frame [m], (3,)."""
@@ -20,12 +20,12 @@ class BuoyancyEngine(Actuator):
 
 @wp.func
 def volume_wrench(value: float, up: wp.vec3, density: float, position: wp.vec3, gravity: float) -> vec6:
-    """Buoyancy [ρ g V k; r × ρ g V k] of a volume                                        (Archimedes)
+    """Return the buoyancy [ρ g V k; r × ρ g V k] of a volume                                (Archimedes)
 
     Args:
         value: Volume V [m³].
         up: World's z axis k in the body frame [-].
-        density: Of the water [kg/m³].
+        density: Density of the water [kg/m³].
         position: r, body frame [m].
         gravity: [m/s²].
 

@@ -1,4 +1,4 @@
-"""A fin: a deflected surface with lift and drag by its angle of attack, in the flow at its place."""
+"""Fin: a deflected surface with lift and drag by its angle of attack in the local flow."""
 
 # mypy: disable-error-code="arg-type,no-any-return,no-untyped-call,operator,valid-type"
 
@@ -32,32 +32,31 @@ class Fin(Actuator):
     """Section of a fin; its value is the deflection [rad], about `span` by the right-hand rule."""
 
     off: Number | None = 0.0
-    """Deflection while the vehicle is disarmed or in a fault [rad]; it stays where it is if None."""
+    """Deflection while the vehicle is disarmed or in a fault [rad]; None leaves it unchanged."""
     position: Vector3
     """Centre of pressure, from the body origin, body frame [m], (3,)."""
     span: Axis
-    """Axis about which the fin turns, body frame, unit length, (3,)."""
+    """Axis of the deflection, body frame, unit length, (3,)."""
     chord: Axis = Field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     """Direction of the leading edge at deflection 0, body frame, unit length, perpendicular to `span`, (3,)."""
     area: Positive
-    """Planform area of the surface, or of all surfaces that turn together [m²]."""
+    """Planform area of the surface, or of all surfaces that are deflected together [m²]."""
     lift_slope: Positive
     """Slope of the lift coefficient over the angle of attack, below stall [1/rad]."""
     stall: Positive
-    """Angle of attack beyond which lift falls, to 0 at 90° [rad]."""
+    """Angle of attack beyond which the lift decreases, to 0 at 90° [rad]."""
     drag: Vector3 = zeros(3)
     """Drag coefficient d0 + d1 |α| + d2 α² over the angle of attack α: [-], [1/rad], [1/rad²], (3,); at most 2."""
     incidence: Probability = 1.0
-    """Part of the flow's own angle that counts: 1 for a fin in the flow, 0 where the hull's coefficients hold the lift
-    of the fixed fins and the deflection alone counts."""
+    """Weight of the flow angle in the angle of attack: 1 for a fin in the flow; 0 if the hull's coefficients contain
+    the lift of the undeflected fins, so that only the deflection counts."""
     wake: dict[str, NonNegative] = Field(default_factory=dict)
-    """Name of a thruster in whose wake the fin is -> part of the wake's momentum that reaches it, up to 1 at the disc's
-    exit [-]; the thruster needs a `diameter`."""
+    """Name of a thruster whose wake reaches the fin -> fraction of the wake's momentum at the fin, up to 1 at the exit
+    of the disc [-]; the thruster needs a `diameter`."""
 
     @property
     def sides(self) -> tuple[float, float]:
-        """Return length along the chord and along the span of a plate of this area, twice as wide as long, to be drawn
-        [m]."""
+        """Return the lengths along chord and span of a plate of this area, twice as wide as long, for drawings [m]."""
         length = float(np.sqrt(0.5 * self.area))
         return length, 2.0 * length
 
@@ -88,19 +87,19 @@ def fin_wrench(
     incidence: float,
     wake: vec8,
 ) -> vec6:
-    """Lift ½ρ A C_L(α) V² across the flow and drag ½ρ A C_D(α) V² along it.
+    """Return the lift ½ρ A C_L(α) V² across the flow and the drag ½ρ A C_D(α) V² along it.
 
     α = δ - β,  β = incidence · atan2(v·n, v·c),  n = span × c          (Fossen 2021, sec. 9.7; thin aerofoil)
 
-    V² is that of the flow in the plane across the span, and in a propeller's wake it is greater by 2 T / (ρ A_disc)
-    (momentum theory). Beyond the stall lift falls linearly to 0 at 90°; a fin that moves backwards is one turned by
-    180°.
+    V is the speed of the flow in the plane perpendicular to the span; a propeller's wake increases V² by 2 T / (ρ
+    A_disc) (momentum theory). Beyond stall, lift decreases linearly to 0 at 90°; a fin in reverse flow is treated as
+    rotated by 180°.
 
     Args:
         value: Deflection δ [rad].
         nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s].
-        thrust: Of each thruster [N].
-        density: Of the water [kg/m³].
+        thrust: Thrust of each thruster [N].
+        density: Density of the water [kg/m³].
         position: Centre of pressure, body frame [m].
         span: Axis of the deflection, body frame [-].
         chord: c, direction of the leading edge at deflection 0, body frame [-].
@@ -108,8 +107,8 @@ def fin_wrench(
         lift_slope: [1/rad].
         stall: [rad].
         drag: Coefficients of C_D over |α|, [-], [1/rad] and [1/rad²].
-        incidence: Part of the flow's angle that counts [-].
-        wake: 2 k / A_disc of each thruster, with the part k of its wake that reaches the fin [1/m²].
+        incidence: Weight of the flow angle [-].
+        wake: 2 k / A_disc of each thruster, with the fraction k of its wake that reaches the fin [1/m²].
 
     Returns:
         Wrench about the body origin, body frame [N, N m].
@@ -149,20 +148,20 @@ def fin_slope(
     drag: wp.vec3,
     incidence: float,
 ) -> vec6:
-    """Return twice ½ρ A V (incidence C_Lα + d0) along the normal, and that times the square of its lever.
+    """Return twice ½ρ A V (incidence C_Lα + d0) along the normal, and this times the square of the lever arm.
 
-    That is the slope of a fin straight ahead; twice, since a fin couples sway and yaw, each of which takes its part.
+    This is the slope of the force of a fin in straight flow, doubled because a fin couples sway and yaw.
 
     Args:
         nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s].
-        density: Of the water [kg/m³].
+        density: Density of the water [kg/m³].
         position: Centre of pressure, body frame [m].
         span: Axis of the deflection, body frame [-].
         chord: Direction of the leading edge at deflection 0, body frame [-].
         area: A [m²].
         lift_slope: C_Lα [1/rad].
         drag: Coefficients of C_D over |α|, [-], [1/rad] and [1/rad²].
-        incidence: Part of the flow's angle that counts [-].
+        incidence: Weight of the flow angle [-].
 
     Returns:
         Slope of the wrench on each axis, body frame [N s/m, N m s/rad].

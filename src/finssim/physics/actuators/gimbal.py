@@ -1,4 +1,4 @@
-"""A gimbal that turns the thrust of one thruster about an axis: vectored thrust."""
+"""Gimbal that rotates the thrust of one thruster about an axis: vectored thrust."""
 
 # mypy: disable-error-code="arg-type,no-any-return,no-untyped-call,operator,valid-type"
 
@@ -16,9 +16,9 @@ class Gimbal(Actuator):
     """Section of a gimbal; its value is the angle [rad] about `axis` by the right-hand rule."""
 
     off: Number | None = 0.0
-    """Angle while the vehicle is disarmed or in a fault [rad]; it stays where it is if None."""
+    """Angle while the vehicle is disarmed or in a fault [rad]; None leaves it unchanged."""
     thruster: str
-    """Name of the thruster that it turns, about the centre of its disc."""
+    """Name of the thruster that the gimbal rotates, about the centre of its disc."""
     axis: Axis
     """Axis of the rotation, body frame, unit length, (3,)."""
 
@@ -27,18 +27,18 @@ class Gimbal(Actuator):
 def turned_wrench(
     value: float, thrust: vec8, axis: wp.vec3, turned: vec8, arm: wp.vec3, direction: wp.vec3, reaction: float
 ) -> vec6:
-    """Difference between the thrust T along R(δ) a and along a: T [Ra - a; r × (Ra - a) + q (Ra - a)].
+    """Return the difference between the thrust T along R(δ) a and along a: T [Ra - a; r × (Ra - a) + q (Ra - a)].
 
-    R is the rotation about `axis` by δ (Rodrigues). The inflow's part of a propeller stays along its own axis.
+    R is the rotation about `axis` by δ (Rodrigues). The effect of inflow on a propeller is not rotated.
 
     Args:
         value: Angle δ [rad].
-        thrust: Of each thruster [N].
+        thrust: Thrust of each thruster [N].
         axis: Axis of the rotation, body frame [-].
-        turned: 1 of the thruster that is turned, 0 of the others [-].
+        turned: 1 for the rotated thruster, 0 for the others [-].
         arm: Position r of its disc, body frame [m].
         direction: Its axis a at angle 0, body frame [-].
-        reaction: q, moment about its axis over its thrust [m].
+        reaction: q, ratio of the moment about its axis to its thrust [m].
 
     Returns:
         Wrench about the body origin, body frame [N, N m].

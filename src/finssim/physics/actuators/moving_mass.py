@@ -1,4 +1,4 @@
-"""A mass that moves along an axis within the vehicle: batteries on a spindle."""
+"""Mass that moves along an axis within the vehicle, such as batteries on a spindle."""
 
 # mypy: disable-error-code="arg-type,call-overload,index,no-any-return,no-untyped-call,valid-type"
 
@@ -10,10 +10,10 @@ from finssim.vehicles.part import Axis, Positive, Vector3
 
 
 class MovingMass(Actuator):
-    """Section of a moving mass; its value is the way from `position` along `axis` [m].
+    """Section of a moving mass; its value is the displacement from `position` along `axis` [m].
 
-    `body` contains the mass, at `position`. The body recoils while the mass moves: it is moved by -M⁻¹ m Δδ [a; p × a],
-    M with the added mass; its velocity is given as if the mass stood still.
+    `body` includes the mass, at `position`. A displacement Δδ of the mass moves the body by the recoil -M⁻¹ m Δδ [a; p
+    × a], where M includes the added mass; the reported velocity of the body is that without the mass's own motion.
     """
 
     mass: Positive
@@ -21,15 +21,15 @@ class MovingMass(Actuator):
     position: Vector3
     """Position at value 0, from the body origin, body frame [m], (3,)."""
     axis: Axis
-    """Direction of the way, body frame, unit length, (3,)."""
+    """Direction of the displacement, body frame, unit length, (3,)."""
 
 
 @wp.func
 def moved_mass(value: float, mass: float, position: wp.vec3, axis: wp.vec3) -> vec9:
-    """Change of the first moment, m δ, and of the inertia, m [(r·r) 1 - r rᵀ] from r = p to r = p + δ.
+    """Return the change of the first moment, m δ, and of the inertia, m [(r·r) 1 - r rᵀ] from r = p to r = p + δ.
 
     Args:
-        value: Way δ along the axis [m].
+        value: Displacement δ along the axis [m].
         mass: m [kg].
         position: p, body frame [m].
         axis: Direction of δ, body frame [-].
@@ -54,10 +54,10 @@ def moved_mass(value: float, mass: float, position: wp.vec3, axis: wp.vec3) -> v
 
 @wp.func
 def carried_mass(value: float, mass: float, position: wp.vec3, axis: wp.vec3) -> vec6:
-    """m δ [a; p × a]: its rate is the momentum of the mass relative to the body.
+    """Return m δ [a; p × a]: its rate is the momentum of the mass relative to the body.
 
     Args:
-        value: Way δ along the axis [m].
+        value: Displacement δ along the axis [m].
         mass: m [kg].
         position: p, body frame [m].
         axis: a, body frame [-].

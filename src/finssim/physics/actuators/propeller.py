@@ -1,4 +1,4 @@
-"""Thrust and torque that a propeller loses as water flows towards it."""
+"""Loss of thrust and torque of a propeller by inflow."""
 
 # mypy: disable-error-code="arg-type,no-any-return,operator,valid-type"
 
@@ -22,14 +22,14 @@ def inflow_wrench(
     torque_loss: float,
     wake_fraction: float,
 ) -> vec6:
-    """Difference between a propeller in a flow and one at rest, of which the thrust is c± ω|ω|.
+    """Return the difference between the wrench of a propeller in a flow and its static thrust c± ω|ω|.
 
     T = c ω|ω| - a |ω| V_a,  Q = k ω|ω| - b |ω| V_a,  V_a = (1 - w) a·(v + ω × r)     (Fossen 2021, eq. 9.8-9.13)
 
     Args:
         value: Static thrust c± ω|ω| [N].
         nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s].
-        position: Of the disc, body frame [m].
+        position: Position of the disc, body frame [m].
         axis: Direction of positive thrust, body frame [-].
         c_plus: [N s²/rad²].
         c_minus: [N s²/rad²].

@@ -1,4 +1,4 @@
-"""Calibrated Fossen hydrodynamics (paper, eq. 1-2): restoring and damping; the added mass is the engine's."""
+"""Calibrated Fossen hydrodynamics (paper, eq. 1-2): restoring forces and damping; the engine adds the added mass."""
 
 # mypy: disable-error-code="valid-type"
 
@@ -28,12 +28,12 @@ def fossen_wrench(
     body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
-    """Hydrostatic and damping wrench of a submerged or emerging vehicle.
+    """Return the hydrostatic and damping wrench of a submerged or surfaced vehicle.
 
     tau_H + tau_D(nu_r)                     (paper, eq. 1)
 
-    Its terms in M_A belong to the equation of motion, and so does the damping that is coupled to surge, which most
-    vehicles do not have: the kernel leaves it out for them.
+    The terms in M_A are part of the equation of motion. The damping that is coupled to surge is a separate term, which
+    the kernel evaluates only for vehicles that have it.
 
     Args:
         plant: Parameters.
@@ -45,7 +45,7 @@ def fossen_wrench(
         flow: Water at the body origin.
 
     Returns:
-        Wrench about the body origin, the mass of water displaced and the part under water.
+        Wrench about the body origin, mass of displaced water and submerged fraction.
     """
     r_b = plant[w, v].r_b
     height = body.position[2] + wp.dot(body.up, r_b) - flow.elevation

@@ -1,6 +1,6 @@
-"""Drag and displacement of a closed triangle mesh cut by the water surface (paper, eq. 3-4).
+"""Drag and displacement of a closed triangle mesh that the water surface cuts (paper, eq. 3-4).
 
-The water surface is given as a plane in body axes: its upward normal and the signed height of the body origin above it.
+The water surface is a plane in body axes: its upward normal and the signed height of the body origin above it.
 """
 # mypy: disable-error-code="call-overload,valid-type,no-untyped-call,misc,attr-defined,operator,no-any-return"
 # mypy: disable-error-code="assignment,arg-type"
@@ -21,42 +21,43 @@ from finssim.physics.water import Flow, WaterArrays
 
 @wp.struct
 class HullMesh:
-    """Closed hulls of one or several kinds of vehicle, body frame; hull k owns faces start[k] to start[k + 1]."""
+    """Closed hulls of one or several kinds of vehicle, body frame; hull k consists of faces start[k] to start[k +
+    1]."""
 
     start: wp.array(dtype=wp.int32)
-    """First face of each hull, and the number of all faces at the end (kinds + 1,)."""
+    """First face of each hull, and last the total number of faces (kinds + 1,)."""
     volume: wp.array(dtype=wp.float32)
     """Enclosed volume (kinds,) [m³]."""
     centroid: wp.array(dtype=wp.vec3)
     """Centroid of the enclosed volume (kinds,) [m]."""
     box_center: wp.array(dtype=wp.vec3)
-    """Centre of the box around the hull (kinds,) [m]."""
+    """Centre of the hull's bounding box (kinds,) [m]."""
     box_half: wp.array(dtype=wp.vec3)
-    """Half lengths of that box (kinds,) [m]."""
+    """Half lengths of the bounding box (kinds,) [m]."""
     face: wp.array(dtype=vec8)
-    """Centroid [m], outward unit normal and area [m²] of each face (faces,), side by side for one read; then 0."""
+    """Centroid [m], outward unit normal and area [m²] of each face (faces,), together for one memory read; then 0."""
     slope_form: wp.array(dtype=mat66)
-    """Slope of the form drag on each axis, by the columns of `drag_slope` (kinds,), for a density and a coefficient of
-    1 [m², m³, m⁴ and m⁵]."""
+    """Slope of the form drag on each axis, with the columns of `drag_slope` (kinds,), for a density and a coefficient
+    of 1 [m², m³, m⁴ and m⁵]."""
     slope_skin: wp.array(dtype=mat66)
-    """Slope of the skin drag on each axis, by the columns of `drag_slope` (kinds,), for a density and a coefficient of
-    1 [m², m³, m⁴ and m⁵]."""
+    """Slope of the skin drag on each axis, with the columns of `drag_slope` (kinds,), for a density and a coefficient
+    of 1 [m², m³, m⁴ and m⁵]."""
     corners: wp.array(dtype=wp.mat33)
-    """Corners of each face, a row each (faces,) [m]; only read near the surface."""
+    """Corners of each face, one per row (faces,) [m]; only used near the surface."""
 
 
 def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None = None) -> HullMesh:
-    """Put closed hulls into the arrays that the mesh functions read.
+    """Return closed hulls as the arrays that the mesh functions read.
 
     Args:
         hulls: For each kind of vehicle its vertices (n, 3) [m], body frame, and outward faces (m, 3).
-        device: Warp device; the default one if None.
+        device: Warp device; None is the default device.
 
     Returns:
         The hulls in float32; kind k is the k-th of `hulls`.
 
     Raises:
-        MeshError: A hull is not closed and outward.
+        MeshError: A hull is not closed, or its faces do not point outward.
     """
     start, volume, centroid, box_center, box_half, face, corners = [0], [], [], [], [], [], []
     form, skin = [], []
@@ -92,11 +93,11 @@ def hull_mesh(hulls: Sequence[tuple[ArrayLike, ArrayLike]], device: str | None =
 def _slopes(
     middle: NDArray[np.float64], normal: NDArray[np.float64], area: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Form and skin drag's growth with speed on each axis, (6, 6) each: column 0 per |v|, column 1 per |ω|.
+    """Return the slope of form and skin drag over speed on each axis, (6, 6) each: column 0 per |v|, column 1 per |ω|.
 
-    A face at c moves along s = e_i or e_i × c with axis i, and its drag grows with its speed |v| + |c| |ω|: the form's
-    by at most |n·s| |s| + |s|² [n·v]_+/|v|, half and a quarter of which is the mean over all directions of the flow;
-    the skin's by 2 |s|².
+    A face at c moves along s = e_i or e_i × c with axis i, and its drag grows with its speed |v| + |c| |ω|. The slope
+    of the form drag is at most |n·s| |s| + |s|² [n·v]_+/|v|; the means of its terms over all flow directions are a half
+    and a quarter. The slope of the skin drag is at most 2 |s|².
     """
     turning = np.stack([np.cross(e, middle) for e in np.eye(3)], axis=1)
     s = np.concatenate([np.broadcast_to(np.eye(3), turning.shape), turning], axis=1)  # (faces, 6, 3)
@@ -113,13 +114,13 @@ def _slopes(
 
 @wp.func
 def drag_slope(hull: HullMesh, kind: int, nu_r: vec6, density: float, form: float, skin: float) -> vec6:
-    """About how fast the drag of a submerged hull grows with the speed on each axis [N s/m, N m s/rad].
+    """Estimate the slope of the drag of a submerged hull over the speed on each axis [N s/m, N m s/rad].
 
     Args:
         hull: The hulls.
-        kind: Which of them.
+        kind: Index of the hull.
         nu_r: Twist relative to the water, body frame [m/s, rad/s].
-        density: Of the water [kg/m³].
+        density: Density of the water [kg/m³].
         form: Form drag coefficient [-].
         skin: Skin drag coefficient [-].
     """
@@ -129,7 +130,7 @@ def drag_slope(hull: HullMesh, kind: int, nu_r: vec6, density: float, form: floa
 
 @wp.func
 def wet_corner(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: float) -> wp.vec4:
-    """Centroid and share of the area of the part at a, the only corner below the surface (h_a < 0)."""
+    """Return centroid and area fraction of the part at a, the only corner below the surface (h_a < 0)."""
     s = h_a / (h_a - h_b)
     t = h_a / (h_a - h_c)
     m = a + (s * (b - a) + t * (c - a)) / 3.0
@@ -138,12 +139,13 @@ def wet_corner(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: 
 
 @wp.func
 def wet_side(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: float) -> wp.vec4:
-    """Centroid and share of the area of the part at b and c, a being the only corner above (h_a > 0)."""
+    """Return centroid and area fraction of the part at b and c, where a is the only corner above the surface (h_a >
+    0)."""
     s = h_b / (h_b - h_a)
     t = h_c / (h_c - h_a)
     p = b + s * (a - b)
     q = c + t * (a - c)
-    # As two triangles (b, c, q) and (b, q, p): a difference of areas would cancel as the part gets small.
+    # As two triangles (b, c, q) and (b, q, p): a difference of areas would lose accuracy for a small part.
     first = t
     second = s * (1.0 - t)
     m = b + (first * (c - b + q - b) + second * (q - b + p - b)) / (3.0 * wp.max(first + second, 1.0e-30))
@@ -152,15 +154,15 @@ def wet_side(a: wp.vec3, b: wp.vec3, c: wp.vec3, h_a: float, h_b: float, h_c: fl
 
 @wp.func
 def wet_part(corners: wp.mat33, surface_normal: wp.vec3, surface_height: float) -> wp.vec4:
-    """Part of a triangle below the water surface.
+    """Return the part of a triangle below the water surface.
 
     Args:
-        corners: Corners a, b, c, a row each, body frame [m].
+        corners: Corners a, b, c, one per row, body frame [m].
         surface_normal: Upward unit normal of the surface [-], body frame.
         surface_height: Height of the body origin above the surface [m].
 
     Returns:
-        Centroid of the part, body frame [m], and its share of the triangle's area, 0 to 1.
+        Centroid of the part, body frame [m], and its fraction of the triangle's area, 0 to 1.
     """
     a = corners[0]
     b = corners[1]
@@ -173,7 +175,7 @@ def wet_part(corners: wp.mat33, surface_normal: wp.vec3, surface_height: float) 
     if h_a <= 0.0 and h_b <= 0.0 and h_c <= 0.0:
         m = (a + b + c) / 3.0
         return wp.vec4(m[0], m[1], m[2], 1.0)
-    # Cyclic order is kept, and the lone corner put first.
+    # The corners are rotated cyclically so that the single corner is first.
     if h_a < 0.0 and h_b >= 0.0 and h_c >= 0.0:
         return wet_corner(a, b, c, h_a, h_b, h_c)
     if h_b < 0.0 and h_c >= 0.0 and h_a >= 0.0:
@@ -189,7 +191,7 @@ def wet_part(corners: wp.mat33, surface_normal: wp.vec3, surface_height: float) 
 
 @wp.func
 def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
-    """Form and skin drag per area on a face in the flow v                              (paper, eq. 4)
+    """Return form and skin drag per area on a face in the flow v                           (paper, eq. 4)
 
     form [-μ]_+ v |v| + skin v_t |v_t|,  μ = n·v / |v|,  v_t = (I - n nᵀ) v
 
@@ -204,7 +206,7 @@ def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
     """
     across = wp.dot(normal, v)
     v_t = v - across * normal
-    # |v| cancels against the one in μ.
+    # |v| cancels with the one in μ.
     return form * wp.max(-across, 0.0) * v + skin * wp.length(v_t) * v_t
 
 
@@ -212,7 +214,8 @@ def face_drag(v: wp.vec3, normal: wp.vec3, form: float, skin: float) -> wp.vec3:
 def wet_face_drag(
     i: int, hull: HullMesh, v_origin: wp.vec3, turn: wp.mat33, form: float, skin: float
 ) -> vec6:
-    """Drag of face i, wholly below the surface, about the body origin [N, N m]; see `mesh_drag` and `face_drag`."""
+    """Return the drag of face i, completely submerged, about the body origin [N, N m]; see `mesh_drag` and
+    `face_drag`."""
     f = hull.face[i]
     c = wp.vec3(f[0], f[1], f[2])
     pull = f[6] * face_drag(v_origin + turn * c, wp.vec3(f[3], f[4], f[5]), form, skin)
@@ -223,7 +226,7 @@ def wet_face_drag(
 def faces_drag(
     first: int, end: int, hull: HullMesh, v_origin: wp.vec3, turn: wp.mat33, form: float, skin: float
 ) -> vec6:
-    """Sum of `wet_face_drag` over the faces from `first` to before `end` [N, N m]."""
+    """Return the sum of `wet_face_drag` over the faces from `first` to before `end` [N, N m]."""
     tau = vec6()
     for i in range(first, end):
         tau += wet_face_drag(i, hull, v_origin, turn, form, skin)
@@ -246,16 +249,16 @@ def mesh_drag(
     surface_normal: wp.vec3,
     surface_height: float,
 ) -> vec6:
-    """Form and skin drag over the part of the hull below the water surface             (paper, eq. 3-4)
+    """Return form and skin drag over the submerged part of the hull                        (paper, eq. 3-4)
 
-    The flow at a face is v_i = v_water + G c_i - (v + ω × c_i), at the centroid c_i of its part below the surface.
+    The flow at a face is v_i = v_water + G c_i - (v + ω × c_i), at the centroid c_i of its submerged part.
 
     Args:
         hull: The hulls.
-        kind: Which of them.
+        kind: Index of the hull.
         nu: Twist of the body at its origin, body frame [m/s, rad/s].
         v_water: Velocity of the water at the body origin, body frame [m/s].
-        flow_gradient: G, derivative of the water's velocity by place, body frame [1/s].
+        flow_gradient: G, spatial derivative of the water's velocity, body frame [1/s].
         density: ρ [kg/m³].
         form_drag: C_form [-].
         skin_drag: C_skin [-].
@@ -290,19 +293,20 @@ def mesh_drag(
 
 @wp.func
 def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surface_height: float) -> wp.vec4:
-    """Volume and centroid of the part of the hull below the water surface.
+    """Return volume and centroid of the submerged part of the hull.
 
-    The sum over the faces' wet parts of the pyramids with apex P on the surface: V_i = A_i n_i·(c_i - P)/3, whose
-    centroid is P + 3/4 (c_i - P). The cut through the hull lies in the surface, as P does, so it adds nothing.
+    The volume is the sum, over the submerged parts of the faces, of pyramids with apex P on the surface:
+    V_i = A_i n_i·(c_i - P)/3, with centroid P + 3/4 (c_i - P). The cut through the hull lies in the surface, as P does,
+    so its pyramid is zero.
 
     Args:
         hull: The hulls.
-        kind: Which of them.
+        kind: Index of the hull.
         surface_normal: Upward unit normal of the water surface [-], body frame.
         surface_height: Height of the body origin above the surface along that normal, negative below [m].
 
     Returns:
-        Volume [m³] and its centroid, body frame [m]; zeros if the hull is dry.
+        Volume [m³] and its centroid, body frame [m]; zeros if the hull is above the surface.
     """
     center = hull.box_center[kind]
     middle = surface_height + wp.dot(surface_normal, center)
@@ -313,7 +317,7 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
     if middle - reach >= 0.0:
         return wp.vec4(0.0)
 
-    # The point of the surface nearest to the hull's middle keeps the pyramids small and float32 exact enough.
+    # With the apex at the surface point nearest to the hull centre, pyramids are small enough for float32.
     apex = center - middle * surface_normal
     volume = float(0.0)
     moment = wp.vec3(0.0)
@@ -325,7 +329,7 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
             pyramid = wet[3] * f[6] * wp.dot(wp.vec3(f[3], f[4], f[5]), arm) / 3.0
             volume += pyramid
             moment += pyramid * arm
-    # Below float32's resolution of the total volume, the quotient of two rounding errors is no centroid.
+    # Below float32's resolution of the total volume, the quotient of two rounding errors is meaningless.
     if volume <= 1.0e-7 * hull.volume[kind]:
         return wp.vec4(0.0)
     c = apex + 0.75 * moment / volume
@@ -336,17 +340,17 @@ def mesh_displacement(hull: HullMesh, kind: int, surface_normal: wp.vec3, surfac
 def mesh_inflow(
     hull: HullMesh, kind: int, nu_r: vec6, surface_normal: wp.vec3, surface_height: float
 ) -> float:
-    """Rate at which the volume below the surface grows: what the wet faces sweep, ∫ n·(v + ω × c) dA.
+    """Return the rate at which the submerged volume grows: the volume swept by the wet faces, ∫ n·(v + ω × c) dA.
 
     Args:
         hull: The hulls.
-        kind: Which of them.
+        kind: Index of the hull.
         nu_r: Twist of the body at its origin relative to the water, body frame [m/s, rad/s].
         surface_normal: Upward unit normal of the water surface [-], body frame.
         surface_height: Height of the body origin above the surface along that normal, negative below [m].
 
     Returns:
-        [m³/s]; 0 for a hull that is wholly wet or dry, up to rounding.
+        Rate [m³/s]; 0, up to rounding, for a hull that is completely above or below the surface.
     """
     v = linear(nu_r)
     omega = angular(nu_r)
@@ -373,11 +377,11 @@ def mesh_wrench(
     body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
-    """Wrench of the part of a hull mesh below the instantaneous surface: buoyancy, form drag and skin drag.
+    """Return the wrench on the part of a hull mesh below the instantaneous surface: buoyancy, form drag and skin drag.
 
     The surface is the plane tangent to the waves above the body origin; the water's velocity varies linearly over the
-    hull. The vehicle file's displaced volume and centre of buoyancy hold when wholly submerged, and the mesh says how
-    they change at the surface: a mesh without the vehicle's insides still floats it right.
+    hull. Displaced volume and centre of buoyancy of the submerged vehicle are those of the vehicle file; the mesh
+    determines how they change at the surface, so a mesh without the vehicle's interior also floats correctly.
 
     Args:
         plant: Parameters.
@@ -389,7 +393,7 @@ def mesh_wrench(
         flow: Water at the body origin.
 
     Returns:
-        Wrench about the body origin, the mass of water displaced and the part under water.
+        Wrench about the body origin, mass of displaced water and submerged fraction.
     """
     kind = plant[w, v].hull
     normal = body.up

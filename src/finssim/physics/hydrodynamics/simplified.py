@@ -1,4 +1,4 @@
-"""Simplified hydrodynamics (paper, eq. 5): restoring and damping of the body's own velocity, nothing else."""
+"""Simplified hydrodynamics (paper, eq. 5): only restoring forces and damping of the body's own velocity."""
 
 # mypy: disable-error-code="valid-type"
 
@@ -21,10 +21,10 @@ def simplified_wrench(
     body: Afloat,
     flow: Flow,
 ) -> WaterWrench:
-    """Hydrostatic and damping wrench: tau_H + tau_D(nu)                               (paper, eq. 5)
+    """Return the hydrostatic and damping wrench: tau_H + tau_D(nu)                       (paper, eq. 5)
 
-    Added mass, its Coriolis terms and moving water are left out on purpose: a current does not act on this model, and
-    accelerating water does not either (no water counts as displaced).
+    Added mass, its Coriolis terms and moving water are deliberately omitted: neither a current nor accelerating water
+    acts on this model (its displaced mass of water is 0).
 
     Args:
         plant: Parameters.
@@ -33,10 +33,10 @@ def simplified_wrench(
         w: World.
         v: Vehicle.
         body: Pose and motion; its twist relative to the water is not used.
-        flow: Water at the body origin; of its velocity only the vertical part counts here.
+        flow: Water at the body origin; only the vertical component of its velocity is used.
 
     Returns:
-        As of `fossen_wrench`, with no water displaced.
+        Same as `fossen_wrench`, with a displaced mass of 0.
     """
     own = Afloat()
     own.position = body.position

@@ -1,4 +1,4 @@
-"""Hydrodynamic terms, one file each: keys in a vehicle file, wrench, and entries in draws and fits."""
+"""Hydrodynamic terms, one file each: keys in a vehicle file, wrench, and entries in ranges files and fits."""
 
 from typing import TYPE_CHECKING
 

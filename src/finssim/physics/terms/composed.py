@@ -1,16 +1,16 @@
-"""Adding terms, and the functions that evaluate all terms and actuators of a simulation, written from what it has.
+"""Registration of terms, and generated functions that evaluate all terms and actuators of a simulation.
 
 The functions of a term or of a kind of actuator are called by the names of their arguments:
 
     nu_r      velocity relative to the water at the reference point of the set, body frame [m/s, rad/s], vec6
     up        world's z axis in the body frame, vec3
-    depth     of the body origin below the still surface [m]
-    density   of the water [kg/m³]
-    thrust    of each thruster [N], vec8
-    value     of an actuator: its angle, volume or position, float
+    depth     depth of the body origin below the still surface [m]
+    density   density of the water [kg/m³]
+    thrust    thrust of each thruster [N], vec8
+    value     value of an actuator: its angle, volume or position, float
 
-and each parameter by its name: a float, vec3, vec6, vec8 or mat66. The engine takes a wrench in proportion to
-the part of the vehicle that is under water, and moves it from the reference point to the body origin.
+and each parameter by its name: a float, vec3, vec6, vec8 or mat66. The engine scales a wrench by the submerged fraction
+of the vehicle, and moves it from the reference point to the body origin.
 """
 
 # mypy: disable-error-code="misc,no-any-return,no-untyped-call,no-untyped-def,untyped-decorator,valid-type"
@@ -36,20 +36,20 @@ from finssim.vehicles.terms import Term
 from finssim.vehicles.vehicle import Vehicle
 
 STATE: dict[str, Any] = {"nu_r": vec6, "up": wp.vec3, "depth": float, "density": float, "thrust": vec8}
-"""Arguments that a term's functions may take besides its parameters."""
+"""Arguments of a term's functions besides its parameters."""
 VALUE: dict[str, Any] = {**STATE, "value": float}
-"""Arguments that an actuator's functions may take besides its parameters."""
+"""Arguments of an actuator's functions besides its parameters."""
 ROLES = {"wrench": vec6, "slope": vec6, "push": vec6, "yield": vec6, "shift": vec9, "carry": vec6}
-"""Role -> what its function returns: terms give `wrench` and `slope`, actuators `push`, `yield` (slope), `shift` and
-`carry`."""
+"""Role -> type of its function's result: terms have `wrench` and `slope`, actuators `push`, `yield` (slope), `shift`
+and `carry`."""
 KINDS = {"float": float, "vec3": wp.vec3, "vec6": vec6, "vec8": vec8, "mat66": mat66}
 """Types of a parameter."""
 PIECE = 8
-"""Multiple to which a row of parameters is padded, since a processor reads so many numbers together."""
+"""Multiple to which a row of parameters is padded: the number of floats that a processor loads together."""
 
 
 Item = Term | InstalledActuator
-"""Terms and installed actuators: both have parameters in a row and functions of them."""
+"""Terms and installed actuators: both have parameters in a row, and functions of them."""
 
 
 class TermError(ValueError):
@@ -57,13 +57,13 @@ class TermError(ValueError):
 
 
 def add_term(term: Term) -> Term:
-    """Make a term known: vehicle files may then have it, and simulations of vehicles that do evaluate it.
+    """Register a term: vehicle files may then use its key, and simulations of these vehicles evaluate it.
 
     Args:
-        term: The term, of one file.
+        term: The term.
 
     Raises:
-        RegistryError: There is another term of that key.
+        RegistryError: Another term has that key.
         TermError: A function has an argument that is neither state nor parameter, or a unit is missing.
     """
     TERMS[term.name] = term
@@ -71,14 +71,15 @@ def add_term(term: Term) -> Term:
 
 
 def check_registered(name: str, term: Any) -> None:
-    """Refuse what is no term, or a term that cannot be evaluated.
+    """Refuse an object that is not a term, or a term that cannot be evaluated.
 
     Args:
         name: Key in a hydrodynamic set.
         term: The object that is registered under it.
 
     Raises:
-        TermError: It is no `Term`, has another name, an argument that is neither state nor parameter, or no unit.
+        TermError: It is not a `Term`, has another name, has an argument that is neither state nor parameter, or lacks a
+            unit.
     """
     if not isinstance(term, Term) or term.name != name:
         raise TermError(f"{name} is {term!r:.80}, expected a finssim.physics.terms.Term of that name")
@@ -93,14 +94,15 @@ def check_registered(name: str, term: Any) -> None:
 
 
 def check_actuator(name: str, kind: Any) -> None:
-    """Refuse what is no kind of actuator, or one that cannot be evaluated.
+    """Refuse an object that is not a kind of actuator, or a kind that cannot be evaluated.
 
     Args:
         name: Value of `kind` in a vehicle file.
         kind: The object that is registered under it.
 
     Raises:
-        TermError: It is no `ActuatorKind`, has another name, or an argument that is neither state nor parameter.
+        TermError: It is not an `ActuatorKind`, has another name, or has an argument that is neither state nor
+            parameter.
     """
     if not isinstance(kind, ActuatorKind) or kind.name != name or not name.isidentifier():
         raise TermError(
@@ -116,30 +118,33 @@ def check_actuator(name: str, kind: Any) -> None:
 def _refuse_arguments(
     label: str, functions: Mapping[str, Any], state: Mapping[str, Any], parameters: Mapping[str, Any]
 ) -> None:
-    """Refuse functions with an argument that is neither state nor parameter, and parameters that none takes."""
+    """Refuse functions with an argument that is neither state nor parameter, and parameters that no function uses."""
     used = set()
     for role, function in functions.items():
         for name, kind in _arguments(function).items():
             expected = [state[name]] if name in state else list(KINDS.values())
             if (name not in state and name not in parameters) or kind not in expected:
                 raise TermError(
-                    f"{label}: {role} takes '{name}: {getattr(kind, '__name__', kind)}', expected of: "
+                    f"{label}: {role} has the argument '{name}: {getattr(kind, '__name__', kind)}', expected of: "
                     f"{', '.join([*state, *parameters])}; parameters are {', '.join(KINDS)}"
                 )
             used.add(name)
     unused = [name for name in parameters if name not in used]
     if unused:
-        raise TermError(f"{label}: no function takes the parameter '{unused[0]}'")
+        raise TermError(f"{label}: no function uses the parameter '{unused[0]}'")
 
 
-@cache  # not as a term is added: this starts Warp, which a vehicle file alone does not need
+@cache  # not called while a term is added: this starts Warp, which a vehicle file alone does not need
 def _require_zero(item: Item, role: str) -> None:
-    """Refuse a function that is not zero where parameters are: vehicles without it are simulated so beside others."""
+    """Refuse a function that is not zero where its parameters are: it is also evaluated for vehicles without the
+    item."""
     function = _functions(item)[role]
     examples = (_example(name, kind) for name, kind in _arguments(function).items())
     result = lane_function(function)(*examples).numbers
     if any(float(x) != 0.0 for x in result):
-        raise TermError(f"'{item.name}': its {role} is not zero where all its parameters are: make it so")
+        raise TermError(
+            f"'{item.name}': its {role} is not zero when all its parameters are: make it zero there"
+        )
 
 
 def _functions(item: Item) -> dict[str, Any]:
@@ -158,7 +163,7 @@ def _arguments(function: Any) -> dict[str, Any]:
 
 
 def _example(name: str, kind: Any) -> Any:
-    """A state in which forces act, and parameters that are zero."""
+    """Return an example of an argument: nonzero for the state, zero for parameters."""
     numbers = {
         "nu_r": (0.7, -0.4, 0.5, 0.3, -0.6, 0.2), "up": (0.6, 0.0, 0.8), "thrust": (5.0,) * 8, "value": (0.3,),
         "depth": (3.0,), "density": (3.0,),
@@ -171,7 +176,8 @@ def _example(name: str, kind: Any) -> Any:
 
 @dataclass(frozen=True)
 class Slot:
-    """A parameter in a row of the array that holds those of all terms and actuators of a simulation."""
+    """Position of one parameter in a row of the array with the parameters of all terms and actuators of a
+    simulation."""
 
     term: Item
     name: str
@@ -181,12 +187,13 @@ class Slot:
 
     @property
     def entry(self) -> str:
-        """Name in a ranges file: of a term its path, of an actuator kind and parameter, as in `fin.lift_slope`."""
+        """Name in a ranges file: the path of a term's parameter; kind and parameter of an actuator, such as
+        `fin.lift_slope`."""
         return f"{self.term.kind.name}.{self.name}" if isinstance(self.term, InstalledActuator) else self.path
 
     @property
     def size(self) -> int:
-        """Numbers in it."""
+        """Number of floats in the parameter."""
         return 1 if self.kind is float else int(np.prod(self.kind._shape_))
 
 
@@ -203,13 +210,12 @@ def layout(terms: tuple[Item, ...]) -> tuple[Slot, ...]:
 
 
 def row_length(terms: tuple[Item, ...]) -> int:
-    """Numbers in a row, a multiple of `PIECE`."""
+    """Return the number of floats in a row, a multiple of `PIECE`."""
     return PIECE * max(1, -(-sum(slot.size for slot in layout(terms)) // PIECE))
 
 
 def parameter_row(terms: tuple[Item, ...], numbers: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the row of parameters by path, each in the unit of its term, zero where one is not given,
-    (`row_length`,)."""
+    """Return the row of parameters by path, each in the unit of its term, zero for missing ones, (`row_length`,)."""
     row = np.zeros(row_length(terms))
     for slot in layout(terms):
         row[slot.first : slot.first + slot.size] = np.ravel(numbers.get(slot.path, 0.0))
@@ -218,14 +224,14 @@ def parameter_row(terms: tuple[Item, ...], numbers: Mapping[str, Any]) -> NDArra
 
 @cache
 def composed(terms: tuple[Item, ...], role: str) -> Any:
-    """Sum of what the terms or actuators give, as a `wp.func` of (x, w, v, nu_r, up, depth, density, thrust).
+    """Return the sum of terms or actuators as a `wp.func` of (x, w, v, nu_r, up, depth, density, thrust).
 
     Args:
         terms: Terms and actuators, in the order of their rows.
         role: A key of `ROLES`.
 
     Returns:
-        None where no item gives it. x holds the parameters, (worlds, vehicles, `row_length`).
+        The function, whose x holds the parameters, (worlds, vehicles, `row_length`); None if no item has that role.
     """
     space: dict[str, Any] = {"wp": wp, "vec6": vec6, "vec8": vec8, "mat66": mat66, "vec3": wp.vec3}
     calls = []
@@ -291,20 +297,20 @@ def term_wrenches(
     density: float,
     channels: ArrayLike = (0.0,) * MAX_THRUSTERS,
 ) -> NDArray[np.float64]:
-    """The wrench of terms, or of actuators, in given motions, by the functions that simulations run.
+    """Return the wrench of terms, or of actuators, in given motions, from the functions that simulations use.
 
     Args:
-        terms: Terms alone, or actuators alone.
+        terms: Only terms, or only actuators.
         rows: Their parameters in the units of the terms, in several versions, (k, `row_length`).
-        nu_r: Relative to the water at the reference point of terms, or at the body origin for actuators, body frame
-            [m/s, rad/s], (n, 6).
+        nu_r: Velocity relative to the water at the reference point of terms, or at the body origin for actuators, body
+            frame [m/s, rad/s], (n, 6).
         up: World z in the body frame, unit vectors, (n, 3).
-        depth: Of the body origin [m], (n,) or one number.
-        density: Of the water [kg/m³].
+        depth: Depth of the body origin [m], (n,) or one number.
+        density: Density of the water [kg/m³].
         channels: Value of each channel [N, rad, m³ or m], (n, 8), or (8,) for all.
 
     Returns:
-        About the same point, body frame [N, N m], (n, k, 6).
+        Wrench about the same point, body frame [N, N m], (n, k, 6).
     """
     n, k = len(np.asarray(nu_r)), len(np.asarray(rows))
     x = np.ascontiguousarray(np.asarray(rows, np.float32)[:, None])
@@ -326,20 +332,20 @@ def term_wrenches(
 def actuator_wrenches(
     vehicle: Vehicle, nu_r: ArrayLike, up: ArrayLike, depth: ArrayLike, channels: ArrayLike
 ) -> NDArray[np.float64]:
-    """Wrench of a vehicle's actuators beyond the static thrust of its propellers, submerged.
+    """Return the wrench of a submerged vehicle's actuators, without the static thrust of its propellers.
 
-    It is that of fins, buoyancy engines and gimbals, and what a flow takes from propellers; the weight of moved masses
-    is not in it.
+    It contains the wrench of fins, buoyancy engines and gimbals, and the effect of inflow on propellers; it does not
+    contain the weight of moved masses.
 
     Args:
         vehicle: The vehicle.
         nu_r: Velocity of the body origin relative to the water, body frame [m/s, rad/s], (n, 6).
         up: World z in the body frame, unit vectors, (n, 3).
-        depth: Of the body origin [m], (n,) or one number.
+        depth: Depth of the body origin [m], (n,) or one number.
         channels: Value of each channel, in the order of `Vehicle.channel_names` [N, rad, m³ or m], (n, c).
 
     Returns:
-        About the body origin, body frame [N, N m], (n, 6).
+        Wrench about the body origin, body frame [N, N m], (n, 6).
     """
     found = {item: part for item, part in installed(vehicle).items() if item.kind.wrench is not None}
     values = np.asarray(channels, float)

@@ -1,4 +1,4 @@
-"""Cross-flow drag of a slender hull: each strip along its length resists the flow across it (strip theory)."""
+"""Cross-flow drag of a slender hull: the sum of the drag of its transverse strips (strip theory)."""
 
 # mypy: disable-error-code="index,no-any-return,no-untyped-call,valid-type"
 
@@ -28,7 +28,8 @@ class CrossFlow(Part):
 def strips(first: float, last: float, length: float) -> wp.vec3:
     """Return the integrals over the length L of s|s|, of x s|s| about the middle, and the sum of |s| at both ends.
 
-    s is the speed across the hull, linear in x. With S = |a| + |b| of its values at both ends these are, exactly,
+    s is the speed across the hull, linear in x, with the values a at the stern and b at the bow. With S = |a| + |b| the
+    integrals are, exactly,
 
         L/3 (a + b) S (1 - |a b|/S²)  and  L²/12 (b - a) S (1 - 2 q - 2 q²),  q = (|a b| - a b) / (2 S²)
 
@@ -52,7 +53,8 @@ def strips(first: float, last: float, length: float) -> wp.vec3:
 
 @wp.func
 def cross_flow_wrench(nu_r: vec6, length: float, center: float, sway: float, heave: float) -> vec6:
-    """dY = -c_y |s| s dx with s = v + x r, and dZ = -c_z |s| s dx with s = w - x q, over the length of the hull.
+    """Return the integrals of dY = -c_y |s| s dx, s = v + x r, and dZ = -c_z |s| s dx, s = w - x q, over the hull's
+    length.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
@@ -76,9 +78,9 @@ def cross_flow_wrench(nu_r: vec6, length: float, center: float, sway: float, hea
 
 @wp.func
 def cross_flow_slope(nu_r: vec6, length: float, center: float, sway: float, heave: float) -> vec6:
-    """Return c L S and c L S (L/2 + |center|)², which the slopes 2 c ∫|s| dx and 2 c ∫|s| x² dx do not exceed.
+    """Return c L S and c L S (L/2 + |center|)², upper bounds of the slopes 2 c ∫|s| dx and 2 c ∫|s| x² dx.
 
-    S is the sum of |s| at both ends, and |s| lies below the line between its values there.
+    S is the sum of |s| at both ends; |s| lies below the line between its values at the ends.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].

@@ -1,4 +1,4 @@
-"""Lift and drag of a slender hull, or of a wing, by its angle of attack in the plane of surge and heave."""
+"""Lift and drag of a slender hull, or of a wing, over its angle of attack in the plane of surge and heave."""
 
 # mypy: disable-error-code="index,no-any-return,no-untyped-call,valid-type"
 
@@ -12,22 +12,23 @@ from finssim.vehicles.terms import Term
 
 
 class LiftDrag(Part):
-    """Coefficients with half density and area, in a vehicle file under `lift_drag`: half rho S times C."""
+    """Coefficients in a vehicle file under `lift_drag`, each multiplied by half the density and the area: half rho
+    S times C."""
 
     drag: NonNegative
-    """Drag without lift, of C_D0 [N s²/m²]."""
+    """Drag coefficient without lift, from C_D0 [N s²/m²]."""
     lift: NonNegative
-    """Slope of the lift, of dC_L/d(alpha) [N s²/(m² rad)]."""
+    """Slope of the lift, from dC_L/d(alpha) [N s²/(m² rad)]."""
     induced: NonNegative = 0.0
-    """Growth of the drag, of d C_D/d(alpha²) [N s²/(m² rad²)]."""
+    """Increase of the drag, from d C_D/d(alpha²) [N s²/(m² rad²)]."""
 
 
 @wp.func
 def lift_drag_wrench(nu_r: vec6, drag: float, lift: float, induced: float) -> vec6:
-    """Drag U V (d + k sin² a) against the flow and lift U V l sin a cos a across it, with the angle of attack a.
+    """Return the drag U V (d + k sin² a) and the lift U V l sin a cos a, with the angle of attack a.
 
-    U is the speed, V its part in the plane of surge and heave. For small angles sin a is a; lift ends at 90°, and a
-    hull that moves astern has the same lift.
+    U is the speed, V its component in the plane of surge and heave. Drag acts against the flow, lift across it. For
+    small angles sin a is a; the lift vanishes at 90°, and is the same for a hull that moves astern.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
@@ -50,7 +51,7 @@ def lift_drag_wrench(nu_r: vec6, drag: float, lift: float, induced: float) -> ve
 
 @wp.func
 def lift_drag_slope(nu_r: vec6, drag: float, lift: float, induced: float) -> vec6:
-    """Return bounds of -dX/du and -dZ/dw, which they reach straight ahead.
+    """Return upper bounds of -dX/du and -dZ/dw, which are exact for motion straight ahead.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].

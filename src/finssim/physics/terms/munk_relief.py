@@ -1,7 +1,7 @@
-"""Share of the coupling by added mass, the Munk moment first, that the wake of a hull takes away.
+"""Part of the added mass's coupling, mainly the Munk moment, that the wake of a hull cancels.
 
 In ideal flow the added mass turns a slender hull across its path. Behind a real hull the flow separates, and models
-such as Fossen's for torpedoes leave those products of velocities out.
+such as Fossen's for torpedo-shaped vehicles omit those products of velocities.
 """
 
 # mypy: disable-error-code="index,no-any-return,no-untyped-call,valid-type"
@@ -21,7 +21,7 @@ def munk_relief_wrench(nu_r: vec6, munk_relief: wp.vec3) -> vec6:
 
     X = A_3 w q - A_2 v r,  Y = A_1 u r,  Z = -A_1 u q,  M = (A_1 - A_3) u w,  N = (A_2 - A_1) u v
 
-    It is the opposite of those parts of the added mass's own wrench, and takes no energy out.
+    It is the opposite of these parts of the wrench of the added mass, and dissipates no energy.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].

@@ -1,4 +1,5 @@
-"""Damping that grows with the surge speed, -Du |u_r| nu_r: lift of body and fins, drag of a hull that moves ahead."""
+"""Damping that grows with the surge speed, -Du |u_r| nu_r: lift of body and fins, drag of a hull with forward
+speed."""
 
 # mypy: disable-error-code="index,no-any-return,no-untyped-call,valid-type"
 
@@ -15,11 +16,11 @@ from finssim.vehicles.terms import Term
 
 @wp.func
 def surge_coupled_wrench(nu_r: vec6, surge_damping: mat66) -> vec6:
-    """tau = -Du |u_r| nu_r                                                              (paper, eq. 2)
+    """Return the damping wrench tau = -Du |u_r| nu_r                                       (paper, eq. 2)
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
-        surge_damping: Du, of whose diagonal the units are [N s²/m², N s²/rad].
+        surge_damping: Du; the units of its diagonal are [N s²/m², N s²/rad].
 
     Returns:
         Wrench about the same point, body frame [N, N m].
@@ -29,11 +30,11 @@ def surge_coupled_wrench(nu_r: vec6, surge_damping: mat66) -> vec6:
 
 @wp.func
 def surge_coupled_slope(nu_r: vec6, surge_damping: mat66) -> vec6:
-    """Diagonal of Du times the sum of the linear speeds, which is never less than |u_r|; in surge twice that.
+    """Return the diagonal of Du times the sum of the linear speeds, which is never less than |u_r|; doubled in surge.
 
     Args:
         nu_r: Velocity of the reference point relative to the water, body frame [m/s, rad/s].
-        surge_damping: Du, of whose diagonal the units are [N s²/m², N s²/rad].
+        surge_damping: Du; the units of its diagonal are [N s²/m², N s²/rad].
 
     Returns:
         Slope of the damping on each axis, body frame [N s/m, N m s/rad].
