@@ -1,4 +1,4 @@
-"""Where colcon puts what `ros2 run finssim_ros` and `ros2 launch finssim_ros` look for."""
+"""Installation of the nodes and launch files for `ros2 run finssim_ros` and `ros2 launch finssim_ros`."""
 
 from glob import glob
 

@@ -1,5 +1,4 @@
-"""Launch files from the description of graphs that `finssim ros2 up` uses; arguments win over parameter files, but only
-where given."""
+"""Launch descriptions from the graphs that `finssim ros2 up` uses; given arguments override parameter files."""
 
 import re
 from pathlib import Path
@@ -16,7 +15,8 @@ FILE = "params_file"
 
 
 def description(graph):
-    """Return the launch description of a graph; an argument left empty leaves a parameter to file and nodes."""
+    """Return the launch description of a graph; an empty argument leaves its parameter to the file and the
+    nodes' defaults."""
     options = {option.name: option for option in read("finssim.extensions.ros2.up:Options").all_options()}
     declared = {
         name: f"{options[name].metavar or options[name].kind.__name__}: {options[name].help}"
@@ -36,8 +36,8 @@ def description(graph):
             Node(
                 package="finssim_ros",
                 executable=one.node,
-                # With name and namespace launch_ros writes the parameters below the node's full name; without, below
-                # /**, which loses against every node that a file names after a /** of its own.
+                # With name and namespace, launch_ros writes the parameters below the node's full name; without, below
+                # /**, which a later entry for the node in a parameter file overrides if the file has its own /** first.
                 name=one.node,
                 namespace=one.namespace,
                 parameters=[*([file] if file else []), *([_words(one.parameters)] if one.parameters else [])],
@@ -51,7 +51,7 @@ def description(graph):
 
 
 def _words(parameters):
-    """Return parameters whose words stay words, whatever they look like."""
+    """Return parameters whose strings stay strings, whatever they look like."""
     return {
         name: ParameterValue(value, value_type=str) if isinstance(value, str) else value
         for name, value in parameters.items()

@@ -1,4 +1,5 @@
-"""The virtual pool and a robot in it: ros2 launch finssim_ros pool.launch.py severity:=realistic goal:=0.4,0,-0.5,0
+"""Launch the virtual pool and a robot: ros2 launch finssim_ros pool.launch.py severity:=realistic
+goal:=0.4,0,-0.5,0
 
 Several vehicles: team:=finsrov,finsrov,finsrov site:=open-water positioning:=motion-capture
 """

@@ -1,4 +1,5 @@
-"""A simulated vehicle with its controller: ros2 launch finssim_ros sim.launch.py vehicle:=bluerov2_heavy policy:=DIR"""
+"""Launch a simulated vehicle and its controller: ros2 launch finssim_ros sim.launch.py
+vehicle:=bluerov2_heavy policy:=DIR"""
 
 from finssim_ros.launching import description
 

@@ -1,4 +1,4 @@
-"""ROS 2 for FinsSim: the real wire without a ROS installation, one source for messages, names and frames."""
+"""ROS 2 for FinsSim: native DDS without a ROS installation, and one source for messages, names and frames."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ __getattr__, __dir__ = exports(__name__)
 
 
 class Ros2Error(ValueError):
-    """A setting, name or definition of ROS 2 cannot be used; the message is one sentence that states what to do."""
+    """Setting, name or definition of ROS 2 that cannot be used; the message states in one sentence how to
+    correct it."""
 
 
 class MessageError(AssertionError):
-    """A value does not fit its field. Real rclpy asserts here, so code written for it may expect an AssertionError."""
+    """Value that does not fit its field. Real rclpy asserts here, so code written for it may expect an
+    AssertionError."""

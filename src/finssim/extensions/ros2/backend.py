@@ -1,4 +1,4 @@
-"""Choice of rclpy for a process: that of a sourced ROS 2 if it can be imported, otherwise our shim on the same wire."""
+"""Selection of rclpy for a process: that of a sourced ROS 2 if it can be imported, otherwise FinsSim's own on DDS."""
 
 from __future__ import annotations
 
@@ -23,29 +23,30 @@ __all__ = ["activate", "install"]
 
 @dataclass(frozen=True)
 class Backend:
-    """Modules that `import rclpy` gives."""
+    """Modules behind `import rclpy`."""
 
     name: str
-    """"native" or "dds"."""
+    """Name of the backend: "native" or "dds"."""
     description: str
-    """One line: which, where it talks, and why it was chosen."""
+    """Description in one line: kind, network settings, and the reason for the selection."""
 
 
 _active: list[Backend] = []
 
 
 def activate(interfaces: Sequence[Path] = (), *, announce: bool = True) -> Backend:
-    """Make `import rclpy` and the message packages work; later calls give the first one's answer.
+    """Make `import rclpy` and the message packages work; later calls return the result of the first.
 
-    `PLATFORM_ROS` may be `native` or `dds`; without it the real rclpy is used wherever it can be imported. The
-    environment's FINSSIM_ROS_INTERFACES names more folders of interface packages, apart by colons.
+    `PLATFORM_ROS` may be `native` or `dds`; by default the real rclpy is used if it can be imported. The
+    environment variable FINSSIM_ROS_INTERFACES names more folders of interface packages, separated by colons.
 
     Args:
-        interfaces: Folders of interface packages (`msg/*.msg`, `srv/*.srv`) besides ours; a sourced ROS 2 has its own.
-        announce: Whether to print the choice to standard error.
+        interfaces: Additional folders of interface packages (`msg/*.msg`, `srv/*.srv`); a sourced ROS 2 uses
+            its own.
+        announce: True to print the selection to standard error.
 
     Raises:
-        Ros2Error: `PLATFORM_ROS` asks for what is not there, or a setting of the wire is malformed.
+        Ros2Error: The backend requested by `PLATFORM_ROS` is not available, or a network setting is malformed.
     """
     if not _active:
         requested = os.environ.get("PLATFORM_ROS", "")
@@ -63,8 +64,8 @@ def activate(interfaces: Sequence[Path] = (), *, announce: bool = True) -> Backe
 
 
 def _why_not_native() -> str:
-    """Return why the real rclpy cannot be used; empty if it can. Found by importing: half-sourced shells have it
-    broken."""
+    """Return the reason why the real rclpy cannot be used; empty if it can. It is imported, since partly
+    sourced shells have a broken rclpy."""
     try:
         importlib.import_module("rclpy")
         importlib.import_module("rclpy.node")
@@ -103,7 +104,8 @@ def _shim(interfaces: Sequence[Path], reason: str) -> Backend:
     return Backend("dds", f"built-in rclpy over Cyclone DDS, {domain_text} ({reason})")
 
 
-# What lets `import rclpy`, `import nav_msgs.msg` and `import std_srvs.srv` find the shim and the codec's classes.
+# Import hooks by which `import rclpy`, `import nav_msgs.msg` and `import std_srvs.srv` find the shim and
+# message classes.
 
 PARTS = {
     "context": ("context", "signals", "utilities"),
@@ -119,7 +121,7 @@ PARTS = {
     "qos": ("qos",),
     "time": ("clock", "clock_type", "duration", "time"),
 }  # fmt: skip
-"""Modules of the shim, and the submodules of rclpy that each is."""
+"""Module of the shim -> submodules of rclpy that it replaces."""
 TF2 = (
     "buffer",
     "buffer_interface",
@@ -127,17 +129,17 @@ TF2 = (
     "transform_broadcaster",
     "transform_listener",
 )
-"""Submodules of tf2_ros, which are all one module of the shim."""
+"""Submodules of tf2_ros, all of which are one module of the shim."""
 
 
 def install(interfaces: Sequence[Path] = ()) -> None:
-    """Give this process the names of rclpy and of all message packages.
+    """Make rclpy and all message packages importable in this process.
 
     Args:
-        interfaces: Folders of interface packages besides ours.
+        interfaces: Additional folders of interface packages.
 
     Raises:
-        Ros2Error: A folder without definitions, or a malformed one.
+        Ros2Error: A folder contains no definitions, or a malformed one.
     """
     codec = codec_of()
     for folder in interfaces:
@@ -157,7 +159,7 @@ def install(interfaces: Sequence[Path] = ()) -> None:
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds message packages, and reports what rclpy's other parts need."""
+    """Finder of message packages, which also reports parts of rclpy that are not available."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec, self._packages = codec, codec.packages()
@@ -179,11 +181,11 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return _Types(spec.name, self._codec, package, kind) if kind else ModuleType(spec.name)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Nothing to run: classes are made when first asked for."""
+        """Do nothing: classes are created at their first use."""
 
 
 class _Absent(importlib.abc.MetaPathFinder):
-    """Finder that is asked last: it reports what to do without missing packages of ROS 2."""
+    """Last finder, which reports alternatives to missing packages of ROS 2."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> None:
         hint = PACKAGES.get(name.partition(".")[0])
@@ -192,7 +194,7 @@ class _Absent(importlib.abc.MetaPathFinder):
 
 
 class _Types(ModuleType):
-    """The types of a package, each made when it is first asked for."""
+    """Types of a package, each created at its first use."""
 
     def __init__(self, name: str, codec: Codec, package: str, kind: str) -> None:
         super().__init__(name, f"Types of {package}, from their definitions.")

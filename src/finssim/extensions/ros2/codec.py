@@ -1,4 +1,4 @@
-"""Messages to bytes and back: little-endian CDR as ROS 2 sends it, and the hash that names a type's layout."""
+"""Serialization of messages: little-endian CDR, as ROS 2 sends it, and the hash of a type's definition."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from finssim.extensions.ros2 import MessageError, Ros2Error
 
 @dataclass(frozen=True)
 class Distro:
-    """One release of ROS 2 as its peers see it."""
+    """Release of ROS 2 with the properties that its peers see."""
 
     name: str
     gid_length: int
-    """Bytes of an endpoint's identifier in the node list: 24 up to Humble, 16 since Iron."""
+    """Length of an endpoint's identifier in the node list [bytes]: 24 up to Humble, 16 since Iron."""
     type_hashes: bool
     """True if endpoints announce the hash of their type (since Iron)."""
 
@@ -40,14 +40,14 @@ DISTROS = {
     "jazzy": Distro("jazzy", 16, True),
     "kilted": Distro("kilted", 16, True),
 }
-"""Releases whose messages and wire are known."""
+"""Name -> release with known messages and protocol."""
 
 
 def distro_of(environ: Mapping[str, str] = os.environ) -> Distro:
-    """Return the release to use: that of `ROS_DISTRO`, Jazzy if it is not set.
+    """Return the release to use: that of `ROS_DISTRO`, Jazzy by default.
 
     Raises:
-        Ros2Error: A release that is not known.
+        Ros2Error: The release is not supported.
     """
     name = environ.get("ROS_DISTRO") or "jazzy"
     if name not in DISTROS:
@@ -57,11 +57,11 @@ def distro_of(environ: Mapping[str, str] = os.environ) -> Distro:
     return DISTROS[name]
 
 
-# Message and service definitions: those of ROS 2 itself, our own, and those of folders the user names.
+# Message and service definitions: those of ROS 2, FinsSim's own, and those of folders named by the user.
 
 
 INTERFACES = Path(__file__).parents[2] / "robot" / "interfaces"
-"""Folder of our own interface packages, one folder each, as ROS 2 lays them out."""
+"""Folder of FinsSim's interface packages, one folder each, with the layout of ROS 2."""
 
 STANDARD_SERVICES = {
     "rcl_interfaces/srv/DescribeParameters": "string[] names\n---\nrcl_interfaces/ParameterDescriptor[] descriptors\n",
@@ -80,9 +80,9 @@ STANDARD_SERVICES = {
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message\n",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message\n",
 }
-"""Services that every ROS 2 has; rosbags knows messages only."""
+"""Services of every ROS 2 installation; rosbags provides only messages."""
 
-NO_FIELDS = "uint8 structure_needs_at_least_one_member"  # what ROS 2 itself sends for an empty message
+NO_FIELDS = "uint8 structure_needs_at_least_one_member"  # as ROS 2 sends it for an empty message
 
 _DEFAULT = re.compile(r"^(?P<type>[\w/<>=\[\]]+)\s+(?P<name>[a-z]\w*)\s+(?P<value>[^=\s].*)$")
 
@@ -91,9 +91,9 @@ class Definitions:
     """Field lists of all known types of one release.
 
     Attributes:
-        store: rosbags' store, which holds fields and constants and makes the (de)serialisers.
-        defaults: Type -> field -> default value, where it is not zero.
-        services: Names of services, as `std_srvs/srv/Trigger`.
+        store: Type store of rosbags, which contains fields and constants and creates the (de)serializers.
+        defaults: Type -> field -> default value, if not zero.
+        services: Names of services, such as `std_srvs/srv/Trigger`.
     """
 
     def __init__(self, distro: str) -> None:
@@ -107,10 +107,10 @@ class Definitions:
             self.add_package(package)
 
     def add_package(self, folder: Path) -> None:
-        """Add every `msg/*.msg` and `srv/*.srv` of a package, in whatever order they need each other.
+        """Add every `msg/*.msg` and `srv/*.srv` of a package, in any order of dependence.
 
         Raises:
-            Ros2Error: The folder holds none, or one is malformed.
+            Ros2Error: The folder contains none, or one is malformed.
         """
         messages, services = sorted(folder.glob("msg/*.msg")), sorted(folder.glob("srv/*.srv"))
         if not messages and not services:
@@ -123,10 +123,10 @@ class Definitions:
             self.add_service(f"{folder.name}/srv/{path.stem}", path.read_text(encoding="utf-8"))
 
     def add_message(self, name: str, text: str) -> None:
-        """Add a type, named as `finssim_msgs/msg/ThrusterCommand`, from the text of its `.msg` file.
+        """Add a type, with a name such as `finssim_msgs/msg/ThrusterCommand`, from the text of its `.msg` file.
 
         Raises:
-            Ros2Error: The text is no definition, or another one of that name is known.
+            Ros2Error: The text is not a definition, or the name has a different one already.
         """
         fields = _without_char(_parsed(name, text))
         try:
@@ -136,10 +136,10 @@ class Definitions:
         self.defaults.setdefault(name, _defaults(text))
 
     def add_service(self, name: str, text: str) -> None:
-        """Add a service, named as `std_srvs/srv/Trigger`, from the text of its `.srv` file.
+        """Add a service, with a name such as `std_srvs/srv/Trigger`, from the text of its `.srv` file.
 
         Raises:
-            Ros2Error: The text is no definition.
+            Ros2Error: The text is not a definition.
         """
         halves = re.split(r"^---[ \t]*$", text, flags=re.MULTILINE)
         if len(halves) != 2:
@@ -152,14 +152,14 @@ class Definitions:
         self.services.add(name)
 
     def known(self) -> list[str]:
-        """Names of all types, the halves of services among them."""
+        """Return the names of all types, including the requests and responses of services."""
         return list(self.store.fielddefs)
 
     def fields(self, name: str) -> list[tuple[str, Any]]:
-        """Names and descriptions of a type's fields, as rosbags has them.
+        """Return the names and descriptions of a type's fields, in the format of rosbags.
 
         Raises:
-            Ros2Error: Unknown type.
+            Ros2Error: The type is unknown.
         """
         if name not in self.store.fielddefs:
             raise Ros2Error(
@@ -169,12 +169,12 @@ class Definitions:
         return fields or [(NO_FIELDS.split()[1], (Nodetype.BASE, ("uint8", 0)))]
 
     def constants(self, name: str) -> list[tuple[str, str, Any]]:
-        """Name, type and value of a type's constants."""
+        """Return name, type and value of a type's constants."""
         return list(self.store.fielddefs[name][0])
 
 
 def _parsed(name: str, text: str) -> Any:
-    """Constants and fields of a `.msg` text; rosbags reads services as messages under another name."""
+    """Return the constants and fields of a `.msg` text; services are parsed as messages of another name."""
     package, kind, short = name.split("/")
     as_message = f"{package}/msg/{short}"
     try:
@@ -184,7 +184,7 @@ def _parsed(name: str, text: str) -> Any:
 
 
 def _without_char(definition: Any) -> Any:
-    """Constants and fields with uint8 for char: what rosidl makes of it, and hashes, where rosbags keeps the word."""
+    """Return constants and fields with uint8 for char, as rosidl converts and hashes it; rosbags keeps char."""
     constants, fields = definition
 
     def plain(described: Any) -> Any:
@@ -197,12 +197,12 @@ def _without_char(definition: Any) -> Any:
 
 
 def _defaults(text: str) -> dict[str, Any]:
-    """Default values that a `.msg` text gives to fields."""
+    """Return the default values of fields in a `.msg` text."""
     lines = (_DEFAULT.match(re.sub(r"#.*", "", line).strip()) for line in text.splitlines())
     return {line["name"]: yaml.safe_load(line["value"]) for line in lines if line}
 
 
-# What a field takes: as strict as real rclpy on Humble, so that code that runs here runs there.
+# Checks of field values: as strict as real rclpy on Humble, so that code that runs here also runs there.
 
 
 INTEGERS = {
@@ -216,16 +216,17 @@ DTYPES = {
     "float64": np.dtype("float64"),
     "bool": np.dtype("bool"),
 }
-"""Base types whose arrays are NumPy arrays."""
+"""Base types whose arrays are NumPy arrays -> dtype."""
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 Check = Callable[[Any], Any]
 
 
 class Numbers(np.ndarray[Any, Any]):
-    """A sequence of numbers as messages keep it: a NumPy array with the manners of rclpy's `array.array`.
+    """Sequence of numbers in a message: a NumPy array that behaves like rclpy's `array.array`.
 
-    Its elements are Python's numbers, and what is computed from it is an ordinary NumPy array, which no field takes.
+    Its elements are Python numbers, and results of computations are ordinary NumPy arrays, which sequence
+    fields refuse.
     """
 
     def __getitem__(self, index: Any) -> Any:
@@ -240,23 +241,23 @@ class Numbers(np.ndarray[Any, Any]):
 
 
 class Octet(bytes):
-    """One byte: Python sees `bytes`, as in rclpy, and the serialiser its number."""
+    """One byte: `bytes` in Python, as in rclpy, and a number for the serializer."""
 
     def __index__(self) -> int:
         return self[0]
 
     @classmethod
     def of(cls, number: int) -> Octet:
-        """Return the octet of a number."""
+        """Return the octet with a number."""
         return cls((number,))
 
 
 def check_of(described: Any, nested: Callable[[str], type]) -> Check:
-    """Return the function that checks a value of a field and returns it in the message's form.
+    """Return the function that checks a value of a field and returns it in the message's format.
 
     Args:
-        described: The field, as rosbags has it.
-        nested: Gives the class of a type that is a field.
+        described: The field, in the format of rosbags.
+        nested: Function that returns the class of a nested type.
     """
     kind, detail = described
     if kind == Nodetype.NAME:
@@ -328,9 +329,10 @@ def _octet(value: Any) -> Octet:
 
 
 def _numbers(base: str, count: int, fixed: bool) -> Check:
-    """Arrays of numbers are kept as NumPy arrays; bytes and `array.array` are not copied.
+    """Return the check of number arrays, which are stored as NumPy arrays; bytes and `array.array` are not copied.
 
-    As the messages of rosidl_generator_py on Humble: arrays of a fixed length take NumPy arrays, sequences do not.
+    As in the messages of rosidl_generator_py on Humble, arrays of a fixed length accept NumPy arrays,
+    sequences do not.
     """
     dtype, single = DTYPES[base], _integer("uint8") if base in ("byte", "octet") else _base(base, 0)
 
@@ -376,7 +378,7 @@ def _shown(value: Any) -> str:
 
 
 def spelled(described: Any) -> str:
-    """The field's type as ROS 2 spells it in `get_fields_and_field_types`."""
+    """Return the field's type as spelled in ROS 2's `get_fields_and_field_types`."""
     kind, detail = described
     if kind == Nodetype.NAME:
         package, _, short = detail.split("/")
@@ -391,11 +393,11 @@ def spelled(described: Any) -> str:
     return f"sequence<{spelled(inner)}, {count}>" if count else f"sequence<{spelled(inner)}>"
 
 
-# Python classes of messages, with the manners of real rclpy: defaults, checks on assignment, constants.
+# Python classes of messages that behave like those of real rclpy: defaults, checks on assignment, constants.
 
 
 class Message:
-    """A message: slots, keyword arguments, and a check of every value that is assigned."""
+    """Message with slots, keyword arguments, and a check of every assigned value."""
 
     __slots__ = ()
     TYPE: str
@@ -436,22 +438,23 @@ class Message:
 
     @classmethod
     def get_fields_and_field_types(cls) -> dict[str, str]:
-        """Field names and their types, spelled as ROS 2 does."""
+        """Return field names and their types, spelled as in ROS 2."""
         return dict(cls._spelled)
 
 
 def message_class(
     name: str, definitions: Definitions, nested: Callable[[str], type[Message]]
 ) -> tuple[type[Message], Callable[..., Message]]:
-    """The class of a type, and what makes one from checked field values in order, for deserialising.
+    """Return the class of a type, and a function that creates one from valid field values in order, for
+    deserialization.
 
     Args:
-        name: As `nav_msgs/msg/Odometry`.
-        definitions: Where its fields are found.
-        nested: Gives the class of a type that is a field.
+        name: Name such as `nav_msgs/msg/Odometry`.
+        definitions: Definitions that contain its fields.
+        nested: Function that returns the class of a nested type.
 
     Raises:
-        Ros2Error: Unknown type.
+        Ros2Error: The type is unknown.
     """
     described = {f"{n}_" if keyword.iskeyword(n) else n: d for n, d in definitions.fields(name)}
     defaults = definitions.defaults.get(name, {})
@@ -470,7 +473,7 @@ def message_class(
 
 
 def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Message]:
-    """Make a message from values that need no check: the slots are set directly, which is several times faster."""
+    """Return a function that creates a message from valid values: it sets the slots directly, several times faster."""
     names = list(described)
     lines = [f"def make({', '.join(f'v{i}' for i in range(len(names)))}):", "    m = new(cls)"]
     for i, (kind, detail) in enumerate(described.values()):
@@ -487,7 +490,7 @@ def _maker(cls: type[Message], described: Mapping[str, Any]) -> Callable[..., Me
 
 
 def _zero(described: Any, nested: Callable[[str], type[Message]], default: Any) -> Callable[[], Any]:
-    """Return the function that makes a field's default: zero, empty, or as in its definition."""
+    """Return the function that creates a field's default: zero, empty, or as in its definition."""
     kind, detail = described
     if default is not None:
         check = check_of(described, nested)
@@ -507,7 +510,7 @@ def _zero(described: Any, nested: Callable[[str], type[Message]], default: Any) 
 
 
 def _base_zero(base: str) -> Callable[[], Any]:
-    """Zero of a base type."""
+    """Return the function that creates the zero of a base type."""
     if base == "string":
         return str
     if base == "bool":
@@ -517,15 +520,15 @@ def _base_zero(base: str) -> Callable[[], Any]:
     return float if base.startswith("float") else int
 
 
-# Messages to bytes and back: little-endian CDR as ROS 2 sends it, and the hash that names a type's layout.
+# Serialization of messages: little-endian CDR, as ROS 2 sends it, and the hash of a type's definition.
 
 
 HEADER = b"\x00\x01\x00\x00"
-"""Encapsulation: plain CDR, little endian."""
+"""Encapsulation header: plain CDR, little endian."""
 
 
 class ServiceType:
-    """A service type, as rclpy has it: two messages under one name."""
+    """Service type as in rclpy: a request and a response class."""
 
     TYPE: str
     Request: type[Message]
@@ -533,10 +536,10 @@ class ServiceType:
 
 
 class Codec:
-    """Classes, bytes and hashes of all types of one release of ROS 2.
+    """Classes, serialization and hashes of all types of one release of ROS 2.
 
     Args:
-        distro: Name of the release, e.g. "jazzy".
+        distro: Name of the release, such as "jazzy".
     """
 
     def __init__(self, distro: str) -> None:
@@ -545,10 +548,10 @@ class Codec:
         self._services: dict[str, type[ServiceType]] = {}
 
     def message(self, name: str) -> type[Message]:
-        """Class of a message, named as `nav_msgs/msg/Odometry`.
+        """Return the class of a message, with a name such as `nav_msgs/msg/Odometry`.
 
         Raises:
-            Ros2Error: Unknown type.
+            Ros2Error: The type is unknown.
         """
         if name not in self._classes:
             cls, make = message_class(name, self.definitions, self.message)
@@ -559,10 +562,10 @@ class Codec:
         return self._classes[name]
 
     def service(self, name: str) -> type[ServiceType]:
-        """Class of a service, named as `std_srvs/srv/Trigger`.
+        """Return the class of a service, with a name such as `std_srvs/srv/Trigger`.
 
         Raises:
-            Ros2Error: Unknown service.
+            Ros2Error: The service is unknown.
         """
         if name not in self.definitions.services:
             raise Ros2Error(
@@ -576,19 +579,19 @@ class Codec:
         return self._services[name]
 
     def names(self, package: str, kind: str) -> list[str]:
-        """Short names of a package's types; `kind` is "msg" or "srv"."""
+        """Return the short names of a package's types; `kind` is "msg" or "srv"."""
         available = self.definitions.services if kind == "srv" else self.definitions.known()
         return sorted(name.rsplit("/", 1)[1] for name in available if name.startswith(f"{package}/{kind}/"))
 
     def packages(self) -> set[str]:
-        """Names of all packages with a type."""
+        """Return the names of all packages with a type."""
         return {name.partition("/")[0] for name in self.definitions.known()}
 
     def serialize(self, message: Message) -> bytearray:
-        """Bytes of a message: header, CDR, zeros up to a multiple of four.
+        """Return the bytes of a message: header, CDR, padding to a multiple of four.
 
         Raises:
-            MessageError: A field was changed in place into something that does not fit.
+            MessageError: A field was modified in place so that it no longer fits.
         """
         definition = self.definitions.store.cache[message.TYPE]
         try:
@@ -603,12 +606,12 @@ class Codec:
         return buffer
 
     def deserialize(self, data: bytes | bytearray | memoryview, name: str) -> Message:
-        """A message from its bytes; its arrays are writable and share the given buffer if that is writable.
+        """Return a message from its bytes; its arrays are writable and share the given buffer if that is writable.
 
-        Bytes left over at the end are allowed: some writers pad.
+        Extra bytes at the end are allowed: some writers pad.
 
         Raises:
-            Ros2Error: Unknown type, or bytes that are none of its messages.
+            Ros2Error: The type is unknown, or the bytes are not one of its messages.
         """
         self.message(name)
         definition = self.definitions.store.cache[name]
@@ -623,16 +626,16 @@ class Codec:
         return message  # type: ignore[no-any-return]
 
     def type_hash(self, name: str) -> str:
-        """The hash that Iron and later announce with an endpoint, `RIHS01_` and 64 hexadecimal digits."""
+        """Return the hash that Iron and later announce with an endpoint, `RIHS01_` and 64 hexadecimal digits."""
         return self.definitions.store.hash_rihs01(name)
 
     def fields(self, name: str) -> list[tuple[str, Any]]:
-        """Fields of a type, as rosbags has them."""
+        """Return the fields of a type, in the format of rosbags."""
         return self.definitions.fields(name)
 
 
 def codec_of(distro: str | None = None) -> Codec:
-    """The process's one codec for a release; that of `ROS_DISTRO` where none is named."""
+    """Return the process's shared codec for a release; by default that of `ROS_DISTRO`."""
     return _codec(distro or distro_of().name)
 
 

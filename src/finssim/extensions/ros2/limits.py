@@ -1,4 +1,4 @@
-"""Names of rclpy that the built-in one lacks, with the sentence that states what to do instead."""
+"""Names of rclpy that the built-in one lacks, each with an alternative."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ MISSING: dict[str, dict[str, str]] = {
         "all_frames_as_string": "use ros2 run tf2_tools view_frames on another computer",
     },
 }
-"""Class -> what real rclpy has and the class lacks -> what to do."""
+"""Class -> missing name of real rclpy -> alternative."""
 
 MODULES = {
     "MultiThreadedExecutor": "use SingleThreadedExecutor",
@@ -101,7 +101,7 @@ MODULES = {
     "BufferClient": "use Buffer and TransformListener",
     "BufferServer": "let each node have a Buffer of its own",
 }
-"""Name in a module of rclpy or tf2_ros -> what to do."""
+"""Missing name of a module of rclpy or tf2_ros -> alternative."""
 
 PACKAGES = {
     "message_filters": "compare the stamps of messages in your callbacks",
@@ -110,11 +110,11 @@ PACKAGES = {
     "cv_bridge": "make an array of Image.data with numpy.frombuffer and reshape",
     "rosbag2_py": "use the package rosbags, or finssim record",
 }
-"""Package of ROS 2 that nodes import beside rclpy -> what to do."""
+"""Package of ROS 2 that nodes import besides rclpy -> alternative."""
 
 
 class Limited:
-    """A class of rclpy that reports what to do about what it lacks."""
+    """Base of rclpy classes that suggests alternatives for missing attributes."""
 
     def __getattr__(self, name: str) -> NoReturn:
         for kind in type(self).__mro__:
@@ -125,11 +125,11 @@ class Limited:
 
 
 def refuse(module: str, name: str) -> Any:
-    """Refuse a name that a module lacks, in place of the module's `__getattr__`.
+    """Refuse a name that a module lacks; used as the module's `__getattr__`.
 
     Raises:
-        ImportError: Always, which reaches whoever writes `from module import name`, unlike an AttributeError.
-        AttributeError: One of Python's own names.
+        ImportError: Always; unlike an AttributeError, its text reaches the user of `from module import name`.
+        AttributeError: The name is one of Python's own.
     """
     if name.startswith("__"):
         raise AttributeError(f"module '{module}' has no attribute '{name}'")

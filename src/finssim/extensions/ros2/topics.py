@@ -1,4 +1,4 @@
-"""Messages between nodes: the table of topics, frames, services, and the rclpy profiles of their policies."""
+"""Messages between nodes: table of topics, frames, services, and the rclpy profiles of their policies."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ServiceName:
-    """One service. None is needed for safety: services reach Cyclone DDS only."""
+    """A service. None is needed for safety, because services are available only over Cyclone DDS."""
 
     name: str
     type: str
@@ -66,11 +66,11 @@ SERVICES = {
         "set_armed", "std_srvs/srv/SetBool", "hardware_bridge, sim", "the topic arm, with an answer"
     ),
 }
-"""Key -> service, for convenience beside the topics."""
+"""Key -> service; each is an alternative to a topic."""
 
 
 def quality_profile(quality: str) -> object:
-    """The rclpy profile of a topic's policies; needs a rclpy (`finssim.extensions.ros2.backend.activate`)."""
+    """Return the rclpy profile of a topic's policies; needs a rclpy (`finssim.extensions.ros2.backend.activate`)."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(

@@ -52,29 +52,28 @@ __all__ = [
 
 
 PATIENCE = 10.0
-"""Time that a node has to end before it is killed [s]."""
+"""Time for a node to end before it is killed [s]."""
 
 
 @dataclass
 class Child:
-    """One node's process."""
+    """Process of one node."""
 
     what: GraphNode
     name: str
-    """Name for people."""
+    """Name in messages."""
     process: subprocess.Popen[bytes]
     dead: bool = False
 
 
 class Supervisor:
-    """Runs the nodes of a plan. Use it as a context: whatever happens, no process is left."""
+    """Runs the nodes of a plan. As a context manager, it ends all processes."""
 
     def __init__(self, plan: GraphPlan, parameters: Path, notify: Callable[[str], None]) -> None:
-        """
-        Args:
-            plan: Nodes and namespaces.
-            parameters: File that `plan.write` wrote.
-            notify: Takes a sentence for the person who watches.
+        """Args:
+        plan: Nodes and namespaces.
+        parameters: File that `plan.write` wrote.
+        notify: Receives messages for the user.
         """
         self._plan, self._parameters, self._say = plan, parameters, notify
         self.children: list[Child] = []
@@ -86,12 +85,12 @@ class Supervisor:
         self.end()
 
     def start(self, one: GraphNode) -> Child:
-        """Start a node; it ends with this process even if that is killed."""
+        """Start a node; it ends with this process, even if that is killed."""
         name = one.node if len(self._plan.namespaces) == 1 else one.full_name.strip("/")
         ros = ["--ros-args", "-r", f"__ns:=/{one.namespace}", "--params-file", str(self._parameters)]
         command = [sys.executable, "-m", "finssim", "ros2", "node", one.node, *ros]
         environment = {**os.environ, PARENT: str(os.getpid())}
-        # In a separate session: Ctrl-C reaches this process alone, and the nodes end in our order.
+        # In a separate session: Ctrl-C reaches only this process, and the nodes end in the planned order.
         process = subprocess.Popen(
             command,
             env=environment,
@@ -104,7 +103,7 @@ class Supervisor:
         return child
 
     def look(self) -> list[Child]:
-        """Return the nodes that have died since the last call, each once."""
+        """Return the nodes that have died since the last call."""
         died = [c for c in self.children if not c.dead and c.process.poll() is not None]
         for child in died:
             child.dead = True
@@ -114,7 +113,7 @@ class Supervisor:
         return died
 
     def end(self) -> None:
-        """End all, those first that were started last."""
+        """End all nodes, in the reverse order of their start."""
         for child in reversed(self.children):
             if child.process.poll() is None:
                 interrupt(child.process)
@@ -130,50 +129,52 @@ class Supervisor:
 
 
 def _status(code: int) -> str:
-    """A return code in words."""
+    """Return a description of a return code."""
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"status {code}"
 
 
-# `finssim ros2 up`: a complete graph of nodes as processes, without ROS installed.
+# `finssim ros2 up`: a complete graph of nodes as processes, without a ROS installation.
 
 
 DIED, FAULT = 1, 3
-"""Exit status where a node died, and where the bridge ended in a fault."""
+"""Exit status if a node died, and if the bridge ended in a fault."""
 STARTING = 180.0
 """Longest wait for the first message of a bridge [s]; the first rendering on a machine compiles."""
 APART = 10
-"""Ports between one vehicle of a team and the next, as of a virtual pool."""
+"""Distance of the ports of two successive vehicles of a team, as in a virtual pool."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedWorld:
-    """World of a virtual pool or of a simulated vehicle."""
+    """Simulated vehicle, or virtual pool: its world, water, plant, firmware, camera and ports."""
 
     world: str | None = None
-    """(SITE|FILE) World for the own cameras, sonars and altimeters of a vehicle in a virtual pool; in open water
-    also its water. The node camera publishes them."""
+    """(SITE|FILE) World for the vehicle's own cameras, sonars and altimeters in a virtual pool; in open water
+    also its water. The node camera publishes their measurements."""
     water: Path | None = None
-    """(FILE) Water file of a virtual pool (.yaml): currents and waves, which add to the site's own."""
+    """(FILE) Water file of a virtual pool (.yaml): currents and waves, which are added to those of the site."""
     positioning: str = "none"
     """(NAME) Position fixes of a virtual pool: none, motion-capture or usbl."""
     plant: str = "1"
-    """(SEED|FILE) Plant of a virtual pool: a seed, or a file."""
+    """(SEED|FILE) Plant of a virtual pool: a seed or a file."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
-    """(NAME) Firmware of a virtual pool's vehicle: mcu, or ardusub, an autopilot with DVL and compass and no camera.
-    Ground stations connect by TCP to the port after --port, the DVL has the one after that."""
+    """(NAME) Firmware of a virtual pool's vehicle: mcu, or ardusub, an autopilot with DVL and compass,
+    without a camera. Ground stations connect by TCP to the port after --port; the DVL uses the port after
+    that."""
     severity: str = "realistic"
-    """(NAME) Of a drawn plant: nominal, realistic or hard."""
+    """(NAME) Severity of a drawn plant: nominal, realistic or hard."""
     camera: str | None = None
-    """(KIND) Output of a virtual pool's camera: pictures, corners (of the tags) or none, which is none for a robot
-    too. Default: pictures, in a tank corners."""
+    """(KIND) Output of a virtual pool's camera: pictures, corners (of the tags) or none, which applies also
+    to a robot.
+    Default: pictures; in a tank, corners."""
     port: int = 58766
-    """UDP port of a virtual pool; images use the next port."""
+    """UDP port of a virtual pool; pictures use the next port."""
     truth: Path | None = None
-    """(FILE) Truth file of a virtual pool."""
+    """(FILE) Truth file of a virtual pool, which is written."""
     start: str | None = None
-    """(X,Y,Z,YAW) Where the vehicle starts in sim and pool: x,y,z [m], yaw [deg]."""
+    """(X,Y,Z,YAW) Start pose of the vehicle in sim and pool: x,y,z [m], yaw [deg]."""
     hydrodynamics: str | None = None
-    """(MODEL) Model of sim: calibrated, mesh or simplified."""
+    """(MODEL) Hydrodynamic model of sim: calibrated, mesh or simplified."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,49 +185,49 @@ class GraphWiring:
     """(ADDRESS) Motor controller of a robot: udp://HOST:PORT, serial:DEVICE, or pool for a finssim pool on
     this machine; or its autopilot: mavlink or mavlink://KIND:ADDRESS, as in finssim run."""
     bind: str = "127.0.0.1:54321"
-    """(ADDRESS:PORT) Local address and port for udp; images arrive at the next port."""
+    """(ADDRESS:PORT) Local address and port for UDP; pictures are received on the next port."""
     pictures: str | None = None
-    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; the pool's with --robot pool."""
+    """(ADDRESS) Overhead camera of a robot: udp://HOST:PORT or none; with --robot pool that of the pool."""
     pool_file: Path | None = None
-    """(FILE|none) Pool file: read by a robot, written by a virtual pool (.yaml); none without an overhead camera."""
+    """(FILE|none) Pool file (.yaml): a robot reads it, a virtual pool writes it; none without an overhead camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraphPace:
-    """Pace of the graph's time."""
+    """Rate and lock-step of the graph's time."""
 
     lockstep: bool = False
-    """Let /clock advance when every node has done its work of the last step, however long it takes: for a slow machine
-    or CI. As fast as possible, unless --real-time-factor limits it."""
+    """Let /clock advance only when every node has finished its work of the last step, however long it takes;
+    for a slow machine or CI. As fast as possible, unless --real-time-factor limits it."""
     real_time_factor: Annotated[float | None, (0.0, None)] = None
     """Time of /clock per real time [-]; 0: without limit, for sim and in lock-step. A virtual pool publishes /clock
-    where this or --lockstep is given; otherwise it runs in real time."""
+    if this or --lockstep is given; otherwise it runs in real time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TeamMessages:
-    """Messages between the vehicles of a team."""
+    """Loss and delay of the messages between the vehicles of a team."""
 
     message_loss: Annotated[float | None, (0.0, 1.0)] = None
-    """Probability that a vehicle of a team misses a message of another; as of training, 0.1, if not given."""
+    """Probability that a vehicle of a team misses a message of another; if not given, 0.1 as in training."""
     message_delay: Annotated[float | None, (0.0, None)] = None
-    """Time to process such a message, besides its way at the speed of sound [s]; 0.1 if not given."""
+    """Time to process such a message, in addition to its travel time at the speed of sound [s]; 0.1 if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraphMission:
-    """Controller and where it steers to."""
+    """Controller and its goal."""
 
     policy: str = "pid"
-    """(DIR|pid|pid-paper|none) A policy's directory, or pid, or pid-paper; none for a controller of your own."""
+    """(DIR|pid|pid-paper|none) Directory of a policy, or pid, or pid-paper; none for your own controller."""
     task: str | None = None
-    """Task that the policy must have been trained for; its own if not given."""
+    """Task that the policy must have been trained for; if not given, the policy's task."""
     let_in: str | None = None
     """(X,Y) Position at the start, in the map [m], for dead reckoning by DVL and compass, without camera and
     position fixes."""
     goal: str | None = None
-    """(X,Y,Z,YAW|FILE) Station to keep: x,y,z [m] in the map (z = 0 at the surface) and heading [deg], or a file;
-    the position at arming if not given. The topic goal changes it."""
+    """(X,Y,Z,YAW|FILE) Pose to keep: x,y,z [m] in the map (z = 0 at the surface) and heading [deg], or a file;
+    if not given, the pose at arming. The topic goal changes it."""
     trajectory: str | None = None
     """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
 
@@ -236,20 +237,20 @@ class VehicleNames:
     """Vehicles of the graph, and the names of their topics and frames."""
 
     vehicle: str = "finsrov"
-    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
+    """(NAME|FILE) Vehicle in the catalogue, or a vehicle file."""
     team: str | None = None
-    """(NAME,NAME) Several vehicles of one virtual pool instead: robot_1 and so on, which are their namespaces. Of goal,
-    trajectory and let-in give one for each, separated by semicolons; record and truth are folders."""
+    """(NAME,NAME) Several vehicles of one virtual pool instead; their namespaces are robot_1 and so on. Give goal,
+    trajectory and let-in for each, separated by semicolons; record and truth are folders."""
     namespace: str | None = None
     """(NAME) Namespace of the vehicle's topics and prefix of its frames, such as robot_1, if there are several
-    vehicles. The vehicle's name, without prefix, if not given."""
+    vehicles. If not given, the vehicle's name, without a prefix."""
     frame_prefix: str | None = None
-    """(PREFIX/) Prefix of the vehicle's frames in /tf, if not the namespace's."""
+    """(PREFIX/) Prefix of the vehicle's frames in /tf, if it differs from the namespace's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of the command."""
+    """Options of the command `finssim ros2 up`."""
 
     mission: Annotated[GraphMission, "options"] = GraphMission()
     names: Annotated[VehicleNames, "options"] = VehicleNames()
@@ -260,19 +261,20 @@ class Options:
     wiring: Annotated[GraphWiring, "options"] = GraphWiring()
     simulated: Annotated[SimulatedWorld, "options"] = SimulatedWorld()
     record: Path | None = None
-    """(FILE) Record all topics to this file (.mcap)."""
+    """(FILE) File to which all topics are recorded (.mcap)."""
     teleop: str | None = None
-    """(DEVICE) Also drive by hand: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
+    """(DEVICE) Also drive manually: joy (topic), gamepad or keyboard. The bridge then arms without localization."""
     pace: Annotated[GraphPace, "options"] = GraphPace()
     messages: Annotated[TeamMessages, "options"] = TeamMessages()
     duration: Annotated[float | None, (0.0, None)] = None
-    """Duration from the bridge's first word [s], of /clock where nodes live by it; until Ctrl-C if not given."""
+    """Duration from the bridge's first message [s], in the time of /clock for nodes that use it; until Ctrl-C
+    if not given."""
     seed: int = 1
-    """Seed of every random number; equal seeds give equal results."""
+    """Seed of all random numbers; equal seeds give equal results."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Options:
-        """Return the options of values by name; what is left out has its default."""
+        """Return the options with the given values by name; missing ones have their defaults."""
         by_group: dict[str | None, dict[str, Any]] = {}
         for group, option in each_option():
             if option.name in values:
@@ -300,7 +302,7 @@ GROUPS = {
 
 
 def each_option() -> Iterator[tuple[str | None, Field[Any]]]:
-    """Yield all options, each with the group that it is in, if any."""
+    """Yield all options, each with the name of its group, or None."""
     for field in fields(Options):
         if field.name in GROUPS:
             yield from ((field.name, option) for option in fields(GROUPS[field.name]))
@@ -309,20 +311,21 @@ def each_option() -> Iterator[tuple[str | None, Field[Any]]]:
 
 
 NOT_LAUNCHED = ("arm", "duration")
-"""Options that launch files lack: arming needs a message there, and Ctrl-C ends them."""
+"""Options that launch files lack: there, arming needs a message, and Ctrl-C ends them."""
 
 
 def launch_arguments() -> list[str]:
-    """Return the options that every launch file takes as arguments."""
+    """Return the options that every launch file has as arguments."""
     return [option.name for _, option in each_option() if option.name not in NOT_LAUNCHED]
 
 
 def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
-    """Plan a launch file: as `up` does, but what is not given is left to parameter files and nodes.
+    """Plan the nodes of a launch file as `up` does, but leave options that are not given to parameter files
+    and nodes.
 
     Args:
         graph: sim, pool or robot.
-        given: Launch argument -> text, of those that a person gave.
+        given: Launch argument -> text, of the arguments that the user gave.
 
     Raises:
         Ros2Error, VehicleError, GoalError, ControlError: As of `plan_of`, or a text that is no number or no flag.
@@ -348,7 +351,7 @@ MEANT: dict[str, tuple[Callable[[str], Any], str]] = {
     "float": (float, "a number"),
     "int": (int, "an integer"),
 }
-"""Word in an option's type -> what makes the value of a launch argument's text, and what that is."""
+"""Type name in an option's type -> converter of a launch argument's text, and description of its values."""
 
 
 def plan_of(
@@ -358,9 +361,9 @@ def plan_of(
 
     Args:
         graph: sim, pool or robot.
-        options: As the person chose.
-        pool_file: That robot's nodes read, and the virtual pool writes; None: the nodes' own.
-        since: Time of day at which the graph starts, before which a virtual pool has not written that file [s].
+        options: Options that the user chose.
+        pool_file: Pool file that the robot's nodes read and the virtual pool writes; None leaves it to the nodes.
+        since: Time of day at which the graph starts [s]; a pool file of a virtual pool that is older is not used.
 
     Raises:
         Ros2Error: There is no such graph, or an option that has no effect there.
@@ -402,7 +405,7 @@ def plan_of(
             given, below = values, namespace
             if node in WORLDS:
                 if i:
-                    continue  # one for all
+                    continue  # one for all vehicles
                 given = {
                     **values,
                     **_world_values(o, blind, file),
@@ -486,7 +489,7 @@ def _members(graph: str, o: Options, blind: bool) -> tuple[str, ...]:
 
 
 def _check(graph: str, o: Options) -> None:
-    """Refuse options that have no effect in a graph."""
+    """Raise for options that have no effect in a graph."""
     world, wiring, pace = o.simulated, o.wiring, o.pace
     single = (
         o.names.namespace or o.names.frame_prefix or o.teleop or world.start or world.firmware == "ardusub"
@@ -506,7 +509,7 @@ def _check(graph: str, o: Options) -> None:
         host = "" if wiring.robot is None else wiring.robot.rpartition("//")[2]
         if wiring.robot not in (None, "pool") and not host.startswith(("127.", "localhost")):
             raise Ros2Error(
-                f"--robot {wiring.robot} lives in real time: leave --lockstep and --real-time-factor out"
+                f"--robot {wiring.robot} runs in real time: leave --lockstep and --real-time-factor out"
             )
     if graph == "pool" and pace.real_time_factor == 0.0 and not pace.lockstep:
         raise Ros2Error(
@@ -524,7 +527,7 @@ def _check(graph: str, o: Options) -> None:
 
 
 def _share(name: str, text: str | None, n: int) -> list[str | None]:
-    """Return each vehicle's share of an option that has one for each of a team."""
+    """Return the values of an option for each of `n` vehicles."""
     if text is None or n == 1:
         return [text] * n
     parts = [part.strip() for part in text.split(";")]
@@ -536,11 +539,11 @@ def _share(name: str, text: str | None, n: int) -> list[str | None]:
 
 
 def _wire(graph: str, o: Options, further: int) -> dict[str, Any]:
-    """Addresses: pictures come from the port after the motor controller's, to the port after our own end's.
+    """Return addresses: pictures come from the port after the motor controller's, to the port after our own.
 
     Args:
         graph: sim, pool or robot.
-        o: As the person chose.
+        o: Options that the user chose.
         further: Distance of this vehicle's ports from those of the first.
     """
     if graph == "sim":
@@ -576,14 +579,14 @@ def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[
 
     Args:
         graph (sim|pool|robot): sim (a simulated vehicle), pool (the virtual pool and a robot in it) or robot.
-        options: As the person chose.
-        notify: Takes a sentence.
+        options: Options that the user chose.
+        notify: Receives messages for the user.
 
     Returns:
         Exit status: 0, `DIED` or `FAULT`.
 
     Raises:
-        TwinError: Another graph of the same namespace is on the wire.
+        TwinError: Another graph of the same namespace is running.
     """
     activate()
     import rclpy
@@ -601,7 +604,9 @@ def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[
         for name, topic in topics_of(plan):
             notify(f"  {name}  {topic.type}  {topic.meaning}")
         with interruptible() as interrupted:
-            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # `interruptible` has them
+            rclpy.init(
+                args=[], signal_handler_options=SignalHandlerOptions.NO
+            )  # `interruptible` handles signals
             try:
                 watchers = [Watcher(plan, namespace, arm=options.arm) for namespace in plan.namespaces]
                 with Supervisor(plan, parameters, notify) as nodes:
@@ -626,7 +631,7 @@ def _watch(
     longest = float("inf") if options.duration is None else options.duration
     while not interrupted() and not first.now() - begun >= longest:
         if math.isnan(begun) and (not first.bridge.silent or time.monotonic() > patient):
-            begun = first.now()  # the duration begins with the bridge's first word
+            begun = first.now()  # the duration begins with the bridge's first message
         for watcher in watchers:
             watcher.turn(0.2 / len(watchers))
         gone = nodes.look()
@@ -643,7 +648,7 @@ def _watch(
     return DIED if died else FAULT if fault else 0
 
 
-# Which nodes make up a robot, its virtual pool or a simulated vehicle, and with which parameters.
+# Nodes of a robot, of its virtual pool and of a simulated vehicle, and their parameters.
 
 NODES = {
     "camera": "finssim.extensions.ros2.nodes.camera:CameraNode",
@@ -661,10 +666,10 @@ NODES = {
 ROBOT = ("hardware_bridge", "camera", "localizer", "state_estimation", "controller")
 
 GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool", *ROBOT)}
-"""Graph -> nodes, in the order of their start; they end in the reverse order, the bridge after who commands it."""
+"""Graph -> nodes, in the order of their start; they end in reverse order, so the bridge ends after its commanders."""
 
 WORLDS = ("sim", "virtual_pool")
-"""Nodes that are a world, which keeps the time of its graph: it ends with them."""
+"""Nodes that simulate a world and determine the time of their graph, which ends with them."""
 
 EVERYWHERE = "vehicle robot site frame_prefix number use_sim_time lockstep pool_since"
 """Parameters of every node."""
@@ -681,7 +686,7 @@ TAKES = {
     "virtual_pool": "plant firmware severity camera port bind pool_file truth start positioning world water seed team "
     "message_loss message_delay real_time_factor",
 }
-"""Node -> its parameters that options give, by the names of the options where these are the same."""
+"""Node -> its parameters that options set, by the names of the options if these are equal."""
 
 ALWAYS = "vehicle namespace frame_prefix site arm record teleop duration lockstep"
 """Options of every graph."""
@@ -693,17 +698,17 @@ SHARED = ("goal", "trajectory", "let_in")
 MCU_PORT = 58766
 """Port of a virtual pool's motor controller by default; pictures are sent from the next port."""
 STATIONS_AFTER, DVL_AFTER = 1, 2
-"""Distances of an autopilot's TCP ports from it: of ground stations, and of the DVL."""
+"""Distances of an autopilot's TCP ports from its port: for ground stations, and for the DVL."""
 
 
 @dataclass(frozen=True)
 class GraphNode:
-    """One node of a graph: `up` makes it a process, a launch file a `launch_ros` node."""
+    """One node of a graph: `up` makes it a process, a launch file makes it a `launch_ros` node."""
 
     node: str
-    """Name, and executable."""
+    """Name of the node and of its executable."""
     namespace: str
-    """Namespace, without the slash before it."""
+    """Namespace, without a leading slash."""
     parameters: dict[str, Any]
     """Parameters that the graph sets; all others keep the default of the node or of a parameter file."""
 
@@ -715,32 +720,33 @@ class GraphNode:
 
 @dataclass(frozen=True)
 class GraphPlan:
-    """A graph before it lives."""
+    """Plan of a graph: nodes and namespaces."""
 
     graph: str
     nodes: tuple[GraphNode, ...]
-    """Nodes in the order of their start; they end in the reverse order, the bridge after who commands it."""
+    """Nodes in the order of their start; they end in reverse order, so the bridge ends after its commanders."""
     namespaces: tuple[str, ...]
     """Namespaces of the vehicles."""
 
     def write(self, path: Path) -> None:
-        """The parameters as a ROS 2 parameter file."""
+        """Write the parameters as a ROS 2 parameter file."""
         tree = {one.full_name: {"ros__parameters": one.parameters} for one in self.nodes if one.parameters}
         path.write_text(yaml.dump(tree, Dumper=_Quoting, sort_keys=False), encoding="utf-8")
 
 
 def run_node(name: str, *arguments: str) -> int:
-    """Run one node in this process, until Ctrl-C; its parameters come after --ros-args, or from a file there.
+    """Run one node in this process, until Ctrl-C; its parameters follow after --ros-args, or are in a file
+    given there.
 
     Example: finssim ros2 node state_estimation
 
     Args:
         name (NAME): camera, controller, hardware_bridge, localizer, recorder, sim, state_estimation, teleop or
-            virtual_pool; after it --ros-args as for any ROS 2 node.
-        arguments: What follows it on the command line; those of the process if none is given.
+            virtual_pool; then --ros-args as for any ROS 2 node.
+        arguments: Further command-line arguments; if none is given, those of the process.
 
     Returns:
-        The exit status.
+        Exit status.
 
     Raises:
         Ros2Error: There is no such node.
@@ -757,7 +763,7 @@ def run_node(name: str, *arguments: str) -> int:
 
 
 class _Quoting(yaml.SafeDumper):
-    """Puts words into quotes: rcl would read `1e3`, `inf` and `y` as numbers and true where YAML reads words."""
+    """Dumper that quotes strings: rcl would read `1e3`, `inf` and `y` as numbers and true, unlike YAML."""
 
 
 _Quoting.add_representer(
@@ -766,7 +772,7 @@ _Quoting.add_representer(
 
 
 def topics_of(plan: GraphPlan) -> list[tuple[str, Topic]]:
-    """Full names of what a graph's nodes publish, and of what they take from people."""
+    """Return the full names of topics that a graph's nodes publish or receive from users, each with its topic."""
     senders = {"you", "every node", *(one.node for one in plan.nodes)}
     return list(
         {

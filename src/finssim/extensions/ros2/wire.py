@@ -1,4 +1,4 @@
-"""The wire of ROS 2 from Python alone, over Cyclone DDS: discovery, topics and services of a participant."""
+"""ROS 2 network protocol in Python over Cyclone DDS: discovery, topics and services of a participant."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from finssim.extensions.ros2 import Ros2Error
 from finssim.extensions.ros2.codec import Codec, Distro, Message, Nodetype, codec_of, distro_of
 
 MAX_DOMAIN = 232
-"""A higher domain has no room for its UDP ports (7400 + 250 d + 2·index)."""
+"""Largest ROS domain; a larger one has no UDP ports (7400 + 250 d + 2·index)."""
 
 LOOPBACK = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
@@ -47,41 +47,42 @@ LOOPBACK = (
     "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
     "</Domain></CycloneDDS>"
 )
-"""Cyclone's configuration for this machine alone: the loopback interface has no multicast, so peers are asked."""
+"""Configuration of Cyclone for this machine only: the loopback interface has no multicast, so peers are contacted
+directly."""
 
 LOOPBACK_WORDS = "sends on the loopback alone, listens on every address"
-"""Cyclone binds what it receives on to all addresses, whatever interface it is given."""
+"""Description of the interface: Cyclone receives on all addresses, whatever interface it is given."""
 
 
 @dataclass(frozen=True)
 class WireSettings:
-    """Settings of a participant."""
+    """Settings of a participant: domain, network interface and release."""
 
     domain: int
     """ROS domain, 0 to 232."""
     xml: str | None
-    """Configuration of Cyclone; None where the environment's own or Cyclone's default rules."""
+    """Configuration of Cyclone; None uses that of the environment, or Cyclone's default."""
     interface: str
-    """Interface in words, for the line at the start."""
+    """Description of the interface, which is printed at the start."""
     distro: Distro
 
 
 def wire_settings(environ: Mapping[str, str] = os.environ, domain: int | None = None) -> WireSettings:
-    """Return the settings of the environment: this machine only, unless it states otherwise.
+    """Return the settings of the environment: only this machine, unless it states otherwise.
 
-    `CYCLONEDDS_URI` wins over everything. Without it, the network is used only when `ROS_LOCALHOST_ONLY=0`, or
-    `ROS_AUTOMATIC_DISCOVERY_RANGE` is SUBNET or SYSTEM_DEFAULT.
+    `CYCLONEDDS_URI` has priority. Without it, the network is used only with `ROS_LOCALHOST_ONLY=0`, or with
+    `ROS_AUTOMATIC_DISCOVERY_RANGE` SUBNET or SYSTEM_DEFAULT.
 
     Args:
-        environ: The environment.
-        domain: Domain to use instead of `ROS_DOMAIN_ID` (0 where that is not set either).
+        environ: Environment variables.
+        domain: Domain to use instead of `ROS_DOMAIN_ID` (0 if that is not set either).
 
     Raises:
-        Ros2Error: A variable holds what it cannot.
+        Ros2Error: A variable has an invalid value.
     """
     number = _domain(environ.get("ROS_DOMAIN_ID") or "0") if domain is None else _domain(str(domain))
     if environ.get("CYCLONEDDS_URI"):
-        return WireSettings(number, None, "as CYCLONEDDS_URI says", distro_of(environ))
+        return WireSettings(number, None, "as given by CYCLONEDDS_URI", distro_of(environ))
     if _network_wanted(environ):
         return WireSettings(
             number, None, "the network interface that Cyclone DDS chooses", distro_of(environ)
@@ -107,40 +108,41 @@ def _network_wanted(environ: Mapping[str, str]) -> bool:
     return local == "0" if local else reach in ("SUBNET", "SYSTEM_DEFAULT")
 
 
-# Quality of service: ROS 2's policies as values, and as Cyclone DDS takes them.
+# Quality of service: ROS 2's policies as values, and in the form of Cyclone DDS.
 
 
 BLOCKING_NS = 100_000_000
-"""The longest a reliable writer waits for its readers; ROS 2 would wait for ever and stop the control loop."""
+"""Longest wait of a reliable writer for its readers [ns]; ROS 2 would wait without limit and block the
+control loop."""
 
 POLICY_NAMES = {2: "DURABILITY", 4: "DEADLINE", 8: "LIVELINESS", 11: "RELIABILITY", 12: "DESTINATION_ORDER"}
-"""DDS's numbers of the policies that can make two endpoints incompatible."""
+"""Numbers in DDS of the policies that can make two endpoints incompatible."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Policies that a writer offers or a reader requests; the defaults are ROS 2's."""
+    """Policies that a writer offers or a reader requests; the defaults are those of ROS 2."""
 
     depth: int = 10
-    """Samples kept; 0 keeps all."""
+    """Number of samples that are kept; 0 keeps all."""
     reliable: bool = True
     transient_local: bool = False
-    """True if the last samples are kept for readers that come later."""
+    """True if the last samples are kept for readers that are discovered later."""
     deadline: float = 0.0
-    """Longest time between samples [s]; 0 is no promise."""
+    """Longest time between samples [s]; 0: no limit."""
     lifespan: float = 0.0
-    """Age at which a sample is worthless [s]; 0 is never."""
+    """Age at which a sample expires [s]; 0: never."""
 
 
 LATCHED = Quality(depth=1, transient_local=True)
 
 
 def dds_qos(quality: Quality, user_data: bytes = b"") -> Qos:
-    """Cyclone's form.
+    """Return policies in the form of Cyclone DDS.
 
     Args:
-        quality: The policies.
-        user_data: What the endpoint tells its peers, e.g. the hash of its type.
+        quality: Policies.
+        user_data: Data of the endpoint that its peers receive, e.g. the hash of its type.
     """
     history = Policy.History.KeepLast(quality.depth) if quality.depth else Policy.History.KeepAll
     policies = [
@@ -160,7 +162,7 @@ def dds_qos(quality: Quality, user_data: bytes = b"") -> Qos:
     return Qos(*policies)
 
 
-# DDS types of ROS messages: they carry the type's name and let Cyclone check the bounds of what comes in.
+# DDS types of ROS messages: they contain the type's name and let Cyclone check the bounds of received samples.
 
 
 PRIMITIVES: dict[str, Any] = {
@@ -176,20 +178,21 @@ PRIMITIVES: dict[str, Any] = {
 
 
 def dds_type_name(name: str) -> str:
-    """`nav_msgs/msg/Odometry` as DDS has it: `nav_msgs::msg::dds_::Odometry_`."""
+    """Return the DDS form of a ROS type name: `nav_msgs::msg::dds_::Odometry_` of `nav_msgs/msg/Odometry`."""
     package, kind, short = name.split("/")
     return f"{package}::{kind}::dds_::{short}_"
 
 
 def ros_type_name(name: str) -> str:
-    """The reverse of `dds_type_name`; a name of another form is left as it is."""
+    """Return the ROS form of a DDS type name, the reverse of `dds_type_name`; a name of another form is unchanged."""
     parts = name.split("::")
     if len(parts) != 4 or parts[2] != "dds_":
         return name
     return f"{parts[0]}/{parts[1]}/{parts[3].removesuffix('_')}"
 
 
-# Functions of Cyclone's library that the binding lacks. Those of `_c` let other threads run meanwhile: a reliable
+# Functions of Cyclone's library that its Python binding lacks. Those of `_c` release the interpreter's lock,
+# because a reliable writer may wait for its readers. Those of `_quick` do not wait and keep the lock.
 # writer waits for its readers. Those of `_quick` wait for nothing and keep the interpreter's lock.
 
 
@@ -230,10 +233,10 @@ _matched_readers = _function(_c, "dds_get_matched_subscriptions", _Handle, _Hand
 _matched_writers = _function(_c, "dds_get_matched_publications", _Handle, _Handle, _Pointer, _Size)
 
 LOCAL_DOMAIN = 1
-"""Cyclone's word for types that are known here."""
+"""Constant of Cyclone for types that are defined in this process."""
 
 DATA = 2
-"""Cyclone's number for a complete sample."""
+"""Constant of Cyclone for a complete sample."""
 
 
 def _checked(code: int, what: str) -> int:
@@ -243,7 +246,7 @@ def _checked(code: int, what: str) -> int:
 
 
 def _domain_of(number: int, xml: str) -> Domain:
-    domain = Domain.__new__(Domain)  # its own __init__ takes ASCII alone
+    domain = Domain.__new__(Domain)  # its own __init__ accepts only ASCII
     Entity.__init__(domain, _create_domain(number, os.fsencode(xml)))
     return domain
 
@@ -252,14 +255,14 @@ SILENT = "<CycloneDDS><Domain><General><Transport>none</Transport></General></Do
 """Configuration of a domain without a network."""
 
 SILENT_DOMAIN = MAX_DOMAIN + 1
-"""Number that no ROS domain has."""
+"""Number of the domain without a network; no ROS domain has it."""
 
 _making = threading.Lock()
-"""Held while a domain or a type is made."""
+"""Lock for creating a domain or a type."""
 
 
 class DdsTypes:
-    """Cyclone's types of a codec's messages, made when first asked for and kept for the process."""
+    """Cyclone's types of a codec's messages, created on first use and kept until the process ends."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec = codec
@@ -267,11 +270,11 @@ class DdsTypes:
         self._described: dict[tuple[str, bool], ctypes.c_void_p] = {}
 
     def descriptor_of(self, name: str, *, service: bool = False) -> ctypes.c_void_p:
-        """Return what Cyclone's library creates a topic from; arguments as of `type_of`.
+        """Return the descriptor with which Cyclone's library creates a topic; arguments as of `type_of`.
 
-        Cyclone 11.0.1 reads its list of types without a lock while it translates a type, and crashes where another
-        of its threads changes that list: one that forgets a participant that has left, or one that discovers a peer.
-        The types are translated in a domain that has neither.
+        While Cyclone 11.0.1 translates a type, it reads its list of types without a lock, and crashes if
+        another of its threads changes that list, for example when a participant leaves or is discovered. The
+        types are therefore translated in a domain without participants and discovery.
         """
         with _making:
             if (name, service) not in self._described:
@@ -279,7 +282,8 @@ class DdsTypes:
             return self._described[name, service]
 
     def type_of(self, name: str, *, service: bool = False) -> Any:
-        """The type of a message; that of a service's half begins with the client's number and the request's."""
+        """Return the type of a message; that of a service message begins with the numbers of the client and
+        of the request."""
         if (name, service) not in self._made:
             fields = {"header_client_": idl.uint64, "header_sequence_": idl.int64} if service else {}
             fields |= {f"{n}_": self._field(*described) for n, described in self._codec.fields(name)}
@@ -322,7 +326,7 @@ def _translate(dds_type: Any) -> ctypes.c_void_p:
 
 
 class _Topic(Topic):
-    """A topic of the library's own type, which no thread needs the interpreter for."""
+    """Topic with a type of Cyclone's library, which its threads use without the interpreter."""
 
     def __init__(self, participant: DomainParticipant, name: str, descriptor: ctypes.c_void_p) -> None:
         Entity.__init__(self, _create_topic(participant._ref, descriptor, name.encode(), None, None))
@@ -364,7 +368,7 @@ def _bytes_of(sample: ctypes.c_void_p) -> bytes:
 
 
 _kept: set[int] = set()
-"""Types of writers, kept for the process: a thread may still write while another leaves the wire."""
+"""Types of writers, kept until the process ends: a thread may still write while another closes the writer."""
 
 
 def _type_of(writer: DataWriter) -> ctypes.c_void_p:
@@ -377,7 +381,7 @@ def _type_of(writer: DataWriter) -> ctypes.c_void_p:
 
 
 def _handles(matched: Callable[[int, Any, int], int], endpoint: int) -> list[int]:
-    """Handles of the peers of an endpoint; one may come while they are counted, where the binding fails."""
+    """Return handles of the peers of an endpoint. A peer may appear during the count, for which the binding fails."""
     room, handles = 0, None
     while (count := _checked(matched(endpoint, handles, room), "counting peers")) > room:
         room, handles = count, (ctypes.c_uint64 * count)()
@@ -395,19 +399,19 @@ class DdsEndpoint:
     closed = False
 
     def close(self) -> None:
-        """Leave the wire."""
+        """Destroy the endpoint."""
         self.closed = True
         self.entity.__del__()
 
     def _incompatible(self, status: Any) -> str:
-        """Name of the policy that last kept a peer away; empty without news."""
+        """Return the name of the policy that last prevented a match; empty if nothing changed."""
         if not status.total_count_change:
             return ""
         return POLICY_NAMES.get(status.last_policy_id, f"policy {status.last_policy_id}")
 
 
 class Writer(DdsEndpoint):
-    """Sends ready CDR bytes."""
+    """Writer of serialized samples (CDR)."""
 
     def __init__(self, publisher: Publisher, topic: Topic, qos: Qos) -> None:
         self._keeps = Policy.Durability.TransientLocal in qos
@@ -417,13 +421,14 @@ class Writer(DdsEndpoint):
         self._type = _type_of(self.entity)
 
     def write(self, buffer: bytearray) -> bool:
-        """Send one sample, a multiple of four bytes; False if slow readers left no room for it within 100 ms.
+        """Send a sample, whose length is a multiple of four bytes; False if slow readers left no room for it
+        in 100 ms.
 
         Raises:
-            DDSException: The wire refused it for another reason.
+            DDSException: Cyclone rejected it for another reason.
         """
         if not self._keeps and self.matched() == 0:
-            return True  # it has no reader, and Cyclone copies even then
+            return True  # without a reader; Cyclone would copy the sample nevertheless
         view = (ctypes.c_char * 0).from_buffer(buffer)
         blob = _Blob(ctypes.addressof(view), len(buffer))
         sample = _sample_of(self._type, DATA, 1, ctypes.byref(blob), len(buffer))
@@ -447,12 +452,12 @@ class Writer(DdsEndpoint):
         return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
-        """Name of the policy by which a reader newly turned out not to fit; empty if none did."""
+        """Return the name of the policy for which a reader was newly found incompatible; empty if none was."""
         return self._incompatible(self.entity.get_offered_incompatible_qos_status())
 
 
 class Reader(DdsEndpoint):
-    """Receives CDR bytes."""
+    """Reader of serialized samples (CDR)."""
 
     def __init__(self, subscriber: Subscriber, topic: Topic, qos: Qos) -> None:
         self.entity = DataReader(subscriber, topic, qos)
@@ -462,14 +467,14 @@ class Reader(DdsEndpoint):
         """True while a sample waits."""
 
     def take(self) -> tuple[bytes, Any] | None:
-        """Return the oldest waiting sample, and DDS's information about it; None without one."""
+        """Return the oldest waiting sample and DDS's information about it; None if none waits."""
         while True:
             sample, info = ctypes.c_void_p(), SampleInfo()
             if _take(self.entity._ref, ctypes.byref(sample), 1, ctypes.byref(info), ANY) <= 0:
                 return None
             data = _bytes_of(sample) if info.valid_data else None
             _release(sample)
-            if data is not None:  # else only the news that a writer left
+            if data is not None:  # else only the notification that a writer left
                 return data, info
 
     def close(self) -> None:
@@ -477,11 +482,12 @@ class Reader(DdsEndpoint):
         super().close()
 
     def watch_matches(self) -> None:
-        """Let `matches` wake who waits."""
+        """Let changes of `matches` end a wait."""
         self.entity.set_status_mask(DDSStatus.RequestedIncompatibleQos | DDSStatus.SubscriptionMatched)
 
     def matches(self) -> tuple[int, int, int, int]:
-        """Writers ever matched, those newly so since last asked, those matched now, and that number's change."""
+        """Return the numbers of writers matched in total, newly since the last call, and now, and the change
+        of the last."""
         status = self.entity.get_subscription_matched_status()
         return (
             status.total_count,
@@ -501,11 +507,11 @@ class Reader(DdsEndpoint):
         return [peer for peer in matched if peer is not None]
 
     def incompatible(self) -> str:
-        """Name of the policy by which a writer newly turned out not to fit; empty if none did."""
+        """Return the name of the policy for which a writer was newly found incompatible; empty if none was."""
         return self._incompatible(self.entity.get_requested_incompatible_qos_status())
 
 
-# One DDS participant, as ROS 2 has one per context: its endpoints, and the nodes that it announces to its peers.
+# A DDS participant, one per ROS 2 context: its endpoints, and the nodes that it announces to its peers.
 
 
 FOREVER = 2**63 - 1
@@ -514,13 +520,13 @@ FOREVER = 2**63 - 1
 NODE_LIST = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 _domains: dict[int, Domain] = {}
-"""Domains of this process, kept until its end: Cyclone reads a domain's configuration once, and samples and types that
-are still in use lie in its memory."""
+"""Domains of this process, kept until its end: Cyclone reads a domain's configuration once, and samples and
+types in use are in its memory."""
 
 
 @dataclass
 class NodeRecord:
-    """A node as the node list has it."""
+    """A node in the announced node list."""
 
     name: str
     namespace: str
@@ -530,23 +536,23 @@ class NodeRecord:
 
 
 class EndpointRecord(NamedTuple):
-    """A writer or reader on the wire, as discovery has it."""
+    """A writer or reader that was discovered."""
 
     topic: str
     """Topic with its prefix."""
     dds_type: str
     gid: bytes
-    """16 bytes."""
+    """Identifier of 16 bytes."""
     qos: Qos
 
     @property
     def user_data(self) -> bytes:
-        """Return the data of the endpoint for its peers."""
+        """Return the data that the endpoint sends to its peers."""
         return next((bytes(p.data) for p in self.qos if isinstance(p, Policy.Userdata)), b"")
 
     @property
     def quality(self) -> Quality:
-        """Its policies; the depth of another vendor's endpoint is not known."""
+        """Return its policies; the depth of an endpoint of another DDS implementation is not known."""
         spans = {
             kind: getattr(policy, key)
             for policy in self.qos
@@ -564,7 +570,7 @@ class EndpointRecord(NamedTuple):
 
 
 class Participant:
-    """A process's presence on the wire.
+    """DDS participant of a process.
 
     Args:
         settings: Domain, interface and release.
@@ -592,23 +598,23 @@ class Participant:
         self._seen: dict[bytes, list[NodeRecord]] = {}
 
     def writer(self, topic: str, name: str, quality: Quality) -> Writer:
-        """A writer of messages of type `name` on a topic with its prefix, e.g. `rt/odom`."""
+        """Create a writer of messages of type `name` on a topic with its prefix, e.g. `rt/odom`."""
         return Writer(self._publisher, self._topic(topic, name), dds_qos(quality, self._type_hash(name)))
 
     def reader(self, topic: str, name: str, quality: Quality) -> Reader:
-        """A reader of messages of type `name` on a topic with its prefix."""
+        """Create a reader of messages of type `name` on a topic with its prefix."""
         return Reader(self._subscriber, self._topic(topic, name), dds_qos(quality, self._type_hash(name)))
 
     def service_writer(self, topic: str, name: str, quality: Quality, user_data: bytes) -> Writer:
-        """A writer of one half of a service, its samples led by client and sequence number."""
+        """Create a writer of requests or replies of a service; its samples begin with client and sequence number."""
         return Writer(self._publisher, self._topic(topic, name, service=True), dds_qos(quality, user_data))
 
     def service_reader(self, topic: str, name: str, quality: Quality, user_data: bytes) -> Reader:
-        """A reader of one half of a service."""
+        """Create a reader of requests or replies of a service."""
         return Reader(self._subscriber, self._topic(topic, name, service=True), dds_qos(quality, user_data))
 
     def announce(self, nodes: Sequence[NodeRecord]) -> None:
-        """Announce the nodes of this participant to every peer, also to those that come later."""
+        """Announce the nodes of this participant to every peer, also to peers that are discovered later."""
         with self._lock:
             message = self.codec.message(NODE_LIST)(
                 gid=self._gid(self.gid), node_entities_info_seq=[self._node(n) for n in nodes]
@@ -616,13 +622,13 @@ class Participant:
             self._node_list.write(self.codec.serialize(message))
 
     def nodes(self) -> list[NodeRecord]:
-        """Every node that is known on the wire, those of this participant among them."""
+        """Return all known nodes, including those of this participant."""
         with self._lock:
             while (sample := self._others.take()) is not None:
                 try:
                     message: Any = self.codec.deserialize(sample[0], NODE_LIST)
                 except Ros2Error:
-                    continue  # a participant of another release: its data flows, its nodes cannot be read
+                    continue  # a participant of another release: its data can be received, but its nodes cannot be read
                 self._seen[bytes(message.gid.data[:16])] = [
                     _record(n) for n in message.node_entities_info_seq
                 ]
@@ -631,7 +637,7 @@ class Participant:
             return [node for nodes in self._seen.values() for node in nodes]
 
     def endpoints(self, kind: str) -> list[EndpointRecord]:
-        """Return every endpoint on the wire.
+        """Return every discovered endpoint.
 
         Args:
             kind: "publications" or "subscriptions".
@@ -643,7 +649,7 @@ class Participant:
             reader, known = self._builtin[kind]
             for sample in reader.take(
                 N=10_000
-            ):  # news alone: those that have left would be read again for ever
+            ):  # only changes: those that have left would be read again and again
                 if sample.sample_info.instance_state == InstanceState.Alive:
                     record = EndpointRecord(sample.topic_name, sample.type_name, sample.key.bytes, sample.qos)
                     known[sample.key.bytes] = record
@@ -652,7 +658,7 @@ class Participant:
             return list(known.values())
 
     def close(self) -> None:
-        """Leave the wire immediately: peers are notified, and nothing waits."""
+        """Destroy the participant immediately: peers are notified, and nothing waits."""
         self.entity.__del__()
 
     def _topic(self, topic: str, name: str, *, service: bool = False) -> Topic:
@@ -689,26 +695,26 @@ def _record(message: Any) -> NodeRecord:
     )
 
 
-# Services as rmw_cyclonedds sends them: two topics whose samples begin with the client's number and the request's.
+# Services as in rmw_cyclonedds: two topics whose samples begin with the numbers of the client and of the request.
 
 
 PREFIX = struct.Struct("<Qq")
-"""Number of the client and of its request, right after the CDR header."""
+"""Numbers of the client and of its request, directly after the CDR header."""
 
 REPLY_PATIENCE = 1.0
-"""Time for which a reply waits for its client's reader to be discovered [s]."""
+"""Longest time for which a reply waits until its client's reader is discovered [s]."""
 
 _count = itertools.count(1)
 
 
 class ServerEnd:
-    """The serving end of a service.
+    """Server of a service.
 
     Args:
-        participant: Where it lives.
+        participant: Participant that owns it.
         service: Full name, e.g. `/finsrov/reset`.
-        name: Its type, e.g. `std_srvs/srv/Trigger`.
-        handler: Answers a request.
+        name: Type of the service, e.g. `std_srvs/srv/Trigger`.
+        handler: Returns the reply to a request.
         quality: Policies of both topics.
     """
 
@@ -728,7 +734,7 @@ class ServerEnd:
         self._late: list[tuple[float, bytes, bytearray]] = []
 
     def take(self) -> Callable[[], None] | None:
-        """Return the answer to the next request; None without one."""
+        """Return a function that answers the next request; None if none waits."""
         self._send_late()
         sample = self.reader.take()
         if sample is None:
@@ -748,7 +754,7 @@ class ServerEnd:
             self._late.append((time.monotonic() + REPLY_PATIENCE, client, reply))
 
     def _reachable(self, client: bytes) -> bool:
-        """Return whether the client's reader is known: a reply sent before that would be lost."""
+        """Return whether the client's reader is known; a reply sent before would be lost."""
         if client and client not in self._clients:
             self._clients = {_client_id(peer) for peer in self.writer.peers()}
         return not client or client in self._clients
@@ -764,7 +770,7 @@ class ServerEnd:
 
 
 class ClientEnd:
-    """The asking end of a service; arguments as of `ServerEnd`."""
+    """Client of a service; arguments as of `ServerEnd`."""
 
     def __init__(self, participant: Participant, service: str, name: str, quality: Quality) -> None:
         self._codec, self._name = participant.codec, name
@@ -775,40 +781,40 @@ class ClientEnd:
         self._sequence = itertools.count(1)
 
     def ready(self) -> bool:
-        """Return whether a server is known to take requests and to answer."""
+        """Return whether a server is known to receive requests and to reply."""
         return self.writer.matched() > 0 and self.reader.matched() > 0
 
     def send(self, request: Message) -> int:
-        """Send a request; returns its number.
+        """Send a request and return its number.
 
         Raises:
-            Ros2Error: The server took none of the earlier ones.
+            Ros2Error: The server received none of the earlier requests.
         """
         sequence = next(self._sequence)
         buffer = self._codec.serialize(request)
         buffer[4:4] = PREFIX.pack(self._number, sequence)
         if not self.writer.write(buffer):
-            raise Ros2Error(f"{self.writer.topic}: the server takes no requests: see whether it still spins")
+            raise Ros2Error(f"{self.writer.topic}: the server takes no requests: check that it still spins")
         return sequence
 
     def take(self) -> tuple[int, Message] | None:
-        """Number of an answered request, and the answer; None without one."""
+        """Return the number of an answered request and the reply; None if none waits."""
         while (sample := self.reader.take()) is not None:
             data = sample[0]
             client, sequence = PREFIX.unpack_from(data, 4)
-            if client == self._number:  # every client of a service receives all its answers
+            if client == self._number:  # every client of a service receives all its replies
                 return sequence, self._codec.deserialize(data[:4] + data[20:], f"{self._name}_Response")
         return None
 
 
 def _tag(participant: Participant, key: str) -> bytes:
-    """Return the mark of both ends of one server or client."""
+    """Return the identifier of both endpoints of one server or client."""
     number = participant.gid[:12] + struct.pack(">I", next(_count))
     return (f"{key}=" + ".".join(f"{byte:02x}" for byte in number) + ";").encode()
 
 
 def _client_id(peer: object) -> bytes:
-    """The `clientid` in an endpoint's user data; empty without one."""
+    """Return the `clientid` in an endpoint's user data; empty without one."""
     for policy in getattr(peer, "qos", ()):
         data = getattr(policy, "data", None)
         if isinstance(data, bytes) and b"clientid=" in data:
@@ -816,11 +822,12 @@ def _client_id(peer: object) -> bytes:
     return b""
 
 
-# Waiting for any of many endpoints.
+# Waiting for any of several endpoints.
 
 
 class Waiter:
-    """Sleeps until a watched reader has a sample, a watched endpoint meets a peer that does not fit, or `wake`."""
+    """Waits until a watched reader has a sample, a watched endpoint meets an incompatible peer, or `wake` is
+    called."""
 
     def __init__(self, participant: Participant) -> None:
         self._set = WaitSet(participant.entity)
@@ -830,17 +837,17 @@ class Waiter:
         self._watched: set[DdsEndpoint] = set()
 
     def watch(self, endpoints: Iterable[DdsEndpoint]) -> None:
-        """Watch exactly these from now on."""
+        """Watch only these endpoints from now on."""
         required = set(endpoints)
         for endpoint in self._watched - required:
-            if not endpoint.closed:  # DDS itself lets go of a closed one
+            if not endpoint.closed:  # DDS itself detaches a closed one
                 self._each(endpoint, self._set.detach)
         for endpoint in required - self._watched:
             self._each(endpoint, self._set.attach)
         self._watched = required
 
     def wait(self, timeout: float) -> bool:
-        """Sleep at most `timeout` [s]; whether anything happened."""
+        """Wait at most `timeout` [s]; return whether anything happened."""
         try:
             happened = self._set.wait(int(timeout * 1e9)) > 0
             if happened:
@@ -848,16 +855,16 @@ class Waiter:
         except DDSException:
             if not self._closed:
                 raise
-            return False  # another thread closed it meanwhile
+            return False  # another thread has closed it
         return happened
 
     def wake(self) -> None:
-        """End the current or the next `wait`; from any thread."""
+        """End the current or the next `wait`; can be called from any thread."""
         if not self._closed:
             self._guard.set(True)
 
     def close(self) -> None:
-        """Let everything go."""
+        """Detach all endpoints and destroy the waiter."""
         self._closed = True
         self._set.attached = []
         self._set.__del__()

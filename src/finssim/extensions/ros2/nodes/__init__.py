@@ -1,4 +1,5 @@
-"""The robot's nodes, each a module with `main`. Importing this package makes `import rclpy` work, real or ours."""
+"""Nodes of the robot, each a module with `main`. Importing this package makes `import rclpy` work, real or
+built-in."""
 
 from finssim.extensions.ros2.backend import activate
 

@@ -1,4 +1,5 @@
-"""Camera node: the wire of pictures to topics: the overhead camera's with tags and calibration, and own sensors'."""
+"""Camera node: publishes received pictures: of the overhead camera with tags and calibration, and of onboard
+sensors."""
 
 from __future__ import annotations
 
@@ -9,11 +10,11 @@ from finssim.robot.messages import Picture
 from finssim.robot.pictures import DEFAULT_CAMERA, DEFAULT_PICTURES, open_pictures
 
 POLL = 90.0
-"""Looks for a new picture [Hz]."""
+"""Rate of polling for new pictures [Hz]."""
 
 
 class CameraNode(RobotNode):
-    """Publishes pictures, stamped with the middle of their exposure; each form only while there is a subscriber."""
+    """Publisher of pictures, stamped with the middle of their exposure; each format only while it has a subscriber."""
 
     def __init__(self) -> None:
         super().__init__("camera")
@@ -68,5 +69,5 @@ class CameraNode(RobotNode):
         self.diagnose("pictures", level, self.source.describe(), {})
 
     def close(self) -> None:
-        """Let go of the wire."""
+        """Close the connection."""
         self.source.close()

@@ -1,4 +1,5 @@
-"""Controller node: PID, policy or a person's wrench to thrusts, while the bridge reports that it is armed."""
+"""Controller node: computes thrusts by PID, policy or an operator's wrench, while the bridge reports that it
+is armed."""
 
 from __future__ import annotations
 
@@ -29,21 +30,21 @@ from finssim.robot.runtime import Runtime
 Array = npt.NDArray[np.float64]
 
 STALE = 0.5
-"""A wrench older than this is none [s]."""
+"""Age from which a wrench is ignored [s]."""
 
 
 class Modes:
-    """PIDs by name, `policy` where a directory was given, and `teleop`: the topic `wrench_cmd`."""
+    """Control modes: PIDs by name, `policy` if a directory is given, and `teleop` by the topic `wrench_cmd`."""
 
     def __init__(self, node: RobotNode, policy: str, task: str) -> None:
-        """
-        Args:
-            node: That hears wrenches.
-            policy: A PID's name or a policy's directory, to begin with.
-            task: That the policy must have been trained for; empty: its own.
+        """Args:
+            node: Node that receives wrenches.
+            policy: Initial mode: name of a PID, or directory of a policy.
+            task: Task for which the policy must have been trained; empty: its own.
 
         Raises:
-            PolicyError, ControlError: It does not fit the vehicle.
+            PolicyError: The policy does not fit the vehicle.
+            ControlError: The controller does not fit the vehicle.
         """
         self._node = node
         self._wrench, self._wrench_at = np.zeros(6), -math.inf
@@ -59,7 +60,7 @@ class Modes:
         node.hears("wrench", self._on_wrench)
 
     def select(self, mode: str) -> bool:
-        """Hand over; whether that changed anything: an unknown mode does not."""
+        """Switch the mode; return whether it changed, which it does not for an unknown mode."""
         if mode == self.switch.mode:
             return False
         try:
@@ -71,7 +72,7 @@ class Modes:
         return True
 
     def told(self, stamp: int, runtime: Runtime) -> Any:
-        """PolicyInfo of the decision just made."""
+        """Return the PolicyInfo of the latest decision."""
         pilot = self._pilots[self.switch.mode]
         values: dict[str, Any] = {
             "period": pilot.period,
@@ -98,36 +99,37 @@ class Modes:
 
 
 class _Timed:
-    """A pilot, and how long its latest decision took."""
+    """Pilot with a measurement of the duration of its latest decision."""
 
     def __init__(self, pilot: Any) -> None:
         self._pilot = pilot
         self.took = math.nan
-        """[s]"""
+        """Duration of the latest decision [s]."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._pilot, name)
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
+        """Return the requested thrusts in canonical order [N], (n,)."""
         start = time.perf_counter()
         force: Array = self._pilot.act(reading, guide, t)
         self.took = time.perf_counter() - start
         return force
 
 
-# Controller node: PID, policy or a person's wrench to thrusts, while the bridge reports that it is armed.
+# Node and its callbacks.
 
 
 STATE_TIMEOUT = 0.5
-"""Oldest reading to act on, where the vehicle file does not say [s]."""
+"""Greatest age of a usable reading, unless the vehicle file specifies one [s]."""
 PATH_POINTS = 200
 MOST_PICTURES = 16
-"""Greatest number of pictures that wait while the bridge is not armed; the oldest is dropped."""
+"""Greatest number of queued pictures while the bridge is not armed; the oldest is dropped."""
 
 
 class ControllerNode(RobotNode):
-    """Silent until the bridge is armed; a trajectory's time begins then, and without a goal the place is kept."""
+    """Node that is silent until the bridge is armed; then a trajectory starts, or without a goal the vehicle
+    holds its pose."""
 
     def __init__(self) -> None:
         super().__init__("controller")
@@ -142,7 +144,7 @@ class ControllerNode(RobotNode):
         self.runtime = Runtime(self.vehicle, self.state, self.modes.switch, nowhere, bridge=self.bridge)
         self.guide: Guide | None = None
         self.armed = False
-        # What the first path needs is imported and computed now: armed, the loop may not wait for it.
+        # Import and compute everything for the first path now: once armed, the loop must not wait for it.
         check_speed(through_points("", [(0.0, 0.0, 0.0, 0.0), (1e3, 0.0, 0.0, 0.0)]), self.vehicle)
         goal, trajectory = self.parameter("goal", ""), self.parameter("trajectory", "")
         if goal or trajectory:
@@ -159,7 +161,7 @@ class ControllerNode(RobotNode):
         self.create_timer(1.0, self._tell)
 
     def _turn(self) -> None:
-        if self.bridge.silent:  # which does not mean disarming: a trajectory continues with its next message
+        if self.bridge.silent:  # not the same as disarmed: a trajectory continues with the next message
             return
         now, armed = self.now(), self.bridge.state in ("armed", "hold")
         begins, self.armed = armed and not self.armed, armed
@@ -178,7 +180,7 @@ class ControllerNode(RobotNode):
             self.send("policy", self.modes.told(self.ns(now), self.runtime))
 
     def _on_own(self, name: str, message: Any) -> None:
-        """A reading of the vehicle's own sensor, for a policy that sees it; what is none is left out."""
+        """Queue a reading of an onboard sensor for a policy with perception; invalid ones are ignored."""
         reading = own_reading(message)
         if reading is not None:
             late = self.vehicle.perception[name].latency
@@ -187,10 +189,10 @@ class ControllerNode(RobotNode):
             del self._seen[:-MOST_PICTURES]
 
     def _follow(self, guide: Guide) -> None:
-        """Follow a guide from now on, if the vehicle may go there.
+        """Follow a guide from now on, if the vehicle can reach it.
 
         Raises:
-            GoalError: It may not.
+            GoalError: The vehicle cannot reach it.
         """
         check_reachable(guide, self.vehicle)
         self.guide = self.runtime.guide = guide
@@ -201,7 +203,7 @@ class ControllerNode(RobotNode):
         self.event("goal", guide.name)
 
     def _show(self, guide: Guide, began: float) -> None:
-        """Publish the way and its times, as of a start then [s]."""
+        """Publish the path with its times, for a start at a given time [s]."""
         end = guide.duration if math.isfinite(guide.duration) else 0.0
         times = np.linspace(0.0, end, PATH_POINTS if end else 1)
         way, stamps = guide.at(times), [self.ns(began + float(t)) for t in times]
@@ -219,7 +221,7 @@ class ControllerNode(RobotNode):
 
     def _on_mode(self, message: Any) -> None:
         if self.modes.select(str(message.data)):
-            self.runtime.started = math.nan  # the next pilot restarts
+            self.runtime.started = math.nan  # the new pilot restarts
 
     def _try(self, make: Any) -> None:
         try:
@@ -234,6 +236,6 @@ class ControllerNode(RobotNode):
 
 
 def _here(reading: Reading) -> Guide:
-    """The place and heading of a reading, to be kept."""
+    """Return a guide that holds the position and heading of a reading."""
     x, y, z = (float(v) for v in reading.position)
     return Station((x, y, z), float(quat_yaw(reading.quaternion)), "here")

@@ -1,4 +1,5 @@
-"""Messages of ROS 2 to the robot's own values. What is malformed comes out as a sentence or None; nothing raises."""
+"""Conversions of ROS 2 messages to the robot's own values. Malformed messages give a sentence or None, not an
+exception."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ from finssim.vehicles import Vehicle
 Array = npt.NDArray[np.float64]
 
 LEVEL = math.radians(20.0)
-"""A goal's roll and pitch must be smaller: vehicles here hold level poses."""
+"""Limit of a goal's roll and pitch [rad]: vehicles here hold level poses."""
 GRAY = {"rgb8": (0.299, 0.587, 0.114), "bgr8": (0.114, 0.587, 0.299)}
 """Weights of the channels in brightness (ITU-R BT.601)."""
 MOST_TAGS = 1000
@@ -42,7 +43,7 @@ MOST_POSES = 10_000
 
 
 def nanoseconds(stamp: Any) -> int:
-    """A stamp [ns]."""
+    """Return a stamp [ns]."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
@@ -52,12 +53,12 @@ def xyz(v: Any) -> tuple[float, float, float]:
 
 
 def xyzw(q: Any) -> tuple[float, float, float, float]:
-    """A quaternion's numbers."""
+    """Return the components of a quaternion."""
     return float(q.x), float(q.y), float(q.z), float(q.w)
 
 
 def telemetry_of(message: Any) -> Telemetry:
-    """The snapshot in a HardwareTelemetry; what is no number is left to those who use it, as on the wire."""
+    """Return the snapshot of a HardwareTelemetry message; NaN values are passed on, as on the wire."""
     rpm = tuple(float(v) for v in message.motor_rpm)
     return Telemetry(
         sequence=int(message.sequence),
@@ -73,13 +74,13 @@ def telemetry_of(message: Any) -> Telemetry:
 
 
 def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | str:
-    """Return the reading of a navigation instrument, or why it cannot be used; missing numbers are left to its users.
+    """Return the reading of a navigation instrument, or the reason why it cannot be used; NaN values are passed on.
 
     Args:
-        key: Of its topic: positioning, dvl or compass.
-        message: As it came.
-        age: Since its stamp [s].
-        frame: In which it must be.
+        key: Key of its topic: positioning, dvl or compass.
+        message: Received message.
+        age: Time since its stamp [s].
+        frame: Required frame.
     """
     if message.header.frame_id not in ("", frame):
         return "of another frame"
@@ -98,12 +99,13 @@ def aid_of(key: str, message: Any, age: float, frame: str) -> NavigationAid | st
 
 
 def force_of(message: Any, names: Sequence[str]) -> Array | str:
-    """The thrusts of a ThrusterCommand in canonical order [N], or why it cannot be used."""
+    """Return the thrusts of a ThrusterCommand in canonical order [N], or the reason why it cannot be used."""
     return _in_order(message.names, message.force, names, "thruster", "thrust")
 
 
 def setpoints_of(message: Any, names: Sequence[str]) -> Array | str:
-    """The positions of a JointState in the order of the names [rad, m³ or m], or why it cannot be used."""
+    """Return the positions of a JointState in the order of the names [rad, m³ or m], or the reason why it
+    cannot be used."""
     return _in_order(message.name, message.position, names, "actuator", "position")
 
 
@@ -120,14 +122,15 @@ def _in_order(
 
 
 def wrench_of(message: Any, frame: str = "base_link") -> Array | None:
-    """The wrench of a WrenchStamped, body frame [N, N m], (6,); None where it is of another frame or not finite."""
+    """Return the wrench of a WrenchStamped, body frame [N, N m], (6,); None if it is in another frame or not
+    finite."""
     tau = np.array([*xyz(message.wrench.force), *xyz(message.wrench.torque)])
     fits = message.header.frame_id in ("", frame)
     return tau if fits and np.isfinite(tau).all() else None
 
 
 def station_of_pose(message: Any) -> Station | str:
-    """The station of a PoseStamped, or why it is none."""
+    """Return the station of a PoseStamped, or the reason for refusing it."""
     frame = message.header.frame_id
     if frame not in ("", "map"):
         return f"a goal in frame '{frame}', expected map"
@@ -138,14 +141,14 @@ def station_of_pose(message: Any) -> Station | str:
     if not 0.9 < length < 1.1:
         return "a goal whose orientation is no unit quaternion"
     x, y, _, _ = q / length
-    # The z axis' lean: its cosine is 1 - 2 (x² + y²), whatever the yaw.
+    # Tilt of the z axis: its cosine is 1 - 2 (x² + y²), for any yaw.
     if 1.0 - 2.0 * (x * x + y * y) < math.cos(LEVEL):
         return "a goal that is not level: give a turn about z alone"
     return Station((float(position[0]), float(position[1]), float(position[2])), float(quat_yaw(q / length)))
 
 
 def trajectory_of(message: Any) -> Trajectory | str:
-    """The trajectory through the poses of a Path at their times, or why there is none."""
+    """Return the trajectory through the poses of a Path at their times, or the reason for refusing it."""
     if len(message.poses) > MOST_POSES:
         return f"a path of {len(message.poses)} poses, expected at most {MOST_POSES}"
     rows = []
@@ -164,12 +167,12 @@ def trajectory_of(message: Any) -> Trajectory | str:
 
 
 def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:
-    """The reading of an EstimatorStatus and the Odometry of the same stamp; without one nothing is known.
+    """Return the reading of an EstimatorStatus and the Odometry of the same stamp.
 
     Args:
         status: EstimatorStatus.
         odometry: Odometry; None: position and velocity are NaN.
-        time: Of its stamp, robot's clock [s].
+        time: Time of its stamp, robot's clock [s].
     """
     std = np.array([*status.position_std, *status.velocity_std, status.yaw_std], float)
     if odometry is None:
@@ -186,11 +189,11 @@ def reading_of(status: Any, odometry: Any | None, time: float) -> Reading:
 
 
 def image_of(message: Any, *, colour: bool = False) -> npt.NDArray[np.uint8] | None:
-    """The picture in an Image of encoding mono8, rgb8 or bgr8; None where it is none.
+    """Return the picture of an Image with encoding mono8, rgb8 or bgr8; None if it is invalid.
 
     Args:
-        message: As it came.
-        colour: Leave one in colour as it is, red green blue, (rows, columns, 3); else all are gray, (rows, columns).
+        message: Received message.
+        colour: True to keep colour, red green blue, (rows, columns, 3); else the result is gray, (rows, columns).
     """
     channels = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3}.get(message.encoding, 0)
     rows, columns, step = int(message.height), int(message.width), int(message.step)
@@ -208,7 +211,7 @@ def image_of(message: Any, *, colour: bool = False) -> npt.NDArray[np.uint8] | N
 
 
 def own_reading(message: Any) -> Picture | None:
-    """The reading in an Image, a ProjectedSonarImage or a Range, without its time; None where it is none."""
+    """Return the reading of an Image, a ProjectedSonarImage or a Range, without its time; None if it is invalid."""
     if hasattr(message, "beam_directions"):
         beams, echoes = message.image.beam_count, np.frombuffer(memoryview(message.image.data), np.uint8)
         if message.image.dtype != 0 or beams == 0 or len(echoes) == 0 or len(echoes) % beams:
@@ -222,19 +225,19 @@ def own_reading(message: Any) -> Picture | None:
 
 
 def compressed_of(message: Any) -> npt.NDArray[np.uint8] | None:
-    """The gray picture in a CompressedImage; None where it is none."""
+    """Return the gray picture of a CompressedImage; None if it is invalid."""
     return picture_of(np.frombuffer(memoryview(message.data), np.uint8))
 
 
 def tags_of(message: Any) -> tuple[int, str, Picture] | None:
-    """Time of exposure [ns], finder, and tags of a String with JSON; None where it is malformed."""
+    """Return time of exposure [ns], finder and tags of a String with JSON; None if it is malformed."""
     try:
         decoded = json.loads(message.data)
         tags = tuple(_tag(tag) for tag in decoded["tags"][:MOST_TAGS])
         stamp, sequence, finder = int(decoded["stamp_ns"]), int(decoded["sequence"]), str(decoded["finder"])
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return None
-    if not FIRST_TIME <= stamp <= LAST_TIME:  # a number of any size in JSON
+    if not FIRST_TIME <= stamp <= LAST_TIME:  # JSON integers may have any size
         return None
     return stamp, finder, Picture(0.0, sequence, None, tags)
 
@@ -246,27 +249,27 @@ def _tag(values: Any) -> TagCorners:
     return TagCorners(int(values["id"]), corners)
 
 
-# The messages of a record as messages of rclpy: one description of what each field holds, for both.
+# Messages of a record as rclpy messages: both use one description of the fields.
 
 
 OPTICAL = "camera_optical"
 
 
 def ros_type(name: str) -> Any:
-    """The class of a type named as `nav_msgs/msg/Odometry`."""
+    """Return the class of a type with a name such as `nav_msgs/msg/Odometry`."""
     package, kind, short = name.split("/")
     return getattr(import_module(f"{package}.{kind}"), short)
 
 
 class RosMessages(Messages):
-    """Messages as in `robot.record_messages`, for publishers; and those that a record does not hold."""
+    """Messages of `robot.record_messages`, for publishers, and further ones that a record does not contain."""
 
     def __init__(self, vehicle: Vehicle, prefix: str = "") -> None:
         super().__init__(vehicle, prefix)
         self._of = _Makers()
 
     def fix(self, stamp: int, position: Any, quaternion: Any, covariance: Any) -> Any:
-        """Pose from one picture, map frame; covariance (6, 6)."""
+        """Return the pose from one picture, map frame; covariance (6, 6)."""
         of = self._of
         pose = of["geometry_msgs/msg/PoseWithCovariance"](
             self.pose(position, quaternion), np.ascontiguousarray(covariance, np.float64).ravel()
@@ -274,16 +277,16 @@ class RosMessages(Messages):
         return of["geometry_msgs/msg/PoseWithCovarianceStamped"](self.header(stamp, MAP), pose)
 
     def compressed(self, stamp: int, image: npt.NDArray[np.uint8]) -> Any | None:
-        """Return a picture as JPEG; None if it cannot be packed."""
+        """Return a picture as JPEG; None if it cannot be encoded."""
         return self.picture(stamp, jpeg(image), OPTICAL)
 
     def found_tags(self, stamp: int, picture: Picture, finder: str) -> Any:
-        """Corners of tags as JSON: with the time of exposure [ns] and who found them."""
+        """Return the corners of tags as JSON, with the time of exposure [ns] and the name of the detecting node."""
         values = json.loads(self.tags(picture).data)
         return self.words({"stamp_ns": stamp, "finder": finder, **values})
 
     def transforms(self, stamp: int, parts: Any) -> Any:
-        """Frames in frames: parent, child, and position [m] with quaternion."""
+        """Return transforms from (parent, child, (position [m], quaternion))."""
         of = self._of
         return of["tf2_msgs/msg/TFMessage"](
             [
@@ -297,26 +300,27 @@ class RosMessages(Messages):
         )
 
     def path(self, stamp: int, times: Any, places: Any, yaws: Any) -> Any:
-        """A trajectory's poses, (n, 3) [m] and (n,) [rad], each stamped with its time, (n,) [ns]."""
+        """Return a trajectory's poses, (n, 3) [m] and (n,) [rad], each stamped with its time, (n,) [ns]."""
         poses = [self.goal(int(t), p, float(yaw)) for t, p, yaw in zip(times, places, yaws, strict=True)]
         return self._of["nav_msgs/msg/Path"](self.header(stamp, MAP), poses)
 
     def clock(self, stamp: int) -> Any:
-        """Simulated time."""
+        """Return the simulated time."""
         return self._of["rosgraph_msgs/msg/Clock"](self.time(stamp))
 
     def done(self, stamp: int, name: str) -> Any:
-        """Report of a node, by its full name, in lock-step."""
+        """Return a node's report in lock-step, with its full name."""
         return self._of["std_msgs/msg/Header"](self.time(stamp), name)
 
     def team_message(self, stamp: int, sender: str, data: bytes) -> Any:
-        """Message of a vehicle to the others of its team."""
+        """Return the message of a vehicle to the others of its team."""
         header = self._of["std_msgs/msg/Header"](self.time(stamp), "")
         return self._of["finssim_msgs/msg/TeamMessage"](header, sender, np.frombuffer(data, np.uint8))
 
 
 class _Makers(dict[str, Callable[..., Any]]):
-    """Type -> what makes a message of it, with fields by position or by name, and arrays as rclpy takes them."""
+    """Type -> function that creates a message from fields by position or name, with arrays in the form that
+    rclpy accepts."""
 
     def __missing__(self, name: str) -> Callable[..., Any]:
         cls = ros_type(name)

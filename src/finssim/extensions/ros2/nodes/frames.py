@@ -1,4 +1,4 @@
-"""Coordinate frames as topics: map, odom and base_link of REP-105, what is mounted where, and the vehicle's URDF."""
+"""Coordinate frames as topics: map, odom and base_link of REP-105, frames of mounted parts, and the vehicle's URDF."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ Array = npt.NDArray[np.float64]
 
 BASE = "base_link"
 OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
-"""NAME_optical in NAME_link, xyzw: z along the view, x right, y down (REP-103)."""
+"""Rotation of NAME_optical in NAME_link, xyzw: z along the view, x right, y down (REP-103)."""
 ACOUSTIC = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
-"""NAME_acoustic in NAME_link, xyzw: z along the view, x up, y right."""
+"""Rotation of NAME_acoustic in NAME_link, xyzw: z along the view, x up, y right."""
 
 
 def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
-    """Frame, position [m] (3,) and orientation xyzw (4,) in base_link of sensors, tags and thrusters.
+    """Yield frame, position [m] (3,) and orientation xyzw (4,) in base_link of sensors, tags and thrusters.
 
-    Cameras have their optical frame beside their own, sonars and Doppler logs that of marine_acoustic_msgs.
+    Cameras also have an optical frame, sonars and Doppler logs the acoustic frame of marine_acoustic_msgs.
 
     A thruster's x axis is the direction of its positive thrust.
     """
@@ -63,7 +63,8 @@ def mounts(vehicle: Vehicle) -> Iterator[tuple[str, Array, Array]]:
 
 
 def urdf_of(vehicle: Vehicle) -> str:
-    """URDF of a vehicle: mass and inertia without water, hull or envelope, `mounts` as fixed joints, fins that turn."""
+    """Return the URDF of a vehicle: mass and inertia without water, hull or envelope, `mounts` as fixed
+    joints, movable fins."""
     robot, body = ElementTree.Element("robot", name=vehicle.name), vehicle.body
     base = ElementTree.SubElement(robot, "link", name=BASE)
     inertial = ElementTree.SubElement(base, "inertial")
@@ -106,26 +107,27 @@ def _numbers(values: npt.ArrayLike) -> str:
 
 
 def _along(axis: Array) -> Array:
-    """Quaternion of a frame whose x axis is that one; its y axis is level unless that is upright."""
+    """Return the quaternion of a frame whose x axis is `axis`; its y axis is level unless `axis` is nearly
+    vertical."""
     side = np.cross([0.0, 0.0, 1.0], axis) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     side = side - axis * (side @ axis)
     side /= np.linalg.norm(side)
     return np.asarray(matrix_to_quat(np.column_stack([axis, side, np.cross(axis, side)])))
 
 
-# Fixes between the pool's frame, in which the estimator works, and the map, in which they travel.
+# Conversion of fixes between the pool frame, used by the estimator, and the map frame, used in messages.
 
 
 KNOWN = [0, 1, 2, 5]
-"""x, y, z and yaw among the six of a pose's covariance."""
+"""Indices of x, y, z and yaw in a pose's covariance."""
 UNKNOWN = 1.0e6
-"""Variance of a heading [rad²] or a height [m²] that is not known."""
+"""Variance of an unknown heading [rad²] or height [m²]."""
 TILT_VARIANCE = 0.02
-"""Variance of roll and pitch, which are the attitude filter's [rad²]."""
+"""Variance of roll and pitch from the attitude filter [rad²]."""
 
 
 class FixFrame:
-    """One pool's frames. Height and tilt, which a fix does not measure, go along as what was used for it."""
+    """Frames of one pool. Height and tilt, which a fix does not measure, are included as used for the fix."""
 
     def __init__(self, pool: Pool, estimator: Estimator) -> None:
         self._T_wp = pool.T_wp
@@ -136,11 +138,11 @@ class FixFrame:
         self._height_variance = estimator.settings.depth_std**2
 
     def to_map(self, fix: VisionSample, estimator: Estimator) -> tuple[Array, Array, Array]:
-        """Position [m], quaternion xyzw and covariance (6, 6) in the map.
+        """Return position [m], quaternion xyzw and covariance (6, 6) in the map frame.
 
         Args:
-            fix: Pool frame.
-            estimator: Knows height and tilt at its time.
+            fix: Fix in the pool frame.
+            estimator: Estimator with height and tilt at its time.
         """
         near = estimator.at(fix.time)
         height = float(estimator.estimate(fix.time).x[2])
@@ -159,12 +161,12 @@ class FixFrame:
         return self._T_wp[:3, :3] @ position + self._T_wp[:3, 3], q, full
 
     def from_map(self, message: Any, time: float, now: float) -> VisionSample:
-        """The fix in a PoseWithCovarianceStamped; whether its numbers are fit to be used is the estimator's to say.
+        """Return the fix of a PoseWithCovarianceStamped; the estimator checks its numbers.
 
         Args:
-            message: Map frame.
-            time: Of its stamp [s].
-            now: [s]
+            message: Message in the map frame.
+            time: Time of its stamp [s].
+            now: Present time [s].
         """
         pose = message.pose.pose
         position = self._T_wp[:3, :3].T @ (np.array(xyz(pose.position)) - self._T_wp[:3, 3])
@@ -176,36 +178,37 @@ class FixFrame:
         return VisionSample(time, (float(position[0]), float(position[1])), yaw, rows, now)
 
 
-# Coordinate frames as topics: map, odom and base_link of REP-105, what is mounted where, and the vehicle's URDF.
+# Frames as topics.
 
 
 GAP = 0.5
-"""Silence after which the way between two readings is not known, and odom is constant over it [s]."""
+"""Gap between readings above which odom stays constant, since the motion in between is unknown [s]."""
 
 
 class FramePose(NamedTuple):
     """Pose of one frame in another."""
 
     position: Array
-    """[m], (3,)"""
+    """Position [m], (3,)."""
     orientation: Array
-    """xyzw, (4,)"""
+    """Orientation, xyzw, (4,)."""
 
     def times(self, other: FramePose) -> FramePose:
-        """Return the pose of a frame of the second pose in that of the first."""
+        """Return the pose of the second pose's frame in the reference frame of the first."""
         position = self.position + np.asarray(quat_rotate(self.orientation, other.position))
         return FramePose(position, np.asarray(quat_multiply(self.orientation, other.orientation)))
 
     def inverse(self) -> FramePose:
-        """The other way round."""
+        """Return the inverse pose."""
         q = np.asarray(quat_conjugate(self.orientation))
         return FramePose(-np.asarray(quat_rotate(q, self.position)), q)
 
 
 class Odometer:
-    """base_link in odom: velocities added up from the first reading on, so that it drifts and never jumps (REP-105).
+    """Pose of base_link in odom: velocities integrated from the first reading on, so that it drifts without
+    jumps (REP-105).
 
-    Roll and pitch are the reading's; odom begins as the map and stays level.
+    Roll and pitch are those of the reading; odom coincides with the map at the start and stays level.
     """
 
     def __init__(self) -> None:
@@ -213,7 +216,7 @@ class Odometer:
         self._place, self._yaw = np.zeros(3), 0.0
 
     def take(self, reading: Reading) -> FramePose:
-        """The pose at a reading whose position is known; later ones follow in time."""
+        """Return the pose at a reading with a known position; readings must be in order of time."""
         roll, pitch, yaw = (float(a) for a in quat_to_euler(reading.quaternion))
         before, self._before = self._before, reading
         if before is None:
@@ -230,13 +233,12 @@ class Odometer:
 
 
 class Frames:
-    """Publishes all frames, in the one node that knows the vehicle's state."""
+    """Publisher of all frames, in the one node that knows the vehicle's state."""
 
     def __init__(self, node: RobotNode, pool: Pool | None = None) -> None:
-        """
-        Args:
-            node: That says it.
-            pool: Where the camera is; None without one.
+        """Args:
+        node: Node that publishes the frames.
+        pool: Pool with the pose of the camera; None without a camera.
         """
         self._node, self._odometer = node, Odometer()
         node.sends("transform", "fixed_transform", "robot")
@@ -255,7 +257,7 @@ class Frames:
         node.send("robot", ros_type("std_msgs/msg/String")(data=urdf_of(node.vehicle)))
 
     def tell(self, stamp: int, reading: Reading) -> None:
-        """Publish map to odom and odom to base_link of a reading whose position is known."""
+        """Publish map to odom and odom to base_link for a reading with a known position."""
         odom = self._odometer.take(reading)
         drift = FramePose(np.asarray(reading.position), np.asarray(reading.quaternion)).times(odom.inverse())
         parts = [("map", "odom", drift), ("odom", BASE, odom)]

@@ -1,4 +1,5 @@
-"""Hardware bridge node: the one process that talks to motor controller or autopilot, with arming and every watchdog."""
+"""Hardware bridge node: the only process that talks to motor controller or autopilot, with arming and all
+watchdogs."""
 
 from __future__ import annotations
 
@@ -21,18 +22,17 @@ from finssim.robot.runtime import Counters, Intake
 from finssim.robot.wiring import POOL_ADDRESS, link_of
 
 LOOK = 0.5
-"""Between two counts of those who publish commands [s]."""
+"""Interval of counting the publishers of commands [s]."""
 
 
 class BridgeTopics:
-    """Arming, stops and acknowledgements are topics, so that they work with every middleware."""
+    """Topics of a bridge: arming, stops and acknowledgements, which work with every middleware."""
 
     def __init__(self, node: RobotNode, bridge: Bridge, *, readings: bool = True) -> None:
-        """
-        Args:
-            node: That hears and sends.
-            bridge: It is for.
-            readings: Whether to hear the estimator; False where the node knows the state itself.
+        """Args:
+        node: Node that subscribes and publishes.
+        bridge: The bridge.
+        readings: True to subscribe to the estimator; False if the node knows the state itself.
         """
         self._node, self._bridge = node, bridge
         self._publishers = self._matched = 0
@@ -76,7 +76,7 @@ class BridgeTopics:
         self._node.diagnose("watchdogs", level, f"{state}: {reason}" if reason else state, values)
 
     def _arm(self, requested: bool) -> str:
-        """Arm or disarm; "" or why it is refused."""
+        """Arm or disarm; return the reason of a refusal, or ""."""
         now = self._node.now()
         if not requested:
             self._bridge.disarm(now)
@@ -99,7 +99,7 @@ class BridgeTopics:
         stamp = self._node.seconds(message.header.stamp)
         if now - self._set_at <= self._node.vehicle.safety.command_timeout:
             force = np.append(force, self._setpoints)
-        # Who commands is a node; what it names after a slash, its mode, may change.
+        # The source is a node; the mode that it appends after a slash may change.
         self._bridge.command(now, force, source.partition("/")[0], stamp=stamp)
         self._label = source
 
@@ -114,20 +114,21 @@ class BridgeTopics:
         self._bridge.reading(self._node.now(), reading)
 
     def _on_match(self, info: Any) -> None:
-        """Note that publishers came or went: two are a fault immediately, even if one has left again before."""
+        """React to appearing or vanishing publishers: two are a fault at once, even if one has already vanished."""
         highest = self._matched + info.total_count_change
         self._matched = info.current_count
         self._judge(highest)
 
     def _count(self) -> None:
-        """Count publishers twice a second; all that Humble has, whose rclpy searches the complete graph for it."""
+        """Count publishers twice a second; the only method on Humble, whose rclpy searches the complete graph
+        for them."""
         count = getattr(self._commands, "get_publisher_count", None)
         topic = self._node.topic("command")
         self._publishers = int(count() if count else self._node.count_publishers(topic))
         self._judge(self._publishers)
 
     def _judge(self, publishers: int) -> None:
-        """Two that publish commands are a fault, even under one name."""
+        """Stop if two publishers send commands, even under one name."""
         if publishers > 1 and self._bridge.state in ("armed", "hold"):
             reason = f"two publishers command the thrusters: {publishers} on {self._node.topic('command')}"
             self._bridge.stop(self._node.now(), reason)
@@ -138,16 +139,16 @@ class BridgeTopics:
         return response
 
 
-# Hardware bridge node: the one process that talks to the motor controller, with arming and every watchdog.
+# Node and its callbacks.
 
 
 LAST_FRAMES = 3
-"""Frames without thrust at the end."""
+"""Number of frames without thrust at the end."""
 RPM = 2.0 * math.pi / 60.0
 
 
 class HardwareBridge(RobotNode):
-    """Frames to and from the motor controller; disarmed until the topic `arm` is true."""
+    """Node that exchanges frames with the motor controller; disarmed until the topic `arm` is true."""
 
     def __init__(self) -> None:
         super().__init__("hardware_bridge")
@@ -166,12 +167,12 @@ class HardwareBridge(RobotNode):
         self.event("start", self.transport.describe())
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """Publish a snapshot, as `robot.runtime.Intake` gives it to a recorder; stamps are of the measurement.
+        """Publish a snapshot, called by `robot.runtime.Intake` as for a recorder; the stamps are measurement times.
 
         Args:
-            now: When it came [s].
+            now: Time of arrival [s].
             telemetry: The snapshot.
-            time: When it was measured [s].
+            time: Time of the measurement [s].
         """
         stamp, received = self.ns(time), self.ns(now)
         self.send("telemetry", self.make.telemetry(stamp, received, telemetry))
@@ -188,7 +189,7 @@ class HardwareBridge(RobotNode):
         self.send("echo", self.make.echo(self.ns(now), echo))
 
     def aid(self, now: float, aid: NavigationAid) -> None:
-        """Publish what a navigation instrument measured, stamped with its measurement. `now` is the time [s]."""
+        """Publish a measurement of a navigation instrument, stamped with its time. `now` is the time [s]."""
         message = self.make.aid(self.ns(now - aid.age), aid)
         if message is not None:
             self.send(*message)
@@ -206,7 +207,9 @@ class HardwareBridge(RobotNode):
             self.bridge.note(now, note)
         self.intake.link.notes.clear()
         command = self.bridge.tick(now)
-        if self.now() - now < self.bridge.settings.command_timeout:  # else the process stood still meanwhile
+        if (
+            self.now() - now < self.bridge.settings.command_timeout
+        ):  # otherwise the process was suspended in between
             for data in self.intake.link.encode(now, command, self.bridge.state):
                 self.transport.send(data)
         self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
@@ -219,7 +222,7 @@ class HardwareBridge(RobotNode):
         )
 
     def close(self) -> None:
-        """Disarm, send that to the motor controller, and release the wire."""
+        """Disarm, notify the motor controller, and close the connection."""
         self.bridge.disarm(self.now())
         for _ in range(LAST_FRAMES):
             for data in self.intake.link.encode(self.now(), self.bridge.tick(self.now()), self.bridge.state):

@@ -1,4 +1,4 @@
-"""Localizer node: tags in pictures, seen through the refracting water, to poses in the map."""
+"""Localizer node: poses in the map from tags in pictures through the refracting water."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FORMS = {"raw": ("image", image_of), "compressed": ("picture", compressed_of)}
 
 
 class Localizer(RobotNode):
-    """Listens to pictures, or to tags that the camera found itself, and to telemetry for height and tilt."""
+    """Node that receives pictures, or tags detected by the camera itself, and telemetry for height and tilt."""
 
     def __init__(self) -> None:
         super().__init__("localizer")
@@ -42,7 +42,7 @@ class Localizer(RobotNode):
         self.perception.fixes = self.fixes = _Kept(self.perception.fixes)
         self.frame = FixFrame(self.pool, self.perception.estimator)
         tags = self.vehicle.tags
-        assert tags is not None  # Perception has refused such a vehicle
+        assert tags is not None  # Perception refuses a vehicle without tags
         self._tracker = RegionTracker(detector(tags.family), set(tags.mounts))
         self.verdicts: Counter[str] = Counter()
         self.sequence = 0
@@ -80,7 +80,8 @@ class Localizer(RobotNode):
         self._locate(stamp, picture)
 
     def _locate(self, stamp: int, picture: Picture) -> None:
-        """A picture stamped in the middle of its exposure [ns]; for the robot a picture's time is that of arrival."""
+        """Localize in a picture stamped with the middle of its exposure [ns]; the robot's picture times are
+        those of arrival."""
         arrival = (stamp - self.base) * 1e-9 + self.pool.latency
         self.fixes.newest = None
         verdict = self.perception.picture(self.now(), replace(picture, time=arrival))
@@ -97,7 +98,7 @@ class Localizer(RobotNode):
 
 
 class _Kept:
-    """Fixes, and the newest of them to look at."""
+    """Source of fixes that stores the newest one."""
 
     def __init__(self, fixes: Fixes) -> None:
         self._fixes = fixes

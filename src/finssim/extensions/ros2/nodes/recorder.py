@@ -1,4 +1,4 @@
-"""Recorder node: every topic of a vehicle to one MCAP, byte for byte as it came, that rosbag2 and Foxglove open."""
+"""Recorder node: records all topics of a vehicle unchanged in one MCAP, which rosbag2 and Foxglove open."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from finssim.robot.recorder import Recorder
 from finssim.vehicles import Vehicle
 
 LEFT_OUT, RAW = ("clock", "done"), "sensor_msgs/msg/Image"
-"""Raw pictures fill disks, and their compressed ones are kept; simulated time is in every stamp."""
+"""Topics that are not recorded: raw pictures fill disks and are recorded compressed; simulated time is in
+every stamp."""
 
 
 class RecorderNode(RobotNode):
-    """Records from its start to its end; a full disk ends the record, not the node."""
+    """Node that records from its start to its end; a full disk ends the record, not the node."""
 
     urgent = False
 
@@ -51,13 +52,13 @@ class RecorderNode(RobotNode):
             )
 
     def close(self) -> None:
-        """Finish the file."""
+        """Close the file."""
         if self.mcap is not None:
             self.mcap.close()
 
 
 class _WireRecord(Recorder):
-    """A record whose messages come ready from the wire, under the names they have there."""
+    """Record of serialized messages as received, under the topic names of the network."""
 
     def __init__(
         self,
@@ -71,7 +72,7 @@ class _WireRecord(Recorder):
         super().__init__(path, vehicle, meta, files=files)
 
     def message(self, key: str, at: int, data: bytes) -> None:
-        """One message that came at a time [ns]."""
+        """Write one message that arrived at a time [ns]."""
         self._sink.put(key, at, data, len(data))
 
     def _topic_name(self, key: str) -> str:

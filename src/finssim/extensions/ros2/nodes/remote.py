@@ -1,4 +1,4 @@
-"""The bridge and the estimator of another process, as the robot's own objects know them."""
+"""Bridge and estimator in another process, with the interfaces of the robot's own objects."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from finssim.robot.record_messages import STATES
 Array = npt.NDArray[np.float64]
 
 SILENT = 0.5
-"""A bridge that has not been heard for so long does nothing that we know of [s]."""
+"""Time without messages after which the bridge counts as disarmed [s]."""
 
 
 class RemoteReadings:
-    """Puts Odometry and EstimatorStatus of one stamp together; calls back with each reading."""
+    """Matcher of Odometry and EstimatorStatus with equal stamps, which calls back with each reading."""
 
     def __init__(self, node: RobotNode, take: Any) -> None:
         self._node, self._take = node, take
@@ -45,7 +45,7 @@ class RemoteReadings:
         self._status = message
         if all(map(math.isfinite, message.position_std)):
             self._match()
-        else:  # nothing is known, so no odometry comes with it
+        else:  # the position is unknown, so there is no odometry with it
             self._give(message, None)
 
     def _match(self) -> None:
@@ -61,15 +61,14 @@ class RemoteReadings:
 
 
 class RemoteState:
-    """The newest reading, in place of a `Perception`; one that is too old is not ready."""
+    """Newest reading, in place of a `Perception`; a reading that is too old is not ready."""
 
     def __init__(self, node: RobotNode, oldest: float) -> None:
+        """Args:
+        node: Node that receives it.
+        oldest: Age above which a reading must not be used [s].
         """
-        Args:
-            node: That hears it.
-            oldest: Age at which a reading may not be acted on any more [s].
-        """
-        # `robot.runtime.Intake` wants to know the frames of a motor controller; here none comes.
+        # `robot.runtime.Intake` reads the format of a motor controller's frames, of which there are none here.
         self.vehicle, self.let_in = node.vehicle, None
         self._oldest = oldest
         nothing = np.full(3, math.nan), np.array([0.0, 0.0, 0.0, 1.0]), np.full(6, math.nan)
@@ -77,19 +76,19 @@ class RemoteState:
         RemoteReadings(node, self._take)
 
     def reading(self, now: float) -> Reading:
-        """The state. `now` is the time [s]."""
+        """Return the state. `now` is the time [s]."""
         age = now - self._newest.time
         if age > self._oldest:
             return replace(self._newest, ready=False, reason=f"the estimator is silent for {age:.1f} s")
         return self._newest
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
-        """None comes here.
+        """Do nothing: there is no telemetry here.
 
         Args:
-            now: When it would have come [s].
+            now: Not used [s].
             telemetry: Not used.
-            time: When it would have been measured [s].
+            time: Not used [s].
         """
 
     def _take(self, reading: Reading) -> None:
@@ -97,16 +96,15 @@ class RemoteState:
 
 
 class RemoteBridge:
-    """The bridge of another process: commands travel as messages, its state returns as one."""
+    """Bridge in another process: commands are sent and its state is received as messages."""
 
     getting_ready = False
-    """True if arming waits for an autopilot, which a state does not report: request it again when it has armed."""
+    """True while arming waits for an autopilot; always False, since the state message does not contain it."""
 
     def __init__(self, node: RobotNode, source: Callable[[], str] | None = None) -> None:
-        """
-        Args:
-            node: That hears and sends.
-            source: Tells what commands are signed with; by who gives them where there is none.
+        """Args:
+        node: Node that subscribes and publishes.
+        source: Function that returns the signature of commands; None: the source passed with each command.
         """
         self._node, self._source = node, source
         self._state, self.reason, self._at = "disarmed", "", -math.inf
@@ -120,30 +118,30 @@ class RemoteBridge:
 
     @property
     def silent(self) -> bool:
-        """Return whether no message has come from it for too long."""
+        """Return whether no message has arrived from the bridge for too long."""
         return self._node.now() - self._at > SILENT
 
     def arm(self, now: float, source: str) -> str:
-        """Ask for arming; whether it is granted shows in the state. `now` is the time [s]."""
+        """Request arming; the state shows whether it is granted. `now` is the time [s]."""
         self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=True))
         return ""
 
     def disarm(self, now: float) -> None:
-        """Thrusters off. `now` is the time [s]."""
+        """Disarm the thrusters. `now` is the time [s]."""
         self._node.send("arm", ros_type("std_msgs/msg/Bool")(data=False))
 
     def stop(self, now: float, reason: str) -> None:
-        """Emergency stop. `now` is the time [s]."""
+        """Request an emergency stop. `now` is the time [s]."""
         self._node.send("stop", ros_type("std_msgs/msg/Empty")())
         self._node.event("stop", reason, now)
 
     def acknowledge(self, now: float) -> None:
-        """End a fault. `now` is the time [s]."""
+        """Acknowledge a fault. `now` is the time [s]."""
         self._node.send("acknowledge", ros_type("std_msgs/msg/Empty")())
 
     def command(self, now: float, force: npt.ArrayLike, source: str, stamp: float | None = None) -> Array:
-        """Ask for thrusts along the thrusters' axes, canonical order [N], (n,), and for values of the other actuators
-        that follow them; return the thrusts."""
+        """Request thrusts along the thrusters' axes, canonical order [N], (n,), followed by values of the
+        other actuators; return the thrusts."""
         node, source = self._node, source if self._source is None else self._source()
         channels, stamp = np.asarray(force, float), node.ns(now)
         requested, others = np.split(channels, [len(node.make.names)])
@@ -153,17 +151,17 @@ class RemoteBridge:
         return requested
 
     def reading(self, now: float, reading: Reading) -> None:
-        """Ignore a reading: the bridge receives the estimator's directly. `now` is the time [s]."""
+        """Ignore a reading: the bridge receives those of the estimator directly. `now` is the time [s]."""
 
     def telemetry(self, now: float, telemetry: Telemetry) -> None:
-        """None comes here. `now` is the time [s]."""
+        """Do nothing: there is no telemetry here. `now` is the time [s]."""
 
     def tick(self, now: float) -> ThrusterCommand:
-        """Frames are the bridge's own affair. `now` is the time [s]."""
+        """Return a disabled command: the bridge itself sends the frames. `now` is the time [s]."""
         return ThrusterCommand(False, (0.0,) * 8)
 
     def drain(self) -> list[Event]:
-        """Events are published where they happen."""
+        """Return no events: they are published where they occur."""
         return []
 
     def _on_state(self, message: Any) -> None:
@@ -175,27 +173,26 @@ class RemoteBridge:
             )
 
 
-# The node of `finssim ros2 up`: it observes the state, and requests arming if that was demanded.
+# Node of `finssim ros2 up`: observes the state, and requests arming if the user demands it.
 
 
 ASK_EVERY = 1.0
-"""Between two requests for arming [s]."""
+"""Interval of requests for arming [s]."""
 
 
 class Watcher(RobotNode):
-    """Observes one vehicle. It arms only on demand, and only once."""
+    """Node that observes one vehicle, and requests arming only on demand and only until it is armed once."""
 
     listening = LISTENING
 
     def __init__(self, plan: GraphPlan, namespace: str, *, arm: bool) -> None:
-        """
-        Args:
-            plan: Nodes that are to be started, of which there must be no others.
-            namespace: Of the vehicle.
-            arm: Ask for arming as soon as the state is ready and a controller is there, until it is granted once.
+        """Args:
+            plan: Nodes that will be started, of which no others may exist.
+            namespace: Namespace of the vehicle.
+            arm: True to request arming when the state is ready and a controller exists, until it is granted once.
 
         Raises:
-            TwinError: There are others.
+            TwinError: Other nodes with these names exist.
         """
         nodes = [one for one in plan.nodes if one.namespace == namespace]
         alike = next((one for one in nodes if one.node == "controller"), nodes[-1])
@@ -205,12 +202,12 @@ class Watcher(RobotNode):
         self.sends("event", "diagnostics", "done")
         self.bridge = RemoteBridge(self)
         self.state = self.bridge.state
-        """Of the bridge, as it was seen last while nodes lived."""
+        """Last observed state of the bridge while the nodes ran."""
         self.ready = False
         RemoteReadings(self, self._on_reading)
 
     def turn(self, timeout: float) -> None:
-        """Process the received messages, waiting for them no longer than that [s]."""
+        """Process received messages for a duration [s]."""
         end = time.monotonic() + timeout
         while (remaining := end - time.monotonic()) > 0.0:
             rclpy.spin_once(self, timeout_sec=remaining)
@@ -231,7 +228,7 @@ class Watcher(RobotNode):
 
 
 def _words(parameters: Mapping[str, Any]) -> list[str]:
-    """Return arguments that give a node the parameters which every node has."""
+    """Return the arguments with the parameters that are common to all nodes."""
     words = {name: parameters[name] for name in EVERYWHERE.split() if name in parameters}
     texts = (f"{name}:={json.dumps(value)}" for name, value in words.items())
     return [word for text in texts for word in ("-p", text)]

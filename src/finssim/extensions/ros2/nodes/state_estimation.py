@@ -1,4 +1,4 @@
-"""State estimation node: fixes, inertial samples and depth to one state, sixty times a second."""
+"""State estimation node: fuses fixes, IMU samples and depth to one state, sixty times a second."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from finssim.robot.runtime import USED
 
 
 class StateEstimation(RobotNode):
-    """Publishes Odometry, tf and EstimatorStatus of one stamp; no Odometry while the place is not known."""
+    """Node that publishes Odometry, tf and EstimatorStatus with equal stamps; no Odometry while the position
+    is unknown."""
 
     def __init__(self) -> None:
         super().__init__("state_estimation")
@@ -79,7 +80,7 @@ class StateEstimation(RobotNode):
 
 
 def health_values(health: Health) -> dict[str, Any]:
-    """Return the fields of EstimatorStatus besides a reading."""
+    """Return the fields of EstimatorStatus other than those of a reading."""
     vision = health.counts.get("vision", {})
     used = sum(n for word, n in vision.items() if word in USED)
     return {

@@ -1,4 +1,4 @@
-"""Teleoperation node: a gamepad, the keyboard or the topic `joy` to wrenches, arming and stops."""
+"""Teleoperation node: converts a gamepad, the keyboard or the topic `joy` to wrenches, arming and stops."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from finssim.robot.teleop import (
 )
 
 LAST_WRENCHES = 3
-"""Wrenches of zero at the end."""
+"""Number of zero wrenches at the end."""
 
 
 class Teleop(RobotNode):
-    """Publishes what the hands want; the mode button hands over between `teleop` and the controller `other`."""
+    """Node that publishes the operator's wrench; the mode button switches between `teleop` and the controller
+    `other`."""
 
     def __init__(self) -> None:
         super().__init__("teleop")
@@ -67,7 +68,7 @@ class Teleop(RobotNode):
         self.send("mode", ros_type("std_msgs/msg/String")(data="teleop" if self._mine else self._other))
 
     def close(self) -> None:
-        """Put the device back, and leave without thrust where the wire still carries it."""
+        """Release the device, and send zero wrenches if the network is still up."""
         self._stack.close()
         if self.context.ok():
             for _ in range(LAST_WRENCHES):
@@ -75,20 +76,21 @@ class Teleop(RobotNode):
 
 
 class JoyDevice:
-    """The topic `joy`, as ROS' joy_node publishes it for pads of the Xbox family: left and up are positive there."""
+    """Device of the topic `joy` from ROS' joy_node, for pads of the Xbox family: left and up are positive there."""
 
     def __init__(self) -> None:
         self._newest: Any = None
         self._pad = Pad()
 
     def take(self, message: Any) -> None:
-        """The newest message."""
+        """Store the newest message."""
         self._newest = message
 
     def read(self, now: float) -> Hands | None:
-        """Return the content of the newest message; None without one since the last call, or if it is too short.
+        """Return the content of the newest message; None without a new one since the last call, or if it is
+        too short.
 
-        `now` is the time [s].
+        The argument `now` is the time [s].
         """
         message, self._newest = self._newest, None
         if message is None or len(message.axes) < AXIS_COUNT or len(message.buttons) < BUTTON_COUNT:

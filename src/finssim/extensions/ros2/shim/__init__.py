@@ -1,7 +1,7 @@
-"""The rclpy API on the wire of `finssim.extensions.ros2.wire`: what `import rclpy` gives where no ROS 2 is installed.
+"""rclpy API on `finssim.extensions.ros2.wire`: the target of `import rclpy` without an installed ROS 2.
 
-Names, arguments and errors follow rclpy, so that one node source runs on either. Do not import this package by its
-own name: `finssim.extensions.ros2.backend.activate` decides between it and the real one.
+Names, arguments and errors follow rclpy, so that one node source runs with both. Do not import this package by its
+own name: `finssim.extensions.ros2.backend.activate` selects it or the real one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def init(
     domain_id: int | None = None,
     signal_handler_options: SignalHandlerOptions | None = None,
 ) -> None:
-    """Join the wire; before anything else. SIGTERM ends `spin` unless the options leave it to the program."""
+    """Join the network, before anything else. SIGTERM ends `spin` unless the options leave it to the program."""
     if context is None:
         context = get_default_context()
         if not context.ok():
@@ -55,12 +55,12 @@ def init(
 
 
 def create_node(node_name: str, **arguments: Any) -> Node:
-    """A node; arguments as of `Node`."""
+    """Return a node; arguments as in `Node`."""
     return Node(node_name, **arguments)
 
 
 def get_global_executor(context: Context | None = None) -> SingleThreadedExecutor:
-    """The executor that `spin` and `spin_once` use."""
+    """Return the executor that `spin` and `spin_once` use."""
     context = context or get_default_context()
     if context.executor is None:
         context.executor = SingleThreadedExecutor(context=context)
@@ -97,7 +97,7 @@ def spin_until_future_complete(
     executor: SingleThreadedExecutor | None = None,
     timeout_sec: float | None = None,
 ) -> None:
-    """Run a node's callbacks until an answer has come, at most `timeout_sec` [s]."""
+    """Run a node's callbacks until a future is done, at most `timeout_sec` [s]."""
     executor = executor or get_global_executor(node.context)
     added = executor.add_node(node)
     try:

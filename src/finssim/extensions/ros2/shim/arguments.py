@@ -1,4 +1,4 @@
-"""Names of nodes and topics, and the arguments after `--ros-args`: remapping, parameters, their files, log levels."""
+"""Names of nodes and topics, and arguments after `--ros-args`: remapping, parameters, parameter files, log levels."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from finssim.extensions.ros2.shim.logging import LoggingSeverity
 TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 _TOPIC = re.compile(rf"^(~|(~/|/)?{TOKEN}(/{TOKEN})*)$")
 LONGEST_NODE, LONGEST_NAMESPACE, LONGEST_TOPIC = 255, 245, 247
-"""Greatest lengths by rmw: RMW_NODE_NAME_MAX_NAME_LENGTH, RMW_NAMESPACE_MAX_LENGTH, RMW_TOPIC_MAX_NAME_LENGTH."""
+"""Greatest lengths of names in rmw: RMW_NODE_NAME_MAX_NAME_LENGTH, RMW_NAMESPACE_MAX_LENGTH,
+RMW_TOPIC_MAX_NAME_LENGTH."""
 
 
 @dataclass(frozen=True)
 class Remap:
-    """One rule `[node:]source:=target` of the command line."""
+    """Remapping rule `[node:]source:=target` of the command line."""
 
     node: str
-    """Name of the node it is for; empty for all."""
+    """Name of the node to which it applies; empty for all."""
     source: str
     target: str
 
 
 def check_node(name: str, namespace: str) -> str:
-    """Check a node's names; returns the namespace with its leading slash.
+    """Check a node's names; return the namespace with its leading slash.
 
     Raises:
-        InvalidNodeNameException: Not a name.
-        InvalidNamespaceException: Not a namespace.
+        InvalidNodeNameException: The name is invalid.
+        InvalidNamespaceException: The namespace is invalid.
     """
     if not re.fullmatch(TOKEN, name) or len(name) > LONGEST_NODE:
         raise InvalidNodeNameException(
@@ -55,15 +56,15 @@ def check_node(name: str, namespace: str) -> str:
 
 
 def full_node_name(name: str, namespace: str) -> str:
-    """Namespace and name as one."""
+    """Return namespace and name as one."""
     return f"{namespace.rstrip('/')}/{name}"
 
 
 def expanded(topic: str, name: str, namespace: str) -> str:
-    """The full name of a topic or service, from the name a node uses: absolute, relative or private with `~`.
+    """Return the full name of a topic or service, from an absolute, a relative or, with `~`, a private name.
 
     Raises:
-        InvalidTopicNameException: Not a name.
+        InvalidTopicNameException: The name is invalid.
     """
     if not _TOPIC.match(topic) or "__" in topic:
         raise InvalidTopicNameException(
@@ -83,10 +84,10 @@ def expanded(topic: str, name: str, namespace: str) -> str:
 
 
 def remapped(topic: str, name: str, namespace: str, rules: Sequence[Remap]) -> str:
-    """The full name after the first rule that holds for it.
+    """Return the full name after the first remapping rule that matches.
 
     Raises:
-        InvalidTopicNameException: Not a name.
+        InvalidTopicNameException: The name is invalid.
     """
     full = expanded(topic, name, namespace)
     for rule in rules:
@@ -96,15 +97,15 @@ def remapped(topic: str, name: str, namespace: str, rules: Sequence[Remap]) -> s
     return full
 
 
-# Parameters from outside, files and `-p`, read as rcl reads them (rcl_yaml_param_parser/src/parse.c).
+# Parameters from files and `-p`, parsed like rcl does (rcl_yaml_param_parser/src/parse.c).
 
 
 Overrides = dict[str, dict[str, Any]]
 """Node name or pattern -> parameter -> value, in the order in which the patterns were first mentioned.
 
-That order is their precedence: of several patterns that fit a node the last counts, and a pattern that is mentioned
-again keeps the rank of its first mention. So `/**` of a later file loses against `/**/controller` of an earlier one
-that began with `/**`.
+That order is their precedence: of several matching patterns the last one wins, and a pattern that is
+mentioned again keeps the rank of its first mention. Thus `/**` of a later file is overridden by
+`/**/controller` of an earlier one that began with `/**`.
 """
 
 KEY = "ros__parameters"
@@ -120,14 +121,14 @@ _FLOAT = re.compile(
 _NAME = re.compile(r"/?(\*\*?|[A-Za-z_]\w*)(/(\*\*?|[A-Za-z_]\w*))*")
 
 Tree = Any
-"""A scalar's event, a list of trees, or a list of (key, tree) in a tuple."""
+"""Scalar event, list of trees, or tuple of (key, tree)."""
 
 
 def read_parameters(path: Path, overrides: Overrides) -> None:
     """Add the values of a parameter file.
 
     Raises:
-        RosArgumentsError: No such file, or one that rcl refuses.
+        RosArgumentsError: The file does not exist, or rcl would refuse it.
     """
     try:
         tree = _document(path.read_text(encoding="utf-8"))
@@ -143,7 +144,7 @@ def parsed_value(text: str) -> Any:
     """Return a parameter's value after `-p name:=`; None for an empty list, whose type is unknown.
 
     Raises:
-        ValueError: It is empty, not YAML, a mapping, or a list of different types.
+        ValueError: The text is empty, not YAML, a mapping, or a list of different types.
     """
     try:
         tree = _document(text)
@@ -155,9 +156,9 @@ def parsed_value(text: str) -> Any:
 
 
 def override(overrides: Overrides, pattern: str, name: str, value: Any) -> None:
-    """Give a value: the last counts, but of several types the one that comes first in `TYPES`.
+    """Set a value: the last one wins, but among values of several types the one whose type is first in `TYPES`.
 
-    rcl keeps a value of each type, and rclpy takes the first that it finds (node.cpp, `_parameter_from_rcl_variant`).
+    rcl stores a value of each type, and rclpy uses the first one (node.cpp, `_parameter_from_rcl_variant`).
     """
     values = overrides.setdefault(pattern, {})
     if name not in values or _rank(value) <= _rank(values[name]):
@@ -165,18 +166,19 @@ def override(overrides: Overrides, pattern: str, name: str, value: Any) -> None:
 
 
 def overrides_for(node: str, overrides: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Values for one node by its full name, such as `/finsrov/controller`."""
+    """Return the values for one node by its full name, such as `/finsrov/controller`."""
     values: dict[str, Any] = {}
     for pattern, pattern_values in overrides.items():
         pattern = pattern if pattern.startswith("/") else f"/{pattern}"
-        # As rclpy has it: "/*" is one name, and "/**", which becomes that with a star, any number.
+        # As in rclpy: "/*" matches one name, and "/**", which becomes that with a star, any number.
         if re.fullmatch(pattern.replace("/*", r"(/\w+)"), node):
             values.update(pattern_values)
     return values
 
 
 def _rank(value: Any) -> int:
-    """Place among the types; lists come after single values, and an empty one, which is no value, last."""
+    """Return the rank of a value's type; lists come after single values, and an empty list, which is no
+    value, last."""
     if value is None:
         return 2 * len(TYPES)
     many = isinstance(value, list)
@@ -184,7 +186,7 @@ def _rank(value: Any) -> int:
 
 
 def _document(text: str) -> Tree:
-    """The first document's tree; None of an empty one."""
+    """Return the first document's tree; None if it is empty."""
     events = yaml.parse(text, Loader=yaml.SafeLoader)
     for event in events:
         if isinstance(event, (yaml.StreamEndEvent, yaml.DocumentEndEvent)):
@@ -215,7 +217,7 @@ def _tree(event: Any, events: Iterator[Any], depth: int = 0) -> Tree:
 
 
 def _add_nodes(above: str, tree: Tree, overrides: Overrides) -> None:
-    """Descend to `ros__parameters`; the keys on the way make up a node's name."""
+    """Descend to `ros__parameters`; the keys above it form a node's name."""
     if not isinstance(tree, tuple):
         raise ValueError(f"{above or 'its top'}: expected '{KEY}:' below a node's name")
     for key, below in tree:
@@ -281,12 +283,12 @@ _SWITCHES = {
     f"--{way}-{what}-logs" for way in ("enable", "disable") for what in ("rosout", "stdout", "external-lib")
 }
 _TARGETS = {"__node": TOKEN, "__name": TOKEN, "__ns": rf"/|(/{TOKEN})+"}
-"""Target -> pattern of its replacements, of a node's name or namespace."""
+"""Remapping source of a node's name or namespace -> pattern of its targets."""
 
 
 @dataclass
 class RosArguments:
-    """Arguments in the order given."""
+    """Parsed arguments, in the given order."""
 
     remaps: list[Remap] = field(default_factory=list)
     parameters: Overrides = field(default_factory=dict)
@@ -297,10 +299,10 @@ class RosArguments:
 
 
 def parse_arguments(arguments: Sequence[str]) -> RosArguments:
-    """Read a command line.
+    """Parse a command line.
 
     Raises:
-        RosArgumentsError: An argument for ROS that is malformed or not known.
+        RosArgumentsError: An argument for ROS is malformed or unknown.
     """
     parsed, tokens, ros = RosArguments(), list(arguments), False
     while tokens:

@@ -1,4 +1,5 @@
-"""`rclpy.context`, `rclpy.signals`, `rclpy.utilities`: participant and nodes of a process from `init` to `shutdown`."""
+"""`rclpy.context`, `rclpy.signals`, `rclpy.utilities`: participant and nodes of a process from `init` to
+`shutdown`."""
 
 from __future__ import annotations
 
@@ -27,31 +28,31 @@ class SignalHandlerOptions(Enum):
 
 
 class Context(Limited):
-    """One presence on the wire. Nodes of one process share it."""
+    """One participant of the network, which the nodes of a process share."""
 
     def __init__(self) -> None:
         self.arguments = RosArguments()
         self.nodes: list[Any] = []
         self.changes = 0
-        """Counts every endpoint that came or went."""
+        """Number of endpoints that were created or destroyed."""
         self.executor: Any = None
-        """The one that `rclpy.spin` uses, once it was used."""
+        """Executor of `rclpy.spin`, once it was used."""
         self.asked_to_leave = False
-        """Whether SIGTERM came."""
+        """True if SIGTERM was received."""
         self._participant: Participant | None = None
         self._waiters: weakref.WeakSet[Any] = weakref.WeakSet()
         self._lock = threading.RLock()
 
     def init(self, args: Sequence[str] | None = None, *, domain_id: int | None = None) -> None:
-        """Join the wire.
+        """Join the network.
 
         Args:
-            args: Command line; that of the process where it is None.
+            args: Command line; None: that of the process.
             domain_id: ROS domain instead of that of the environment.
 
         Raises:
-            RuntimeError: Joined already.
-            Ros2Error: A malformed argument or environment variable.
+            RuntimeError: The context has already joined.
+            Ros2Error: An argument or environment variable is malformed.
         """
         if self._participant is not None:
             raise RuntimeError("Context.init() must only be called once")
@@ -62,32 +63,32 @@ class Context(Limited):
 
     @property
     def participant(self) -> Participant:
-        """The presence on the wire.
+        """Return the participant on the network.
 
         Raises:
-            NotInitializedException: Not joined, or left already.
+            NotInitializedException: The context has not joined, or has left.
         """
         if self._participant is None:
             raise NotInitializedException("ROS 2 is not initialized: call rclpy.init() first")
         return self._participant
 
     def ok(self) -> bool:
-        """Return whether it has joined, and no signal has asked it to leave."""
+        """Return whether the context has joined, and no signal has requested its shutdown."""
         return self._participant is not None and not self.asked_to_leave
 
     def get_domain_id(self) -> int:
-        """The ROS domain."""
+        """Return the ROS domain."""
         return self.participant.settings.domain
 
     def announce(self) -> None:
-        """Notify peers and executors that nodes or endpoints came or went."""
+        """Notify peers and executors of created or destroyed nodes and endpoints."""
         with self._lock:
             self.changes += 1
             self.participant.announce([node.record() for node in self.nodes])
             self.wake()
 
     def add_waiter(self, waiter: Any) -> None:
-        """Wake this too when something changes."""
+        """Register an object to wake when something changes."""
         self._waiters.add(waiter)
 
     def wake(self) -> None:
@@ -96,17 +97,17 @@ class Context(Limited):
             waiter.wake()
 
     def shutdown(self) -> None:
-        """Leave the wire.
+        """Leave the network.
 
         Raises:
-            RuntimeError: Not joined.
+            RuntimeError: The context has not joined.
         """
         if self._participant is None:
             raise RuntimeError("Context.shutdown() was called on a context that is not initialized")
         self.try_shutdown()
 
     def try_shutdown(self) -> None:
-        """Leave the wire if joined."""
+        """Leave the network if joined."""
         with self._lock:
             participant, self._participant = self._participant, None
             if participant is None:
@@ -117,7 +118,8 @@ class Context(Limited):
             participant.close()
 
     def leave_on_sigterm(self) -> None:
-        """Let SIGTERM end `spin` as rclpy does, unless the program handles that signal or this is no main thread."""
+        """Make SIGTERM end `spin` as in rclpy, unless the program handles that signal or this is not the main
+        thread."""
         main = threading.current_thread() is threading.main_thread()
         if main and signal.getsignal(signal.SIGTERM) in (signal.SIG_DFL, _on_sigterm):
             _leaving[:] = [self]
@@ -125,11 +127,11 @@ class Context(Limited):
 
 
 _leaving: list[Context] = []
-"""The context that SIGTERM asks to leave."""
+"""Context whose shutdown SIGTERM requests."""
 
 
 def _on_sigterm(*_: Any) -> None:
-    """Only ask: the wire is left where no call on it is under way."""
+    """Only set a flag: the network is left where no call on it is in progress."""
     for context in _leaving:
         context.asked_to_leave = True
 
@@ -141,7 +143,7 @@ _default: list[Context] = []
 
 
 def get_default_context() -> Context:
-    """The context of `rclpy.init()`."""
+    """Return the context of `rclpy.init()`."""
     if not _default:
         _default.append(Context())
     return _default[0]
@@ -159,15 +161,15 @@ def ok(*, context: Context | None = None) -> bool:
 
 
 def shutdown(*, context: Context | None = None) -> None:
-    """Leave the wire."""
+    """Leave the network."""
     (context or get_default_context()).shutdown()
 
 
 def try_shutdown(*, context: Context | None = None) -> None:
-    """Leave the wire if on it."""
+    """Leave the network if joined."""
     (context or get_default_context()).try_shutdown()
 
 
 def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
-    """A command line without what is for ROS."""
+    """Return a command line without the arguments for ROS."""
     return parse_arguments(sys.argv if args is None else args).rest

@@ -1,4 +1,4 @@
-"""Publishers, subscriptions, services and clients as rclpy has them, their events, answers and callback groups."""
+"""Publishers, subscriptions, services and clients as in rclpy, with events, futures and callback groups."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from finssim.extensions.ros2.wire import ClientEnd, Quality, ServerEnd
 
 
 class QoSSubscriptionMatchedInfo(NamedTuple):
-    """Publishers that a subscription was matched with, and the change since the last event."""
+    """Publishers matched with a subscription, and the change since the last event."""
 
     total_count: int
-    """All that ever were."""
+    """Number of publishers that were ever matched."""
     total_count_change: int
     current_count: int
     current_count_change: int
 
 
 class SubscriptionEventCallbacks:
-    """Callbacks of a subscription's events: of those of rclpy only `matched`."""
+    """Callbacks of a subscription's events; of those of rclpy, only `matched` is supported."""
 
     def __init__(
         self, *, matched: Callable[[QoSSubscriptionMatchedInfo], None] | None = None, **others: Any
@@ -40,39 +40,39 @@ class SubscriptionEventCallbacks:
         self.matched = matched
 
 
-# `rclpy.callback_groups`: accepted and met: callbacks run one at a time, which every group allows.
+# `rclpy.callback_groups`: all are accepted, since callbacks run one at a time, which every group allows.
 
 
 class CallbackGroup:
-    """Callbacks that may or may not run at the same time."""
+    """Group of callbacks."""
 
 
 class MutuallyExclusiveCallbackGroup(CallbackGroup):
-    """Callbacks that must not run at the same time."""
+    """Group of callbacks that must not run at the same time."""
 
 
 class ReentrantCallbackGroup(CallbackGroup):
-    """Callbacks that may run at the same time, and here do not."""
+    """Group of callbacks that may run at the same time, which they do not here."""
 
 
 # `rclpy.serialization`: messages to bytes and back.
 
 
 def serialize_message(message: Message) -> bytes:
-    """CDR bytes of a message."""
+    """Return the CDR bytes of a message."""
     return bytes(codec_of().serialize(message))
 
 
 def deserialize_message(data: bytes, message_type: type[Message]) -> Any:
-    """A message of a class from its CDR bytes."""
+    """Return a message of a class from its CDR bytes."""
     return codec_of().deserialize(bytearray(data), message_type.TYPE)
 
 
-# `rclpy.task`: answers that have yet to come.
+# `rclpy.task`: results of calls in progress.
 
 
 class Future(Limited):
-    """An answer that comes while some executor spins. Not to be awaited: coroutines need a sourced ROS 2."""
+    """Result that arrives while an executor spins. It cannot be awaited: coroutines need a sourced ROS 2."""
 
     def __init__(self, *, executor: Any = None) -> None:
         self._finished = False
@@ -82,7 +82,7 @@ class Future(Limited):
         self._callbacks: list[Callable[[Future], Any]] = []
 
     def done(self) -> bool:
-        """Return whether it has a result, or never will."""
+        """Return whether it has a result, or was cancelled."""
         return self._finished
 
     def cancelled(self) -> bool:
@@ -90,7 +90,7 @@ class Future(Limited):
         return self._cancelled
 
     def result(self) -> Any:
-        """The answer; None until then. Raises what the asked one raised."""
+        """Return the result; None until then. Raises the exception of a failed call."""
         if self._exception is not None:
             raise self._exception
         return self._result
@@ -100,7 +100,7 @@ class Future(Limited):
         return self._exception
 
     def set_result(self, result: Any) -> None:
-        """Give the answer."""
+        """Set its result."""
         self._result = result
         self._finish()
 
@@ -110,13 +110,13 @@ class Future(Limited):
         self._finish()
 
     def cancel(self) -> None:
-        """Stop waiting."""
+        """Cancel it."""
         if not self.done():
             self._cancelled = True
             self._finish()
 
     def add_done_callback(self, callback: Callable[[Future], Any]) -> None:
-        """Call a function with this future once it is done, immediately if it is."""
+        """Call a function with this future once it is done, immediately if it is done already."""
         if self.done():
             callback(self)
         else:
@@ -129,31 +129,31 @@ class Future(Limited):
             callback(self)
 
 
-# What publishers, subscriptions, services and clients share.
+# Common base of publishers, subscriptions, services and clients.
 
 
 class Endpoint(Limited):
-    """One end of a topic."""
+    """Endpoint of a topic or service."""
 
     node: Any
     msg_type: type[Message]
     topic_name: str
-    """Full name, remapped."""
+    """Full name of the topic, remapped."""
     wires: tuple[Any, ...] = ()
-    """Its readers and writers on the wire."""
+    """Its readers and writers on the network."""
 
     @property
     def topic(self) -> str:
-        """Full name, remapped."""
+        """Full name of the topic, remapped."""
         return self.topic_name
 
     def close(self) -> None:
-        """Leave the wire; the node does this."""
+        """Leave the network; called by the node."""
         for wire in self.wires:
             wire.close()
 
     def tell_mismatches(self) -> None:
-        """Log each peer that newly turned out not to fit."""
+        """Log each newly discovered peer with incompatible QoS."""
         for wire in self.wires:
             policy = wire.incompatible()
             if policy:
@@ -164,7 +164,7 @@ class Endpoint(Limited):
                 )
 
     def _settle(self, node: Any, msg_type: Any, topic: str, qos_profile: Any) -> Quality:
-        """Take over the arguments; returns the policies."""
+        """Store the arguments; return the policies."""
         if not (isinstance(msg_type, type) and issubclass(msg_type, Message)):
             raise TypeError(
                 f"{topic}: {msg_type!r} is no message type: import one from a package such as nav_msgs.msg"
@@ -182,11 +182,11 @@ POLICY_WORDS = {
 
 
 def check_callback(callback: Any, takes: int) -> None:
-    """Refuse what would silently never run, or fail when it does.
+    """Refuse a callback that would silently never run, or fail when it runs.
 
     Raises:
-        TypeError: Not callable, or a coroutine function.
-        RuntimeError: It does not take that many arguments.
+        TypeError: The object is not callable, or a coroutine function.
+        RuntimeError: It does not accept the number of arguments.
     """
     if not callable(callback):
         raise TypeError(f"the callback is a {type(callback).__name__}: give a function")
@@ -194,7 +194,7 @@ def check_callback(callback: Any, takes: int) -> None:
         raise TypeError("a coroutine as callback needs a sourced ROS 2: give an ordinary function")
     try:
         signature = inspect.signature(callback)
-    except ValueError:  # one of Python's own, which has no message
+    except ValueError:  # one of Python's own, which has no signature
         return
     try:
         signature.bind(*range(takes))
@@ -206,7 +206,7 @@ def check_callback(callback: Any, takes: int) -> None:
 
 
 class Publisher(Endpoint):
-    """Sends messages of one type. Made by `Node.create_publisher`."""
+    """Sender of messages of one type, created by `Node.create_publisher`."""
 
     def __init__(self, node: Any, msg_type: type[Message], topic: str, qos_profile: Any) -> None:
         quality = self._settle(node, msg_type, topic, qos_profile)
@@ -215,12 +215,12 @@ class Publisher(Endpoint):
         self.wires = (self._writer,)
 
     def publish(self, msg: Message | bytes) -> None:
-        """Send a message, or ready CDR bytes.
+        """Send a message, or serialized CDR bytes.
 
         Raises:
-            InvalidHandle: It was destroyed.
-            TypeError: A message of another type.
-            MessageError: One with a field that does not fit.
+            InvalidHandle: The publisher was destroyed.
+            TypeError: The message is of another type.
+            MessageError: A field does not fit.
         """
         if self._writer.closed:
             raise InvalidHandle(f"the publisher of {self.topic_name} was destroyed: make another")
@@ -241,7 +241,7 @@ class Publisher(Endpoint):
         return int(self._writer.matched())
 
     def destroy(self) -> None:
-        """Leave the topic."""
+        """Destroy the publisher."""
         self.node.destroy_publisher(self)
 
 
@@ -249,7 +249,7 @@ class Publisher(Endpoint):
 
 
 class Subscription(Endpoint):
-    """Calls back with each message of a topic. Made by `Node.create_subscription`."""
+    """Receiver that calls back with each message of a topic, created by `Node.create_subscription`."""
 
     def __init__(
         self,
@@ -272,7 +272,8 @@ class Subscription(Endpoint):
             self._reader.watch_matches()
 
     def take(self) -> Callable[[], None] | None:
-        """Return the callback with news of publishers, or with the oldest waiting message; None without either."""
+        """Return the callback for a change of publishers, or for the oldest waiting message; None if there is
+        neither."""
         if self._on_match is not None:
             info = QoSSubscriptionMatchedInfo(*self._reader.matches())
             if info.total_count_change or info.current_count_change:
@@ -288,7 +289,7 @@ class Subscription(Endpoint):
         return int(self._reader.matched())
 
     def destroy(self) -> None:
-        """Leave the topic."""
+        """Destroy the subscription."""
         self.node.destroy_subscription(self)
 
     def _deliver(self, data: bytes) -> None:
@@ -303,11 +304,11 @@ class Subscription(Endpoint):
         self.callback(message)
 
 
-# `rclpy.service`: answers requests.
+# `rclpy.service`: answers to requests.
 
 
 class Service(Endpoint):
-    """Answers requests with a callback. Made by `Node.create_service`."""
+    """Server that answers requests with a callback, created by `Node.create_service`."""
 
     def __init__(
         self, node: Any, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], qos_profile: Any
@@ -328,19 +329,19 @@ class Service(Endpoint):
         return reply
 
     def destroy(self) -> None:
-        """Stop answering."""
+        """Destroy the service."""
         self.node.destroy_service(self)
 
 
-# `rclpy.client`: asks a service.
+# `rclpy.client`: calls of a service.
 
 
 class Client(Endpoint):
-    """Asks a service. Made by `Node.create_client`.
+    """Client of a service, created by `Node.create_client`.
 
     Note:
-        Answers come only from services under Cyclone DDS: under another middleware a service looks ready and stays
-        silent. Give each call a time limit.
+        Responses arrive only from services on Cyclone DDS: with another middleware a service seems ready but never
+        answers. Give each call a time limit.
     """
 
     def __init__(self, node: Any, srv_type: Any, srv_name: str, qos_profile: Any) -> None:
@@ -351,7 +352,7 @@ class Client(Endpoint):
         self._pending: dict[int, Future] = {}
 
     def call_async(self, request: Message) -> Future:
-        """Ask; the answer comes while an executor spins."""
+        """Call the service; the response arrives while an executor spins."""
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(
                 f"{self.srv_name} takes {self.srv_type.Request.TYPE}, found {type(request).__name__}"
@@ -365,7 +366,7 @@ class Client(Endpoint):
         return self._end.ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
-        """Wait until a server is known; whether one is. The timeout is in [s]."""
+        """Wait until a server is known, and return whether one is. The timeout is in [s]."""
         end = time.monotonic() + (float("inf") if timeout_sec is None else timeout_sec)
         while not self._end.ready():
             if time.monotonic() >= end or not self.node.context.ok():
@@ -374,21 +375,21 @@ class Client(Endpoint):
         return True
 
     def remove_pending_request(self, future: Future) -> None:
-        """Forget a call."""
+        """Discard a call."""
         self._pending = {n: f for n, f in self._pending.items() if f is not future}
 
     def take(self) -> Callable[[], None] | None:
-        """Return the callback with the next answer; None without one."""
+        """Return the callback for the next response; None if there is none."""
         answer = self._end.take()
         if answer is None:
             return None
         future = self._pending.pop(answer[0], None)
-        if future is None:  # a call that was given up
+        if future is None:  # a call that was discarded
             return lambda: None
         return lambda: future.set_result(answer[1])
 
     def destroy(self) -> None:
-        """Stop asking; open calls are cancelled."""
+        """Destroy the client; open calls are cancelled."""
         self.node.destroy_client(self)
 
     def close(self) -> None:

@@ -1,69 +1,69 @@
-"""`rclpy.exceptions`: the errors that code written for rclpy catches, with rclpy's bases: none is a ValueError."""
+"""`rclpy.exceptions`: exceptions with the base classes of rclpy; none is a ValueError."""
 
 
 class RosArgumentsError(RuntimeError):
-    """Arguments after `--ros-args` that ROS refuses; in rclpy RCLInvalidROSArgsError or UnknownROSArgsError."""
+    """Invalid arguments after `--ros-args`; in rclpy RCLInvalidROSArgsError or UnknownROSArgsError."""
 
 
 class InvalidHandle(RuntimeError):
-    """Something is used that was destroyed."""
+    """Use of a destroyed object."""
 
 
 class NotInitializedException(Exception):
-    """`rclpy.init` has not been called, or `rclpy.shutdown` has."""
+    """Use before `rclpy.init` or after `rclpy.shutdown`."""
 
 
 class NameValidationException(Exception):
-    """A name is malformed."""
+    """Malformed name."""
 
 
 class InvalidNodeNameException(NameValidationException):
-    """A node's name holds something other than letters, digits and underscores."""
+    """Name of a node with characters other than letters, digits and underscores."""
 
 
 class InvalidNamespaceException(NameValidationException):
-    """A namespace is malformed."""
+    """Malformed namespace."""
 
 
 class InvalidTopicNameException(NameValidationException):
-    """A topic's name is malformed."""
+    """Malformed topic name."""
 
 
 class InvalidServiceNameException(NameValidationException):
-    """A service's name is malformed."""
+    """Malformed service name."""
 
 
 class NodeNameNonExistentError(RuntimeError):
-    """No node of that name is on the wire."""
+    """No node with that name on the network."""
 
 
 class ParameterException(Exception):
-    """Something is wrong with a parameter."""
+    """Base of the exceptions about parameters."""
 
 
 class ParameterNotDeclaredException(ParameterException):
-    """A parameter is used that was not declared."""
+    """Use of a parameter that was not declared."""
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
-    """A parameter is declared twice."""
+    """Second declaration of a parameter."""
 
 
 class ParameterUninitializedException(ParameterException):
-    """A parameter is read that has a type but no value."""
+    """Read of a parameter that has a type but no value."""
 
 
 class ParameterImmutableException(ParameterException):
-    """A read-only parameter is set."""
+    """Change of a read-only parameter."""
 
 
 class InvalidParameterException(ParameterException):
-    """A parameter's name is malformed."""
+    """Malformed parameter name."""
 
 
 class InvalidParameterTypeException(ParameterException):
-    """A value is of another type than the parameter."""
+    """Value of another type than the parameter."""
 
 
 class InvalidParameterValueException(ParameterException):
-    """A value is outside its range, or was refused."""
+    """Value outside its range, or refused by a callback."""

@@ -1,4 +1,4 @@
-"""`rclpy.executors` and `rclpy.timer`: run the callbacks of nodes, one at a time, in the thread that spins."""
+"""`rclpy.executors` and `rclpy.timer`: execution of callbacks, one at a time, in the thread that spins."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from finssim.extensions.ros2.wire import Waiter
 
 
 class Timer(Limited):
-    """Calls back at a fixed period of a clock. Made by `Node.create_timer`.
+    """Timer that calls back at a fixed period of a clock, created by `Node.create_timer`.
 
-    Calls that were missed are left out, and the rhythm is kept.
+    Missed calls are skipped without a shift of phase.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Timer(Limited):
 
     @property
     def timer_period_ns(self) -> int:
-        """Between calls [ns]."""
+        """Period [ns]."""
         return self._period
 
     @timer_period_ns.setter
@@ -41,7 +41,7 @@ class Timer(Limited):
         self._period = int(period)
 
     def take(self) -> Callable[[], Any] | None:
-        """The callback if it is due, and then on to the next time; None if not."""
+        """Return the callback if it is due, and schedule the next call; None if not."""
         if self._cancelled or self.time_until_next_call() > 0:
             return None
         now = self._last = self.clock.tick()
@@ -66,7 +66,7 @@ class Timer(Limited):
         return self._cancelled
 
     def cancel(self) -> None:
-        """Rest."""
+        """Cancel the timer."""
         self._cancelled = True
 
     def reset(self) -> None:
@@ -76,25 +76,25 @@ class Timer(Limited):
         self._next = self._last + self._period
 
 
-# `rclpy.executors`: run the callbacks of nodes, one at a time, in the thread that spins.
+# `rclpy.executors`: execution of callbacks in the thread that spins.
 
 
 LONGEST_WAIT = 0.1
 """Longest sleep [s]: Python handles Ctrl-C only between sleeps."""
 
 MISMATCH_PERIOD = 1.0
-"""Period at which a busy executor looks for peers that do not fit [s]; one without work looks immediately."""
+"""Period at which a busy executor checks for incompatible peers [s]; an idle one checks immediately."""
 
 
 class ExternalShutdownException(Exception):
-    """The context was shut down by another caller while an executor spun."""
+    """Shutdown of the context by another caller while an executor spins."""
 
 
 class SingleThreadedExecutor(Limited):
-    """Runs callbacks one at a time.
+    """Executor that runs callbacks one at a time.
 
     Args:
-        context: Whose nodes; that of `rclpy.init()` where none is given.
+        context: Context of the nodes; None: that of `rclpy.init()`.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -110,7 +110,7 @@ class SingleThreadedExecutor(Limited):
         self._stopped = self._spins = False
 
     def add_node(self, node: Any) -> bool:
-        """Run a node's callbacks too; whether it is new."""
+        """Add a node whose callbacks are run; return whether it is new."""
         if node in self._nodes:
             return False
         self._nodes.append(node)
@@ -118,20 +118,20 @@ class SingleThreadedExecutor(Limited):
         return True
 
     def remove_node(self, node: Any) -> None:
-        """Leave a node alone."""
+        """Remove a node."""
         if node in self._nodes:
             self._nodes.remove(node)
 
     def get_nodes(self) -> list[Any]:
-        """The nodes whose callbacks it runs."""
+        """Return the nodes whose callbacks are run."""
         return list(self._nodes)
 
     def wake(self) -> None:
-        """End the current wait; from any thread."""
+        """End the current wait; may be called from any thread."""
         self._waiter.wake()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop spinning. The timeout is in [s] and ignored."""
+        """Stop spinning. The timeout [s] is ignored."""
         self._stopped = True
         self.wake()
         return True
@@ -149,20 +149,20 @@ class SingleThreadedExecutor(Limited):
             raise ExternalShutdownException("SIGTERM came while an executor spun")
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run one callback, waiting for it if need be.
+        """Run one callback, waiting for it if necessary.
 
         Args:
-            timeout_sec: Longest wait [s]; for ever where it is None or negative.
+            timeout_sec: Longest wait [s]; infinite if None or negative.
 
         Raises:
             ExternalShutdownException: The context was shut down while waiting.
-            RuntimeError: It spins already, as within a callback.
+            RuntimeError: The executor is already spinning, as within a callback.
         """
         with self._spinning():
             self._spin_once(timeout_sec)
 
     def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
-        """Run callbacks until an answer has come, or a time has passed [s]."""
+        """Run callbacks until a future is done, or a time has passed [s]."""
         end = float("inf") if timeout_sec is None or timeout_sec < 0 else time.monotonic() + timeout_sec
         future.add_done_callback(lambda _: self.wake())
         with self._spinning():
@@ -197,17 +197,18 @@ class SingleThreadedExecutor(Limited):
             work()
 
     def _search(self) -> Callable[[], Any] | None:
-        """Begin a new round over everything that may have work; the first that has."""
+        """Begin a new round over everything that may have work; return the first work."""
         if not self.context.ok():
             raise ExternalShutdownException("the context was shut down while an executor spun")
         self._round = self._work()
         return next(self._round, None)
 
     def _work(self) -> Iterator[Callable[[], Any]]:
-        """One piece of work from each that has some: timers first, as they were due."""
+        """Yield one piece of work from each object that has some: timers first, in the order in which they
+        were due."""
         for node in list(self._nodes):
             for source in (*sorted(node.timers, key=lambda t: t.time_until_next_call()), *node.takers()):
-                # Between two pieces anything may have left: the node this executor, or the context the wire.
+                # Between two pieces, a node may have left this executor, or the context the network.
                 if node not in self._nodes or not self.context.ok():
                     break
                 work = source.take()
@@ -215,7 +216,7 @@ class SingleThreadedExecutor(Limited):
                     yield work
 
     def _wait(self, longest: float) -> bool:
-        """Sleep until something happens, a timer is due or `longest` [s] has passed; whether anything happened."""
+        """Sleep until an event, a due timer or for `longest` [s]; return whether there was an event."""
         key = (self.context.changes, tuple(id(node) for node in self._nodes))
         if key != self._watching:
             self._waiter.watch(wire for node in self._nodes for end in node.endpoints() for wire in end.wires)

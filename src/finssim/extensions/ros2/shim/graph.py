@@ -1,4 +1,4 @@
-"""`rclpy.topic_endpoint_info`, `rclpy.type_hash`, and the part of a node that looks at the graph."""
+"""`rclpy.topic_endpoint_info`, `rclpy.type_hash`, and the graph queries of a node."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from finssim.extensions.ros2.shim.time import Duration
 from finssim.extensions.ros2.wire import EndpointRecord, NodeRecord, ros_type_name
 
 UNKNOWN_NODE, UNKNOWN_NAMESPACE = "_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"
-"""Names, as in rmw, of the node of an endpoint that no node list contains."""
+"""Names, as in rmw, for the node of an endpoint that is in no node list."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class TypeHash:
     """Hash of a type's definition."""
 
     version: int = -1
-    """1 for RIHS01, -1 where the endpoint gives none."""
+    """1 for RIHS01, -1 if the endpoint announces none."""
     value: bytes = bytes(32)
 
     def __str__(self) -> str:
@@ -57,7 +57,7 @@ class TopicEndpointInfo:
 
 
 Named = list[tuple[str, list[str]]]
-"""Names of topics or services with their types."""
+"""Names of topics or services, each with its types."""
 
 KINDS = {
     TopicEndpointTypeEnum.PUBLISHER: "publications",
@@ -66,7 +66,7 @@ KINDS = {
 
 
 class NodeGraph:
-    """The part of `Node` that looks at the graph."""
+    """Part of `Node` with the graph queries."""
 
     context: Any
     _name: str
@@ -74,35 +74,35 @@ class NodeGraph:
     resolve_topic_name: Callable[..., str]
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Return every node on the wire, this one among them."""
+        """Return every node on the network, including this one."""
         return sorted((node.name, node.namespace) for node in self.context.participant.nodes())
 
     def get_node_names(self) -> list[str]:
-        """Return the names of every node on the wire."""
+        """Return the names of all nodes on the network."""
         return [name for name, _ in self.get_node_names_and_namespaces()]
 
     def count_publishers(self, topic_name: str) -> int:
-        """Count the publishers that are known on a topic."""
+        """Count the known publishers of a topic."""
         return self._count("publications", "rt", topic_name)
 
     def count_subscribers(self, topic_name: str) -> int:
-        """Count the subscriptions that are known on a topic."""
+        """Count the known subscriptions of a topic."""
         return self._count("subscriptions", "rt", topic_name)
 
     def count_services(self, service_name: str) -> int:
-        """Count the servers that are known of a service."""
+        """Count the known servers of a service."""
         return self._count("subscriptions", "rq", service_name, "Request")
 
     def count_clients(self, service_name: str) -> int:
-        """Count the clients that are known of a service."""
+        """Count the known clients of a service."""
         return self._count("publications", "rq", service_name, "Request")
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> Named:
-        """Return every topic on the wire with its types; with `no_demangle` under their names in DDS."""
+        """Return every topic on the network with its types; with `no_demangle` under their DDS names."""
         return _named(self._every("publications", "subscriptions"), no_demangle)
 
     def get_service_names_and_types(self) -> Named:
-        """Return every service on the wire with its types."""
+        """Return every service on the network with its types."""
         return _services(self._every("subscriptions"))
 
     def get_publishers_info_by_topic(
@@ -134,7 +134,7 @@ class NodeGraph:
         return _services(self._of(node_name, node_namespace, "subscriptions"))
 
     def get_client_names_and_types_by_node(self, node_name: str, node_namespace: str) -> Named:
-        """Return the services that a node asks, with their types."""
+        """Return the services of which a node is a client, with their types."""
         return _services(self._of(node_name, node_namespace, "publications"))
 
     def _every(self, *kinds: str) -> Iterator[EndpointRecord]:
@@ -145,7 +145,7 @@ class NodeGraph:
         return sum(end.topic == full for end in self._every(kind))
 
     def _of(self, name: str, namespace: str, kind: str) -> Iterator[EndpointRecord]:
-        """Endpoints of one node."""
+        """Return the endpoints of one node."""
         nodes = [
             node
             for node in self.context.participant.nodes()
@@ -176,7 +176,7 @@ class NodeGraph:
 
 
 def _named(ends: Iterable[EndpointRecord], raw: bool) -> Named:
-    """Topics and their types."""
+    """Return topics and their types."""
     return _sorted(
         (end.topic, end.dds_type) if raw else (end.topic[2:], ros_type_name(end.dds_type))
         for end in ends
@@ -185,7 +185,7 @@ def _named(ends: Iterable[EndpointRecord], raw: bool) -> Named:
 
 
 def _services(ends: Iterable[EndpointRecord]) -> Named:
-    """Services and their types, from the halves that carry requests."""
+    """Return services and their types, from the topics of requests."""
     return _sorted(
         (end.topic[2:].removesuffix("Request"), ros_type_name(end.dds_type).removesuffix("_Request"))
         for end in ends
@@ -201,13 +201,13 @@ def _sorted(pairs: Iterable[tuple[str, str]]) -> Named:
 
 
 def _hash(user_data: bytes) -> TypeHash:
-    """Hash in an endpoint's user data."""
+    """Return the hash in an endpoint's user data."""
     _, found, digits = user_data.partition(b"typehash=RIHS01_")
     return TypeHash(1, bytes.fromhex(digits[:64].decode())) if found else TypeHash()
 
 
 def _profile(end: EndpointRecord) -> QoSProfile:
-    """Policies of an endpoint as rclpy has them."""
+    """Return the policies of an endpoint in the form of rclpy."""
     quality = end.quality
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST if quality.depth else HistoryPolicy.KEEP_ALL,
@@ -221,5 +221,5 @@ def _profile(end: EndpointRecord) -> QoSProfile:
 
 
 def _span(seconds: float) -> Duration:
-    """Duration of a policy; no limit is `Infinite`."""
+    """Return the duration of a policy; no limit is `Infinite`."""
     return Duration(nanoseconds=round(seconds * 1e9) if seconds else 2**63 - 1)

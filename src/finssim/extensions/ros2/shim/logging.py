@@ -1,4 +1,4 @@
-"""`rclpy.logging`: lines on standard error in the form of ROS 2."""
+"""`rclpy.logging`: log lines on standard error in the format of ROS 2."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ class LoggingSeverity(IntEnum):
 
 
 SUPPORTED = ("throttle_duration_sec", "throttle_time_source_type", "skip_first", "once")
-"""Conditions of a call."""
+"""Supported conditions of a log call."""
 
 
 @dataclass
 class _Site:
-    """One call in the program: what it was called with first, which it has to keep, and what became of it."""
+    """State of one log call in the program: its first arguments, which must not change, and its history."""
 
     severity: LoggingSeverity
     when: dict[str, Any]
     skipped: bool = False
     shown: bool = False
     last: float = -math.inf
-    """When it was due last, by the conditions [s]."""
+    """Time at which it was last due by its conditions [s]."""
 
 
 _levels: dict[str, LoggingSeverity] = {"": LoggingSeverity.INFO}
 
 
 class RcutilsLogger:
-    """A named logger; names are dotted, and a level holds for all below it."""
+    """Named logger; names are dotted, and a level applies to all loggers below."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._sites: dict[tuple[str, str, int, int], _Site] = {}
 
     def get_child(self, name: str) -> RcutilsLogger:
-        """The logger below this one."""
+        """Return the child logger with a name."""
         if not name:
             raise ValueError("the logger below this one has no name: give one")
         return get_logger(f"{self.name}.{name}" if self.name else name)
 
     def set_level(self, level: int) -> None:
-        """The least grave lines shown."""
+        """Set the lowest severity that is shown."""
         set_logger_level(self.name, level)
 
     def get_effective_level(self) -> LoggingSeverity:
-        """The level set here or above."""
+        """Return the level set here or in the nearest parent."""
         return get_logger_effective_level(self.name)
 
     def is_enabled_for(self, severity: int) -> bool:
@@ -69,16 +69,16 @@ class RcutilsLogger:
         """Write a line.
 
         Args:
-            message: What happened.
+            message: Text.
             severity: A `LoggingSeverity`.
-            **when: `once`, `skip_first` or `throttle_duration_sec`, each counted by call in the program.
+            **when: `once`, `skip_first` or `throttle_duration_sec`, counted for each call in the program.
 
         Returns:
             Whether it was shown.
 
         Raises:
             ValueError: The same call in the program had another severity or other conditions before, as in rclpy.
-            TypeError: An unknown condition, or a message that is no str.
+            TypeError: A condition is unknown, or the message is not a str.
         """
         severity = LoggingSeverity(severity)
         if not isinstance(message, str):
@@ -90,7 +90,7 @@ class RcutilsLogger:
         return True
 
     def _site(self, severity: LoggingSeverity, when: dict[str, Any]) -> _Site:
-        """The call in the program that has led here; two on one line are two."""
+        """Return the state of the calling statement; two calls on one line are distinct."""
         unknown = set(when) - set(SUPPORTED)
         if unknown:
             raise TypeError(f"a log line takes {', '.join(SUPPORTED)}, found '{min(unknown)}'")
@@ -110,11 +110,11 @@ class RcutilsLogger:
         return site
 
     def debug(self, message: str, **when: Any) -> bool:
-        """Log a line for debugging."""
+        """Log a debug message."""
         return self.log(message, LoggingSeverity.DEBUG, **when)
 
     def info(self, message: str, **when: Any) -> bool:
-        """Log a line for information."""
+        """Log an informational message."""
         return self.log(message, LoggingSeverity.INFO, **when)
 
     def warning(self, message: str, **when: Any) -> bool:
@@ -124,16 +124,16 @@ class RcutilsLogger:
     warn = warning
 
     def error(self, message: str, **when: Any) -> bool:
-        """Something does not work."""
+        """Log an error."""
         return self.log(message, LoggingSeverity.ERROR, **when)
 
     def fatal(self, message: str, **when: Any) -> bool:
-        """Nothing works."""
+        """Log a fatal error."""
         return self.log(message, LoggingSeverity.FATAL, **when)
 
 
 def _due(site: _Site) -> bool:
-    """Return whether the conditions of a call let it through this time; in the order of rclpy."""
+    """Return whether the conditions of a call are met this time, evaluated in the order of rclpy."""
     now = time.monotonic()
     if now < site.last + site.when.get("throttle_duration_sec", 0.0):
         return False
@@ -148,17 +148,17 @@ def _due(site: _Site) -> bool:
 
 
 def get_logger(name: str) -> RcutilsLogger:
-    """Return a logger of a name; each logger counts the conditions of calls separately, as in rclpy."""
+    """Return a logger with a name; each logger counts the conditions of calls separately, as in rclpy."""
     return RcutilsLogger(name)
 
 
 def set_logger_level(name: str, level: int) -> None:
-    """The least grave lines that a logger and those below it show; "" is all."""
+    """Set the lowest severity that a logger and those below it show; "" is the root."""
     _levels[name] = LoggingSeverity(level)
 
 
 def get_logger_effective_level(name: str) -> LoggingSeverity:
-    """The level that holds for a logger."""
+    """Return the level that applies to a logger."""
     while name and _levels.get(name, LoggingSeverity.UNSET) == LoggingSeverity.UNSET:
         name = name.rpartition(".")[0]
     return _levels[name]

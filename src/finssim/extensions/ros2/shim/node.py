@@ -1,4 +1,4 @@
-"""`rclpy.node`: a node: its names, its endpoints, its clock, its parameters."""
+"""`rclpy.node`: nodes with names, endpoints, clock and parameters."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from finssim.extensions.ros2.shim.qos import (
 from finssim.extensions.ros2.shim.time import Clock, ROSClock, Time
 from finssim.extensions.ros2.wire import NodeRecord
 
-# Simulated time: the topic /clock drives a node's clock where its parameter `use_sim_time` is true.
+# Simulated time: the topic /clock drives a node's clock if its parameter `use_sim_time` is true.
 
 
 class TimeSource:
-    """Declares `use_sim_time` on a node and feeds its clock."""
+    """Time source that declares `use_sim_time` on a node and sets its clock."""
 
     def __init__(self, node: Any, clock: ROSClock) -> None:
         self._node, self._clock, self._subscription = node, clock, None
@@ -51,7 +51,7 @@ class TimeSource:
         self.use_simulated(bool(node.get_parameter("use_sim_time").value))
 
     def use_simulated(self, simulated: bool) -> None:
-        """Follow /clock, or the system's time."""
+        """Follow /clock, or the system time."""
         if simulated == self._clock.ros_time_is_active:
             return
         self._clock.ros_time_is_active = simulated
@@ -69,24 +69,24 @@ class TimeSource:
         self._clock.set_ros_time_override(Time.from_msg(message.clock))
 
 
-# `rclpy.node`: a node: its names, its endpoints, its clock, its parameters.
+# Node.
 
 
 Made = TypeVar("Made", bound=Endpoint)
 
 
 class Node(NodeParameters, NodeGraph, Limited):
-    """A node.
+    """Node.
 
     Args:
-        node_name: Its name, unless the command line renames it.
-        context: What it belongs to; that of `rclpy.init()` where none is given.
+        node_name: Name, unless the command line renames it.
+        context: Context; None: that of `rclpy.init()`.
         cli_args: Arguments for this node alone, with `--ros-args`.
-        namespace: What its relative names stand below.
-        use_global_arguments: Whether the process's command line counts too.
-        parameter_overrides: Values that win over files and command line.
-        start_parameter_services: Whether `ros2 param` reaches it.
-        **services: `enable_rosout` and `enable_logger_service` are accepted; the shim has neither.
+        namespace: Namespace of relative names.
+        use_global_arguments: True if the process's command line applies too.
+        parameter_overrides: Values that override files and command line.
+        start_parameter_services: True to offer the services that `ros2 param` uses.
+        **services: `enable_rosout` and `enable_logger_service` are accepted but have no effect.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         self._rules = [rule for source in reversed(sources) for rule in source.remaps]
         self._name, self._namespace = self._named(node_name, namespace or "")
         self._logger = get_logger(self.get_fully_qualified_name().strip("/").replace("/", "."))
-        self.context.participant.codec  # noqa: B018 - refuses a context that is not initialized, before anything else
+        self.context.participant.codec  # noqa: B018 - raises if the context is not initialized, before anything else
         self._timers: list[Timer] = []
         self._ends: list[Any] = []
         overrides: dict[str, Any] = {}
@@ -136,47 +136,47 @@ class Node(NodeParameters, NodeGraph, Limited):
 
     @property
     def timers(self) -> Iterator[Timer]:
-        """Its timers; like the properties below, not to be assigned to."""
+        """Yield its timers; this property and those below are read-only."""
         yield from self._timers
 
     @property
     def publishers(self) -> Iterator[Publisher]:
-        """Its publishers."""
+        """Yield its publishers."""
         yield from (end for end in self._ends if isinstance(end, Publisher))
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Its subscriptions."""
+        """Yield its subscriptions."""
         yield from (end for end in self._ends if isinstance(end, Subscription))
 
     @property
     def services(self) -> Iterator[Service]:
-        """Its services."""
+        """Yield its services."""
         yield from (end for end in self._ends if isinstance(end, Service))
 
     @property
     def clients(self) -> Iterator[Client]:
-        """Its clients."""
+        """Yield its clients."""
         yield from (end for end in self._ends if isinstance(end, Client))
 
     def get_name(self) -> str:
-        """Its name."""
+        """Return its name."""
         return self._name
 
     def get_namespace(self) -> str:
-        """Its namespace, with a leading slash."""
+        """Return its namespace, with a leading slash."""
         return self._namespace
 
     def get_fully_qualified_name(self) -> str:
-        """Namespace and name."""
+        """Return namespace and name."""
         return full_node_name(self._name, self._namespace)
 
     def get_logger(self) -> RcutilsLogger:
-        """Its logger, named by namespace and name with dots."""
+        """Return its logger, named by namespace and name with dots."""
         return self._logger
 
     def get_clock(self) -> ROSClock:
-        """Its clock: system time, or that of /clock where the parameter `use_sim_time` is true."""
+        """Return its clock: system time, or that of /clock if the parameter `use_sim_time` is true."""
         return self._clock
 
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
@@ -186,7 +186,7 @@ class Node(NodeParameters, NodeGraph, Limited):
     resolve_service_name = resolve_topic_name
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
-        """A publisher; `qos_profile` is a `QoSProfile` or a depth."""
+        """Create a publisher; `qos_profile` is a `QoSProfile` or a depth."""
         _check_options(options)
         return self._added(Publisher(self, msg_type, topic, qos_profile))
 
@@ -201,7 +201,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         event_callbacks: SubscriptionEventCallbacks | None = None,
         **options: Any,
     ) -> Subscription:
-        """A subscription; with `raw` the callback gets CDR bytes."""
+        """Create a subscription; with `raw` the callback gets CDR bytes."""
         _check_options(options)
         return self._added(Subscription(self, msg_type, topic, callback, qos_profile, raw, event_callbacks))
 
@@ -214,14 +214,14 @@ class Node(NodeParameters, NodeGraph, Limited):
         qos_profile: Any = qos_profile_services_default,
         **options: Any,
     ) -> Service:
-        """A service; the callback fills in and returns the response it is given."""
+        """Create a service; the callback fills in and returns the response object that it gets."""
         _check_options(options)
         return self._added(Service(self, srv_type, srv_name, callback, qos_profile))
 
     def create_client(
         self, srv_type: Any, srv_name: str, *, qos_profile: Any = qos_profile_services_default, **options: Any
     ) -> Client:
-        """A client of a service."""
+        """Create a client of a service."""
         _check_options(options)
         return self._added(Client(self, srv_type, srv_name, qos_profile))
 
@@ -233,37 +233,37 @@ class Node(NodeParameters, NodeGraph, Limited):
         clock: Clock | None = None,
         autostart: bool = True,
     ) -> Timer:
-        """A timer with a period [s] of the node's clock, or of another."""
+        """Create a timer with a period [s] of the node's clock, or of another."""
         timer = Timer(callback, int(timer_period_sec * 1e9), clock or self._clock, autostart=autostart)
         self._timers.append(timer)
         self.context.wake()
         return timer
 
     def destroy_timer(self, timer: Timer) -> bool:
-        """Remove a timer; whether it was the node's."""
+        """Destroy a timer; return whether it was the node's."""
         present = timer in self._timers
         timer.cancel()
         self._timers = [t for t in self._timers if t is not timer]
         return present
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
-        """Remove a publisher; whether it was the node's."""
+        """Destroy a publisher; return whether it was the node's."""
         return self._removed(publisher)
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
-        """Remove a subscription; whether it was the node's."""
+        """Destroy a subscription; return whether it was the node's."""
         return self._removed(subscription)
 
     def destroy_service(self, service: Service) -> bool:
-        """Remove a service; whether it was the node's."""
+        """Destroy a service; return whether it was the node's."""
         return self._removed(service)
 
     def destroy_client(self, client: Client) -> bool:
-        """Remove a client; whether it was the node's."""
+        """Destroy a client; return whether it was the node's."""
         return self._removed(client)
 
     def destroy_node(self) -> None:
-        """Remove the node with all it has."""
+        """Destroy the node with its timers and endpoints."""
         for timer in self._timers:
             timer.cancel()
         self._timers = []
@@ -275,7 +275,7 @@ class Node(NodeParameters, NodeGraph, Limited):
             self.context.announce()
 
     def endpoints(self) -> list[Any]:
-        """Publishers, subscriptions, services and clients."""
+        """Return publishers, subscriptions, services and clients."""
         return list(self._ends)
 
     def takers(self) -> Iterator[Any]:
@@ -283,7 +283,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         return (end for end in list(self._ends) if not isinstance(end, Publisher))
 
     def record(self) -> NodeRecord:
-        """The node as the node list has it."""
+        """Return the node's entry in the node list."""
         wires = [wire for end in self._ends for wire in end.wires]
         return NodeRecord(
             self._name,
@@ -293,7 +293,7 @@ class Node(NodeParameters, NodeGraph, Limited):
         )
 
     def _named(self, name: str, namespace: str) -> tuple[str, str]:
-        """Name and namespace after the rules `__node` and `__ns`, checked."""
+        """Return name and namespace after the remapping rules `__node` and `__ns`, checked."""
         rules = [rule for rule in self._rules if rule.node in ("", name)]
         namespace = next((r.target for r in rules if r.source == "__ns"), namespace)
         name = next((r.target for r in rules if r.source in ("__node", "__name")), name)
@@ -334,7 +334,7 @@ class Node(NodeParameters, NodeGraph, Limited):
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    """Callback groups are met anyway; everything else would be ignored, so it is refused."""
+    """Refuse options that would be ignored; callback groups are satisfied in any case."""
     unknown = set(options) - {"callback_group"}
     if unknown:
         raise TypeError(f"'{min(unknown)}' needs a sourced ROS 2: omit it")

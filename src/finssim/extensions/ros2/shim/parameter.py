@@ -1,4 +1,4 @@
-"""`rclpy.parameter`, the parameters of a node, and the services by which `ros2 param` lists, reads and sets them."""
+"""`rclpy.parameter`, the parameters of a node, and the services that `ros2 param` uses to list, read and set them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PARAMETER_SEPARATOR_STRING = DOT = "."
 
 
 class _ParameterType(Enum):
-    """Types of parameters, numbered as in rcl_interfaces; no integers, as in rclpy."""
+    """Types of parameters, numbered as in rcl_interfaces; not integers, as in rclpy."""
 
     NOT_SET = 0
     BOOL = 1
@@ -39,10 +39,10 @@ class _ParameterType(Enum):
 
     @classmethod
     def from_parameter_value(cls, value: Any) -> _ParameterType:
-        """The type of a Python value; lists are of one type throughout, and an empty one is of bytes.
+        """Return the type of a Python value; lists have elements of one type, and an empty list is of bytes.
 
         Raises:
-            TypeError: A value that no parameter can hold.
+            TypeError: The value cannot be a parameter.
         """
         if value is None:
             return cls.NOT_SET
@@ -81,15 +81,15 @@ _KINDS = (
 
 
 class Parameter:
-    """A name, a type and a value, none of which changes.
+    """Parameter with name, type and value; immutable.
 
     Args:
-        name: As declared.
-        type_: That of the value where it is left out.
-        value: What it holds.
+        name: Declared name.
+        type_: Type; None: that of the value.
+        value: Value.
 
     Raises:
-        TypeError: A value that no parameter can hold, or `type_` is no `Parameter.Type`.
+        TypeError: The value cannot be a parameter, or `type_` is not a `Parameter.Type`.
         ValueError: Value and type disagree.
     """
 
@@ -124,14 +124,14 @@ class Parameter:
         return f"Parameter(name={self.name!r}, type_={self.type_.name}, value={self.value!r})"
 
     def get_parameter_value(self) -> Any:
-        """Return it as rcl_interfaces/ParameterValue."""
+        """Return the value as rcl_interfaces/ParameterValue."""
         message = codec_of().message("rcl_interfaces/msg/ParameterValue")(type=self.type_.value)
         if self.type_ is not _ParameterType.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)
         return message
 
     def to_parameter_msg(self) -> Any:
-        """Return it as rcl_interfaces/Parameter."""
+        """Return the parameter as rcl_interfaces/Parameter."""
         cls = codec_of().message("rcl_interfaces/msg/Parameter")
         return cls(name=self.name, value=self.get_parameter_value())
 
@@ -152,7 +152,7 @@ def parameter_value_to_python(message: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-# `rclpy.parameter_service`: the services by which `ros2 param` lists, reads and sets a node's parameters.
+# `rclpy.parameter_service`: services that `ros2 param` uses to list, read and set a node's parameters.
 
 
 NAMES = (
@@ -166,7 +166,7 @@ NAMES = (
 
 
 class ParameterService:
-    """The six services of one node; what they refuse they say in the answer, as rclpy's do."""
+    """Six parameter services of one node; refusals are part of the response, as in rclpy."""
 
     def __init__(self, node: Any) -> None:
         self._node = node
@@ -183,7 +183,7 @@ class ParameterService:
         try:
             response.descriptors = self._node.describe_parameters(request.names)
         except ParameterNotDeclaredException:
-            pass  # nothing at all, as in rclpy
+            pass  # an empty response, as in rclpy
         return response
 
     def _get_parameters(self, request: Any, response: Any) -> Any:
@@ -220,21 +220,21 @@ class ParameterService:
             return result(successful=False, reason=str(error))
 
 
-# The parameters of a node: declared with a default, overridden by file and command line, checked when set.
+# Parameters of a node: declared with a default, overridden by file and command line, checked when set.
 
 
 Kind = Parameter.Type
 SetCallback = Callable[[list[Parameter]], Any]
 
 CLOSE = 1e-6
-"""Relative tolerance at the ends of a range and at its steps, as in rclpy."""
+"""Relative tolerance at the ends and steps of a range, as in rclpy."""
 
 
 class NodeParameters:
-    """The part of `Node` that holds parameters.
+    """Part of `Node` with the parameters.
 
     Args:
-        overrides: Values given from outside, by name.
+        overrides: Values from files and command line, by name.
     """
 
     def __init__(self, overrides: Mapping[str, Any]) -> None:
@@ -250,17 +250,17 @@ class NodeParameters:
 
         Args:
             name: Its name.
-            value: Default, or a `Parameter.Type` where a value must come from outside.
+            value: Default, or a `Parameter.Type` if a file or the command line must set a value.
             descriptor: rcl_interfaces/ParameterDescriptor: range, read-only, dynamic typing.
-            ignore_override: Keep the default whatever is given from outside.
+            ignore_override: True to ignore values of files and command line.
 
         Raises:
-            InvalidParameterException: No name.
-            ParameterAlreadyDeclaredException: It is declared.
-            InvalidParameterTypeException: The value from outside is of another type.
-            InvalidParameterValueException: The value, from outside or not, is out of its range or was refused.
-            TypeError: A default that no parameter can hold, or a descriptor that is none.
-            ValueError: No default, though the type is fixed; or a type that is given twice.
+            InvalidParameterException: The name is empty.
+            ParameterAlreadyDeclaredException: The parameter is already declared.
+            InvalidParameterTypeException: The override is of another type.
+            InvalidParameterValueException: The value is out of range or was refused.
+            TypeError: The default cannot be a parameter, or the descriptor is not a ParameterDescriptor.
+            ValueError: There is no default although the type is fixed, or the type is given twice.
         """
         described = codec_of().message("rcl_interfaces/msg/ParameterDescriptor")
         if not isinstance(name, str):
@@ -302,7 +302,7 @@ class NodeParameters:
     def declare_parameters(
         self, namespace: str, parameters: Sequence[tuple[Any, ...]], ignore_override: bool = False
     ) -> list[Parameter]:
-        """Declare several as (name, value, descriptor), their names below `namespace` if it is not empty."""
+        """Declare several parameters as (name, value, descriptor), with names below `namespace` if it is not empty."""
         prefix = f"{namespace}{DOT}" if namespace else ""
         if not all(1 <= len(entry) <= 3 for entry in parameters):
             raise TypeError("each parameter is (name,), (name, value) or (name, value, descriptor)")
@@ -312,25 +312,26 @@ class NodeParameters:
         ]
 
     def undeclare_parameter(self, name: str) -> None:
-        """Forget a parameter.
+        """Remove a parameter.
 
         Raises:
-            ParameterNotDeclaredException, ParameterImmutableException: It is not declared, or read-only.
+            ParameterNotDeclaredException: The parameter is not declared.
+            ParameterImmutableException: The parameter is read-only.
         """
         if self._declared(name).read_only:
             raise ParameterImmutableException(f"parameter '{name}' is read-only: it stays")
         del self._values[name], self._descriptors[name]
 
     def has_parameter(self, name: str) -> bool:
-        """Return whether it is declared."""
+        """Return whether a parameter is declared."""
         return name in self._values
 
     def get_parameter(self, name: str) -> Parameter:
-        """A parameter.
+        """Return a parameter.
 
         Raises:
-            ParameterNotDeclaredException: It is not declared.
-            ParameterUninitializedException: It has a type but no value.
+            ParameterNotDeclaredException: The parameter is not declared.
+            ParameterUninitializedException: The parameter has a type but no value.
         """
         dynamic = self._declared(name).dynamic_typing
         parameter = self._values[name]
@@ -341,30 +342,31 @@ class NodeParameters:
         return parameter
 
     def get_parameters(self, names: Sequence[str]) -> list[Parameter]:
-        """Several parameters."""
+        """Return several parameters."""
         return [self.get_parameter(name) for name in names]
 
     def get_parameter_or(self, name: str, alternative: Parameter | None = None) -> Parameter:
-        """A parameter, or another where it is not declared or has no value."""
+        """Return a parameter, or an alternative if it is not declared or has no value."""
         value = self._values.get(name)
         if value is None or value.type_ is Kind.NOT_SET:
             return alternative or Parameter(name)
         return value
 
     def get_parameter_type(self, name: str) -> Any:
-        """Number of its type."""
+        """Return the number of a parameter's type."""
         self._declared(name)
         return self._values[name].type_.value
 
     def get_parameter_types(self, names: Sequence[str]) -> list[Any]:
-        """Numbers of several types."""
+        """Return the numbers of several parameters' types."""
         return [self.get_parameter_type(name) for name in names]
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
-        """Names down to a depth (0: all) below prefixes (none: everywhere), as rcl_interfaces/ListParametersResult.
+        """Return names down to a depth (0: all) below prefixes (none: all), as rcl_interfaces/ListParametersResult.
 
         Raises:
-            TypeError, ValueError: Prefixes that are no list of str, or a depth that is negative or no int.
+            TypeError: The prefixes are not a list of str, or the depth is not an int.
+            ValueError: The depth is negative.
         """
         if not isinstance(prefixes, list) or not all(isinstance(p, str) for p in prefixes):
             raise TypeError("the prefixes must be a list of str")
@@ -386,18 +388,18 @@ class NodeParameters:
         )
 
     def set_parameters(self, parameters: Sequence[Parameter]) -> list[Any]:
-        """Set each on its own; gives a rcl_interfaces/SetParametersResult for each.
+        """Set each parameter separately; return a rcl_interfaces/SetParametersResult for each.
 
         Raises:
-            ParameterNotDeclaredException: One is not declared; those before it are set.
+            ParameterNotDeclaredException: A parameter is not declared; those before it are set.
         """
         return [self.set_parameters_atomically([parameter]) for parameter in parameters]
 
     def set_parameters_atomically(self, parameters: Sequence[Parameter]) -> Any:
-        """Set all or none; gives a rcl_interfaces/SetParametersResult. A value of None undeclares.
+        """Set all or none; return a rcl_interfaces/SetParametersResult. A value of None undeclares.
 
         Raises:
-            ParameterNotDeclaredException: One is not declared.
+            ParameterNotDeclaredException: A parameter is not declared.
         """
         if not all(isinstance(parameter, Parameter) for parameter in parameters):
             raise TypeError("only a Parameter can be set")
@@ -409,28 +411,28 @@ class NodeParameters:
         )
 
     def describe_parameter(self, name: str) -> Any:
-        """Its rcl_interfaces/ParameterDescriptor."""
+        """Return a parameter's rcl_interfaces/ParameterDescriptor."""
         return self._declared(name)
 
     def describe_parameters(self, names: Sequence[str]) -> list[Any]:
-        """Several descriptors."""
+        """Return several descriptors."""
         return [self.describe_parameter(name) for name in names]
 
     def add_on_set_parameters_callback(self, callback: SetCallback) -> None:
-        """Ask this before parameters are set; it gives a rcl_interfaces/SetParametersResult."""
+        """Register a callback that checks new values and returns a rcl_interfaces/SetParametersResult."""
         self._callbacks.insert(0, callback)
 
     def remove_on_set_parameters_callback(self, callback: SetCallback) -> None:
-        """Ask no more."""
+        """Remove a callback."""
         self._callbacks.remove(callback)
 
     def _parameters_changed(
         self, new: list[Parameter], changed: list[Parameter], removed: list[Parameter]
     ) -> None:
-        """Parameters have been declared, set and undeclared."""
+        """React to parameters that were declared, set or undeclared."""
 
     def _declared(self, name: str) -> Any:
-        """The descriptor of a declared parameter."""
+        """Return the descriptor of a declared parameter."""
         if name not in self._values:
             raise ParameterNotDeclaredException(
                 f"parameter '{name}' is not declared: declare it before it is used"
@@ -438,7 +440,7 @@ class NodeParameters:
         return self._descriptors[name]
 
     def _set(self, parameters: list[Parameter], descriptors: Mapping[str, Any] | None = None) -> str:
-        """Set all, or none and say why; with descriptors they are declared thereby."""
+        """Set all parameters, or none and return the reason; with descriptors, declare them."""
         for parameter in parameters:
             name = parameter.name
             descriptor = (self._descriptors if descriptors is None else descriptors).get(name)
@@ -490,7 +492,7 @@ class NodeParameters:
 
 
 def _outside(value: float, limits: Any, close: float) -> str:
-    """Return why a number is outside of a range; its ends are always inside."""
+    """Return the reason why a number is outside a range; its ends always count as inside."""
     low, high = sorted((limits.from_value, limits.to_value))
     if any(math.isclose(value, end, rel_tol=close, abs_tol=0.0) for end in (low, high)):
         return ""

@@ -10,7 +10,7 @@ from finssim.extensions.ros2.wire import Quality
 
 
 class HistoryPolicy(IntEnum):
-    """Policy of kept samples."""
+    """Policy of the number of stored samples."""
 
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
@@ -18,7 +18,7 @@ class HistoryPolicy(IntEnum):
 
 
 class ReliabilityPolicy(IntEnum):
-    """Policy of repeating lost samples."""
+    """Policy of resending lost samples."""
 
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
@@ -26,7 +26,7 @@ class ReliabilityPolicy(IntEnum):
 
 
 class DurabilityPolicy(IntEnum):
-    """Policy of earlier samples for readers that come late."""
+    """Policy of earlier samples for late readers."""
 
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
@@ -34,7 +34,7 @@ class DurabilityPolicy(IntEnum):
 
 
 class LivelinessPolicy(IntEnum):
-    """Policy of reporting that a writer is alive; only the automatic one."""
+    """Policy of liveliness; only automatic is supported."""
 
     SYSTEM_DEFAULT = 0
     AUTOMATIC = 1
@@ -45,7 +45,7 @@ QoSDurabilityPolicy, QoSLivelinessPolicy = DurabilityPolicy, LivelinessPolicy
 
 
 class InvalidQoSProfileException(Exception):
-    """A profile without a depth."""
+    """Profile without a depth."""
 
 
 POLICIES = {
@@ -57,7 +57,7 @@ POLICIES = {
     "deadline": Duration(),
     "liveliness": LivelinessPolicy.SYSTEM_DEFAULT,
 }
-"""Policy -> default (rmw_qos_profile_default), which has its type."""
+"""Policy -> default (rmw_qos_profile_default), which also determines its type."""
 
 
 class QoSProfile:
@@ -98,10 +98,11 @@ class QoSProfile:
 
 
 def quality_of(profile: QoSProfile | int) -> Quality:
-    """A profile, or a depth alone, as the wire has it.
+    """Return the network policies of a profile or a depth.
 
     Raises:
-        TypeError, ValueError: Neither, or a negative depth.
+        TypeError: The argument is neither a profile nor a depth.
+        ValueError: The depth is negative.
     """
     if isinstance(profile, int):
         if profile < 0:
@@ -126,7 +127,7 @@ qos_profile_parameter_events = QoSProfile(depth=1000)
 
 
 class QoSPresetProfiles(Enum):
-    """The named profiles."""
+    """Named profiles."""
 
     SYSTEM_DEFAULT = qos_profile_system_default
     SENSOR_DATA = qos_profile_sensor_data

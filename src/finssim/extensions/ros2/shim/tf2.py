@@ -1,4 +1,5 @@
-"""`tf2_ros`: poses of frames over time from /tf and /tf_static, and the two broadcasters; names and errors as there."""
+"""`tf2_ros`: poses of frames over time from /tf and /tf_static, and both broadcasters; names and errors as in
+tf2_ros."""
 
 from __future__ import annotations
 
@@ -30,38 +31,38 @@ Pose = tuple[Array, Array]
 
 NONE, CACHE = Duration(), Duration(seconds=10.0)
 UNIT = 0.01
-"""Largest deviation of a quaternion's squared length from 1."""
+"""Largest deviation of a quaternion's squared length from 1 [-]."""
 POLL = 0.02
-"""Between two looks while a lookup waits [s]."""
+"""Polling interval while a lookup waits [s]."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class TransformException(Exception):
-    """A transform cannot be given."""
+    """Base of the exceptions about transforms."""
 
 
 class LookupException(TransformException):
-    """A frame does not exist."""
+    """Unknown frame."""
 
 
 class ConnectivityException(TransformException):
-    """Two frames belong to different trees."""
+    """Two frames in different trees."""
 
 
 class ExtrapolationException(TransformException):
-    """The time lies outside of the known range."""
+    """Time outside the known range."""
 
 
 class InvalidArgumentException(TransformException):
-    """A frame's name or a transform is malformed."""
+    """Malformed frame name or transform."""
 
 
 class TimeoutException(TransformException):
-    """Defined for code that catches it; nothing here raises it."""
+    """Exception that is defined only for code that catches it."""
 
 
 def _times(first: Pose, second: Pose) -> Pose:
-    """Pose of the second pose's frame in the parent of the first."""
+    """Return the pose of the second pose's frame in the parent of the first."""
     position = first[0] + np.asarray(quat_rotate(first[1], second[0]))
     return position, np.asarray(quat_multiply(first[1], second[1]))
 
@@ -76,15 +77,15 @@ IDENTITY: Pose = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 @dataclass
 class _Link:
-    """A frame's parent and pose there, over time; a static one holds at any time."""
+    """Parent of a frame and its pose there, over time; a static one is valid at any time."""
 
     static: bool
     stamps: list[int] = field(default_factory=list)
-    """[ns], increasing; one, of no meaning, if static."""
+    """Stamps [ns], increasing; a single meaningless one if static."""
     samples: list[tuple[str, Pose]] = field(default_factory=list)
 
     def add(self, stamp: int, parent: str, pose: Pose, cache: int) -> bool:
-        """Insert a sample; whether it is recent enough."""
+        """Insert a sample; return whether it is recent enough."""
         if self.static:
             self.stamps, self.samples = [0], [(parent, pose)]
             return True
@@ -98,10 +99,10 @@ class _Link:
         return True
 
     def at(self, stamp: int) -> tuple[str, Pose]:
-        """Parent and pose at a time [ns], linear and spherical between two samples.
+        """Return parent and pose at a time [ns], interpolated linearly and spherically.
 
         Raises:
-            ExtrapolationException: The time lies before the first or after the last sample.
+            ExtrapolationException: The time is before the first or after the last sample.
         """
         if self.static:
             return self.samples[0]
@@ -127,7 +128,7 @@ class Buffer(Limited):
     """Frames and their poses over the last seconds.
 
     Args:
-        cache_time: How long poses are kept; 10 s where none is given.
+        cache_time: Time for which poses are stored; default 10 s.
         node: Accepted as in tf2_ros; the service `tf2_frames` is not offered.
     """
 
@@ -139,16 +140,17 @@ class Buffer(Limited):
         """Add a TransformStamped.
 
         Raises:
-            InvalidArgumentException: A frame without name or in itself, a number that is not finite, no rotation.
+            InvalidArgumentException: A frame has no name or is its own parent, a number is not finite, or the
+                rotation is invalid.
         """
         self._set(transform, static=False)
 
     def set_transform_static(self, transform: Any, authority: str) -> None:
-        """Add a TransformStamped that holds at any time; raises as `set_transform`."""
+        """Add a TransformStamped that is valid at any time; raises as `set_transform`."""
         self._set(transform, static=True)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all transforms."""
         self._links.clear()
 
     def lookup_transform(
@@ -157,13 +159,16 @@ class Buffer(Limited):
         """Return the pose of the source frame in the target frame, as TransformStamped.
 
         Args:
-            target_frame: Frame in which coordinates are wanted.
-            source_frame: Frame in which they are known.
-            time: When; `Time()` is the latest time at which the whole chain is known.
-            timeout: How long to wait for it; only another thread can bring it meanwhile.
+            target_frame: Frame of the resulting coordinates.
+            source_frame: Frame of the given coordinates.
+            time: Time; `Time()` is the latest time at which the complete chain is known.
+            timeout: Longest wait; only another thread can receive transforms meanwhile.
 
         Raises:
-            LookupException, ConnectivityException, ExtrapolationException, InvalidArgumentException: There is none.
+            LookupException: A frame is unknown.
+            ConnectivityException: The frames are not connected.
+            ExtrapolationException: The time is outside the known range.
+            InvalidArgumentException: A name is malformed.
         """
         return self.lookup_transform_full(target_frame, time, source_frame, time, target_frame, timeout)
 
@@ -176,9 +181,9 @@ class Buffer(Limited):
         fixed_frame: str,
         timeout: Duration = NONE,
     ) -> Any:
-        """Return the source frame at one time in the target frame at another, by a frame that does not move.
+        """Return the source frame at one time in the target frame at another, through a fixed frame.
 
-        Arguments and errors are as of `lookup_transform`.
+        Arguments and errors are as in `lookup_transform`.
         """
         later, earlier = _nanoseconds(target_time), _nanoseconds(source_time)
         parts = ((fixed_frame, source_frame, earlier), (target_frame, fixed_frame, later))
@@ -206,7 +211,7 @@ class Buffer(Limited):
         timeout: Duration = NONE,
         return_debug_tuple: bool = False,
     ) -> Any:
-        """Return whether `lookup_transform` has an answer; with `return_debug_tuple` also why not."""
+        """Return whether `lookup_transform` has a result; with `return_debug_tuple` also the reason if not."""
         stamp = _nanoseconds(time)
         self._wait(lambda: self._try(target_frame, source_frame, stamp)[1] == "", timeout)
         _, reason = self._try(target_frame, source_frame, stamp)
@@ -241,7 +246,7 @@ class Buffer(Limited):
             return None, str(error)
 
     def _look(self, target: str, source: str, stamp: int) -> tuple[int, Pose]:
-        """Time, the latest common one for 0, and pose of the source in the target."""
+        """Return the time (the latest common one for 0) and the pose of the source in the target."""
         known = self._links.keys() | {parent for link in self._links.values() for parent, _ in link.samples}
         for argument, frame in (("target_frame", target), ("source_frame", source)):
             if not frame or frame.startswith("/"):
@@ -276,7 +281,8 @@ class Buffer(Limited):
         )
 
     def _chain(self, frame: str, stamp: int) -> tuple[dict[str, Pose], ExtrapolationException | None]:
-        """Pose of a frame in each frame above it at a time, itself first, and why it goes no further up."""
+        """Return a frame's pose in each frame above it at a time, itself first, and the exception that ends
+        the chain."""
         start, pose, poses = frame, IDENTITY, {frame: IDENTITY}
         while frame in self._links:
             try:
@@ -290,7 +296,7 @@ class Buffer(Limited):
         return poses, None
 
     def _way(self, frame: str, newest: Callable[[_Link], int]) -> list[tuple[str, _Link | None]]:
-        """Frames from one up to its root by their newest parents, each with the link above it."""
+        """Return the frames from one up to its root by their newest parents, each with the link above it."""
         way: list[tuple[str, _Link | None]] = []
         while (link := self._links.get(frame)) is not None and frame not in (seen for seen, _ in way):
             way.append((frame, link))
@@ -306,7 +312,7 @@ class Buffer(Limited):
 def _until_common(
     way: list[tuple[str, _Link | None]], other: list[tuple[str, _Link | None]]
 ) -> Iterable[_Link]:
-    """Links of a way below its first frame that is on the other one too."""
+    """Return the links of a chain below the first frame that is also in the other one."""
     shared = {frame for frame, _ in other}
     for frame, link in way:
         if frame in shared or link is None:
@@ -315,7 +321,7 @@ def _until_common(
 
 
 def _nanoseconds(time: Any) -> int:
-    """A `Time` or its message [ns]."""
+    """Return a `Time` or its message in [ns]."""
     if isinstance(time, Time):
         return time.nanoseconds
     if isinstance(time, codec_of().message("builtin_interfaces/msg/Time")):
@@ -324,12 +330,12 @@ def _nanoseconds(time: Any) -> int:
 
 
 class TransformListener:
-    """Fills a buffer from /tf and /tf_static while its node is spun.
+    """Listener that fills a buffer from /tf and /tf_static while its node is spun.
 
     Args:
-        buffer: To be filled.
-        node: That listens.
-        spin_thread: Only False: spin the node yourself.
+        buffer: Buffer to fill.
+        node: Node that subscribes.
+        spin_thread: Only False is supported: spin the node yourself.
         qos: Policies for /tf.
         static_qos: Policies for /tf_static.
     """
@@ -350,7 +356,7 @@ class TransformListener:
         )
 
     def unregister(self) -> None:
-        """Listen no more."""
+        """Destroy the subscriptions."""
         self.node.destroy_subscription(self.tf_sub)
         self.node.destroy_subscription(self.tf_static_sub)
 
@@ -366,11 +372,11 @@ class TransformListener:
 
 
 class TransformBroadcaster:
-    """Publishes poses of frames on /tf.
+    """Publisher of poses of frames on /tf.
 
     Args:
-        node: That publishes.
-        qos: Its policies.
+        node: Node that publishes.
+        qos: Policies of the publisher.
     """
 
     topic, policies = "/tf", QoSProfile(depth=100)
@@ -389,7 +395,7 @@ class TransformBroadcaster:
 
 
 class StaticTransformBroadcaster(TransformBroadcaster):
-    """Publishes poses that hold at any time on /tf_static, each time all that it was ever given."""
+    """Publisher of static poses on /tf_static, which sends all poses given so far each time."""
 
     topic, policies = "/tf_static", LATCHED
 

@@ -1,4 +1,4 @@
-"""Time as rclpy has it: spans, points in time, and clocks of the system or of the topic /clock."""
+"""Time as in rclpy: durations, points in time, and clocks of the system or of the topic /clock."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ class ClockType(IntEnum):
 
     UNINITIALIZED = 0
     ROS_TIME = 1
-    """System time, or that of the topic /clock where `use_sim_time` is set."""
+    """System time, or the time of the topic /clock if `use_sim_time` is set."""
     SYSTEM_TIME = 2
     STEADY_TIME = 3
-    """Never jumps; begins anywhere."""
+    """Never jumps; its zero is arbitrary."""
 
 
-# `rclpy.duration`: spans of time.
+# `rclpy.duration`: durations.
 
 
 @total_ordering
 class Duration:
-    """Hold a span of time, kept in nanoseconds; `seconds` is in [s]."""
+    """Duration, stored in nanoseconds; `seconds` is in [s]."""
 
     def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = int(seconds * 10**9) + int(nanoseconds)
@@ -64,7 +64,7 @@ Infinite = Duration(nanoseconds=2**63 - 1)
 
 @total_ordering
 class Time:
-    """Hold a point in time of one clock, kept in nanoseconds; those of different clocks do not compare.
+    """Point in time of one clock, stored in nanoseconds; times of different clocks cannot be compared.
 
     `seconds` is in [s].
     """
@@ -129,14 +129,14 @@ class Time:
         return other.nanoseconds
 
 
-# `rclpy.clock`: what time it is, by the system or by the topic /clock.
+# `rclpy.clock`: the present time of the system or of the topic /clock.
 
 
 class Clock(Limited):
     """A clock.
 
     Args:
-        clock_type: What it counts.
+        clock_type: Kind of clock.
     """
 
     def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> Any:
@@ -147,12 +147,12 @@ class Clock(Limited):
         self.clock_type = clock_type
 
     def now(self) -> Time:
-        """The present."""
+        """Return the present time."""
         steady = self.clock_type == ClockType.STEADY_TIME
         return Time(nanoseconds=time.monotonic_ns() if steady else time.time_ns(), clock_type=self.clock_type)
 
     def tick(self) -> int:
-        """Return the time of timers [ns], which never jumps with the system's time of day."""
+        """Return the time of timers [ns], which does not jump when the system's time of day is set."""
         return time.monotonic_ns()
 
     @property
@@ -161,13 +161,13 @@ class Clock(Limited):
         return True
 
     def sleep_for(self, duration: Duration) -> bool:
-        """Sleep by this clock; only for one that runs without messages."""
+        """Sleep by this clock, which must run without messages."""
         time.sleep(max(duration.nanoseconds, 0) / 1e9)
         return True
 
 
 class ROSClock(Clock):
-    """System time, until a node with `use_sim_time` feeds it from /clock."""
+    """Clock of the system time, or of /clock while a node with `use_sim_time` updates it."""
 
     def __init__(self, *, clock_type: ClockType = ClockType.ROS_TIME) -> None:
         super().__init__(clock_type=ClockType.ROS_TIME)
@@ -175,7 +175,7 @@ class ROSClock(Clock):
         self._simulated = 0
 
     def now(self) -> Time:
-        """The present; 0 while simulated time is used and none has come."""
+        """Return the present time; 0 while simulated time is used and none was received yet."""
         nanoseconds = self._simulated if self.ros_time_is_active else time.time_ns()
         return Time(nanoseconds=nanoseconds, clock_type=ClockType.ROS_TIME)
 

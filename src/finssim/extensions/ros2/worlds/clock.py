@@ -1,4 +1,4 @@
-"""Topic /clock: one publisher in a domain, a real-time factor, and lock-step with the nodes that live by it."""
+"""Topic /clock: one publisher in a domain, a real-time factor, and lock-step with the nodes that use its time."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from finssim.extensions.ros2.topics import quality_profile
 __all__ = ["Barrier", "PacedClock", "SharedClock"]
 
 CLAIMING = 1.0
-"""Time in which simulators that started together find each other [s]."""
+"""Time in which simulators that started together discover each other [s]."""
 LOOK = 0.5
-"""Between two looks at who publishes /clock [s]."""
+"""Time between two checks which node publishes /clock [s]."""
 
 
 class SharedClock:
-    """Topic /clock of a domain: one world publishes it, every other simulator follows it, and a virtual pool ends.
+    """Topic /clock of a domain: one simulator publishes it, all others follow it, and a virtual pool stops.
 
-    A simulator that finds another publisher follows it. Of simulators that began to publish within `CLAIMING` of each
-    other, the first by name continues. One that follows takes over, without a jump, when the publisher has left.
+    A simulator that discovers another publisher follows it. Of simulators that began to publish within
+    `CLAIMING` of each other, the first by name continues. A simulator that follows becomes the publisher,
+    without a jump, when the publisher has left.
     """
 
     def __init__(
@@ -36,8 +37,8 @@ class SharedClock:
         """
         Args:
             node: Node of the simulator.
-            follow: Takes each time of the other's clock [s]; None where the node cannot follow.
-            lead: Called when time becomes the node's own.
+            follow: Receives each time of the other publisher's clock [s]; None if the node cannot follow.
+            lead: Called when the node becomes the publisher.
 
         Raises:
             TwinError: Another node publishes /clock, and this one cannot follow.
@@ -51,7 +52,7 @@ class SharedClock:
         node.create_timer(LOOK, self.look, clock=self._steady)
 
     def look(self) -> None:
-        """Claim /clock, or give way to another publisher."""
+        """Publish /clock, or follow another publisher."""
         node, now = self._node, 1e-9 * self._steady.now().nanoseconds
         own = node.get_fully_qualified_name()
         infos = node.get_publishers_info_by_topic(node.topic("clock"))
@@ -85,15 +86,15 @@ class SharedClock:
 
 
 STARTING = 180.0
-"""Time for all nodes of a graph to start [s]; the first rendering on a machine compiles."""
+"""Longest time for all nodes of a graph to start [s]; the first rendering on a machine compiles."""
 PATIENCE = 10.0
-"""Between two sentences about nodes that keep the others waiting [s]."""
+"""Time between two messages about nodes that delay the others [s]."""
 DEPTH = 200
-"""Reports of nodes that wait to be taken."""
+"""Number of reports of nodes that can wait in the queue."""
 
 
 class Barrier:
-    """Lock-step: the nodes that have not yet done their work of a time, by their reports on `/clock_done`.
+    """Lock-step: determines which nodes have not finished their work of a time, by their reports on `/clock_done`.
 
     Every node that reports is waited for, until it leaves.
     """
@@ -102,8 +103,8 @@ class Barrier:
         """
         Args:
             node: Node of the world.
-            names: Full names of the nodes without which time does not begin.
-            again: Publishes the present time again, in case it was lost.
+            names: Full names of the nodes without which time does not start.
+            again: Publishes the present time again, in case the message was lost.
         """
         self._node, self._again = node, again
         self._done: dict[str, float] = dict.fromkeys(names, -1.0)
@@ -114,7 +115,7 @@ class Barrier:
         node.create_timer(AGAIN, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def missing(self, now: float) -> list[str]:
-        """Return the names of the nodes that have not done their work of a time [s]."""
+        """Return the names of the nodes that have not finished their work of a time [s]."""
         if now != self._time:
             self._time, self._since = now, time.monotonic()
         return [name for name, done in self._done.items() if done < now - 0.5 * STEP]
@@ -126,7 +127,7 @@ class Barrier:
             self._done[message.frame_id] = 1e-9 * nanoseconds(message.stamp)
 
     def _look(self) -> None:
-        """Publish the time again where nodes are missing, and forget those that have left."""
+        """Publish the time again if nodes are missing, and remove nodes that have left."""
         missing, waited = self.missing(self._time), time.monotonic() - self._since
         if not missing or waited < AGAIN:
             return
@@ -146,7 +147,7 @@ class Barrier:
 
 
 class PacedClock:
-    """Clock of a virtual pool: steps shown on /clock, at a real-time factor at most, in lock-step as the nodes can."""
+    """Clock of a virtual pool: steps on /clock, limited by a real-time factor and, in lock-step, by the nodes."""
 
     def __init__(self, node: RobotNode, factor: float, names: Sequence[str]) -> None:
         """
@@ -163,14 +164,14 @@ class PacedClock:
         self._barrier = Barrier(node, names, self._tell) if node.lockstep else None
         self._due = 0.0
         self.spin: Callable[..., None] = partial(rclpy.spin_once, node)
-        """Runs a callback, and waits for one no longer than `timeout_sec` [s]."""
+        """Runs a callback; waits for one at most `timeout_sec` [s]."""
 
     def wait(self, until: Callable[[], bool]) -> None:
-        """Publish the time, and return when the next step may begin, or when a function returns true."""
+        """Publish the time, and return when the next step may begin, or when `until` returns true."""
         self._tell()
         while self._barrier is not None and self._barrier.missing(self.time) and not until():
             self.spin(timeout_sec=0.1)
-        # Time that was lost is not made up for.
+        # A delay is not made up for.
         now = time.monotonic()
         self._due = max(self._due + STEP / self._factor, now) if self._factor > 0.0 and self._count else now
         while True:

@@ -1,4 +1,4 @@
-"""Sim node: any vehicle of the engine as a ROS 2 robot, with the bridge and the topics of a real one, and /clock."""
+"""Sim node: any vehicle of the engine as a ROS 2 robot, with the bridge and topics of a real one, and /clock."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ __all__ = ["Sim"]
 
 SUBSTEPS = 3
 MOST_BEHIND = 5
-"""Steps made up for at a time; a computer that is slower lets simulated time be slower."""
+"""Largest number of steps made up for at a time; on a slower computer, simulated time is slower."""
 POLL = 0.001
-"""Between two looks whether a step in lock-step may begin [s]."""
+"""Time between two checks whether a step in lock-step may begin [s]."""
 
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 
 class IdealSensors:
-    """Inertial unit and pressure port at their mounts, without noise; velocities at the IMU are those of the origin."""
+    """Inertial unit and pressure port at their mounts, without noise; velocities at the IMU are those of the
+    origin."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         imu, depth = vehicle.sensors.imu, vehicle.sensors.depth
@@ -52,12 +53,12 @@ class IdealSensors:
         self.reset()
 
     def reset(self) -> None:
-        """The vehicle was put elsewhere."""
+        """Start anew, after the vehicle was placed elsewhere."""
         self._velocity: np.ndarray | None = None
         self._count = 0
 
     def sample(self, reading: Reading, step: float) -> Telemetry:
-        """The instruments after a step [s]; the specific force is the mean over the step."""
+        """Return the measurements after a step [s]; the specific force is the mean over the step."""
         q, gravity = reading.quaternion, self._water.gravity
         velocity = np.asarray(quat_rotate(q, reading.nu[:3]))
         before, self._velocity = self._velocity, velocity
@@ -82,8 +83,8 @@ class IdealSensors:
 
 
 class Sim(RobotNode):
-    """Simulator node. Its time begins at 0, or follows /clock if another node publishes it already; the state is the
-    truth."""
+    """Simulator node. Its time begins at 0, or follows /clock if another node already publishes it. It
+    publishes the true state."""
 
     def __init__(self) -> None:
         super().__init__("sim")
@@ -114,7 +115,7 @@ class Sim(RobotNode):
         self.create_timer(period, self._turn, clock=self._steady)
 
     def now(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self.time
 
     def _lead(self) -> None:
@@ -122,7 +123,7 @@ class Sim(RobotNode):
         self._began, self._made = self._steady.now().nanoseconds, 0
 
     def _follow(self, now: float) -> None:
-        """Step up to a time of another's clock [s]; no more than a few steps, the rest is left out."""
+        """Step up to a time of another publisher's clock [s], by at most a few steps; the others are skipped."""
         if now < self.time - MOST_BEHIND * STEP:  # that clock restarted
             self.time = now
         due = int((now - self.time) / STEP + 0.01)
@@ -132,13 +133,13 @@ class Sim(RobotNode):
             self._step()
 
     def _turn(self) -> None:
-        """Make as many steps as are due, but no more than a few."""
+        """Do the steps that are due, at most a few."""
         if not self.clock.ours:
             return
         passed = (self._steady.now().nanoseconds - self._began) * 1e-9 * self._factor / STEP
         due = int(passed) - self._made if self._factor > 0.0 else 1
         self._made += due
-        if self._barrier is not None:  # time that the nodes take is no simulated time
+        if self._barrier is not None:  # the time that the nodes need is not simulated time
             due = min(due, 0 if self._barrier.missing(self.time) else 1)
         for _ in range(min(due, MOST_BEHIND)):
             self._step()
@@ -174,7 +175,7 @@ class Sim(RobotNode):
             np.array(self.sim.numpy(name)[0, 0], float) for name in ("position", "quaternion", "velocity")
         )
         valid = bool(np.isfinite([*position, *q, *nu]).all())
-        reason = "" if valid else "the simulation has come to grief: reset it"
+        reason = "" if valid else "the simulation diverged: reset it"
         return Reading(self.time, position, q / np.linalg.norm(q), nu, valid, "fresh", reason, np.zeros(7))
 
     def _reset(self) -> None:

@@ -1,4 +1,5 @@
-"""Virtual pool node: vehicles and room on the wires of real ones, of which camera and hardware_bridge make topics."""
+"""Virtual pool node: vehicles and room with the interfaces of real ones, from which camera and hardware_bridge make
+topics."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ __all__ = ["MessageTopics", "VirtualPoolNode"]
 
 
 class MessageTopics:
-    """Medium between the vehicles of a team: each hears what the others publish, late and sometimes not at all."""
+    """Acoustic channel between the vehicles of a team: each receives what the others publish, delayed and
+    with losses."""
 
     def __init__(self, node: RobotNode, fleet: Fleet, communication: Communication, seed: int) -> None:
         """
@@ -34,7 +36,7 @@ class MessageTopics:
             node: Node of the pool.
             fleet: Vehicles; their names are their namespaces.
             communication: Speed of sound, processing time and loss.
-            seed: Of what is lost.
+            seed: Seed of the losses.
         """
         place = lambda: {name: world.plant.position for name, world in fleet.worlds.items()}  # noqa: E731
         self._medium, self._now, self._node = Medium(place, communication, seed), 0.0, node
@@ -54,7 +56,7 @@ class MessageTopics:
 
 
 class VirtualPoolNode(RobotNode):
-    """Reads its parameters and then is the pool until it is ended; nothing of the truth is published."""
+    """Reads its parameters, then runs the pool until it is ended. Nothing of the truth is published."""
 
     def __init__(self) -> None:
         super().__init__("virtual_pool")
@@ -66,7 +68,7 @@ class VirtualPoolNode(RobotNode):
             plant=str(self.parameter("plant", "1")),
             severity=self.parameter("severity", "realistic"),
             firmware=self.parameter("firmware", "mcu"),
-            site=None if world is not None and site == "open-water" else site,  # as deep as the world
+            site=None if world is not None and site == "open-water" else site,  # as deep as the world's water
             world=world,
             water=_path(water),
             start=self.parameter("start", "") or None,
@@ -93,17 +95,17 @@ class VirtualPoolNode(RobotNode):
         self.event("start", f"plant {self.choice.plant}, {self.choice.severity}")
 
     def now(self) -> float:
-        """Return the pool's clock, where it is that of the topic /clock [s]."""
+        """Return the time of the pool, which is that of the topic /clock if it is published [s]."""
         return super().now() if self.clock is None else self.clock.time
 
     def spin(self) -> None:
-        """Be the pool until SIGINT or SIGTERM."""
+        """Run the pool until SIGINT or SIGTERM."""
         files = PoolFiles(pool_file=self._pool_file, truth=self._truth)
         serve(self.choice, self._addresses, team=self.team, files=files, timing=_NodeTiming(self))
 
 
 class _NodeTiming(PoolTiming):
-    """Time of the pool of a node: by /clock, or real time in which a team's messages are taken."""
+    """Timing of the pool of a node: by /clock, or by real time, in which a team's messages are received."""
 
     def __init__(self, node: VirtualPoolNode) -> None:
         self._node, self._clock = node, node.clock
