@@ -463,15 +463,15 @@ def _world_values(o: Options, blind: bool, file: str | None) -> dict[str, Any]:
 
 
 def _check_vehicle(o: Options, vehicle: Vehicle, own: Mapping[str, str | None]) -> None:
-    """Refuse a goal, a trajectory or an initial position that this vehicle cannot use.
+    """Raise for a goal, a trajectory or an initial position that this vehicle cannot use.
 
     Args:
         o: Options of the graph.
-        vehicle: The vehicle.
+        vehicle: Vehicle of the graph.
         own: Its `goal`, `trajectory` and `let_in`, where given.
     """
     if o.simulated.firmware == "ardusub":
-        Mixer.of(vehicle)  # refuses a vehicle without an autopilot
+        Mixer.of(vehicle)  # raises for a vehicle without an autopilot
     goal, trajectory, let_in = own.get("goal"), own.get("trajectory"), own.get("let_in")
     if goal is not None or trajectory is not None:
         check_reachable(guide_of(goal, trajectory), vehicle)

@@ -1,4 +1,4 @@
-"""Teams: tasks of several vehicles, and what they communicate."""
+"""Teams: tasks of several vehicles and the messages between them."""
 
 from typing import TYPE_CHECKING
 

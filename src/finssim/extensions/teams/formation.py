@@ -1,4 +1,4 @@
-"""Formation keeping: three vehicles hold a triangular net between them, catch something that drifts, and carry it."""
+"""Formation keeping: three vehicles hold a triangular net between them, catch a drifting target, and carry it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -50,22 +50,22 @@ AGENTS = 3
 NEAR = 3.0
 """Distances to target, goal and net are divided by this in the observation [m]."""
 REACH = 4.0
-"""Scaled distances are clipped here."""
+"""Limit of scaled distances [-]."""
 SETTLE = 0.5
-"""Rate at which a held target slides to the middle of the net [1/s]."""
+"""Rate at which a held target moves to the centre of the net [1/s]."""
 DEPTH_SCALE = 5.0
 """The depth is divided by this [m]."""
 
 ROOM = 2.1
-"""The net's side is at least this many lengths of a vehicle: with that of FinsROV, 1.2 m."""
+"""Smallest side of the net in lengths of a vehicle: 1.2 m for FinsROV."""
 
 
 @wp.func
 def triangle_distance(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Distance from a point to a triangle [m].
+    """Return the distance from a point to a triangle [m].
 
-    The nearest point by the region of the triangle that the point lies before: a corner, an edge or the inside
-    (Ericson, Real-Time Collision Detection, section 5.1.5).
+    The nearest point is determined by the region of the triangle in front of which the point lies: a corner,
+    an edge or the interior (Ericson, Real-Time Collision Detection, section 5.1.5).
     """
     ab = b - a
     ac = c - a
@@ -96,7 +96,7 @@ def triangle_distance(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
 
 @wp.func
 def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """Lengths of a triangle's edges, the shortest first [m]."""
+    """Return the lengths of a triangle's edges, the shortest first [m]."""
     ab = wp.length(b - a)
     bc = wp.length(c - b)
     ca = wp.length(a - c)
@@ -107,26 +107,26 @@ def sorted_edges(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
 
 @wp.func
 def spanned(x: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec4:
-    """A net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
+    """Return a net's distance from a point [m], and the lengths of its edges, the shortest first [m]."""
     edges = sorted_edges(a, b, c)
     return wp.vec4(triangle_distance(x, a, b, c), edges[0], edges[1], edges[2])
 
 
 @wp.func
 def corner_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """Return the way from the agent to its k-th next corner, body frame [m]."""
+    """Return the position of the k-th next corner relative to the agent, body frame [m]."""
     return gap_to(arrays, w, a, (a + k) % AGENTS)
 
 
 @wp.func
 def corner_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """Velocity of the k-th next corner less one's own, body frame [m/s]."""
+    """Return the velocity of the k-th next corner relative to the agent's, body frame [m/s]."""
     return motion_of(arrays, w, a, (a + k) % AGENTS)
 
 
 @wp.func
 def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """The target's velocity less the agent's own, body frame [m/s]."""
+    """Return the target's velocity relative to the agent's, body frame [m/s]."""
     slip = arrays.net.motion[w] - measured_velocity(arrays, w, a)
     return wp.quat_rotate_inv(arrays.quaternion[w, a], slip)
 
@@ -145,27 +145,28 @@ def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> float:
-    """Bearing of the way out from the net's middle, seen from the agent [rad]."""
+    """Return the bearing of the direction from the net's centre outwards, seen from the agent [rad]."""
     away = wp.quat_rotate_inv(arrays.quaternion[w, a], 2.0 * arrays.position[w, a] - left - right)
     return wp.atan2(away[1], away[0])
 
 
 @wp.func
 def seen_net(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec4:
-    """Return `spanned` of the target, as far as the agent has heard, with the other corners as of `corner_gap` [m]."""
+    """Return `spanned` of the target, with the other corners at the last positions that the agent received [m]."""
     return spanned(arrays.net.target[w], arrays.position[w, a], left, right)
 
 
 @wp.func
 def edge_errors(p: Any, net: wp.vec4) -> wp.vec3:
-    """Return lengths of the edges less the side [sides], the shortest first, of a net as of `spanned`."""
+    """Return the relative errors of a net's edge lengths, the shortest first, as shares of the side; net as
+    of `spanned`."""
     side = wp.vec3(p.side, p.side, p.side)
     return (wp.vec3(net[1], net[2], net[3]) - side) / p.side
 
 
 @wp.func
 def target_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the way from the agent to the target, body frame [m]."""
+    """Return the position of the target relative to the agent, body frame [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.net.target[w] - arrays.position[w, a])
 
 
@@ -180,7 +181,7 @@ def from_net(net: wp.vec4) -> float:
 
 @wp.func
 def stretch_left(p: Any, net: wp.vec4) -> float:
-    """Return how much the longest edge may still stretch [sides].
+    """Return by how much the longest edge may still be stretched, as a share of the side.
 
     The net is as of `spanned`.
     """
@@ -212,22 +213,24 @@ OBSERVATION = (
         term=stretch_left,
     ),
 )
-"""34 numbers of each agent. Team-mates follow in the order of the triangle: each sees its next one first."""
+"""34 numbers of each agent. Team-mates follow in the order of the triangle, beginning with the agent's next corner."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FormationReward:
-    """Weights of the reward; each term has one reason.
+    """Weights of the reward.
 
-    team: net · (way of the net to the target) + goal · (way of the target to the goal)     adds up to the whole way [m]
-                                                          small weights are lost beside what success is worth
-        - shape · (mean error of an edge, in sides)       a triangle with equal sides
-        - step                                            sooner is better
-        + success, once                                   more than all the rest
+    team: net · (decrease of the distance from net to target) + goal · (decrease of the distance from target to goal)
+                                                          sums to the whole distance [m]; small weights would be
+                                                          negligible beside the reward of success
+        - shape · (mean error of an edge, in sides)       for a triangle with equal sides
+        - step                                            for success as early as possible
+        + success, once                                   more than the sum of all others
         - loss, once                                      for a net that tears, or a vehicle out of bounds
     each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
 
-    Published are bonuses for holding and for the shape in every step; with them it pays to hold for ever.
+    Published rewards have bonuses for holding and for the shape in every step; with these, holding without delivery
+    is rewarded most.
     """
 
     net: float = 4.0
@@ -243,13 +246,13 @@ class FormationReward:
 
 @wp.func
 def true_net(state: State, arrays: TaskArrays, w: int) -> wp.vec4:
-    """Return the target's distance and edges, as of `spanned`."""
+    """Return the target's distance from the net and the lengths of the edges, as of `spanned`."""
     return spanned(arrays.net.target[w], state.position[w, 0], state.position[w, 1], state.position[w, 2])
 
 
 @wp.func
 def holds(p: Any, net: wp.vec4) -> bool:
-    """Return whether the net holds the target: near enough, and neither stretched too far nor slack.
+    """Return whether the net holds the target: near enough, and no edge too long or too short.
 
     The net is as of `spanned`.
     """
@@ -258,7 +261,8 @@ def holds(p: Any, net: wp.vec4) -> bool:
 
 @wp.func
 def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
-    """Messages; then the target goes along with the net and into its middle while it is held, else it drifts."""
+    """Exchange messages; then move the target with the net and to its centre while it is held, otherwise with
+    its drift."""
     exchange_messages(state, arrays, w)
     v = arrays.net.drift[w]
     if holds(p, true_net(state, arrays, w)):
@@ -271,7 +275,7 @@ def move_target(state: State, arrays: TaskArrays, p: Any, w: int):
 
 @wp.func
 def misshape(p: Any, net: wp.vec4) -> float:
-    """Return the mean error of an edge [sides] of a net as of `spanned`."""
+    """Return the mean relative error of the edges of a net, as a share of the side; net as of `spanned`."""
     error = float(0.0)
     for i in range(3):
         error += wp.abs(net[i + 1] - p.side) / (3.0 * p.side)
@@ -280,13 +284,14 @@ def misshape(p: Any, net: wp.vec4) -> float:
 
 @wp.func
 def shape_error(state: State, p: Any, w: int, net: wp.vec4, was: float) -> float:
-    """Return the mean of the error of an edge [sides], of a net as of `spanned` and what it `was` before."""
+    """Return the mean edge error over the episode, as a share of the side, of a net as of `spanned`; `was`:
+    the mean before."""
     return was + (misshape(p, net) - was) / float(state.steps[w])
 
 
 @wp.func
 def net_gained(net: wp.vec4, to_net: float) -> float:
-    """Return how much nearer the net came to the target in the step [m].
+    """Return by how much the net approached the target in the step [m].
 
     The net is as of `spanned`.
     """
@@ -295,7 +300,7 @@ def net_gained(net: wp.vec4, to_net: float) -> float:
 
 @wp.func
 def goal_gained(away: float, to_goal: float) -> float:
-    """Return how much nearer the target came to the goal in the step [m]."""
+    """Return by how much the target approached the goal in the step [m]."""
     return to_goal - away
 
 
@@ -307,7 +312,7 @@ def from_goal(arrays: TaskArrays, w: int) -> float:
 
 @wp.func
 def held_time(p: Any, was: float, holding: bool) -> float:
-    """Return for how long the net held the target [s]."""
+    """Return for how long the net has held the target [s]."""
     return was + wp.where(holding, p.control_step, 0.0)
 
 
@@ -322,7 +327,7 @@ def stretched_time(p: Any, net: wp.vec4, stretched: float) -> float:
 
 @wp.func
 def tears(p: Any, net: wp.vec4, stretched: float) -> bool:
-    """Return whether an edge of the net, which is as of `spanned`, has been too long for more than `grace` [s]."""
+    """Return whether an edge of a net as of `spanned` has been too long for more than `grace` [s]."""
     return stretched_time(p, net, stretched) > p.grace + 0.1 * p.control_step
 
 
@@ -334,14 +339,14 @@ def at_goal(p: Any, holding: bool, away: float) -> bool:
 
 @wp.func
 def away_from(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
-    """A place at a level distance from x that is drawn, up to 0.5 m higher or lower. Both in [m]."""
+    """Return a random position at a horizontal distance from x, up to 0.5 m higher or lower. Both in [m]."""
     level = x + wp.randf(rng, p.nearest, p.farthest) * level_direction(wp.randf(rng, -PI, PI))
     return wp.vec3(level[0], level[1], wp.clamp(x[2] + wp.randf(rng, -0.5, 0.5), p.low, p.high))
 
 
 @wp.func
 def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """The team in its triangle, the target some way off, the goal beyond."""
+    """Start an episode: the team in its triangle, the target at a random distance, the goal at one from the target."""
     rng = wp.rand_init(key, 4 * w)
     turn = wp.randf(rng, -PI, PI)
     away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -PI, PI))
@@ -362,11 +367,12 @@ def start(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class Formation(TeamTask):
-    """Carry a virtual net. It is a triangle between the three vehicles, without weight or drag, and it can tear.
+    """Carry a virtual net, which is a triangle between three vehicles, without weight or drag, and can tear.
 
-    The target is held while the net's surface is within `reach` of it, no edge is longer than `stretch` sides and none
-    shorter than `slack`; then it moves along and slides to the net's middle. Success: held within `goal_radius` of the
-    goal for `hold` seconds. An edge that stays too long for more than `grace` seconds tears.
+    The target is held while the net's surface is within `reach` of it, no edge is longer than `stretch` sides
+    and none is shorter than `slack` sides; it then moves with the net and to the net's centre. Success: held
+    within `goal_radius` of the goal for `hold` seconds. The net tears if an edge is too long for more than
+    `grace` seconds.
     """
 
     agents: ClassVar[tuple[str, ...]] = ("corner_1", "corner_2", "corner_3")
@@ -378,27 +384,27 @@ class Formation(TeamTask):
     spawn_radius: float = 1.0
     bounds: float = 8.0
     side: float = 1.2
-    """Side of the triangle between vehicles [m] (published: 0.6 m), larger for longer vehicles: see `ROOM`."""
+    """Side of the triangle between vehicles [m] (published: 0.6 m); at least `ROOM` vehicle lengths."""
     stretch: float = 1.215
-    """[sides]: the published net of 0.6 m has 0.7288 m when it is pulled taut."""
+    """Largest length of an edge that holds the target [sides]; the published net of 0.6 m has 0.7288 m when taut."""
     slack: float = 0.5
-    """[sides]"""
+    """Smallest length of an edge that holds the target [sides]."""
     reach: float = 0.10
-    """[m]"""
+    """Distance from the net within which it holds the target [m]."""
     goal_radius: float = 0.30
-    """[m]"""
+    """Distance from the goal within which a held target counts as delivered [m]."""
     hold: float = 1.0
-    """[s]"""
+    """Time for which the target must be held at the goal [s]."""
     grace: float = 1.0
-    """[s]"""
+    """Time for which an edge may be too long before the net tears [s]."""
     drift: float = 0.05
-    """Speed of a target that is not held, as a share of the speed that the slowest vehicle can hold."""
+    """Speed of a target that is not held, as a share of the steady speed of the slowest vehicle."""
     jitter: float = 0.05
-    """Largest shift of a vehicle from its corner at the start, per axis [m]."""
+    """Largest displacement of a vehicle from its corner at the start, per axis [m]."""
     nearest: float = 1.0
-    """The target starts this far from the net's middle, and the goal from the target [m] ..."""
+    """Smallest distance at the start of the target from the net's centre, and of the goal from the target [m]."""
     farthest: float = 2.0
-    """... to this far [m]."""
+    """Largest of these distances [m]."""
     reward: FormationReward = field(default_factory=FormationReward)
 
     def __post_init__(self) -> None:
@@ -409,12 +415,12 @@ class Formation(TeamTask):
             )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Formation":
-        """The net's side and the drift's speed from the vehicles."""
+        """Return the task with the net's side and the drift speed adapted to the vehicles."""
         longest = max(float(max(vehicle.body.size[:2])) for vehicle in vehicles)
         return replace(self, side=max(self.side, ROOM * longest), speed=self.drift * slowest(vehicles))
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for the target and for messages, if there are any."""
+        """Allocate the target and the messages, if there are any."""
         super().allocate(arrays, worlds, device)
         arrays.net = allocated(NetTable, worlds, device)
 

@@ -1,6 +1,6 @@
-"""Pursuit: come up to a prey that flees with a vehicle like one's own, and stay with it.
+"""Pursuit: approach a prey that flees with a similar vehicle, and stay with it.
 
-Or, of three, a herder drives it into the net that two netters hold between them.
+In the task of three, a herder drives it into the net that two netters hold between them.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,8 @@ Array = NDArray[Any]
 
 @wp.func
 def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
-    """Write the action of the only vehicle that the task commands, as wrench4 or as wrench6 without roll and pitch."""
+    """Write the action of the only vehicle that the task commands, as wrench4, or as wrench6 without roll and
+    pitch."""
     size = arrays.scripted.shape[1]
     for i in range(size):
         arrays.scripted[w, i] = 0.0
@@ -55,45 +56,45 @@ def write_scripted(arrays: TaskArrays, w: int, action: wp.vec4):
 
 
 def slowest(vehicles: Sequence[Vehicle]) -> float:
-    """The smallest speed ahead that vehicles can hold [m/s]: what the speed of their prey is tied to."""
+    """Return the smallest forward speed that vehicles can hold [m/s], to which the speed of their prey is related."""
     return min(DriveNumbers.of(vehicle).top for vehicle in vehicles)
 
 
-# What a pursuer sees of itself, of its prey and of its team-mates, all in its body frame.
+# What a pursuer observes of itself, of its prey and of its team-mates, all in its body frame.
 
 
 DISTANCE_SCALE = 6.0
-"""Distances are divided by this [m]."""
+"""Distances are divided by this in the observation [m]."""
 REACH = 4.0
-"""Scaled distances are clipped here."""
+"""Limit of scaled distances [-]."""
 VELOCITY_CLIP = 4.0
-"""Velocities are clipped here [m/s, rad/s]."""
+"""Limit of velocities [m/s, rad/s]."""
 PI = 3.14159265
 
 
 @wp.func
 def prey_gap(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the way from agent a to the vehicle after the agents, body frame [m]."""
+    """Return the position of the vehicle after the agents relative to agent a, body frame [m]."""
     prey = arrays.agent_reward.shape[1]
     return wp.quat_rotate_inv(arrays.quaternion[w, a], arrays.position[w, prey] - arrays.position[w, a])
 
 
 @wp.func
 def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Its velocity less the agent's own, body frame [m/s]."""
+    """Return its velocity relative to the agent's, body frame [m/s]."""
     relative = measured_velocity(arrays, w, arrays.agent_reward.shape[1]) - measured_velocity(arrays, w, a)
     return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
 
 
 @wp.func
 def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Return the way from agent a to agent b, as far as a has received, body frame of a [m]."""
+    """Return the position of agent b relative to agent a, as last received by a, body frame of a [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
 
 
 @wp.func
 def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Velocity of agent b less that of agent a, as far as a has heard, body frame of a [m/s]."""
+    """Return the velocity of agent b relative to agent a, as last received by a, body frame of a [m/s]."""
     relative = mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a)
     return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
 
@@ -108,7 +109,7 @@ def prey_distance(gap: wp.vec3) -> float:
 def prey_bearing(gap: wp.vec3) -> float:
     """Return the bearing of the prey, positive to the left [rad].
 
-    The way to it is `gap`, body frame [m].
+    Its relative position is `gap`, body frame [m].
     """
     return wp.atan2(gap[1], gap[0])
 
@@ -122,11 +123,11 @@ CHASE = (
     ObservationPart("distance to the prey", 1, "m", DISTANCE_SCALE, REACH, term=prey_distance),
     ObservationPart("bearing of the prey, positive to the left", 1, "rad", PI, 1.0, term=prey_bearing),
 )
-"""14 numbers of one pursuer, for a task that shares `prey_gap` as `gap`."""
+"""14 numbers of a pursuer, for a task that shares `prey_gap` as `gap`."""
 
 
 def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
-    """Return the 6 numbers of the k-th team-mate: its relative position and velocity."""
+    """Return the parts with the 6 numbers of the k-th team-mate: its relative position and velocity."""
     moves = "team-mate's velocity less one's own, body frame"
     return (
         ObservationPart("team-mate from here, body frame", 3, "m", DISTANCE_SCALE, REACH, gap, k),
@@ -134,37 +135,38 @@ def mate(k: int, gap: Any, motion: Any) -> tuple[ObservationPart, ...]:
     )
 
 
-# The scripted prey: a vehicle that wanders, keeps straight on or flees, by its own thrusters, up to a given speed.
+# The scripted prey: a vehicle that wanders, keeps its direction or flees, with its own thrusters, up to a given speed.
 
 
 PREY_MODES = ("random", "straight", "hybrid", "line-of-sight", "mixed")
-"""Behaviours of a prey:
+"""Behaviours of a prey.
 
 random: a new direction and speed every few seconds. straight: one direction, drawn for the episode, at full speed.
-hybrid: flees from everybody near, askance, and wanders while nobody is. line-of-sight: flees straight away from the
-nearest, always. mixed: one of the four, drawn for the episode.
+hybrid: flees obliquely from all pursuers nearby, and wanders if there are none. line-of-sight: always flees
+directly from the nearest pursuer. mixed: one of the four, drawn for the episode.
 """
 
 RESERVE = 0.9
-"""Greatest demanded speed of a prey, as a share of the speed it can hold: the rest is for steering."""
+"""Largest target speed of a prey, as a share of the speed it can hold; the rest is left for steering."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prey:
-    """Behaviour of the prey. Its speed is a share of what the slowest pursuer can hold, never an absolute number."""
+    """Behaviour of the prey. Its speed is given by the task, as a share of the speed that the slowest pursuer
+    can hold."""
 
     mode: str = "mixed"
     """One of `PREY_MODES`."""
     alarm: float = 3.0
-    """A hybrid prey flees from pursuers nearer than this [m]."""
+    """Distance within which a hybrid prey flees from pursuers [m]."""
     retarget: float = 4.0
-    """Time between two draws of a direction, or of the side to flee to [s]."""
+    """Time after which the direction, or the side to flee to, is drawn again [s]."""
     range: float = 9.0
     """Distance from the origin at which it turns along the border [m]."""
     low: float = -5.0
-    """It stays above this height [m] ..."""
+    """Lowest height of the prey [m]."""
     high: float = -1.0
-    """... and below this one [m]."""
+    """Greatest height of the prey [m]."""
 
     def __post_init__(self) -> None:
         if self.mode not in PREY_MODES:
@@ -179,19 +181,19 @@ class Prey:
 
     @property
     def kind(self) -> int:
-        """Number of the mode."""
+        """Return the number of the mode."""
         return PREY_MODES.index(self.mode)
 
 
 @wp.func
 def most_climb(p: Any) -> float:
-    """Up or down [m/s]."""
+    """Return the largest vertical speed [m/s]."""
     return wp.min(0.5 * p.speed, RESERVE * p.prey_drive.terminal[2])
 
 
 @wp.func
 def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
-    """Velocity of a random walk in its n-th stretch [m/s]."""
+    """Return the velocity of a random walk in its n-th section [m/s]."""
     rng = wp.rand_init(wp.randi(wp.rand_init(key, 4 * w + 2)), draw)
     direction = level_direction(wp.randf(rng, -3.14159265, 3.14159265))
     pace = wp.randf(rng, 0.3, 1.0) * p.speed
@@ -200,8 +202,8 @@ def wander(p: Any, key: int, w: int, draw: int) -> wp.vec3:
 
 @wp.func
 def flight(state: State, arrays: TaskArrays, w: int, reach: float) -> wp.vec3:
-    """Return the sum of unit directions away from all pursuers within reach [m], each over d² [1/m²]; zero where there
-    is none."""
+    """Return the sum of unit directions away from all pursuers within reach [m], each divided by d² [1/m²];
+    zero without any."""
     pursuers = arrays.agent_reward.shape[1]
     x = state.position[w, pursuers]
     away = wp.vec3()
@@ -215,7 +217,7 @@ def flight(state: State, arrays: TaskArrays, w: int, reach: float) -> wp.vec3:
 
 @wp.func
 def nearest_pursuer(state: State, arrays: TaskArrays, w: int) -> float:
-    """Distance from the prey to the nearest pursuer [m]."""
+    """Return the distance from the prey to the nearest pursuer [m]."""
     pursuers = arrays.agent_reward.shape[1]
     x = state.position[w, pursuers]
     d = wp.length(x - state.position[w, 0])
@@ -226,9 +228,9 @@ def nearest_pursuer(state: State, arrays: TaskArrays, w: int) -> float:
 
 @wp.func
 def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
-    """Return the velocity v [m/s] at x [m] without what leads out of the prey's range.
+    """Return the velocity v [m/s] at x [m], changed so that it does not leave the prey's range.
 
-    It slides along the border, at the same speed.
+    At the border it is turned along the border, at the same speed.
     """
     pace = wp.sqrt(v[0] * v[0] + v[1] * v[1])
     r = wp.sqrt(x[0] * x[0] + x[1] * x[1])
@@ -247,7 +249,7 @@ def kept_inside(p: Any, x: wp.vec3, v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def prey_velocity(state: State, arrays: TaskArrays, p: Any, key: int, w: int) -> wp.vec3:
-    """Velocity that the prey wants, world frame; its level part is no faster than `speed` [m/s]."""
+    """Return the target velocity of the prey, world frame; its horizontal part is no faster than `speed` [m/s]."""
     pi = 3.14159265
     rng = wp.rand_init(key, 4 * w + 3)
     heading = wp.randf(rng, -pi, pi)
@@ -271,19 +273,19 @@ def prey_velocity(state: State, arrays: TaskArrays, p: Any, key: int, w: int) ->
 
 @wp.func
 def command_prey(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """Write the action of the prey, which is the vehicle after the pursuers; it sees the truth."""
+    """Write the action of the prey, which is the vehicle after the pursuers; it uses the true state."""
     pursuers = arrays.agent_reward.shape[1]
     q = state.quaternion[w, pursuers]
     target = towards(q, prey_velocity(state, arrays, p, key + 7, w))
     write_scripted(arrays, w, drive(p.prey_drive, q, state.velocity[w, pursuers], target))
 
 
-# What the tasks in open water have in common: where episodes start and end, the prey, and the team.
+# Common parts of the tasks in open water: start and end of episodes, the prey, and the team.
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenWater(Task):
-    """Base of the tasks in open water: where episodes start and end. Lengths in metres, world frame with z up."""
+    """Base of the tasks in open water: start and end of episodes. Lengths in metres, world frame with z up."""
 
     action: ClassVar[str] = "wrench4"
     pool: ClassVar[None] = None
@@ -291,23 +293,23 @@ class OpenWater(Task):
 
     time_limit: float = 60.0
     spawn_radius: float = 2.5
-    """Agents start this near to the origin [m]."""
+    """Largest horizontal distance of agents from the origin at the start [m]."""
     low: float = -4.0
-    """Everybody starts between this height [m] ..."""
+    """Lowest height at the start [m]."""
     high: float = -2.0
-    """... and this one [m]."""
+    """Greatest height at the start [m]."""
     bounds: float = 12.0
-    """Going farther from the origin than this ends the episode [m]."""
+    """Horizontal distance from the origin beyond which the episode ends [m]."""
     ceiling: float = 0.3
-    """So does rising above this height [m]."""
+    """Height above which the episode ends [m]."""
     depth: float = 8.0
-    """And sinking below this depth [m]."""
+    """Depth below which the episode ends [m]."""
     nearest: float = 2.0
-    """Least distance of what is to be caught from the agents at the start [m] ..."""
+    """Smallest distance of the target or prey from the agents at the start [m]."""
     farthest: float = 5.0
-    """... to this far [m]."""
+    """Largest of these distances [m]."""
     speed: float = 0.0
-    """Speed of what is to be caught [m/s]: follows from the vehicles."""
+    """Speed of the target or prey [m/s]; determined from the vehicles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,17 +321,17 @@ class Chase(OpenWater):
     moving: ClassVar[bool] = True
 
     prey: Prey = field(default_factory=Prey)
-    """Behaviour of the prey; it sees all agents."""
+    """Behaviour of the prey, which knows the positions of all agents."""
     prey_drive: DriveNumbers | None = field(default=None, repr=False)
-    """Thrusters of the prey: follows from its vehicle."""
+    """Thrusters of the prey; determined from its vehicle."""
 
     def chased(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
-        """The task with the prey's thrust from its vehicle, and its speed.
+        """Return the task with the prey's thrust of its vehicle, and with its speed.
 
         Args:
             part: Share of the speed that the slowest agent can hold.
             vehicles: Agents, then the prey.
-            changes: Of other settings.
+            changes: Changes of other settings.
         """
         if not 0.0 <= part <= 1.0:
             raise EnvironmentSetupError(
@@ -345,12 +347,12 @@ class TeamTask(OpenWater):
     """Base of the tasks of several agents."""
 
     collision: float = 0.6
-    """Agents nearer to each other than this bump [m]; nothing stops them."""
+    """Distance between agents below which they bump [m]; their motion is not affected."""
     communication: Communication | None = None
-    """Messages between agents; None: every agent sees every other."""
+    """Messages between agents; None: every agent knows the states of all others."""
 
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
-        """Room for the messages, if there are any."""
+        """Allocate the messages, if there are any."""
         arrays.messages = message_table(
             self.communication, worlds, len(self.agents), self.control_step, 2.0 * self.bounds, device
         )
@@ -358,7 +360,7 @@ class TeamTask(OpenWater):
 
 @wp.func
 def any_outside(state: State, arrays: TaskArrays, p: Any, w: int) -> bool:
-    """An agent is out of bounds."""
+    """Return whether an agent is out of bounds."""
     out = bool(False)
     for a in range(arrays.agent_reward.shape[1]):
         x = state.position[w, a]
@@ -379,7 +381,7 @@ def bumps(state: State, arrays: TaskArrays, p: Any, w: int, a: int) -> float:
 
 @wp.func
 def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
-    """A place for the prey: at a distance from x that is drawn, in any direction, at about the same height.
+    """Return a start position of the prey: at a random distance and direction from x, at about the same height.
 
     Both in [m].
     """
@@ -395,19 +397,19 @@ def prey_start(p: Any, rng: wp.uint32, x: wp.vec3) -> wp.vec3:
 
 @dataclass(frozen=True, kw_only=True)
 class PursuitReward:
-    """Weights of the reward; each term has one reason.
+    """Weights of the reward.
 
-    r = progress · (closing speed) · dt          nearer is better; over an episode it adds up to the way gained [m]
-      - distance · min(d / 8 m, 1)               a slope everywhere, also behind a prey that keeps its distance
-      + heading · cos(angle to the prey)         the bow, where thrust and camera are best, points at the prey
-      + near, within near_radius                 staying with it is worth something before it counts as captured
-      - spin · r²                                no turning on the spot
-      - action · mean(a²) - change · mean(Δa²)   the cheapest thrusts that do it; commands that a motor can follow
-      - step                                     sooner is better
-      + capture                                  once; more than all the rest of an episode (published: 50)
-      - loss                                     once, on leaving the bounds (published: 1, cheaper than going on)
+    r = progress · (closing speed) · dt          for approaching; over an episode it sums to the distance gained [m]
+      - distance · min(d / 8 m, 1)               a gradient everywhere, also behind a prey that keeps its distance
+      + heading · cos(angle to the prey)         for pointing the bow, where thrust and camera are best, at the prey
+      + near, within near_radius                 for staying with it before it counts as captured
+      - spin · r²                                against turning on the spot
+      - action · mean(a²) - change · mean(Δa²)   for small thrusts, and commands that a motor can follow
+      - step                                     for success as early as possible
+      + capture                                  once; more than all others of an episode (published: 50)
+      - loss                                     once, for leaving the bounds (published: 1, cheaper than continuing)
 
-    Time running out costs nothing (published: 5): the time is not observed, so that nothing could be learnt from it.
+    The end of the time limit costs nothing (published: 5): the time is not observed, so nothing can be learnt from it.
     """
 
     progress: float = 0.9
@@ -425,13 +427,13 @@ class PursuitReward:
 
 @wp.func
 def relative_motion(state: State, w: int) -> wp.vec3:
-    """The prey's velocity less the pursuer's, world frame [m/s]."""
+    """Return the prey's velocity relative to the pursuer's, world frame [m/s]."""
     return world_velocity(state, w, 1) - world_velocity(state, w, 0)
 
 
 @wp.func
 def way_to_prey(state: State, w: int) -> wp.vec3:
-    """Return the way from the pursuer to the prey, world frame [m]."""
+    """Return the position of the prey relative to the pursuer, world frame [m]."""
     return state.position[w, 1] - state.position[w, 0]
 
 
@@ -443,13 +445,13 @@ def distance_of(way: wp.vec3) -> float:
 
 @wp.func
 def way_gained(p: Any, way: wp.vec3, motion: wp.vec3, d: float) -> float:
-    """Return how much nearer the prey came: closing speed times the length of the step [m]."""
+    """Return by how much the prey came nearer in the step: closing speed times the step [m]."""
     return -wp.dot(way, motion) / d * p.control_step
 
 
 @wp.func
 def distance_share(d: float) -> float:
-    """Return the distance to the prey over 8 m, at most 1.
+    """Return the distance to the prey divided by 8 m, at most 1.
 
     The distance `d` is in [m].
     """
@@ -470,32 +472,32 @@ def yaw_rate_squared(state: State, w: int) -> float:
 
 @wp.func
 def has_held(p: Any, held: float) -> bool:
-    """Return whether the tolerance of success was `held` for `hold` [s]."""
+    """Return whether the tolerance of success was met for `hold` [s]; `held` is the time so far."""
     return held > 0.0 and held >= p.hold - 0.1 * p.control_step
 
 
 @wp.func
 def closest(was: float, d: float) -> float:
-    """Return the least distance to the prey so far [m]."""
+    """Return the smallest distance to the prey so far [m]."""
     return wp.min(was, d)
 
 
 @wp.func
 def with_prey(p: Any, d: float, motion: wp.vec3) -> bool:
-    """Return whether the prey is within `radius` [m], at no more than `relative_speed` [m/s]."""
+    """Return whether the prey is within `radius` [m], at a relative speed of at most `relative_speed` [m/s]."""
     return d <= p.radius and wp.length(motion) <= p.relative_speed
 
 
 @wp.func
 def facing(state: State, w: int, way: wp.vec3, d: float) -> float:
-    """Cosine of the angle from the bow to the prey."""
+    """Return the cosine of the angle between the bow and the direction to the prey."""
     ahead = wp.quat_rotate(state.quaternion[w, 0], wp.vec3(1.0, 0.0, 0.0))
     return wp.dot(ahead, way) / d
 
 
 @wp.func
 def start(state: State, p: Any, key: int, w: int):
-    """Pursuer near the origin, prey some way off, both at rest."""
+    """Start an episode: pursuer near the origin, prey at a random distance, both at rest."""
     pi = 3.14159265
     rng = wp.rand_init(key, 4 * w)
     away = p.spawn_radius * wp.sqrt(wp.randf(rng)) * level_direction(wp.randf(rng, -pi, pi))
@@ -515,17 +517,18 @@ class Pursuit(Chase):
     name: str = "pursuit"
     observation: tuple[ObservationPart, ...] = field(default=CHASE, repr=False)
     prey_speed: float = 0.6
-    """Speed of the prey, as a part of what the pursuer can hold (published: 2 m/s, four times that speed)."""
+    """Speed of the prey, as a share of the speed that the pursuer can hold (published: 2 m/s, four times that
+    speed)."""
     radius: float = 0.8
-    """Greatest distance of a capture [m]."""
+    """Largest distance of a capture [m]."""
     relative_speed: float = 0.35
-    """[m/s]"""
+    """Largest relative speed of a capture [m/s]."""
     hold: float = 0.5
-    """[s]"""
+    """Time for which both must be met [s]."""
     reward: PursuitReward = field(default_factory=PursuitReward)
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pursuit":
-        """The prey's speed and thrust from the vehicles: pursuer, prey."""
+        """Return the task with the prey's speed and thrust adapted to the vehicles: pursuer, prey."""
         return self.chased(self.prey_speed, vehicles)
 
     def success_rule(self) -> str:
@@ -573,35 +576,36 @@ AGENTS = 3
 PREY = 3
 
 CAPTURE_MODES = ("net", "touch", "proximity", "either")
-"""Published modes 0 to 3.
+"""Rules of capture, published as modes 0 to 3.
 
-net: the prey is within `net_reach` of the net for `hold` seconds. touch: its hull touches the net. proximity: a vehicle
-is within `proximity` of it. either: net or proximity.
+net: the prey is within `net_reach` of the net for `hold` seconds. touch: its hull touches the net. proximity:
+a vehicle is within `proximity` of it. either: net or proximity.
 """
 
 
 @dataclass(frozen=True)
 class Level:
-    """One step of the published curriculum. Speeds were 0.25, 0.30 and 0.40 m/s, where a pursuer reaches 0.5 m/s."""
+    """A level of the published curriculum. Its speeds were 0.25, 0.30 and 0.40 m/s, with a pursuer's top
+    speed of 0.5 m/s."""
 
     capture: str
     """One of `CAPTURE_MODES`."""
     proximity: float
-    """[m]"""
+    """Distance of a vehicle from the prey that counts as a capture [m]."""
     net_reach: float
-    """[m]"""
+    """Distance of the net from the prey that counts as a capture [m]."""
     hold: float
-    """[s]"""
+    """Time for which the prey must be in the net [s]."""
     prey_speed: float
-    """Part of the speed that the slowest agent can hold."""
+    """Speed of the prey, as a share of the speed that the slowest agent can hold."""
     stake: float
-    """Reward for a capture, and what an agent out of bounds costs everybody."""
+    """Reward of a capture, and cost of an agent out of bounds, for all agents."""
     from_step: int
-    """Agent-steps of training after which it was taken up."""
+    """Number of agent-steps of training after which the level begins."""
 
     @property
     def mode(self) -> int:
-        """Number of the capture mode."""
+        """Return the number of the capture mode."""
         return CAPTURE_MODES.index(self.capture)
 
 
@@ -611,31 +615,31 @@ LEVELS = (
     Level("net", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=4_000_000),
     Level("touch", 1.0, net_reach=0.8, hold=0.25, prey_speed=0.8, stake=30.0, from_step=7_000_000),
 )
-"""The published curriculum in three levels, all of which the formation baseline masters, and the task: one more."""
+"""The published curriculum in three levels, which the formation baseline solves, and a fourth, which is the task."""
 
 
 @wp.func
 def other(a: int, k: int) -> int:
-    """Number of the k-th team-mate of agent a, the lowest number first."""
+    """Return the number of the k-th team-mate of agent a, the lowest number first."""
     return wp.where(k == 1, wp.where(a == 0, 1, 0), wp.where(a == 2, 1, 2))
 
 
 @wp.func
 def mate_role(a: int, k: int) -> wp.vec2:
-    """Return an index of the k-th team-mate's role: (1, 0) a herder, (0, 1) a netter."""
+    """Return the role of the k-th team-mate: (1, 0) a herder, (0, 1) a netter [-]."""
     herds = other(a, k) == 0
     return wp.vec2(wp.where(herds, 1.0, 0.0), wp.where(herds, 0.0, 1.0))
 
 
 @wp.func
 def mate_gap(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """Return the way from the agent to its k-th team-mate, body frame [m]."""
+    """Return the position of the k-th team-mate relative to the agent, body frame [m]."""
     return gap_to(arrays, w, a, other(a, k))
 
 
 @wp.func
 def mate_motion(arrays: TaskArrays, w: int, a: int, k: int) -> wp.vec3:
-    """Velocity of the k-th team-mate less one's own, body frame [m/s]."""
+    """Return the velocity of the k-th team-mate relative to the agent's, body frame [m/s]."""
     return motion_of(arrays, w, a, other(a, k))
 
 
@@ -655,14 +659,15 @@ TEAM = (
 
 @dataclass(frozen=True, kw_only=True)
 class TeamReward:
-    """Weights of the reward besides the level's stake; each term has one reason.
+    """Weights of the reward, besides the level's stake.
 
-    team: progress · (way gained towards a capture)       by the rule of the level; over an episode it adds up to the
-                                                          whole way [m]; a small weight is lost beside the stake
-        - distance · min(gap / 8 m, 1) - step             a slope everywhere, and sooner is better
-    herder: + drive · cos(angle between the way to the prey and the way on to the net)     it stands behind the prey
-            - stray · min(d / 8 m, 1)                     near the prey: one far away drives nothing, and gets lost
-    netters: - spread · | span - 0.7 net_length |         an open net, which is not torn
+    team: progress · (distance gained to a capture)       by the rule of the level; over an episode it sums to the
+                                                          whole distance [m]; a small weight would be negligible
+                                                          beside the stake
+        - distance · min(gap / 8 m, 1) - step             a gradient everywhere, and success as early as possible
+    herder: + drive · cos(angle between the directions to the prey and from it to the net)     to stay behind the prey
+            - stray · min(d / 8 m, 1)                     to stay near the prey, which it could otherwise not drive
+    netters: - spread · | span - 0.7 net_length |         for an open net that is not torn
     each: - bump, nearer than `collision` to another      - action · mean(a²) - change · mean(Δa²)
     """
 
@@ -679,16 +684,17 @@ class TeamReward:
 
 @wp.func
 def net_distance(x: wp.vec3, left: wp.vec3, right: wp.vec3, height: float) -> float:
-    """Distance from a point to the net's surface [m].
+    """Return the distance from a point to the net's surface [m].
 
-    The net reaches from one netter to the other; half its height lies above that line and half below, along the
-    direction across the line that is nearest to upright; with the netters one above the other it shrinks to the line.
+    The net extends from one netter to the other, half of its height above and half below this line, in the
+    direction perpendicular to the line that is nearest to vertical. With one netter above the other it
+    shrinks to the line.
 
     Args:
-        x: The point, world frame [m].
-        left: Place of one netter, world frame [m].
-        right: Place of the other, world frame [m].
-        height: Of the net [m].
+        x: Point, world frame [m].
+        left: Position of one netter, world frame [m].
+        right: Position of the other netter, world frame [m].
+        height: Height of the net [m].
     """
     span = right - left
     length = wp.max(wp.length(span), 1.0e-6)
@@ -704,7 +710,8 @@ def net_distance(x: wp.vec3, left: wp.vec3, right: wp.vec3, height: float) -> fl
 
 @wp.func
 def net_gap(state: State, p: Any, w: int) -> float:
-    """Distance from the prey to the net [m]; a net stretched beyond its length does not catch: the excess is added."""
+    """Return the distance from the prey to the net [m]; beyond the net's length, twice the excess is added:
+    no capture."""
     left = state.position[w, 1]
     right = state.position[w, 2]
     excess = wp.max(wp.length(right - left) - p.net_length, 0.0)
@@ -713,7 +720,7 @@ def net_gap(state: State, p: Any, w: int) -> float:
 
 @wp.func
 def missing(p: Any, net: float, near: float) -> float:
-    """Return how much nearer the prey must come to be captured, by the mode's rule [m]; 0: it is near enough."""
+    """Return how much nearer the prey must come to be captured, by the rule of the mode [m]; 0: near enough."""
     by_net = net - p.rules.net_reach
     by_vehicle = near - p.rules.proximity
     gap = by_net
@@ -728,25 +735,25 @@ def missing(p: Any, net: float, near: float) -> float:
 
 @wp.func
 def shortened(gap: float, gap_now: float) -> float:
-    """Return by how much the step shortened the distance left to a capture [m]."""
+    """Return by how much the remaining distance to a capture decreased in the step [m]."""
     return gap - gap_now
 
 
 @wp.func
 def gap_share(gap_now: float) -> float:
-    """Return the distance left to a capture [m] over 8 m, at most 1."""
+    """Return the remaining distance to a capture [m] divided by 8 m, at most 1."""
     return wp.min(gap_now / 8.0, 1.0)
 
 
 @wp.func
 def closest_agent(was: float, near: float) -> float:
-    """Return the least distance of an agent to the prey so far [m]."""
+    """Return the smallest distance of an agent to the prey so far [m]."""
     return wp.min(was, near)
 
 
 @wp.func
 def closest_to_net(was: float, net: float) -> float:
-    """Return the least distance of the prey to the net so far [m]."""
+    """Return the smallest distance of the prey to the net so far [m]."""
     return wp.min(was, net)
 
 
@@ -758,7 +765,8 @@ def in_net(p: Any, net: float) -> bool:
 
 @wp.func
 def driving(state: State, w: int, a: int) -> float:
-    """Herder: cosine of the angle between the way to the prey and the way on to the net's middle."""
+    """Return, for the herder, the cosine of the angle between the directions to the prey and from it to the
+    net's centre."""
     prey = state.position[w, PREY]
     middle = 0.5 * (state.position[w, 1] + state.position[w, 2])
     ahead = wp.normalize(prey - state.position[w, a])
@@ -767,22 +775,22 @@ def driving(state: State, w: int, a: int) -> float:
 
 @wp.func
 def straying(state: State, w: int, a: int) -> float:
-    """Return the herder's share min(d / 8 m, 1), d its distance to the prey."""
+    """Return, for the herder, min(d / 8 m, 1) [-], with d its distance to the prey."""
     away = wp.length(state.position[w, PREY] - state.position[w, a])
     return wp.where(a == 0, wp.min(away / 8.0, 1.0), 0.0)
 
 
 @wp.func
 def misfit(state: State, p: Any, w: int, a: int) -> float:
-    """Netters: |span - 0.7 net_length|, up to the net's length [m]."""
+    """Return, for netters, |span - 0.7 net_length|, at most the net's length [m]."""
     span = wp.length(state.position[w, 2] - state.position[w, 1])
     return wp.where(a == 0, 0.0, wp.min(wp.abs(span - 0.7 * p.net_length), p.net_length))
 
 
 @wp.func
 def is_captured(p: Any, net: float, near: float, held: float) -> bool:
-    """Return whether it is captured by the mode's rule; the net of modes net and either must have it for `hold`,
-    without a break.
+    """Return whether the prey is captured by the mode's rule; in the modes net and either, the net must hold
+    it for `hold` without a break.
 
     Distances `net` and `near` are in [m], the time `held` in [s].
     """
@@ -797,7 +805,7 @@ def is_captured(p: Any, net: float, near: float, held: float) -> bool:
 
 @wp.func
 def start_team(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """The team around the origin, the prey some way off."""
+    """Start an episode: the team around the origin, the prey at a random distance."""
     pi = 3.14159265
     rng = wp.rand_init(key, 4 * w)
     turn = wp.randf(rng, -pi, pi)
@@ -815,7 +823,7 @@ def start_team(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class TeamPursuit(TeamTask, Chase):
-    """3-v-1 pursuit. What counts as a capture, the prey's speed and the stake are the level's, unless given here."""
+    """3-v-1 pursuit. The capture rule, the prey's speed and the stake are as of the `Level`, unless given here."""
 
     agents: ClassVar[tuple[str, ...]] = ("herder", "left_netter", "right_netter")
     title: ClassVar[str] = "drive a prey into a net, three against one"
@@ -826,23 +834,23 @@ class TeamPursuit(TeamTask, Chase):
     level: int = 3
     """Index of `LEVELS`."""
     capture: str | None = None
-    """One of `CAPTURE_MODES`; the level's if None. So are the next five."""
+    """One of `CAPTURE_MODES`; None: that of the level. The same holds for the next five settings."""
     proximity: float | None = None
     net_reach: float | None = None
     hold: float | None = None
     prey_speed: float | None = None
     stake: float | None = None
     touch: float = 0.02
-    """Mode touch: the net touches a hull that is within this [m]."""
+    """Distance from the net within which it touches a hull, in mode touch [m]."""
     net_length: float = 4.0
-    """A net stretched farther than this does not catch [m]."""
+    """Length beyond which the net does not catch [m]."""
     net_height: float = 1.0
-    """[m]"""
+    """Height of the net [m]."""
     prey: Prey = field(default_factory=lambda: Prey(mode="hybrid"))
     nearest: float = 3.5
     reward: TeamReward = field(default_factory=TeamReward)
     prey_radius: float = 0.0
-    """Radius of its hull, level [m]: follows from its vehicle."""
+    """Horizontal radius of its hull [m]; determined from its vehicle."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.level < len(LEVELS):
@@ -854,14 +862,14 @@ class TeamPursuit(TeamTask, Chase):
 
     @property
     def rules(self) -> Level:
-        """Return the level's rules, with this task's own changes."""
+        """Return the level's rules, with the changes of this task."""
         stated = {setting.name: getattr(self, setting.name, None) for setting in fields(Level)}
         return replace(
             LEVELS[self.level], **{name: value for name, value in stated.items() if value is not None}
         )
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "TeamPursuit":
-        """The prey's speed, size and thrust from the vehicles: herder, netters, prey."""
+        """Return the task with the prey's speed, size and thrust adapted to the vehicles: herder, netters, prey."""
         size = vehicles[-1].body.size
         return self.chased(self.rules.prey_speed, vehicles, prey_radius=float(0.25 * (size[0] + size[1])))
 
