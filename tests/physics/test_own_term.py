@@ -245,7 +245,7 @@ def test_a_term_that_cannot_be_is_refused():
         (Term(name="linear_damping", **parts), "cannot be named 'linear_damping'"),
         (
             Term(name="fin", schema=Wing, units=units, wrench=curious),
-            "takes 'colour: float', expected of: nu_r",
+            "has the argument 'colour: float', expected of: nu_r",
         ),
         (
             Term(name="fin", schema=Wing, units={"lift": "N"}, wrench=wing_wrench),
@@ -254,7 +254,7 @@ def test_a_term_that_cannot_be_is_refused():
     ):
         with pytest.raises((TermError, RegistryError), match=sentence):
             add_term(term)
-    with pytest.raises(TermError, match="not zero where all its parameters are"):
+    with pytest.raises(TermError, match="not zero when all its parameters are"):
         composed((Term(name="fin", schema=Wing, units=units, wrench=pushing),), "wrench")
 
 
