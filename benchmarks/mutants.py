@@ -29,7 +29,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "finssim"
-PACKAGES = "physics,control,localization,calibration,learning,robot"
+PACKAGES = "physics,control,localization,identification,learning,robot"
 """Packages in which places are drawn, in turn."""
 SWAPS: dict[type[ast.AST], tuple[str, str]] = {
     ast.Add: ("+", "-"),
