@@ -1,4 +1,4 @@
-"""A live view in the browser: of the virtual pool, of the simulator, and of what was recorded."""
+"""A live view in the browser of the virtual pool, of the simulator, and of records."""
 
 from typing import TYPE_CHECKING
 

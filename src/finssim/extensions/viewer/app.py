@@ -1,4 +1,4 @@
-"""The view's page and its loop."""
+"""Page of the view and its loop."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LONGEST_TURN", "Playback", "View", "blank", "draw_own", "draw_picture", "legend_of", "plots_of"]
 
-# The three-dimensional part of a view: the stage is built once, and every frame moves what moves.
+# The three-dimensional part of a view: the stage is built once, and every frame moves its objects.
 
 Colour = tuple[int, int, int]
 
@@ -65,13 +65,13 @@ COLOURS: dict[str, Colour] = {
     "part": (52, 58, 66),
     "propeller": (196, 204, 212),
 }
-"""Object -> its colour."""
+"""Object -> colour."""
 PICTURE_HEIGHT = 0.16
 """Size of the camera's frustum [m]."""
 SPIN = 4.0 * math.pi
-"""Drawn speed of a propeller at the largest thrust [rad/s]: its own would be a blur."""
+"""Drawn speed of a propeller at the largest thrust [rad/s]; at its real speed it would be a blur."""
 LANDSCAPE = 0.8
-"""Least width over height of a picture that shows the water whole from the first viewpoint."""
+"""Smallest aspect ratio (width / height) of a window in which the first viewpoint shows all the water."""
 REGION = 2.796
 """Semi-axes of the ellipsoid that contains a normally distributed position with 95 %, in standard deviations."""
 
@@ -80,10 +80,9 @@ class StageScene:
     """Draws frames of one stage."""
 
     def __init__(self, server: viser.ViserServer, stage: ViewStage) -> None:
-        """
-        Args:
-            server: Of the page.
-            stage: What stands still.
+        """Args:
+        server: Server of the page.
+        stage: Part of the view that does not change.
         """
         self._scene, self.stage = server.scene, stage
         self._scene.set_up_direction("+z")
@@ -132,11 +131,11 @@ class StageScene:
                 side="double",
             )  # fmt: skip
         server.initial_camera.up = (0.0, 0.0, 1.0)
-        if not server.get_clients():  # pages that are open are moved one by one
+        if not server.get_clients():  # open pages are moved one by one
             self.look(server.initial_camera)
 
     def draw(self, frame: ViewFrame) -> None:
-        """Move everything to where it is in a frame."""
+        """Move everything to its pose in a frame."""
         self._place("truth", frame.truth, ghost=False)
         self._place("estimate", frame.estimate, ghost=frame.truth is not None)
         self._show(self._goal, frame.goal)
@@ -153,14 +152,15 @@ class StageScene:
         arrows = force_arrows(self.stage.vehicle, frame.force, pose) if pose else np.zeros((0, 2, 3))
         _set_points(self._arrows, arrows)
         trail = line_of(frame.trail)
-        if len(trail):  # it fades into the water with its age
+        if len(trail):  # its colour approaches that of the water with age
             age = np.linspace(0.85, 0.0, len(trail) + 1)[:, None]
             colour = (1.0 - age) * COLOURS["trail"] + age * np.array(self._fog)
             self._trail.colors = _unlit(line_of(colour))
         _set_points(self._trail, trail)
 
     def _turn(self, frame: ViewFrame) -> None:
-        """Turn the propellers by the time since the frame before: their speed grows with the root of the force."""
+        """Turn the propellers by the time since the previous frame; their speed is proportional to the root
+        of the force."""
         elapsed = frame.time - self._time
         self._time = frame.time
         if len(frame.force) != len(self._angles) or not abs(elapsed) < 1.0 or not self._propellers:
@@ -171,7 +171,7 @@ class StageScene:
             node.batched_wxyzs = propeller_poses(self.stage.vehicle, self._angles)[0].astype(np.float32)
 
     def _shimmer(self, time: float) -> None:
-        """Show the caustics of a time [s], as far as their pictures have been made."""
+        """Show the caustics of a time [s], of the pictures computed so far."""
         image = next(self._images, None)
         if image is not None:
             self._add_floor(image)
@@ -181,7 +181,7 @@ class StageScene:
                 floor.visible = k == now
 
     def _doubt(self, frame: ViewFrame) -> None:
-        """Draw the ellipsoid in which the position lies with 95 % probability, where the source has a covariance."""
+        """Draw the ellipsoid that contains the position with a probability of 95 %, if the source has a covariance."""
         self._region.visible = frame.estimate is not None and frame.covariance is not None
         if frame.estimate is not None and frame.covariance is not None:
             variance, axes = np.linalg.eigh(frame.covariance)
@@ -191,7 +191,8 @@ class StageScene:
             self._region.scale = tuple((REGION * np.sqrt(np.maximum(variance, 1e-8))).tolist())
 
     def _place(self, name: str, pose: BodyPose | None, *, ghost: bool) -> None:
-        """Put a body where it is; a ghost is a net of lines, which hides nothing of the body that it lies upon."""
+        """Move a body to its pose; a ghost is drawn as a wireframe, so that it hides nothing of a body at the
+        same place."""
         body, hull, thrusters = self._bodies[name]
         self._show(body, pose)
         if hull.wireframe != ghost:
@@ -204,7 +205,7 @@ class StageScene:
         node.visible = visible
 
     def _vehicle(self, name: str) -> tuple[Any, Any, Any]:
-        """The body's node, its hull and its thrusters."""
+        """Return the body's node, its hull and its thrusters."""
         vehicle = self.stage.vehicle
         body = self._scene.add_frame(f"/{name}", show_axes=False, visible=False)
         mesh = hull_of(vehicle)
@@ -231,7 +232,7 @@ class StageScene:
         return body, hull, thrusters
 
     def _thrusters(self, name: str) -> Any:
-        """Ducts and propellers of a body."""
+        """Add ducts and propellers of a body."""
         node = self._scene.add_frame(name, show_axes=False)
         vehicle, ducts, blades = self.stage.vehicle, duct_mesh(self.stage.vehicle), propeller_mesh()
         if ducts is not None:
@@ -249,7 +250,7 @@ class StageScene:
         return node
 
     def _light(self) -> None:
-        """Daylight from above through water that is thick far away, and blue where it is deep."""
+        """Add daylight from above, and water with fog at a distance and a bluer colour at depth."""
         lower, upper = self.stage.lower, self.stage.upper
         depth, reach = float(-lower[2]), float(np.linalg.norm(upper - lower))
         self._fog = water.water_colour(depth)
@@ -269,7 +270,7 @@ class StageScene:
         )
 
     def _water(self) -> None:
-        """The pool's walls and floor, or the edges of a box, and the surface."""
+        """Add the pool's walls and floor, or the edges of a box, and the surface."""
         lower, upper = self.stage.lower, self.stage.upper
         if self.stage.walls:
             self._ground(water.floor(lower, upper), water.TILES, "tiles")
@@ -279,7 +280,7 @@ class StageScene:
         self._scene.add_mesh_trimesh("/pool/surface", water.surface(lower, top), cast_shadow=False)
 
     def _ground(self, mesh: Mesh, colour: Colour, pattern: Literal["tiles", "sand"]) -> None:
-        """Add the floor under caustics: one picture now, and the others while frames are drawn."""
+        """Add the floor with caustics: one picture now, the others while frames are drawn."""
         self._floor = mesh
         self._images = water.floor_images(colour, pattern, float(-mesh.vertices[:, 2].mean()))
         self._add_floor(next(self._images))
@@ -290,7 +291,7 @@ class StageScene:
         self._floors.append(self._scene.add_mesh_trimesh(name, mesh, cast_shadow=False, visible=first))
 
     def _camera(self, site: Pool) -> None:
-        """The overhead camera where its calibration has it."""
+        """Add the overhead camera at its calibrated pose."""
         lens, T = site.camera.lens, site.T_wp
         T_pc = np.eye(4)
         T_pc[:3, 3] = site.camera.position
@@ -316,8 +317,8 @@ class StageScene:
         """Place a camera beside and above the water; on a phone farther away, with the water above the panel.
 
         Args:
-            camera: Of a page, or the initial one.
-            aspect: Width over height of the picture [-].
+            camera: Camera of a page, or the initial one.
+            aspect: Aspect ratio of the window, width / height [-].
         """
         lower, upper = self.stage.lower, self.stage.upper
         middle, reach = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
@@ -329,7 +330,8 @@ class StageScene:
 
 
 def _unlit(colour: npt.ArrayLike) -> Image:
-    """Return colours for lines and arrows, 0 to 255, (..., 3): viser shows those without the decoding of sRGB."""
+    """Return colours for lines and arrows, 0 to 255, (..., 3), encoded because viser shows these without sRGB
+    decoding."""
     return np.asarray(255.0 * (np.asarray(colour) / 255.0) ** 2.2).astype(np.uint8)
 
 
@@ -339,22 +341,23 @@ def _set_points(node: Any, points: Array) -> None:
     node.visible = bool(len(points))
 
 
-# Curves as the browser's plots take them.
+# Curves for the browser's plots.
 
 LINES = (VERMILION, BLUE, GREEN, PINK)
 """Colours, in the order of the curves."""
 
 
 class Plot:
-    """Curves of one title, over the same times."""
+    """Curves of one title, with the same times."""
 
     def __init__(self, title: str, curves: Sequence[PlotLine]) -> None:
         self.title, self.curves = title, list(curves)
 
     def data(self, now: float) -> tuple[Array, ...]:
-        """Time, and for every curve all of it and the part up to a time [s]; from where each has a value.
+        """Return the time, and for every curve all its values and those up to a time [s], from the first time
+        with all values.
 
-        The browser's plot takes its scales from the first values, and draws nothing where one of these is NaN.
+        The browser's plot scales to the first values, and draws nothing if one of these is NaN.
         """
         finite = np.all([np.isfinite(curve.value) for curve in self.curves], axis=0)
         begin = int(np.argmax(finite))
@@ -366,7 +369,7 @@ class Plot:
         return tuple(np.ascontiguousarray(column, float) for column in columns)
 
     def series(self) -> tuple[Any, ...]:
-        """Return the lines: a complete curve faintly, and its past in full."""
+        """Return the lines: for each curve a faint one of all values and a solid one of its past."""
         drawn: list[Any] = [{"label": "t [s]"}]
         for curve, colour in zip(self.curves, LINES, strict=False):
             drawn += [{"label": "", "stroke": f"{colour}40", "width": 1}]
@@ -375,52 +378,51 @@ class Plot:
 
 
 def plots_of(curves: Sequence[PlotLine]) -> list[Plot]:
-    """Curves by title, in the order in which titles first appear."""
+    """Return curves grouped by title, in the order in which titles first appear."""
     order = list(dict.fromkeys(curve.plot for curve in curves))
     sorted_curves = sorted(curves, key=lambda curve: order.index(curve.plot))
     return [Plot(title, list(same)) for title, same in groupby(sorted_curves, key=lambda curve: curve.plot)]
 
 
 def legend_of(plots: Sequence[Plot]) -> str:
-    """Return the colours of the curves, as markup; curves of the same place in their plots share label and colour."""
+    """Return the colours of the curves as markup; curves of the same index in their plots share label and colour."""
     labels = dict.fromkeys(
         (colour, curve.label) for plot in plots for colour, curve in zip(LINES, plot.curves, strict=False)
     )
     return " · ".join(f'<span style="color:{colour}">■</span> {label}' for colour, label in labels)
 
 
-# The clock of a view: it runs, pauses, runs faster, and is set.
+# The clock of a view: it runs at a speed, pauses, and can be set.
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Times as fast as real."""
+"""Speeds to choose from, relative to real time."""
 LONGEST_TURN = 0.1
-"""Greatest advance of one turn of the loop at single speed [s]: a world slower than real time slows the clock."""
+"""Largest advance per turn of the loop at single speed [s]; a source slower than real time slows the clock down."""
 
 NEARLY = 0.05
-"""So near to its end a recording is over [s]: a slider need not reach it to the last digit."""
+"""Distance from its end at which a recording is over [s], because a slider need not reach it exactly."""
 
 
 class Playback:
-    """Position of the view in a source's time."""
+    """Present time of the view in a source."""
 
     def __init__(self, duration: float, *, speed: float = 1.0, playing: bool = True) -> None:
-        """
-        Args:
-            duration: Of the source [s]; infinite for a live one.
-            speed: Factor on the speed of time.
-            playing: Whether it runs from the start.
+        """Args:
+        duration: Duration of the source [s]; infinite for a live one.
+        speed: Speed factor relative to real time.
+        playing: Whether it runs from the start.
         """
         self.duration, self.speed, self.playing = duration, speed, playing
         self.time = 0.0
-        """[s]"""
+        """Time of the view [s]."""
 
     @property
     def live(self) -> bool:
-        """Return whether there is no end, and no way back."""
+        """Return whether the source is live: without an end, and without going back in time."""
         return math.isinf(self.duration)
 
     def advance(self, elapsed: float) -> float:
-        """Let so much real time go by [s]; returns the new time [s]. A recording stops at its end."""
+        """Advance by a real time [s] and return the new time [s]. A recording stops at its end."""
         if self.playing:
             self.time += min(elapsed, LONGEST_TURN) * self.speed
             if self.time >= self.duration:
@@ -428,36 +430,36 @@ class Playback:
         return self.time
 
     def play(self, playing: bool) -> None:
-        """Run or pause; from the end, run from the beginning."""
+        """Run or pause; at the end, run from the beginning."""
         if playing and self.time >= self.duration - NEARLY:
             self.time = 0.0
         self.playing = playing
 
     def seek(self, time: float) -> None:
-        """Go to a time [s], within the source's; a live source has no other than its own."""
+        """Set the time [s], within that of the source; without effect for a live one."""
         if not self.live:
             self.time = min(max(time, 0.0), self.duration)
 
 
-# The camera's picture with the tags outlined, in the panel's size, and the tags enlarged in a corner.
+# The camera's picture with outlines of the tags, in the panel's size, and the tags enlarged in a corner.
 
 Image = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
 
 WIDTH = 480
-"""Least width of the drawn picture, if the camera has so many pixels [px]."""
+"""Smallest width of the drawn picture, if the camera has as many pixels [px]."""
 DARK, LINE, FIRST = (30, 45, 58), (40, 230, 90), (255, 70, 60)
-"""Ground without a picture, the outline of a tag, and its first edge."""
+"""Background without a picture, outline of a tag, and its first edge."""
 COPPER = np.array([1.25, 0.78, 0.5])
-"""Shades of a sonar's fan, by red, green, blue."""
+"""Colour of a sonar's picture: red, green, blue."""
 INSET = 70
-"""Half the edge of the part that is enlarged [px of the camera]."""
+"""Half the edge of the enlarged part [px of the camera]."""
 ENLARGED = 1.5
 """Magnification of that part of the camera's picture."""
 
 
 def blank() -> Image:
-    """Return the picture before the first one, (h, w, 3)."""
+    """Return the picture that is shown before the first one, (h, w, 3)."""
     return np.full((WIDTH * 9 // 16, WIDTH, 3), DARK, np.uint8)
 
 
@@ -479,7 +481,8 @@ def draw_picture(picture: LatestPicture) -> Image:
 
 
 def draw_own(image: Image) -> Image:
-    """Return a picture of an own camera, or a sonar's fan in copper, enlarged by an integer factor, (h, w, 3)."""
+    """Return the picture of an own camera, or of a sonar in copper colours, enlarged by an integer factor,
+    (h, w, 3)."""
     if image.ndim == 2:
         image = np.clip(image[..., None] * COPPER, 0, 255).astype(np.uint8)
     times = max(1, -(-WIDTH // image.shape[1]))
@@ -487,7 +490,7 @@ def draw_own(image: Image) -> Image:
 
 
 def _inset(canvas: Image, full: Image, outlines: list[Array]) -> None:
-    """Put the surroundings of the tags, enlarged, into the lower left corner."""
+    """Draw the surroundings of the tags, enlarged, in the lower left corner."""
     middle = np.concatenate(outlines).mean(axis=0)
     size = min(round(2 * INSET * ENLARGED), canvas.shape[0], canvas.shape[1])
     first = middle - 0.5 * size / ENLARGED
@@ -500,7 +503,7 @@ def _inset(canvas: Image, full: Image, outlines: list[Array]) -> None:
 
 
 def _outline(image: Image, corners: Array, reach: int) -> None:
-    """Draw a tag's edges, lines `reach` pixels to either side; what lies outside is left out."""
+    """Draw a tag's edges as lines with `reach` pixels to either side, clipped to the picture."""
     for i in range(4):
         a, b = corners[i], corners[(i + 1) % 4]
         if not np.isfinite([a, b]).all():
@@ -514,23 +517,22 @@ def _outline(image: Image, corners: Array, reach: int) -> None:
                 image[v[inside], u[inside]] = FIRST if i == 0 else LINE
 
 
-# The side of a view: clock, health, the camera's picture, events and plots.
+# The side panel of a view: clock, health, the camera's picture, events and plots.
 
 SLIDER_STEP = 0.02
 """Step of the time slider [s]."""
 LABEL = 0.25
-"""Room of an event's word, part of the slider."""
+"""Space for an event's name, as a share of the slider."""
 
 
 class Panel:
-    """Controls and figures of one stage."""
+    """Controls and values of a stage."""
 
     def __init__(self, server: viser.ViserServer, stage: ViewStage, playback: Playback) -> None:
-        """
-        Args:
-            server: Of the page.
-            stage: What is looked at.
-            playback: The clock that the controls set.
+        """Args:
+        server: Server of the page.
+        stage: Part of the view that does not change.
+        playback: Clock that the controls set.
         """
         self._server, self._gui, self._playback = server, server.gui, playback
         self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
@@ -561,7 +563,7 @@ class Panel:
         self._last_events: tuple[str, ...] = ()
 
     def read(self) -> None:
-        """Do what the person at the controls wants."""
+        """Apply the settings of the controls."""
         playback = self._playback
         playback.speed = float(self._speed.value.removesuffix("x"))
         label = "pause" if playback.playing else "play"
@@ -572,7 +574,7 @@ class Panel:
             self._shown = float(self._slider.value)
 
     def show(self, frame: ViewFrame) -> None:
-        """Put a frame's figures on the panel."""
+        """Show a frame's values on the panel."""
         playback = self._playback
         if self._slider is None:
             self._clock.content = f"{frame.time:.1f} s"
@@ -596,7 +598,7 @@ class Panel:
             self._events.content = "  \n".join(_plain(line) for line in reversed(events)) or "none yet"
 
     def plot(self, curves: Any, now: float) -> None:
-        """Draw curves, up to a time in full [s]."""
+        """Draw curves; their part up to a time [s] is solid."""
         plots = plots_of(curves)
         named = legend_of(plots)
         if named != self._named.content:
@@ -636,7 +638,7 @@ class Panel:
 
 
 def event_marks(events: Sequence[tuple[float, str]], end: float) -> tuple[float | tuple[float, str], ...]:
-    """Return marks of a slider from 0 to `end` [s]: each event's time, and its kind where there is room for a word."""
+    """Return marks of a slider from 0 to `end` [s]: each event's time, and its kind if there is space for it."""
     marks: list[float | tuple[float, str]] = []
     free = 0.0
     for moment, text in events:
@@ -655,7 +657,7 @@ def _legend() -> str:
 
 
 def _plain(text: str) -> str:
-    """A line in which nothing is markup."""
+    """Return a line with all markup escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|" else c for c in text)
 
 
@@ -665,21 +667,22 @@ ICON = (
     f"<rect width='32' height='32' rx='7' fill='{BLUE}'/><path fill='#fff' d='M7 20C13 18 16 12 17 4c4 5 7 10 8 16z'/>"
     f"<path fill='none' stroke='{SKY}' stroke-width='3' d='M3 26q4.3-4 8.6 0t8.7 0t8.7 0'/></svg>"
 )
-"""Name of the page, and a fin above water, in the browser's tab."""
+"""Name of the page, and its icon: a fin above water."""
 PHONE = (
     "<style>@media (max-width: 36em) {"
     ".mantine-Paper-root[style*='fixed'] { width: 100% !important; max-height: 45% !important; }"
     ".mantine-Paper-root[style*='fixed'] [style*='20em'] { width: 100% !important; } }</style>"
 )
-"""On a phone, viser's panel is a sheet at the bottom: as wide as the page, and not so high that it hides the scene."""
+"""Style for phones: viser's panel is a sheet at the bottom, as wide as the page and low enough not to hide
+the scene."""
 RATE = 20.0
-"""Frames a second [Hz]."""
+"""Frame rate [Hz]."""
 PLOT_PERIOD = 0.5
-"""Between drawings of the plots [s]."""
+"""Time between two updates of the plots [s]."""
 
 
 def _check_address(bind: str) -> None:
-    """Refuse an address that is not this machine's, at which viser would wait for ever."""
+    """Raise for an address that is not this machine's, for which viser would wait without limit."""
     try:
         family, *_, address = socket.getaddrinfo(bind, 0, type=socket.SOCK_STREAM)[0]
         socket.create_server(address[:2], family=family).close()
@@ -689,13 +692,14 @@ def _check_address(bind: str) -> None:
 
 
 def _own_guests(bind: str) -> Callable[[Any, Any], Any]:
-    """Answer requests of other pages with 403.
+    """Return a function that answers requests of other pages with 403.
 
-    A page of another site may open a WebSocket to any address, and its name may be made to lead here. So the host that
-    a browser asks for must be an address, `localhost` or this machine's name, and a WebSocket's origin the page there.
+    A page of another site can open a WebSocket to any address, and its host name can resolve to this machine.
+    Therefore the host that a browser requests must be an address, `localhost` or this machine's name, and the
+    origin of a WebSocket must be this page.
 
     Args:
-        bind: Where the page is served.
+        bind: Address at which the page is served.
     """
     own = socket.gethostname().lower()
     names = {"localhost", own, f"{own}.local", bind.lower()}
@@ -721,7 +725,7 @@ def _is_address(name: str) -> bool:
 
 
 def _titled(page: Any) -> Any:
-    """Give the page, in the answer to its request, its own title and icon."""
+    """Set the title and icon of the page in the response to its request."""
     if page is not None and page.headers.get("Content-Type", "").startswith("text/html"):
         page.body = page.body.replace(b"<title>Viser</title>", f"<title>{TITLE}</title>{PHONE}".encode(), 1)
         page.body = re.sub(
@@ -734,7 +738,8 @@ def _titled(page: Any) -> Any:
 
 @contextmanager
 def _only_own_pages(bind: str) -> Iterator[None]:
-    """Have the server that viser starts meanwhile check who connects, and name its page, which viser does not offer."""
+    """Let a server that viser starts in this context check who connects, and set the page's title; viser
+    offers neither."""
     serve, check = websockets.asyncio.server.serve, _own_guests(bind)
 
     def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
@@ -743,7 +748,7 @@ def _only_own_pages(bind: str) -> Iterator[None]:
             if refusal is not None or process_request is None:
                 return refusal
             if "Accept-Encoding" in request.headers:
-                del request.headers["Accept-Encoding"]  # so the page comes as text
+                del request.headers["Accept-Encoding"]  # so that the page is sent uncompressed
             return _titled(process_request(connection, request))
 
         return serve(*arguments, process_request=answer, **options)
@@ -760,7 +765,7 @@ _STARTING = threading.Lock()
 
 
 class View:
-    """A page that shows a source. `run` is its loop; `turn` one pass of it."""
+    """Page that shows a source. `run` is its loop, `turn` one iteration of it."""
 
     def __init__(
         self,
@@ -774,10 +779,10 @@ class View:
         """Serve the page.
 
         Args:
-            source: What is shown, which belongs to the view from now on; nothing before `show` if None.
-            bind: Address to serve at; this machine alone by default.
-            port: To serve at, or the next one that is free.
-            speed: Factor on the speed of time.
+            source: Source to show, which the view closes; None shows nothing before `show`.
+            bind: Address to serve at; by default only this machine.
+            port: Port to serve at; if it is in use, the next free one.
+            speed: Speed factor relative to real time.
             playing: Whether it runs from the start.
         """
         _check_address(bind)
@@ -793,10 +798,10 @@ class View:
             self.show(source)
         host = "localhost" if bind in ("0.0.0.0", "::") else bind
         self.url = f"http://{host}:{self.server.get_port()}"
-        """Of the page."""
+        """URL of the page."""
 
     def show(self, source: Source) -> None:
-        """Show a source from its beginning, instead of the one before, which is closed."""
+        """Show a source from its beginning, instead of the previous one, which is closed."""
         if self.source is not None:
             self.source.close()
         with self.server.atomic():
@@ -815,7 +820,7 @@ class View:
             self.scene.look(page.camera, page.camera.aspect)
 
     def turn(self, elapsed: float) -> None:
-        """Let so much real time go by [s], and draw what that changes."""
+        """Advance by a real time [s], and draw the changes."""
         if self.source is None:
             return
         self.panel.read()
@@ -832,7 +837,7 @@ class View:
             self._plotted, self._since_plot = now, 0.0
 
     def run(self, until: Callable[[], bool], *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Show the source until a function asks to stop."""
+        """Show the source until `until` returns true."""
         before = clock()
         while not until():
             now = clock()
@@ -841,7 +846,7 @@ class View:
             time.sleep(max(0.0, 1.0 / RATE - (clock() - now)))
 
     def close(self) -> None:
-        """Take the page down."""
+        """Stop the server and close the source."""
         with redirect_stdout(StringIO()):
             self.server.stop()
         if self.source is not None:

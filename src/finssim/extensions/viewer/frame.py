@@ -1,4 +1,4 @@
-"""Content of a view: the stage, which does not change, and a frame for every moment."""
+"""Content of a view: the stage, which does not change, and a frame for every time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:  # the first picture of a view does not wait for them
+if TYPE_CHECKING:  # not imported before the first picture of a view
     from finssim.extensions.perception import World
     from finssim.localization.overhead_camera import Pool
     from finssim.robot.messages import TagCorners
@@ -20,17 +20,17 @@ Array = npt.NDArray[np.float64]
 
 
 class ViewError(ValueError):
-    """Something that cannot be shown."""
+    """The source cannot be shown."""
 
 
 class FixedBody(NamedTuple):
-    """A fixed body of a world."""
+    """Fixed body of a world."""
 
     name: str
     vertices: Array
-    """World frame [m], (v, 3)."""
+    """Vertices in the world frame [m], (v, 3)."""
     faces: npt.NDArray[np.int64]
-    """(f, 3)"""
+    """Vertex indices of the triangles, (f, 3)."""
     colour: tuple[int, int, int]
     """Red, green, blue, 0 to 255."""
 
@@ -39,13 +39,13 @@ class BodyPose(NamedTuple):
     """Pose of the body."""
 
     position: Array
-    """World frame [m], (3,)."""
+    """Position in the world frame [m], (3,)."""
     quaternion: Array
-    """Body to world, xyzw, (4,)."""
+    """Orientation, body to world, xyzw, (4,)."""
 
 
 def nowhere() -> Array:
-    """Return no points, (0, 3) [m]."""
+    """Return an array of no points, (0, 3) [m]."""
     return np.zeros((0, 3))
 
 
@@ -62,98 +62,97 @@ class ViewStage:
     walls: bool = True
     """True if the box is a pool; otherwise it is the space in which the vehicle may move."""
     site: Pool | None = None
-    """Camera, if one looks on."""
+    """Overhead camera, if there is one."""
     path: Array = field(default_factory=nowhere)
     """Trajectory to follow, world frame [m], (k, 3)."""
     bodies: Sequence[FixedBody] = ()
     """Bodies of the world around the vehicle."""
     events: Sequence[tuple[float, str]] = ()
-    """Time since the source's beginning [s] and text of everything that happens in a recorded one, in order."""
+    """Time since the start of the source [s] and text of all events of a recorded source, in order."""
     eyes: Sequence[str] = ()
-    """Names of the vehicle's own cameras and sonars, whose pictures frames have."""
+    """Names of the vehicle's own cameras and sonars whose pictures frames have."""
 
 
 @dataclass(frozen=True)
 class LatestPicture:
-    """The camera's latest picture."""
+    """Latest picture of the overhead camera."""
 
     image: npt.NDArray[np.uint8] | None
-    """Grey values; None where only tags are known."""
+    """Grey values; None if only tags are known."""
     tags: Sequence[TagCorners] = ()
     size: tuple[int, int] = (720, 1280)
-    """Rows and columns."""
+    """Numbers of rows and columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewFrame:
-    """One moment."""
+    """Content of the view at one time."""
 
     time: float
-    """Since the source's beginning [s]."""
+    """Time since the start of the source [s]."""
     truth: BodyPose | None = None
     estimate: BodyPose | None = None
     covariance: Array | None = None
     """Covariance of the estimated position, world frame [m²], (3, 3); None if the source has none."""
     goal: BodyPose | None = None
     force: Array = field(default_factory=lambda: np.zeros(0))
-    """Forces of the thrusters, canonical order [N], (n,), or none."""
+    """Forces of the thrusters, canonical order [N], (n,), or empty."""
     values: Array = field(default_factory=lambda: np.zeros(0))
-    """Values of the other actuators, in the vehicle file's order [rad, m³ or m], (m,), or none."""
+    """Values of the other actuators, in the vehicle file's order [rad, m³ or m], (m,), or empty."""
     trail: Array = field(default_factory=nowhere)
     """Recent positions of the vehicle, world frame [m], (k, 3)."""
     picture: LatestPicture | None = None
     pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
-    """Latest pictures of the vehicle's own cameras, (rows, columns, 3), and of its sonars as fans from above, gray; by
-    name."""
+    """Latest pictures by name: of the vehicle's own cameras, (rows, columns, 3), and of its sonars as grey
+    fans from above."""
     status: Mapping[str, str] = field(default_factory=dict)
-    """Name -> a few words or a number with its unit."""
+    """Name -> short text, or a number with its unit."""
     events: Sequence[str] = ()
-    """The latest, newest last."""
+    """Latest events, the newest last."""
     notice: str = ""
-    """A few words beside the vehicle."""
+    """Short text beside the vehicle."""
 
 
 class PlotLine(NamedTuple):
-    """One line of a plot."""
+    """Curve of a plot."""
 
     plot: str
     """Title of the plot, with the unit."""
     label: str
     time: Array
-    """[s], (k,)"""
+    """Times [s], (k,)."""
     value: Array
-    """Values in the unit of the plot, NaN where there is none, (k,)."""
+    """Values in the unit of the plot, NaN if unknown, (k,)."""
 
 
 class Source(Protocol):
-    """Source of frames. A recorded one gives any time; a live one advances to the time, and never goes back."""
+    """Source of frames. A recorded one has frames of all times; a live one only advances."""
 
     stage: ViewStage
     duration: float
-    """[s]; infinite for a live one."""
+    """Duration [s]; infinite for a live source."""
 
     def frame(self, time: float) -> ViewFrame:
-        """The moment at a time since the beginning [s]."""
+        """Return the frame at a time since the start [s]."""
 
     def curves(self) -> Sequence[PlotLine]:
-        """Errors over time, as far as they are known. Curves of one plot have the same times."""
+        """Return the known errors over time. Curves of one plot have the same times."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release all resources."""
 
 
 class Placeholder:
-    """A vehicle at rest, shown until the source of a view has been made."""
+    """Vehicle at rest, shown until the source of a view is ready."""
 
     duration = math.inf
 
     def __init__(self, vehicle: Vehicle, title: str, notice: str, *, placed: bool = True) -> None:
-        """
-        Args:
-            vehicle: Any one.
-            title: Of the view.
-            notice: What is being waited for, in a few words.
-            placed: False leaves the vehicle out, where it is not known yet.
+        """Args:
+        vehicle: Vehicle to show.
+        title: Title of the view.
+        notice: Short text about what is being waited for.
+        placed: False hides the vehicle, if it is not yet known.
         """
         deep = max(0.5, float(vehicle.body.size[2]))
         room = max(4.0, 3.0 * float(vehicle.body.size[0]))
@@ -163,34 +162,35 @@ class Placeholder:
         self._pose, self._notice = pose if placed else None, notice
 
     def frame(self, time: float) -> ViewFrame:
-        """Return the vehicle, which does not move, at a time since the beginning [s]."""
+        """Return the vehicle, which does not move, at a time since the start [s]."""
         return ViewFrame(time=time, truth=self._pose, status={"state": self._notice}, notice=self._notice)
 
     def curves(self) -> Sequence[PlotLine]:
-        """No errors."""
+        """Return no curves."""
         return ()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, because nothing is open."""
 
 
 # The box of water that is drawn.
 
 AROUND = 4.0
-"""The viewpoint of a world, to each side [m]."""
+"""Half the width of the shown part of a world, around its viewpoint [m]."""
 MARGIN = 0.5
-"""Around a motion that nothing bounds [m]."""
+"""Margin around a motion without bounds [m]."""
 
 
 def box_of(
     vehicle: Vehicle, basin: tuple[float, float, float] | None, positions: Array
 ) -> tuple[Array, Array]:
-    """Lower and upper corner of a pool; without one of the vehicle's workspace, or of the motion [m], (3,).
+    """Return the lower and upper corner of a pool, otherwise of the vehicle's workspace, or of the motion
+    [m], (3,).
 
     Args:
-        vehicle: Its file may bound where it moves.
+        vehicle: Vehicle, whose file may limit its workspace.
         basin: Length, width and depth [m], centred on the world's z axis under z = 0.
-        positions: That are to be seen, world frame [m], (k, 3).
+        positions: Positions to be included, world frame [m], (k, 3).
     """
     if basin is not None:
         half = np.array([0.5 * basin[0], 0.5 * basin[1]])
@@ -208,7 +208,8 @@ def box_of(
 
 
 def box_of_world(world: World) -> tuple[Array, Array]:
-    """Lower and upper corner of a world: its basin, or about its viewpoint down to the seabed [m], (3,)."""
+    """Return the lower and upper corner of a world: its basin, or around its viewpoint down to the seabed
+    [m], (3,)."""
     if world.basin is not None:
         length, width, depth = world.basin.size
         return np.array([-0.5 * length, -0.5 * width, -depth]), np.array([0.5 * length, 0.5 * width, 0.0])

@@ -1,4 +1,4 @@
-"""`finssim view`: make a source, serve its page, and end with Ctrl-C."""
+"""`finssim view`: open a source, serve its page, and end with Ctrl-C."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ HEEDED = {
     "record": {"truth", "truth_offset", "basin", "world", "seed"},
     "folder": {"world"},
 }
-"""Kind of source -> options, besides the vehicle, that it uses."""
+"""Kind of source -> options that it uses, besides the vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceChoice:
-    """Source that a person wants to view."""
+    """Source that the user wants to view."""
 
     source: Annotated[str, "argument"] = "pool"
     """(pool|sim|FILE|FOLDER) Source: pool (the virtual pool with a robot in it), sim (the simulator), a record
     (.mcap), or a folder written by the engine's recorder."""
     vehicle: str | None = None
-    """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file; finsrov, or that of the record, if not
-    given."""
+    """(NAME|FILE) Vehicle in the catalogue, or a vehicle file; if not given, finsrov, or the vehicle of the record."""
     policy: str = "pid"
     """(DIR|pid|pid-paper) Controller in pool and sim: a policy's directory, pid or pid-paper."""
     task: str | None = None
-    """(TASK) Task that the policy must have been trained for: t1 or t2; t2 follows a default trajectory if none is
-    given."""
+    """(TASK) Task that the policy must have been trained for: t1 or t2; without a trajectory, t2 follows a
+    default one."""
     goal: str | None = None
-    """(X,Y,Z,YAW|FILE) Station to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
+    """(X,Y,Z,YAW|FILE) Pose to keep in pool and sim: x,y,z [m] in the world frame and heading [deg], or a file."""
     trajectory: str | None = None
     """(NAME|FILE) Trajectory to follow instead of a goal: a name or a file."""
     plant: str = "1"
@@ -52,25 +51,25 @@ class SourceChoice:
     hydrodynamics: str = "calibrated"
     """(MODEL) Hydrodynamic model: calibrated, simplified or mesh."""
     truth: Path | None = None
-    """(FILE) Truth file of the pool, to show beside a record."""
+    """(FILE) Truth file of the pool, to show with a record."""
     truth_offset: float | None = None
-    """Robot's clock at time 0 of the pool's clock [s]; estimated from both motions if not given."""
+    """Time of the robot's clock when the pool's clock is 0 [s]; if not given, estimated from both motions."""
     basin: str | None = None
-    """(L,W,D) Pool to show around a record: length,width,depth [m]; the vehicle's workspace if not given."""
+    """(L,W,D) Pool to show around a record: length,width,depth [m]; if not given, the vehicle's workspace."""
     world: str | None = None
-    """(SITE|FILE|NUMBER) For pool, the world of the vehicle's own cameras and sonars (a site of finssim worlds or a
-    file), located by motion capture; for a record, the world to show, drawn from --seed; for a folder, the index of
-    the run's world, the first if not given."""
+    """(SITE|FILE|NUMBER) For pool, the world of the vehicle's own cameras and sonars (a site of finssim
+    worlds or a file), with motion capture for localization; for a record, the world to show, drawn from
+    --seed; for a folder, the index of the run's world, by default the first."""
     seed: int = 1
-    """Seed of every random number; equal seeds give equal results."""
+    """Seed of all random numbers; equal seeds give equal results."""
 
 
 def open_source(choice: SourceChoice) -> Source:
-    """The source that was asked for.
+    """Return the source that a choice describes.
 
     Raises:
-        ViewError: There is none of that name.
-        ValueError: What it is made of is refused, in one sentence.
+        ViewError: There is no such source.
+        ValueError: Its content is invalid; the message is one sentence.
     """
     kind, path = _check(choice), Path(choice.source)
     if kind == "pool":
@@ -113,7 +112,7 @@ def run(
     Example: finssim view pool --policy pid --trajectory ellipse --severity hard --camera pictures
 
     Args:
-        choice: What to look at.
+        choice: Source to view.
         speed: Speed factor relative to real time [-].
         port: Port of the page; the next free one if it is in use.
         bind (ADDRESS): Address to serve at; only this machine if not given.
@@ -143,11 +142,11 @@ def run(
 
 
 FIRST = 0.2
-"""A live source runs to this time before it is shown [s]: so its kernels are compiled behind the placeholder."""
+"""Time to which a live source runs before it is shown [s], so that its kernels are compiled during the placeholder."""
 
 
 def _ready(choice: SourceChoice) -> Source | None:
-    """Return the source once its kernels are compiled, while the page is served by its own thread; None if stopped."""
+    """Return the source once its kernels are compiled, while a thread serves the page; None if interrupted."""
     with interrupting(), suppress(KeyboardInterrupt):
         source = open_source(choice)
         source.frame(FIRST)
@@ -156,7 +155,7 @@ def _ready(choice: SourceChoice) -> Source | None:
 
 
 def _placeholder(choice: SourceChoice, kind: str) -> Source:
-    """Return the first picture of a view: the vehicle, if it is known before a record has been read."""
+    """Return the first content of a view: the vehicle, if it is known before a record has been read."""
     name = choice.vehicle or "finsrov"
     if kind in ("pool", "sim"):
         return Placeholder(load_vehicle(name), f"{kind}: {name}", "compiling kernels …")
@@ -165,7 +164,7 @@ def _placeholder(choice: SourceChoice, kind: str) -> Source:
 
 
 def _check(choice: SourceChoice) -> str:
-    """Return the kind of the source; refuse one that does not exist and options that it would not use."""
+    """Return the kind of the source; raise if it does not exist, and for options that it would not use."""
     path = Path(choice.source)
     kind = choice.source if choice.source in ("pool", "sim") else "folder" if path.is_dir() else "record"
     if kind == "record" and not path.is_file():

@@ -1,4 +1,4 @@
-"""Values over time: looked up in what is recorded, or kept of what goes by."""
+"""Values over time, of a record or collected from a live source."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ TRAIL = 30.0
 """Duration of the displayed trail [s]."""
 TRAIL_POINTS = 150
 KEPT = 1200
-"""Points that a live curve has at most."""
+"""Largest number of points of a live curve."""
 SAMPLE = 0.1
-"""Between the points of a live curve [s]."""
+"""Time between the points of a live curve [s]."""
 
 
 class TimeSeries:
-    """Keep values of any unit in the order of their times [s], (n,)."""
+    """Values of any unit in the order of their times [s], (n,)."""
 
     def __init__(self, time: npt.ArrayLike = (), values: Sequence[Any] | Array = ()) -> None:
         self.time = np.asarray(time, float)
         self.values = values
 
     def at(self, time: float) -> Any:
-        """The newest value that is not later than a time [s]; None before the first."""
+        """Return the last value that is not later than a time [s]; None before the first."""
         i = int(np.searchsorted(self.time, time, side="right")) - 1
         return None if i < 0 else self.values[i]
 
 
 class PoseSeries:
-    """Keep a recorded motion: times [s], (n,), positions [m], (n, 3), and quaternions, (n, 4), world frame."""
+    """Recorded motion: times [s], (n,), positions [m], (n, 3), and quaternions, (n, 4), world frame."""
 
     def __init__(self, time: npt.ArrayLike, position: npt.ArrayLike, quaternion: npt.ArrayLike) -> None:
         self.time = np.asarray(time, float)
@@ -55,17 +55,18 @@ class PoseSeries:
         return len(self.time)
 
     def at(self, time: float) -> BodyPose | None:
-        """The newest pose that is not later than a time [s]; None before the first."""
+        """Return the last pose that is not later than a time [s]; None before the first."""
         i = int(np.searchsorted(self.time, time, side="right")) - 1
         return None if i < 0 else BodyPose(self.position[i], self.quaternion[i])
 
     def trail(self, time: float) -> Array:
-        """Return the positions in the half minute before a time [s], world frame [m], (k, 3)."""
+        """Return the positions in the 30 s before a time [s], world frame [m], (k, 3)."""
         first, last = np.searchsorted(self.time, (time - TRAIL, time))
         return self.position[first:last][:: max(1, (last - first) // TRAIL_POINTS)] if last else nowhere()
 
     def on(self, time: Array) -> tuple[Array, Array]:
-        """Positions (k, 3) and unwrapped headings (k,) [rad] at other times; NaN outside its own."""
+        """Return positions (k, 3) and unwrapped headings (k,) [rad], interpolated at times; NaN outside the
+        record's times."""
         if not len(self):
             return np.full((len(time), 3), np.nan), np.full(len(time), np.nan)
         columns = [*self.position.T, np.unwrap(quat_yaw(self.quaternion))]
@@ -74,13 +75,13 @@ class PoseSeries:
 
 
 def errors_between(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Distances [m] and turns [deg], (k,), between positions and headings (k, 3), (k,)."""
+    """Return distances [m] and heading differences [deg], (k,), between positions and headings (k, 3), (k,)."""
     turn = np.degrees(np.abs((a[1] - b[1] + math.pi) % (2.0 * math.pi) - math.pi))
     return np.linalg.norm(a[0] - b[0], axis=1), turn
 
 
 class Errors:
-    """Errors of a vehicle that is alive, and its trail."""
+    """Errors and recent positions of a vehicle in a live source."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[float, ...]] = deque(maxlen=KEPT)
@@ -89,7 +90,7 @@ class Errors:
     def add(
         self, time: float, true: BodyPose | None, estimate: BodyPose | None, goal: BodyPose | None
     ) -> None:
-        """Keep a moment, its time in [s], if the last one that was kept is old enough."""
+        """Store the errors of a time [s], if the last stored one is at least `SAMPLE` before."""
         if self._rows and time < self._rows[-1][0] + SAMPLE - 1e-9:
             return
         pose = true or estimate
@@ -104,22 +105,22 @@ class Errors:
 
     @property
     def latest(self) -> tuple[float, ...]:
-        """Errors to the goal [m, deg] and of the estimate [m, deg]; NaN where not known."""
+        """Return errors to the goal [m, deg] and of the estimate [m, deg]; NaN if unknown."""
         return self._rows[-1][1:] if self._rows else (math.nan,) * 4
 
     @property
     def to_goal(self) -> str:
-        """Distance and turn to the goal, in words."""
+        """Return distance and heading difference to the goal as text."""
         distance, turn, *_ = self.latest
         return "-" if math.isnan(distance) else f"{100.0 * distance:.1f} cm, {turn:.1f}°"
 
     @property
     def of_estimate(self) -> str:
-        """Distance of the estimate from the truth, in words."""
+        """Return the distance of the estimate from the truth as text."""
         return "-" if math.isnan(self.latest[2]) else f"{100.0 * self.latest[2]:.1f} cm"
 
     def curves(self) -> list[PlotLine]:
-        """Return the errors that have a value."""
+        """Return the curves of the errors that have values."""
         rows = np.array(self._rows).reshape(-1, 5)
         time = rows[:, 0]
         curves = [

@@ -1,4 +1,4 @@
-"""Meshes and lines of what is drawn: the hull, thrusters, tags, the pool, and forces as arrows."""
+"""Meshes and lines that are drawn: hull, thrusters, tags, the pool, and forces as arrows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from finssim.core.rotations import quat_from_rotvec, quat_multiply, quat_to_matr
 from finssim.extensions.viewer.frame import BodyPose, FixedBody
 from finssim.vehicles import Vehicle, VehicleError
 
-if TYPE_CHECKING:  # the first picture of a view does not wait for them
+if TYPE_CHECKING:  # not imported before the first picture of a view
     from finssim.extensions.perception.layout import Shape, WorldLayout
     from finssim.physics.actuators.fin import Fin
     from finssim.robot.messages import Picture
@@ -20,30 +20,31 @@ if TYPE_CHECKING:  # the first picture of a view does not wait for them
 Array = npt.NDArray[np.float64]
 
 ARROW = 1.2
-"""Length of the arrow of the largest thrust, part of the vehicle's length."""
+"""Length of the arrow of the largest thrust, as a share of the vehicle's length."""
 FAINT = 0.002
-"""Part of the largest thrust below which no arrow is drawn."""
+"""Share of the largest thrust below which no arrow is drawn."""
 FAR, GAMMA = 15.0, 2.2
-"""Half the edge of a plane that is drawn [m]; reflectances are shown to this power."""
+"""Half the edge of a drawn plane [m]; gamma of the drawn colours, which are reflectances to the power of 1/gamma."""
 
 
 class Mesh(NamedTuple):
-    """Triangles."""
+    """Triangle mesh."""
 
     vertices: Array
-    """[m], (v, 3)"""
+    """Vertices [m], (v, 3)."""
     faces: npt.NDArray[np.int64]
-    """Counter-clockwise seen from outside, (f, 3)."""
+    """Vertex indices of the triangles, counter-clockwise seen from outside, (f, 3)."""
 
 
 def wxyz(quaternion: npt.ArrayLike) -> tuple[float, float, float, float]:
-    """A quaternion xyzw, body to world, (4,), in the order that the browser takes."""
+    """Return a quaternion xyzw, body to world, (4,), in the order of the browser, wxyz."""
     x, y, z, w = np.asarray(quaternion, float).tolist()
     return w, x, y, z
 
 
 def hull_of(vehicle: Vehicle) -> Mesh:
-    """The hull in the body frame; where the vehicle's file gives none, a body of its size and volume, or its box."""
+    """Return the hull in the body frame; without one in the vehicle's file, a body of its size and volume, or
+    its box."""
     body = vehicle.body
     try:
         if vehicle.hull is None:
@@ -55,7 +56,7 @@ def hull_of(vehicle: Vehicle) -> Mesh:
 
 
 def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
-    """White plates and the dark squares on them where tags sit, body frame; None without tags."""
+    """Return the white plates of the tags and the dark squares on them, body frame; None without tags."""
     tags = vehicle.tags
     if tags is None:
         return None
@@ -72,8 +73,8 @@ def tag_plates(vehicle: Vehicle) -> tuple[Mesh, Mesh] | None:
 
 
 def fin_plates(vehicle: Vehicle) -> dict[int, Mesh]:
-    """Return the plate of each fin about its position at deflection 0, in body axes, by its index among the actuators
-    besides thrusters."""
+    """Return the plate of each fin at deflection 0, in body axes relative to its position, by its index among
+    the actuators besides thrusters."""
     plates: dict[int, Mesh] = {}
     if not vehicle.actuators:
         return plates
@@ -94,7 +95,7 @@ def fin_attitude(fin: Fin, deflection: float) -> Array:
 
 
 def duct_mesh(vehicle: Vehicle) -> Mesh | None:
-    """Return the ducts of the thrusters, body frame; None of a vehicle with a single, open propeller."""
+    """Return the ducts of the thrusters, body frame; None for a vehicle with a single, open propeller."""
     import trimesh
 
     if len(vehicle.thrusters) < 2:
@@ -107,7 +108,7 @@ def duct_mesh(vehicle: Vehicle) -> Mesh | None:
 
 
 def propeller_mesh() -> Mesh:
-    """Return a hub and three twisted blades of unit radius about z."""
+    """Return a hub and three twisted blades of unit radius around z."""
     import trimesh
 
     hub = trimesh.creation.cylinder(0.24, 0.8, sections=12)
@@ -132,13 +133,13 @@ def propeller_poses(vehicle: Vehicle, angles: npt.ArrayLike) -> tuple[Array, Arr
 
 
 def _radii(vehicle: Vehicle) -> Array:
-    """Return the radii of the propellers [m], as the file gives them or in proportion to the hull, (n,)."""
+    """Return the radii of the propellers [m], of the file or in proportion to the hull, (n,)."""
     usual = 0.17 * float(np.min(vehicle.body.size))
     return np.array([usual if t.diameter is None else 0.5 * t.diameter for t in vehicle.thrusters.values()])
 
 
 def _shafts(vehicle: Vehicle) -> list[tuple[Array, Array]]:
-    """Return position [m] and attitude of each propeller, which turns z to the thrust's axis; body frame, xyzw."""
+    """Return position [m] and attitude of each propeller, which rotates z to the thrust's axis; body frame, xyzw."""
     shafts = []
     for thruster in vehicle.thrusters.values():
         x, y, z = thruster.axis
@@ -149,10 +150,11 @@ def _shafts(vehicle: Vehicle) -> list[tuple[Array, Array]]:
 
 
 def force_arrows(vehicle: Vehicle, force: Array, pose: BodyPose) -> Array:
-    """Start and end of an arrow for each thruster that pushes, world frame [m], (k, 2, 3).
+    """Return start and end of an arrow for each thruster with a visible force, world frame [m], (k, 2, 3).
 
-    An arrow points where its thruster pushes the vehicle. Its length grows with the root of the force, as the shaft
-    speed does: linear ones would be too small to see while a station is kept.
+    An arrow has the direction of the force on the vehicle. Its length is proportional to the root of the
+    force, like the shaft speed, because a proportional length would be too small to see while a position is
+    kept.
     """
     if not len(force):
         return np.zeros((0, 2, 3))
@@ -168,13 +170,13 @@ def force_arrows(vehicle: Vehicle, force: Array, pose: BodyPose) -> Array:
 
 
 def line_of(points: Array) -> Array:
-    """Segments of a line through points, (k - 1, 2, 3) [m]."""
+    """Return the segments of a line through points, (k - 1, 2, 3) [m]."""
     points = points[np.isfinite(points).all(axis=1)] if len(points) else points
     return np.stack([points[:-1], points[1:]], axis=1) if len(points) > 1 else np.zeros((0, 2, 3))
 
 
 def box_edges(lower: Array, upper: Array) -> Array:
-    """The twelve edges of a box, (12, 2, 3) [m]."""
+    """Return the twelve edges of a box, (12, 2, 3) [m]."""
     corners = _box(lower, upper).vertices
     pairs = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
     return np.array([[corners[a], corners[b]] for a, b in pairs])
@@ -196,9 +198,9 @@ def shown_of(vehicle: Vehicle, picture: Picture) -> npt.NDArray[np.uint8] | str:
 
 
 def world_bodies(layout: WorldLayout) -> list[FixedBody]:
-    """Return the bodies of the first world of a layout; the copies in a row are one body.
+    """Return the bodies of the first world of a layout; copies in a row are one body.
 
-    Planes end 15 m from their middle, and basins have no walls: the stage has.
+    Planes end 15 m from their centre. Basins are omitted, because the stage draws walls.
     """
     parts: dict[str, list[Mesh]] = {}
     colours = {}
@@ -220,7 +222,7 @@ def _joined(meshes: list[Mesh]) -> Mesh:
 
 
 def _mesh_of(shape: Shape) -> Mesh:
-    """Triangles of a shape, in its axes."""
+    """Return the triangles of a shape, in its axes."""
     size = shape.size
     if shape.kind == "mesh":
         return Mesh(np.asarray(shape.vertices, float), np.asarray(shape.faces))
@@ -249,7 +251,7 @@ def _mesh_of(shape: Shape) -> Mesh:
 
 
 def _box(lower: Array, upper: Array) -> Mesh:
-    """A box, its corners in the order of x, y, z."""
+    """Return a box; its corners are ordered by x, y, z."""
     import trimesh.creation as made
 
     solid = made.box(bounds=[lower, upper])
@@ -257,7 +259,7 @@ def _box(lower: Array, upper: Array) -> Mesh:
 
 
 def _squares(places: list[tuple[Array, Array, float]], lift: float) -> Mesh:
-    """Squares about the z axes of mounts, each with its edge, seen from both sides."""
+    """Return squares perpendicular to the z axes of mounts, each with its edge, visible from both sides."""
     flat = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     vertices = [(edge * flat + [0.0, 0.0, lift]) @ R.T + np.asarray(position) for position, R, edge in places]
     faces = [np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(len(places))]

@@ -62,10 +62,10 @@ from finssim.vehicles import Vehicle, catalogue_vehicle, load_vehicle
 
 Array = npt.NDArray[np.float64]
 
-# The virtual pool with a robot in it: both in this process, in lock-step.
+# The virtual pool with a robot in it, both in this process, in lock-step.
 
 RATE = 60.0
-"""Steps of the robot's loop [Hz]."""
+"""Rate of the robot's loop [Hz]."""
 EVENTS = 8
 """Number of displayed events."""
 
@@ -84,16 +84,15 @@ class PoolSource:
         task: str | None = None,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            guide: Where the vehicle shall go.
-            plan: The pool; a vehicle with its own cameras and sonars begins at the viewpoint of their world.
+        """Args:
+            guide: Goal or trajectory of the vehicle.
+            plan: Pool; a vehicle with its own cameras and sonars starts at the viewpoint of their world.
             policy: Name of a PID, or a policy's directory.
-            task: That the policy must have been trained for.
-            seed: Of noises.
+            task: Task that the policy must have been trained for.
+            seed: Seed of the noises.
 
         Raises:
-            PlantSpecError, PolicyError, ControlError, VehicleError: What cannot be made.
+            PlantSpecError, PolicyError, ControlError, VehicleError: The pool, policy or goal is invalid.
         """
         ours, basin, eye = plan.vehicle, plan.spec.basin, plan.eye()
         begin, self._own = start_of(guide), dict[str, Any]()
@@ -131,7 +130,7 @@ class PoolSource:
         )
 
     def frame(self, time: float) -> ViewFrame:
-        """Let the pool and the robot live until a time [s]."""
+        """Run the pool and the robot up to a time [s]."""
         while self._steps < math.floor(time * RATE + 1e-6):
             self._step()
         runtime, plant = self._runtime, self._world.plant
@@ -151,11 +150,11 @@ class PoolSource:
         )
 
     def curves(self) -> Sequence[PlotLine]:
-        """Errors to the goal and of the estimate."""
+        """Return the errors to the goal and of the estimate."""
         return self._errors.curves()
 
     def close(self) -> None:
-        """Stop the thrusters and empty the pool."""
+        """Stop the thrusters and close the pool."""
         self._runtime.stop(self._steps / RATE)
         self._world.close()
 
@@ -169,7 +168,7 @@ class PoolSource:
         self._errors.add(delivery.time, self._truth(), self._estimate(), self._goal())
 
     def _seen(self, picture: Seen) -> Seen:
-        """Keep what cameras see, with its tags; found here, they need not be sought again by the robot."""
+        """Store a camera's picture with its tags; with these, the robot need not detect them again."""
         if picture.source:
             self._own[picture.source] = shown_of(self._world.vehicle, picture)
             return picture
@@ -213,7 +212,8 @@ class PoolSource:
 
 
 def listed(values: npt.ArrayLike, unit: str, digits: int = 0) -> str:
-    """Return numbers, (n,), of a unit as a text, in the order of the vehicle's thrusters, with so many decimals."""
+    """Return numbers, (n,), as a text with their unit and a number of decimals, in the order of the vehicle's
+    thrusters."""
     return (
         ", ".join(f"{x:.{digits}f}" for x in np.asarray(values)).replace("-", "\N{MINUS SIGN}") + f" {unit}"
     )
@@ -222,7 +222,7 @@ def listed(values: npt.ArrayLike, unit: str, digits: int = 0) -> str:
 # Frames of the simulator with a controller that knows the state exactly.
 
 STEP = 0.02
-"""Between frames at most [s]; the physics step is half of it."""
+"""Longest time between two frames [s]; the physics step is half of it."""
 
 
 class SimulatorSource:
@@ -240,22 +240,21 @@ class SimulatorSource:
         hydrodynamics: str = "calibrated",
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            vehicle: Any one.
-            guide: Where it shall go.
+        """Args:
+            vehicle: Vehicle to simulate.
+            guide: Goal or trajectory of the vehicle.
             policy: Name of a PID, or a policy's directory.
-            task: That the policy must have been trained for.
+            task: Task that the policy must have been trained for.
             hydrodynamics: Model: calibrated, mesh or simplified.
-            seed: Of the engine.
+            seed: Seed of the engine.
 
         Raises:
-            PolicyError, ControlError, SimulatorError: What does not fit.
+            PolicyError, ControlError, SimulatorError: Vehicle, policy and goal are not compatible.
         """
         self._pilot, self._guide = make_pilot(policy, vehicle, task=task), guide
         way = path_of(guide) if math.isfinite(guide.duration) else guide.at(np.zeros(1)).position
         start = start_of(guide)
-        if not math.isfinite(guide.duration):  # wholly under water, however large the vehicle is
+        if not math.isfinite(guide.duration):  # completely under water, however large the vehicle is
             start = replace(start, position=(0.0, 0.0, min(-0.5, -float(vehicle.body.size[2]))))
         size = _basin(np.concatenate([way, [start.position]]), float(np.max(vehicle.body.size)))
         self._simulator = Simulator(
@@ -298,11 +297,11 @@ class SimulatorSource:
         )
 
     def curves(self) -> Sequence[PlotLine]:
-        """Errors to the goal."""
+        """Return the errors to the goal."""
         return self._errors.curves()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, because nothing is open."""
 
     def _step(self) -> None:
         now, s = self._steps * STEP, self._simulator
@@ -327,7 +326,8 @@ class SimulatorSource:
 
 
 def _basin(way: np.ndarray, length: float) -> tuple[float, float, float]:
-    """A pool in which a motion of a vehicle of some length has room: the paper's, or a larger one [m]."""
+    """Return the size of a pool with enough space for a motion of a vehicle of some length: the paper's or
+    larger [m]."""
     half, depth = np.abs(way).max(axis=0) + 1.5 * length, length - float(way[:, 2].min())
     return max(4.0, 2.0 * float(half[0])), max(2.0, 2.0 * float(half[1])), max(1.0, depth)
 
@@ -347,13 +347,13 @@ TOPICS = (
     "events",
 )
 POINTS = 1500
-"""Greatest number of points of a curve."""
+"""Largest number of points of a curve."""
 FRESH = 1.0
-"""An older picture is not shown [s]."""
+"""Age above which a picture is not shown [s]."""
 
 
 class RecordSource:
-    """A record, read completely; `frame` looks up values."""
+    """Record that is read completely at the start."""
 
     def __init__(
         self,
@@ -366,19 +366,18 @@ class RecordSource:
         world: str | None = None,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            path: Of the record.
-            truth: The pool's truth file.
-            offset: The robot's clock when the pool's showed 0 [s]; found by laying the motions over each other if None.
-            basin: Length, width and depth of the pool [m]; the vehicle's workspace is drawn if None.
-            vehicle: Name or file; as the record has it if None.
-            world: Site of the catalogue of worlds, or a path, that is drawn around it; none if None.
-            seed: That the world was drawn with.
+        """Args:
+            path: Record file (.mcap).
+            truth: Truth file of the pool.
+            offset: Time of the robot's clock when the pool's is 0 [s]; None estimates it from both motions.
+            basin: Length, width and depth of the pool [m]; None draws the vehicle's workspace.
+            vehicle: Name or file; None uses that of the record.
+            world: Site of the catalogue of worlds, or a world file, that is drawn around it; None draws none.
+            seed: Seed with which the world was drawn.
 
         Raises:
             RecordError, TruthError, VehicleError: A file that cannot be read.
-            ViewError: Nothing in it that could be shown.
+            ViewError: The record contains nothing that can be shown.
         """
         with open_record(path) as record:
             self._vehicle = load_vehicle(vehicle) if vehicle else vehicle_of(record)
@@ -415,7 +414,7 @@ class RecordSource:
         self._curves = self._all_curves()
 
     def frame(self, time: float) -> ViewFrame:
-        """The moment at a time since the record's beginning [s]."""
+        """Return the frame at a time since the start of the record [s]."""
         at = self.begin + time
         thrusters = self._thrusters.at(at)
         force = np.zeros(0) if thrusters is None else np.asarray(thrusters.force, float)
@@ -437,14 +436,14 @@ class RecordSource:
         )
 
     def curves(self) -> Sequence[PlotLine]:
-        """Return errors over the complete record."""
+        """Return the errors over the complete record."""
         return self._curves
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, because nothing is open."""
 
     def _read(self, record: Record) -> None:
-        """Sort the record's messages by what they are."""
+        """Sort the record's messages by topic."""
         perceived = [
             f"{name}/{kind}" for name in self._vehicle.perception for kind in ("image/compressed", "range")
         ]
@@ -485,7 +484,7 @@ class RecordSource:
         )
 
     def _covariance(self, at: float) -> Array | None:
-        """That of the estimate's position; None where the estimator gives none."""
+        """Return the covariance of the estimated position; None if the estimator has none."""
         covariance = self._covariances.at(at)
         return None if covariance is None else known_covariance(np.reshape(covariance, (6, 6))[:3, :3])
 
@@ -510,7 +509,7 @@ class RecordSource:
         return self._shown[1]
 
     def _own(self, name: str, at: float) -> Any:
-        """The latest picture of an own camera or sonar; None where it is old or none."""
+        """Return the latest picture of an own camera or sonar; None if it is too old or missing."""
         message = self._eyes[name].at(at) if _age(self._eyes[name], at) < FRESH else None
         if message is None:
             return None
@@ -521,7 +520,7 @@ class RecordSource:
 
     def _developed(self, i: int, at: float, tags: tuple[TagCorners, ...]) -> LatestPicture:
         image = picture_of(self._pictures.values[i].data)
-        # The tags of a record came with pictures of their own: those of another picture are not this one's.
+        # A record's tags belong to pictures that may be missing in it; tags of another picture are not used.
         if image is not None and abs(_age(self._tags, at) - _age(self._pictures, at)) > 1e-3:
             tags = self._look.find(image, at)
         return LatestPicture(image, tags, self._size)
@@ -563,14 +562,14 @@ class RecordSource:
 
 
 def known_covariance(covariance: npt.ArrayLike) -> Array | None:
-    """Return a covariance of a position [m²], (3, 3), or None where an axis is not known."""
+    """Return a covariance of a position [m²], (3, 3), or None if the variance of an axis is unknown."""
     known = np.asarray(covariance, float)
     variance = np.diag(known)
     return known if (variance > 0.0).all() and (variance < UNKNOWN).all() else None
 
 
 def _vision(times: Sequence[float], statuses: Sequence[Any]) -> list[tuple[float, str]]:
-    """Return when vision held, lost and found the vehicle; coasting between two pictures is no event."""
+    """Return the times and names of changes of the vision's mode; coasting between two pictures is not counted."""
     modes = [(t, status.mode) for t, status in zip(times, statuses, strict=True) if status.mode != "coast"]
     return [(t, f"vision: {mode}") for (_, last), (t, mode) in pairwise(modes) if mode != last]
 
@@ -587,7 +586,7 @@ def _poses(times: list[float], poses: list[Any]) -> PoseSeries:
 
 
 def _thinned(path: Array) -> Array:
-    """Return the positions of the goal, without the times at which it did not move."""
+    """Return the positions of the goal without those at which it did not move."""
     if len(path) < 2:
         return path[:0]
     moved = np.flatnonzero(np.linalg.norm(np.diff(path, axis=0), axis=1) > 1e-6) + 1
@@ -609,26 +608,25 @@ def _tags_in(text: str) -> tuple[TagCorners, ...]:
             TagCorners(int(tag["id"]), np.asarray(tag["corners"], float).reshape(4, 2)) for tag in tags
         )
     except (ValueError, KeyError, TypeError, OverflowError):
-        return ()  # words of other programs
+        return ()  # texts of other programs
 
 
-# Frames of a run that the engine's recorder wrote.
+# Frames of a run that was written by the engine's recorder.
 
 
 class RunSource:
-    """One vehicle of one world of a recorded run."""
+    """One vehicle in one world of a recorded run."""
 
     def __init__(self, folder: Path | str, *, world: int | None = None, vehicle: str | None = None) -> None:
-        """
-        Args:
-            folder: Of the run.
-            world: Which; the first that was recorded if None.
-            vehicle: Name or file; as the run names it if None.
+        """Args:
+            folder: Folder of the run.
+            world: Index of the world; None is the first recorded one.
+            vehicle: Name or file; None uses that of the run.
 
         Raises:
-            SimulatorError: No run.
-            ViewError: It has not that world.
-            VehicleError: Its vehicle is not in the catalogue.
+            SimulatorError: The folder contains no run.
+            ViewError: The run does not contain that world.
+            VehicleError: The vehicle of the run is not in the catalogue.
         """
         table = read_run(folder)
         worlds = sorted(table["world"].unique().tolist())
@@ -663,7 +661,7 @@ class RunSource:
         self.stage = ViewStage(vehicle=ours, title=title, lower=lower, upper=upper, walls=False)
 
     def frame(self, time: float) -> ViewFrame:
-        """The moment at a time since the run's beginning [s]."""
+        """Return the frame at a time since the start of the run [s]."""
         channels = self._channels.at(time)
         channels = np.zeros(0) if channels is None else channels
         force = channels[: self._n]
@@ -678,26 +676,26 @@ class RunSource:
         )
 
     def curves(self) -> Sequence[PlotLine]:
-        """Its speed."""
+        """Return its speed."""
         return self._curves
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, because nothing is open."""
 
 
-# The wanted motion, as poses and lines to draw.
+# The target motion, as poses and lines to draw.
 
 PATH_POINTS = 240
 """Number of points of a trajectory's line."""
 STATION, TRAJECTORY = "0.8,0.3,-0.6,45", "ellipse"
-"""Default goal."""
+"""Default goals."""
 
 
 def guide_for(goal: str | None, trajectory: str | None, task: str | None, vehicle: Vehicle) -> Guide:
-    """The goal or the trajectory of a command line; one of the task if none is given.
+    """Return the goal or the trajectory of a command line, or the default of the task if neither is given.
 
     Raises:
-        GoalError, ControlError: One that cannot be read, or that the vehicle may not go to.
+        GoalError, ControlError: It cannot be read, or the vehicle may not reach it.
     """
     if goal is None and trajectory is None:
         goal, trajectory = (None, TRAJECTORY) if task == "t2" else (STATION, None)
@@ -713,14 +711,14 @@ def goal_pose(guide: Guide, t: float) -> BodyPose:
 
 
 def path_of(guide: Guide) -> npt.NDArray[np.float64]:
-    """The line of a trajectory, (k, 3) [m]; no points for a station."""
+    """Return the line of a trajectory, (k, 3) [m]; no points for a constant goal."""
     if not math.isfinite(guide.duration):
         return nowhere()
     return np.asarray(guide.at(np.linspace(0.0, guide.duration, PATH_POINTS)).position)
 
 
 def start_of(guide: Guide) -> Station:
-    """Return the start of a vehicle: the start of a trajectory, or the middle, 0.5 m deep, for a station."""
+    """Return the start of a vehicle: that of a trajectory, or for a constant goal the centre, 0.5 m deep."""
     if not math.isfinite(guide.duration):
         return Station((0.0, 0.0, -0.5), 0.0)
     first = guide.at(0.0)
@@ -728,14 +726,14 @@ def start_of(guide: Guide) -> Station:
     return Station((x, y, z), float(first.yaw))
 
 
-# Tags found in a picture for the viewer, if no other process has reported them.
+# Tags detected for the viewer, if no other process has reported them.
 
 LONGEST_STEP = 0.5
-"""Longest time since the picture before; after a longer one the complete picture is searched [s]."""
+"""Longest time between two pictures after which only a part is searched [s]; otherwise the complete picture is."""
 
 
 class TagLook:
-    """A detector that is made when it is first needed; without its library nothing is found."""
+    """Detector that is created when first needed; without its library it detects nothing."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._tags = vehicle.tags
@@ -743,7 +741,7 @@ class TagLook:
         self._last = -np.inf
 
     def find(self, image: npt.NDArray[np.uint8], time: float) -> tuple[TagCorners, ...]:
-        """The vehicle's tags in a grey picture of a time [s]."""
+        """Return the vehicle's tags in a grey picture of a time [s]."""
         if self._tags is None:
             return ()
         if self._tracker is None or not 0.0 <= time - self._last <= LONGEST_STEP:
@@ -751,7 +749,7 @@ class TagLook:
         self._last = time
         try:
             detections = self._tracker.detect(image, time)
-        except ImportError:  # a view without the extra `vision` shows the picture alone
+        except ImportError:  # a view without the extra `vision` shows only the picture
             self._tags = None
             return ()
         return tuple(TagCorners(d.tag, d.corners) for d in detections)

@@ -1,4 +1,5 @@
-"""Appearance of water: tiles or sand under moving caustics, a rippled surface, and the colour that depth takes away."""
+"""Appearance of water: tiles or sand with moving caustics, a rippled surface, and the attenuation of colours
+with depth."""
 
 from __future__ import annotations
 
@@ -27,28 +28,30 @@ Pattern = Literal["tiles", "sand"]
 ATTENUATION = np.array([0.30, 0.06, 0.04])
 """Diffuse attenuation of red, green and blue [1/m], of the order of clear coastal water."""
 WATER = np.array([118.0, 186.0, 208.0])
-"""Colour of thick water just below the surface."""
+"""Colour of water of great optical depth just below the surface."""
 TILES = (236, 244, 246)
 """Colour of a pool's tiles."""
 PATCH, PIXELS = 2.0, 256
-"""Edge of the square of floor that repeats [m], and of its picture [px]."""
+"""Edge of the repeating square of floor [m], and of its picture [px]."""
 TILE, JOINT = 0.25, 2
 """Edge of a tile [m] and width of a joint [px]."""
 FRAMES, PERIOD = 16, 3.2
 """Number of pictures of the caustics, and the time after which they repeat [s]."""
 WAVES, BEND = 14, 0.25
-"""Number of waves of the surface; 1 - 1/n of water, by which a small slope bends a vertical ray [-]."""
+"""Number of waves of the surface; 1 - 1/n of water, the share of a small slope by which a vertical ray is
+refracted [-]."""
 FOCUS = 0.55
-"""Root mean square of the convergence of the rays on the floor [-]; 1 would be a focus on average."""
+"""Root mean square of the convergence of the rays on the floor [-]; at 1 the rays are focused on average."""
 
 
 RIPPLE = 8.0
-"""Height of the drawn surface over that whose rays meet on a floor 1/4 m deep [1/m]: ripples would not be seen."""
+"""Ratio of the height of the drawn surface to the deflection potential [1/m], so that ripples are visible."""
 
 
 @lru_cache(maxsize=4)
 def _waves(seed: int) -> tuple[Array, Array, Array, Array]:
-    """Wave vectors [1/m], (w, 2), amplitudes of the deflection potential [m²], phases [rad] and cycles in a period."""
+    """Return wave vectors [1/m], (w, 2), amplitudes of the deflection potential [m²], phases [rad] and cycles
+    per period."""
     random = np.random.default_rng(seed)
     turns = random.uniform(0.0, 2.0 * np.pi, WAVES)
     k = np.rint(random.uniform(2.5, 9.0, WAVES)[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1))
@@ -61,16 +64,17 @@ def _waves(seed: int) -> tuple[Array, Array, Array, Array]:
 def caustics(frame: int, *, seed: int = 1) -> Array:
     """Return the brightness of a level floor under a rippled surface, mean 1, in a picture that repeats.
 
-    A vertical ray that meets the slope ∇ζ leaves the vertical by (1 - 1/n) ∇ζ, so that it lights the floor at depth d
-    below x at x + d (1 - 1/n) ∇ζ; brightness is the density of rays. The waves are scaled so that the floor lies near
-    the focus whatever the depth: the pattern shows that there is a surface, not its state.
+    A vertical ray that meets the slope ∇ζ is refracted by (1 - 1/n) ∇ζ from the vertical, and so lights the
+    floor at depth d below x at x + d (1 - 1/n) ∇ζ; brightness is the density of rays. The waves are scaled so
+    that the floor is near the focus at any depth: the pattern shows that there is a surface, not its actual
+    state.
 
     Args:
-        frame: Number of the picture, from 0; `FRAMES` of them make a period.
-        seed: Of the waves.
+        frame: Number of the picture, from 0; a period has `FRAMES` pictures.
+        seed: Seed of the waves.
 
     Returns:
-        (PIXELS, PIXELS) [-].
+        Brightness, (PIXELS, PIXELS) [-].
     """
     k, amplitude, phase, cycles = _waves(seed)
     rays = 2 * PIXELS
@@ -90,18 +94,18 @@ def caustics(frame: int, *, seed: int = 1) -> Array:
 
 
 def tint(depth: float) -> Array:
-    """Return the fractions of red, green and blue that come down to a depth and back [-], (3,); depth in [m]."""
+    """Return the shares of red, green and blue that are transmitted down to a depth [m] and back [-], (3,)."""
     return np.asarray(np.exp(-2.0 * ATTENUATION * np.clip(depth, 0.0, 6.0)))
 
 
 def water_colour(depth: float) -> tuple[int, int, int]:
-    """Return the colour of thick water at a depth [m], each 0 to 255."""
+    """Return the colour of water of great optical depth at a depth [m], each 0 to 255."""
     red, green, blue = (WATER * tint(0.3 * depth)).astype(int).tolist()
     return red, green, blue
 
 
 def backdrop(depth: float) -> Image:
-    """Return the picture behind the scene of water of a depth [m], (h, w, 3): light from above, dark below."""
+    """Return the background of the scene for water of a depth [m], (h, w, 3): light at the top, dark at the bottom."""
     down = np.linspace(0.0, 1.0, 256)[:, None, None]
     top, bottom = np.array([232.0, 244.0, 248.0]), np.array(water_colour(depth)) * 0.92
     return np.broadcast_to(top + (bottom - top) * down, (256, 8, 3)).astype(np.uint8)
@@ -110,7 +114,7 @@ def backdrop(depth: float) -> Image:
 def floor_images(
     colour: tuple[int, int, int], pattern: Pattern, depth: float, *, seed: int = 1
 ) -> Iterator[Image]:
-    """Yield the pictures of a floor under caustics at a depth [m], (PIXELS, PIXELS, 3), one period of them."""
+    """Yield the pictures of a floor with caustics at a depth [m], (PIXELS, PIXELS, 3), for one period."""
     plain = np.array(colour) * tint(depth) * _pattern(pattern, PIXELS, PIXELS, seed)
     for frame in range(FRAMES):
         light = 0.60 + 0.32 * np.minimum(caustics(frame, seed=seed), 2.6)
@@ -118,7 +122,7 @@ def floor_images(
 
 
 def _pattern(kind: Pattern, rows: int, columns: int, seed: int) -> Array:
-    """Return tiles with joints or mottled sand, about 1 [-], (rows, columns, 1)."""
+    """Return the brightness of tiles with joints, or of mottled sand, about 1 [-], (rows, columns, 1)."""
     if kind == "sand":
         grain = np.random.default_rng(seed).normal(1.0, 0.06, (rows, columns))
         return np.asarray((grain + np.roll(grain, 1, 0) + np.roll(grain, 1, 1))[..., None] / 3.0)
@@ -136,12 +140,12 @@ def floor(lower: Array, upper: Array) -> Mesh:
 
 
 def draped(vertices: Array, faces: npt.NDArray[np.int64], image: Image) -> trimesh.Trimesh:
-    """Return triangles under a repeating picture that is laid on them from above; vertices in [m], (v, 3)."""
+    """Return triangles with a repeating picture projected on them from above; vertices in [m], (v, 3)."""
     return _textured(vertices, faces, vertices[:, :2] / PATCH, image)
 
 
 def walls(lower: Array, upper: Array) -> trimesh.Trimesh:
-    """Return four tiled walls, seen from inside alone, darker and bluer downward; corners in [m], (3,)."""
+    """Return four tiled walls, visible only from inside, darker and bluer with depth; corners in [m], (3,)."""
     depth = float(upper[2] - lower[2])
     rows = max(2, round(depth * PIXELS / PATCH))
     down = np.linspace(0.0, depth, rows)
@@ -160,7 +164,7 @@ def walls(lower: Array, upper: Array) -> trimesh.Trimesh:
 
 
 def surface(lower: Array, upper: Array, *, seed: int = 1) -> trimesh.Trimesh:
-    """Return the rippled surface of a box of water, transparent, seen from both sides; corners in [m], (3,)."""
+    """Return the rippled surface of a box of water, transparent, visible from both sides; corners in [m], (3,)."""
     import trimesh
 
     x, y = np.meshgrid(*[np.linspace(lower[i], upper[i], 49) for i in (0, 1)])
@@ -178,7 +182,7 @@ def surface(lower: Array, upper: Array, *, seed: int = 1) -> trimesh.Trimesh:
 
 
 def _textured(vertices: Array, faces: npt.ArrayLike, uv: Array, image: Image) -> trimesh.Trimesh:
-    """Return triangles that show a picture, once from 0 to 1 along each axis of `uv`."""
+    """Return triangles that show a picture, which extends from 0 to 1 along each axis of `uv`."""
     import trimesh
     from PIL import Image as pictures
 
