@@ -227,30 +227,7 @@ class Environment:
         self._steps = self._reported = 0
         self._views: dict[int, NDArray[Any]] = {}
         self._arena = pool or task.arena()
-        drawn = bool(randomization and randomization.changes_sensors)
-        sensed = isinstance(self.noise, Sensing)
-        off_by = self.noise.fixes if isinstance(self.noise, Sensing) else self.noise
-        self._seen = measurements(off_by, (worlds, len(vehicles)), self.device)
-        self._measured = sensed or off_by.present or drawn
-        connect_measured(self._measured, self.simulator.state, self.arrays)
-        self.sensing: SensingBatch | None = None
-        """Instruments and filters, if the controller observes their estimates; otherwise None."""
-        if isinstance(self.noise, Sensing):
-            if randomization and randomization.changes_velocities:
-                raise EnvironmentSetupError(
-                    "the ranges draw errors of velocities or rates, and these come from the vehicle's sensors: leave "
-                    "sensors.velocity_... and sensors.rate_... out of the ranges, or observe otherwise"
-                )
-            walls = pool or task.arena()
-            self.sensing = SensingBatch(
-                self.noise,
-                self.simulator,
-                self.arrays,
-                self._seen,
-                walls.depth if walls else None,
-                self.seed,
-                drawn,
-            )
+        self._measure()
         self._draw(randomization, privileged)
         self.sight = self._sight() if task.pictures else None
         """Rendered world and its pictures; None for a task without pictures."""
@@ -268,6 +245,26 @@ class Environment:
     def _sight(self) -> Any:
         """Return the rendered world, with the sensors that the task observes."""
         return described_world(self.task.world).sight(self.task, self.simulator, self.arrays, self.seed)
+
+    def _measure(self) -> None:
+        """Set up what the controller observes: the state, the state with noise, or sensors and their filter."""
+        noise, randomization = self.noise, self.randomization
+        drawn = bool(randomization and randomization.changes_sensors)
+        fixes = noise.fixes if isinstance(noise, Sensing) else noise
+        self._seen = measurements(fixes, (self.worlds, len(self.simulator.vehicles)), self.device)
+        self._measured = isinstance(noise, Sensing) or fixes.present or drawn
+        connect_measured(self._measured, self.simulator.state, self.arrays)
+        self.sensing: SensingBatch | None = None
+        """Instruments and filters, if the controller observes their estimates; otherwise None."""
+        if not isinstance(noise, Sensing):
+            return
+        if randomization and randomization.changes_velocities:
+            raise EnvironmentSetupError(
+                "the ranges draw errors of velocities or rates, and these come from the vehicle's sensors: leave "
+                "sensors.velocity_... and sensors.rate_... out of the ranges, or observe otherwise"
+            )
+        floor = self._arena.depth if self._arena else None
+        self.sensing = SensingBatch(noise, self.simulator, self.arrays, self._seen, floor, self.seed, drawn)
 
     def _draw(self, randomization: Randomization | None, privileged: bool) -> None:
         """Set up the randomisation, and the arrays of the privileged numbers."""
