@@ -411,7 +411,7 @@ def _refuse_depth(fit: PoolFit) -> None:
 
 
 def _touching(fit: PoolFit) -> list[Finding]:
-    """Return findings if the camera ends on the plane, which it cannot pass; refuse large residuals there."""
+    """Return findings if the fitted camera lies on the plane, which it cannot cross; refuse large residuals there."""
     model, error = fit.model, rms(fit.residual[fit.used])
     if model.clearance >= ON_PLANE * (model.clearance + max(model.depth, 0.0)) or error <= ODD:
         return []

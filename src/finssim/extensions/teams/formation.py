@@ -133,13 +133,13 @@ def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the position of the next corner as the agent knows it, world frame [m]."""
+    """Return the last received position of the next corner, world frame [m]."""
     return mate_position(arrays, w, a, (a + 1) % AGENTS)
 
 
 @wp.func
 def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the position of the corner after that as the agent knows it, world frame [m]."""
+    """Return the last received position of the corner after the next, world frame [m]."""
     return mate_position(arrays, w, a, (a + 2) % AGENTS)
 
 

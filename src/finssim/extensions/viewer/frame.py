@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 
 
 class ViewError(ValueError):
-    """The source cannot be shown."""
+    """Error of a source that cannot be shown."""
 
 
 class FixedBody(NamedTuple):

@@ -142,7 +142,7 @@ def run(
 
 
 FIRST = 0.2
-"""Time to which a live source runs before it is shown [s], so that its kernels are compiled during the placeholder."""
+"""Time to which a live source runs before it is shown [s]; its kernels are compiled while the placeholder is shown."""
 
 
 def _ready(choice: SourceChoice) -> Source | None:

@@ -134,7 +134,7 @@ class NodeGraph:
         return _services(self._of(node_name, node_namespace, "subscriptions"))
 
     def get_client_names_and_types_by_node(self, node_name: str, node_namespace: str) -> Named:
-        """Return the services of which a node is a client, with their types."""
+        """Return the services that a node uses as a client, with their types."""
         return _services(self._of(node_name, node_namespace, "publications"))
 
     def _every(self, *kinds: str) -> Iterator[EndpointRecord]:

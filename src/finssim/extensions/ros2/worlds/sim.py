@@ -53,7 +53,7 @@ class IdealSensors:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew, after the vehicle was placed elsewhere."""
+        """Restart, after the vehicle was placed elsewhere."""
         self._velocity: np.ndarray | None = None
         self._count = 0
 
