@@ -60,8 +60,8 @@ def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
     assert load_result(path) == result
     text = path.read_text()
     for changed, reason in (
-        (text.replace("P01", "P02"), "is not as it was written: remove it"),
-        (text.replace("seed", "sead"), "is not as it was written"),
+        (text.replace("P01", "P02"), "has been changed since it was written: remove it"),
+        (text.replace("seed", "sead"), "has been changed since it was written"),
         (text[:20], "not valid JSON"),
         ("{}", "expected a JSON object with the key 'sha256'"),
     ):
@@ -146,9 +146,7 @@ def test_a_key_names_everything_that_decides_the_result():
 
 
 def test_a_result_with_nan_is_refused_and_nothing_is_written(tmp_path):
-    with pytest.raises(
-        ResultError, match="result.json: not written, since it would hold a number that is not finite"
-    ):
+    with pytest.raises(ResultError, match="result.json: not written, since it contains a non-finite number"):
         write_json(tmp_path / "result.json", {"e_p_m": math.nan})
     assert list(tmp_path.iterdir()) == []
 

@@ -44,5 +44,5 @@ def test_surge_and_sway_go_along_the_length_of_the_pool():
 
 
 def test_a_pool_without_room_is_refused():
-    with pytest.raises(CalibrationError, match="leaves -?0.* m to go along heave"):
+    with pytest.raises(CalibrationError, match="has -?0.* m of room along heave"):
         start_of(next(p for p in PLAN if p.axes == ("heave",)), VEHICLE, box_of(Basin(depth=0.6)))

@@ -44,7 +44,7 @@ def waited(attendant):
 
 def test_nobody_waits_for_ever_for_a_vehicle_that_says_nothing():
     """With nobody beside it the trial ends after a minute and says why; somebody at the keys may wait."""
-    assert waited(None) == ("not there", "its state is not known after 60 s: no telemetry yet", 61.0)
+    assert waited(None) == ("not there", "its state is unknown after 60 s: no telemetry yet", 61.0)
     beside = SimpleNamespace(keys=lambda: (), line=lambda text: None)
     assert waited(beside) == ("interrupted", "not finished", 119.0)
 

@@ -45,7 +45,7 @@ def test_a_plant_is_seen_with_what_is_asked_for():
     """In place of its noise; the environment has the sensors, and the result says so."""
     assert load_plant("sensors").environment_arguments()["noise"] == Sensing()
     seen = load_plant("noise").with_view("sensors")
-    assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; seen: sensors")
+    assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; observation: sensors")
     assert load_plant("nominal").with_view("truth").environment_arguments()["noise"] == MeasurementNoise()
     told = seen.observe_record(FINSROV)["observe"]
     assert told["name"] == "sensors" and told["fixes"]["rate"] == 30.0 and told["imu"]["rate"] == 100.0

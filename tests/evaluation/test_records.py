@@ -114,7 +114,7 @@ def test_another_goal_begins_another_episode_of_a_station_task(tmp_path):
 def test_a_drive_to_no_goal_needs_one(tmp_path):
     """A place, or where each stretch ended, at which the last offset is zero."""
     path = written(tmp_path / "a.mcap", 0.5, goal=lambda t: ((0.0, 0.0, 0.0), 0.0))
-    with pytest.raises(DriveError, match="was driven by hand to no goal: give --goal"):
+    with pytest.raises(DriveError, match="was driven by hand without a goal: give --goal"):
         collect_records([path], "t1", out=tmp_path / "set")
     collect_records([path], "t1", out=tmp_path / "end", goal="end")
     assert np.allclose(load(tmp_path / "end").following[-1, :3], 0.0, atol=1e-6)
@@ -135,7 +135,7 @@ def test_every_mode_says_what_was_commanded(tmp_path):
             (again - force) @ vehicle.control_matrix.T, 0.0, atol=0.05 if mode.pilot else 2e-3
         )
     rolled = WRENCH6.to_thrusters(np.tile([0.0, 0.0, 0.0, 0.5, 0.0, 0.0], (10, 1)))
-    with pytest.raises(DriveError, match=r"wrench4 cannot ask for what was commanded in 100 % .* \(roll"):
+    with pytest.raises(DriveError, match=r"wrench4 cannot express the commands in 100 % .* \(roll"):
         actions_of(rolled, action_mode("wrench4", FINSROV), FINSROV)
 
 
@@ -152,7 +152,7 @@ def test_records_that_do_not_fit_are_refused(tmp_path):
         (other, "t1", "is of the vehicle .*, expected finsrov .* --vehicle"),
         (slow, "t1", "decided every 0.2 s, expected at most 0.1 s, the period of t1"),
         (never, "t1", "the robot was never armed"),
-        (tmp_path / "blind.mcap", "t1", "holds no estimate of where it was"),
+        (tmp_path / "blind.mcap", "t1", "contains no estimate of the vehicle's position"),
         (slow, "t9", "unknown task 't9'; available: t1, t2"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -204,7 +204,7 @@ def test_the_trajectory_that_a_record_names_is_no_file(tmp_path, monkeypatch, na
     )
     with pytest.raises(
         DriveError,
-        match=f"followed '{told}', which is none of .*: give the name or the file of what was followed",
+        match=f"followed '{told}', expected one of .*: give the name or the file of the trajectory",
     ):
         collect_records([path], "t2", out=tmp_path / "set")
     assert not (tmp_path / "set").exists()

@@ -151,7 +151,7 @@ def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps
     told = json.loads(capsys.readouterr().out)
     assert told["vehicle"] == {"name": "minnow", "sha256": minnow.sha256} and told["records"]
     assert boundary.run(app, ["evaluate", str(record), "--vehicle", "finsrov"]) == 2
-    assert "name the file that was driven with --vehicle" in capsys.readouterr().err
+    assert "give the file of the recorded vehicle with --vehicle" in capsys.readouterr().err
 
 
 def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_path, capsys):
@@ -164,11 +164,11 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_
     assert told["complete"] == 1 and told["horizontal_rmse_m"] < 0.05 and told["energy"] > 0.0
     (trial,) = evaluate([record], task="t2", truth=truth)["per_trial"]
     assert trial["p95_m"] < 0.08 and trial["success"]
-    with pytest.raises(DriveError, match="its goal moves"):
+    with pytest.raises(DriveError, match="the recorded goal moves"):
         read_record(record, "t1", FINSROV)
     with pytest.raises(DriveError, match="'pursuit' has 2 vehicles and .* is of one"):
         read_record(record, "pursuit", FINSROV)
-    with pytest.raises(DriveError, match="its goal moves, and 'docking' has one"):
+    with pytest.raises(DriveError, match="the recorded goal moves, but 'docking' expects a fixed goal"):
         read_record(record, "docking", FINSROV)
     short = tmp_path / "short.csv"
     short.write_text("t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n")
@@ -243,7 +243,7 @@ def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held)
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["a.mcap", "pid"], "one controller at a time"),
+        (["a.mcap", "pid"], "expected one controller"),
         (["a.mcap", "--trials", "3", "--hydrodynamics", "mesh"], "leave --trials, --hydrodynamics out"),
         (["pid", "--truth", "m.csv"], "--truth is for records"),
     ],

@@ -124,7 +124,7 @@ def test_a_lens_taken_as_exact_is_said(pool, capsys, lens):
     """As a note in the table and a finding in JSON, unless the survey file gives its errors or fits it."""
     text = f"surface: {{height: 1.0}}\n{lens}"
     calibrated(pool, text)
-    assert ("· the lens is taken as exact" in capsys.readouterr().out) == (not lens)
+    assert ("· the lens is assumed exact" in capsys.readouterr().out) == (not lens)
     calibrated(pool, text, as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert ("lens_exact" in {one["code"] for one in said["findings"]}) == (not lens)

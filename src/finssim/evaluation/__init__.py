@@ -1,4 +1,4 @@
-"""Experiments: the paper's definitions of its measures, its setpoints, and the figures drawn from them."""
+"""Experiments: the paper's metrics, setpoints and figures."""
 
 from typing import TYPE_CHECKING
 

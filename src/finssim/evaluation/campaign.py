@@ -1,4 +1,4 @@
-"""Experiments as campaigns: a progress bar, and trials over several processes that a later call continues."""
+"""Execution of experiments: a progress bar, and trials in several processes, which a later call continues."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from finssim.evaluation.tables import Table, print_tables, write_page
 from finssim.vehicles import load_vehicle
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "FINSSIM_THREADS": "1"}
-"""Environment of a worker: one thread each, for there are as many workers as processors."""
+"""Environment of a worker: one thread each, as there are as many workers as processors."""
 SETTINGS = 4
-"""Type of a frame of HTTP/2."""
+"""Type of an HTTP/2 SETTINGS frame."""
 PATIENCE = 10.0
-"""For a cluster's answer to a first knock [s]."""
+"""Timeout of the first connection to a cluster [s]."""
 RETRIES = 3
 """Number of restarts of work on a cluster after its worker was lost."""
 
 
 class ClusterError(ValueError):
-    """A Ray cluster that is not there, or lost what it was given."""
+    """Ray cluster that is unavailable, or that lost its work."""
 
 
 def run_experiment(
@@ -59,16 +59,16 @@ def run_experiment(
     """Run an experiment with a progress bar on standard error and print its tables.
 
     Args:
-        name: What the bar is called.
-        work: The experiment, which writes its directory `out`, if it has one, itself; called with `progress`, if
-            it takes that, and the options.
-        tables: Those of its result.
-        as_json: Print one JSON object in place of the tables.
-        bar: Show it; False where the work has a line of its own on the screen.
-        options: Of the work.
+        name: Label of the bar.
+        work: The experiment, which writes its directory `out`, if it has one, itself; it is called with the
+            options, and with `progress` if it accepts it.
+        tables: Function that returns the tables of the result.
+        as_json: True to print one JSON object instead of the tables.
+        bar: True to show the bar; False if the work prints its own progress.
+        options: Options of the work.
 
     Returns:
-        What `work` returned.
+        The result of `work`.
     """
     start_warp()
     if {"progress", "options"} & set(inspect.signature(work).parameters):
@@ -89,27 +89,27 @@ def run_experiment(
 def check_choices(
     names: Sequence[str], available: Mapping[str, Any] | Sequence[str], kind: str, error: type[Exception]
 ) -> None:
-    """Refuse a name that does not exist, in a sentence with those that do."""
+    """Refuse a name that does not exist, in a sentence with the available ones."""
     for name in names:
         if name not in available:
             raise error(f"unknown {kind} '{name}'; available: {', '.join(available)}")
 
 
 class ResultError(ValueError):
-    """A result that was kept cannot be gone on with; the message is one sentence."""
+    """Stored result that cannot be continued; the message is one sentence."""
 
 
 def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = ()) -> None:
-    """Write a result, and beside it, with the suffix .html, its page.
+    """Write a result, and its HTML page beside it with the suffix .html.
 
     Raises:
-        ResultError: It holds a number that is not finite.
+        ResultError: The result contains a non-finite number.
     """
     try:
         text = json.dumps(result, indent=1, allow_nan=False)
     except ValueError:
         raise ResultError(
-            f"{path}: not written, since it would hold a number that is not finite: look for one in its inputs"
+            f"{path}: not written, since it contains a non-finite number: look for one in its inputs"
         ) from None
     with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
@@ -118,34 +118,34 @@ def write_json(path: Path, result: Mapping[str, Any], tables: Sequence[Table] = 
 
 
 def keep_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result that a later call continues with, with its digest."""
+    """Write a result that a later call continues, with its digest."""
     write_json(path, {**result, "sha256": _digest(result)})
 
 
 def load_result(path: Path) -> dict[str, Any]:
-    """A result that `keep_result` wrote.
+    """Return a result that `keep_result` wrote.
 
     Raises:
-        ResultError: It is not as it was written.
+        ResultError: The file has been changed.
     """
     try:
         result = read_json(path, ResultError, such_as="sha256")
     except ResultError as error:
-        raise ResultError(f"{error}: remove it, and it is made again") from None
+        raise ResultError(f"{error}: remove it to compute it again") from None
     if result.pop("sha256") != _digest(result):
-        raise ResultError(f"{path}: is not as it was written: remove it, and it is made again")
+        raise ResultError(f"{path}: has been changed since it was written: remove it to compute it again")
     return result
 
 
 def _digest(result: Mapping[str, Any]) -> str:
-    """SHA-256 of what a reader of the result gets."""
+    """Return the SHA-256 of the result as read from its file."""
     read = json_value(json.dumps(result), ResultError, "result")
     return hashlib.sha256(json.dumps(read, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One trial as plain data: equal jobs give equal results, and a result is kept under its key."""
+    """One trial as plain data: equal jobs have equal results, and a result is stored under its key."""
 
     row: str
     """Row of the table."""
@@ -157,20 +157,20 @@ class Job:
     """Seed of the noise."""
 
     def described(self) -> dict[str, Any]:
-        """Everything that decides the result, with the contents of files in place of their names."""
+        """Return all data that determines the result, with the contents of files instead of their names."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         del values["row"]
         return {name: _content(name, value) for name, value in values.items()}
 
     def key(self) -> str:
-        """File name of its result: readable first, then a digest of everything that decides it."""
+        """Return the file name of the result: a readable part, and a digest of all data that determines it."""
         digest = hashlib.sha256(json.dumps(self.described(), sort_keys=True).encode()).hexdigest()[:10]
         name = re.sub(r"[^A-Za-z0-9.+-]+", "_", f"{self.row}_{self.target}")
         return f"{name}_plant{self.plant}_seed{self.seed}_{digest}"
 
 
 def _content(name: str, value: Any) -> Any:
-    """A field of a job as plain data: SHA-256 of a vehicle, of a policy's files, of a programme."""
+    """Return a field of a job as plain data: the SHA-256 of a vehicle, of a policy's files, of a programme."""
     if name in ("vehicle", "pool_vehicle"):
         return load_vehicle(value).sha256
     if name == "controller" and value not in CONTROLLERS:
@@ -182,10 +182,10 @@ def _content(name: str, value: Any) -> Any:
 
 
 Play = Callable[[Any, Path], dict[str, Any] | None]
-"""Plays a job, leaves its series in files that begin with the given path, and returns its result as plain data; None:
-there is none yet, and the next call tries again."""
+"""Function that plays a job, writes its time series to files that begin with the given path, and returns its
+result as plain data; None if there is no result yet, so that the next call tries again."""
 Show = Callable[[Any, Mapping[str, Any]], None]
-"""Called with a job that has been played, and its result."""
+"""Function that is called with a job that has been played, and its result."""
 
 
 def run_jobs(
@@ -199,28 +199,29 @@ def run_jobs(
     show: Show = lambda job, result: None,
     more: Callable[[], Sequence[Job]] = tuple,
 ) -> list[dict[str, Any]]:
-    """Play the jobs that have no result yet; after Ctrl-C or a kill the next call continues.
+    """Play the jobs without a result; after Ctrl-C or a kill, the next call continues.
 
     Args:
         jobs: Trials; equal ones are played once.
-        folder: Takes KEY.json of each, made if missing.
-        play: A function of a module, as it is called in other processes; any function with `processes=1`.
-        processes: As many as there are processors if None; 1: in this process, one after the other.
-        address: Of a Ray cluster on which they are played instead, as of `spread`. Policies go there and files come
-            back; vehicle files must be at the same place on each machine.
-        progress: Told the share that is done and what is left.
-        show: Called with each trial that is played now and its result, as soon as there is one.
-        more: Prepares further jobs, as of `spread`.
+        folder: Folder for KEY.json of each job, created if missing.
+        play: Function of a module, since it is called in other processes; any function with `processes=1`.
+        processes: Number of processes; the number of processors if None; 1 to play in this process, one after
+            the other.
+        address: Ray cluster on which they are played instead, as for `spread`. Policies are sent and files
+            are returned; vehicle files must have the same path on each machine.
+        progress: Function that is called with the completed fraction and the number of remaining trials.
+        show: Function that is called with each trial played in this call and its result, as soon as it is available.
+        more: Function that prepares further jobs, as for `spread`.
 
     Returns:
-        The results in the order of the jobs, each with its `job` and `key`; jobs without a result are left out.
+        Results in the order of the jobs, each with its `job` and `key`; jobs without a result are omitted.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     left: set[str] = set()
 
     def planned(jobs: Sequence[Job]) -> list[tuple[Any, ...]]:
-        """Return what `spread` takes of the jobs that have no result."""
+        """Return the arguments of `spread` for the jobs without a result."""
         keys = [job.key() for job in jobs]
         files.extend(folder / f"{key}.json" for key in keys)
         missing = {
@@ -246,19 +247,19 @@ def run_jobs(
 
 
 class Checkpoints:
-    """The newest checkpoint of each piece of work on a cluster, in the memory of an actor on the machine that asked
-    for it: work whose own machine is lost resumes from it elsewhere.
+    """Newest checkpoint of each work item on a cluster, in the memory of an actor on the requesting machine:
+    an item whose machine is lost resumes from it elsewhere.
     """
 
     def __init__(self) -> None:
         self._files: dict[int, dict[str, bytes]] = {}
 
     def store(self, number: int, files: dict[str, bytes]) -> None:
-        """Replace the checkpoint of one piece of work: its files by name."""
+        """Replace the checkpoint of one work item: its files by name."""
         self._files[number] = files
 
     def load(self, number: int) -> dict[str, bytes]:
-        """Return the files of the newest checkpoint, by name; none if there is no checkpoint."""
+        """Return the files of the newest checkpoint, by name; empty if there is no checkpoint."""
         return self._files.get(number, {})
 
 
@@ -271,25 +272,27 @@ def spread(
     resumable: bool = False,
     more: Callable[[], Sequence[Any]] = tuple,
 ) -> Generator[tuple[Any, Future[Any]], None, None]:
-    """Yield the results of items in separate processes, as many in parallel as there are processors if None; in this
-    process if 1.
+    """Yield the results of items, computed in separate processes, as many as there are processors if None; in
+    this process if 1.
 
-    On a cluster work whose process or machine is lost begins anew elsewhere, `RETRIES` times.
+    On a cluster, an item whose process or machine is lost is restarted elsewhere, up to `RETRIES` times.
 
     Args:
-        work: A function of a module, as it is called in other processes.
-        items: What it is called with, each by itself.
-        processes: At once. A process of one's own takes some 3 s to start, which a single one does not make up for.
-        address: HOST:PORT of a Ray cluster on which it is done instead, or auto.
-        resumable: Whether on a cluster the work is called with an item, the files of its newest checkpoint by name,
-            none at first, and a function that stores such files.
-        more: Called in this process while others do the work, and returns further items.
+        work: Function of a module, since it is called in other processes.
+        items: Arguments of the individual calls.
+        processes: Number of parallel processes. Starting a separate process takes about 3 s, which is not
+            worthwhile for a single item.
+        address: HOST:PORT of a Ray cluster that does the work instead, or auto.
+        resumable: True if, on a cluster, the work is called with an item, the files of its newest checkpoint
+            by name (initially none), and a function that stores such files.
+        more: Function that is called in this process while others work, and returns further items.
 
     Yields:
-        An item and its outcome, as each ends. Whoever stops iterating, by Ctrl-C or by closing this, ends them all.
+        An item and its outcome, as each ends. Stopping the iteration, by Ctrl-C or by closing the generator,
+        ends all work.
 
     Raises:
-        ClusterError: Ray is not installed, or nothing answers at the address.
+        ClusterError: Ray is not installed, or there is no response at the address.
     """
     if address is not None:
         yield from _on_cluster(work, [*items, *more()], address, resumable)
@@ -314,12 +317,12 @@ def spread(
 
 @contextmanager
 def running(work: Callable[..., Any], *arguments: Any) -> Iterator[None]:
-    """Run a function in a process of its own beside a block, whose end waits for it.
+    """Run a function in a separate process during a block, whose end waits for it.
 
-    It only prepares: what it returns or raises is not read.
+    The function only prepares data: its result or error is ignored.
 
     Args:
-        work: A function of a module.
+        work: Function of a module.
         arguments: Its arguments.
     """
     with _workers(1) as executor:
@@ -330,8 +333,8 @@ def running(work: Callable[..., Any], *arguments: Any) -> Iterator[None]:
 
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Start processes, which an error or Ctrl-C ends without waiting for results that are not read."""
-    # A fork would copy the threads of Warp and torch half-alive.
+    """Start processes, which an error or Ctrl-C ends without waiting for unread results."""
+    # A fork would copy the threads of Warp and torch in an inconsistent state.
     executor = ProcessPoolExecutor(
         count,
         mp_context=multiprocessing.get_context("spawn"),
@@ -389,13 +392,13 @@ def _on_cluster(
 
 
 def _call(work: Callable[..., Any], item: Any, number: int, checkpoints: Any) -> Any:
-    """Call the work in a worker: Ray takes plain functions alone.
+    """Call the work in a worker: Ray accepts only plain functions.
 
     Args:
-        work: What is called.
-        item: What it is called with.
-        number: Number of this piece of work.
-        checkpoints: Actor that keeps a checkpoint of each; None for work that does not resume.
+        work: Function to call.
+        item: Argument of the call.
+        number: Number of this work item.
+        checkpoints: Actor that stores the checkpoints; None if the work is not resumable.
     """
     if checkpoints is None:
         return work(item)
@@ -408,7 +411,7 @@ def _call(work: Callable[..., Any], item: Any, number: int, checkpoints: Any) ->
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where nothing answers as Ray does: Ray itself tries for minutes, or for ever.
+    """Refuse an address without a Ray server: Ray itself retries for minutes, or forever.
 
     Ray speaks gRPC, so its first frame is one of HTTP/2 settings.
     """
@@ -424,13 +427,13 @@ def _knock(address: str) -> None:
                     b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, SETTINGS, 0, 0, 0, 0, 0))
                 )
                 if connection.recv(9)[3:4] != bytes((SETTINGS,)):
-                    raise OSError("it is another program")
+                    raise OSError("another program is listening there")
     except (OSError, OverflowError) as error:
         raise ClusterError(f"no Ray cluster answers at {address}: {error}") from error
 
 
 def _prepare(parent: int) -> None:
-    """Prepare a worker: one thread, since there are as many workers as processors, and an end with its parent."""
+    """Prepare a worker: one thread, as there are as many workers as processors, and termination with its parent."""
     os.environ.update(ONE_THREAD)
     prepare_worker(parent)
 
@@ -442,7 +445,7 @@ def _play_job(keyed: tuple[str, Job], folder: Path, play: Play) -> dict[str, Any
 
 
 def _stored(job: Job, path: Path, played: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The result with its job, written to PATH.json; None where there is none."""
+    """Return the result with its job, written to PATH.json; None if there is no result."""
     if played is None:
         return None
     key = path.name
@@ -452,7 +455,7 @@ def _stored(job: Job, path: Path, played: dict[str, Any] | None) -> dict[str, An
 
 
 def _policy_files(job: Job) -> dict[str, bytes]:
-    """Content of the policy that steers, by file name; nothing where a name of ours does."""
+    """Return the files of the job's policy by name; empty for a built-in controller."""
     controller = getattr(job, "controller", None)
     if controller is None or controller in CONTROLLERS:
         return {}
@@ -462,7 +465,7 @@ def _policy_files(job: Job) -> dict[str, bytes]:
 def _play_away(
     sent: tuple[str, Job, Mapping[str, bytes]], play: Play
 ) -> tuple[dict[str, Any] | None, dict[str, bytes]]:
-    """Play a job on another machine: its result, and the files that it left by name."""
+    """Play a job on another machine: return its result, and the files that it wrote by name."""
     key, job, policy = sent
     with tempfile.TemporaryDirectory() as scratch:
         out, controller = Path(scratch) / "out", Path(scratch) / "policy"
@@ -479,7 +482,7 @@ def _play_away(
 def _come_back(
     job: Job, path: Path, played: dict[str, Any] | None, files: Mapping[str, bytes]
 ) -> dict[str, Any] | None:
-    """Write what a job left elsewhere beside PATH.json of its result."""
+    """Write the files of a remote job beside PATH.json of its result."""
     for name, content in files.items():
         with atomic_write(path.with_name(plain_name(name, "file of a trial", ClusterError))) as temporary:
             temporary.write_bytes(content)

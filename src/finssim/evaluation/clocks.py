@@ -1,4 +1,4 @@
-"""Offset between the clocks of a record and of a truth file, from the motion that both show."""
+"""Offset between the clocks of a record and of a truth file, from their common motion."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ Array = npt.NDArray[np.float64]
 
 
 class ClockError(ValueError):
-    """Two motions whose clocks cannot be compared."""
+    """Motions whose clocks cannot be compared."""
 
 
 COARSE, FINE = 0.2, 0.01
-"""Steps of the search [s]."""
+"""Coarse and fine step of the search [s]."""
 SAMPLES = 400
 """Number of samples of the estimate that are compared."""
 LONGEST = 86_400.0
-"""Longest duration of truth and estimate together [s]; the search takes 0.1 ms for each of its steps."""
+"""Longest total duration of truth and estimate [s]; the search takes 0.1 ms per step."""
 OVERLAP = 0.5
-"""Part of the estimate that the truth must cover."""
+"""Fraction of the estimate that the truth must cover."""
 
 
 def clock_offset(estimate_time: Array, estimate: Array, time: Array, position: Array) -> float:
     """Return the time to add to the truth's times so that it matches the estimate [s].
 
-    The one with the least mean square distance, of all under which at least half of the estimate is covered.
+    It is the offset with the least mean square distance among those for which at least half of the estimate
+    is covered.
 
     Args:
         estimate_time: Times of the estimate, robot's clock [s], (n,).
         estimate: Estimated positions, world frame [m], (n, 3).
-        time: Of the truth, pool's clock [s], (k,).
-        position: Of the truth, world frame [m], (k, 3).
+        time: Times of the truth, pool's clock [s], (k,).
+        position: True positions, world frame [m], (k, 3).
 
     Raises:
-        ClockError: The truth is too short, or too long to be searched.
+        ClockError: The truth is too short, or too long for the search.
     """
     chosen = np.unique(np.linspace(0, len(estimate_time) - 1, SAMPLES).round().astype(int))
     t, x = estimate_time[chosen], estimate[chosen]
@@ -56,5 +57,5 @@ def clock_offset(estimate_time: Array, estimate: Array, time: Array, position: A
     best = min(np.arange(first, last + COARSE, COARSE), key=error)
     best = min(np.arange(best - COARSE, best + COARSE, FINE), key=error)
     if not np.isfinite(error(float(best))):
-        raise ClockError("the truth covers less than half of the record: it is not of this run")
+        raise ClockError("the truth covers less than half of the record: it belongs to another run")
     return float(best)

@@ -1,4 +1,5 @@
-"""`finssim evaluate`: trials of a controller, on published setpoints and trajectories or in a task's own episodes."""
+"""Implementation of `finssim evaluate`: trials of a controller, on published setpoints and trajectories or in
+a task's episodes."""
 
 from __future__ import annotations
 
@@ -62,21 +63,19 @@ T2_COLUMNS = {
     "vertical_rmse_m": ("vert. [m]", ".4f"),
     "p95_m": ("P95 [m]", ".4f"),
     "cross_track_rmse_m": ("across [m]", ".4f"),
-    "completion": ("way", ".0%"),
+    "completion": ("path", ".0%"),
     "max_tilt_deg": ("tilt [°]", ".1f"),
 }
-CAPTION = (
-    "errors: 40-60 s. success: 0.10 m on each axis and 10° for 10 s; t_s: when the first such 10 s begin."
-)
+CAPTION = "errors: 40-60 s. success: 0.10 m on each axis and 10° for 10 s; t_s: start of the first such 10 s."
 T2_CAPTION = (
     "horiz., vert.: RMSE against the reference at the same time. P95: its distance is less for 95 % of the time. "
-    "across: RMS distance to the way."
+    "across: RMS distance to the path."
 )
-EPISODES_CAPTION = "means over episodes; in brackets 95 % of a bootstrap over them."
+EPISODES_CAPTION = "means over episodes; in brackets the 95 % bootstrap interval."
 
 
 def paper_name(result: Mapping[str, Any]) -> str:
-    """The row of the paper's table that is nearest to what was evaluated."""
+    """Return the row of the paper's table that is closest to the evaluated controller."""
     controller = result["controller"]
     if controller["kind"] != "policy":
         return "PID"
@@ -89,19 +88,19 @@ def paper_name(result: Mapping[str, Any]) -> str:
 
 
 class SummaryForm(NamedTuple):
-    """Summary and display of a task that is measured as in the paper."""
+    """Summary and display of a task that is evaluated as in the paper."""
 
     kind: str
-    """Kind of goal: the key of its name in a row."""
+    """Kind of goal, which is the key of its name in a row."""
     targets: Sequence[str]
     columns: Columns
     """Columns of the table: key -> heading with its unit, format, and a factor."""
     caption: str
     summarize: Callable[[Sequence[Mapping[str, Any]]], dict[str, Any]]
     paper: Callable[[str], dict[str, dict[str, Any]]]
-    """Name of the paper's row -> its rows by their names in our table."""
+    """Function from the name of the paper's row to its rows, by their names in our table."""
     figure: str
-    """Name of its file."""
+    """File name of the figure."""
     shows: str
     """Caption of the figure."""
     draw: Callable[[Mapping[str, Sequence[GoalTrial]], str], Any]
@@ -118,11 +117,12 @@ FORMS: Mapping[str, SummaryForm] = {
         "trajectories.png", TRACKS, draw_tracking,
     ),
 }  # fmt: skip
-"""Forms of the paper's tasks; every other task is measured in episodes as in training."""
+"""Forms of the paper's tasks; every other task is evaluated in episodes as in training."""
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """A row for each target and plant, of several plants in T1 for each plant alone; and the paper's."""
+    """Return tables with a row for each target and plant (for several plants in T1, for each plant), and the
+    paper's rows."""
     results: Sequence[Mapping[str, Any]] = result.get("plants", [result])
     first, several = results[0], len(results) > 1
     title = f"{first['task']} · {first['controller']['name']} · {first['vehicle']['name']}"
@@ -154,7 +154,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
 
 
 def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return remarks on records: why one is not complete, and how far its estimate was from the truth."""
+    """Return remarks on records: why one is incomplete, and the error of its estimate."""
 
     def name(trial: Mapping[str, Any]) -> str:
         return str(next(trial[key] for key in ("record", "setpoint", "trajectory", "trial") if key in trial))
@@ -168,7 +168,7 @@ def _remarks(trials: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
-    """A row for each measure of an episode, and a column for each plant."""
+    """Return a table with a row for each measure of an episode, and a column for each plant."""
     first = results[0]
     complete = "" if results[1:] else f" · {first['valid']} of {first['trials']} episodes"
     return Table(
@@ -185,15 +185,15 @@ def _episodes_table(results: Sequence[Mapping[str, Any]], title: str) -> Table:
 
 
 class EvaluationError(ValueError):
-    """An evaluation that cannot be run."""
+    """Evaluation that cannot be run."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One controller in one plant."""
+    """Evaluation of one controller in one plant."""
 
     result: dict[str, Any]
-    """Result that `--json` prints: controller, place, measures over all trials, `per_trial`, provenance."""
+    """Result that `--json` prints: controller, plant, measures over all trials, `per_trial`, provenance."""
     trials: Sequence[GoalTrial] = ()
     """Trials of T1 and T2, for figures."""
 
@@ -214,18 +214,18 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Evaluations:
-    """One controller in one plant or several."""
+    """Evaluation of one controller in one or several plants."""
 
     each: tuple[Evaluation, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result as plain data; of several plants `plants`, one for each, in their order."""
+        """Return the result as plain data; for several plants as `plants`, in their order."""
         results = [evaluation.result for evaluation in self.each]
         return results[0] if len(results) == 1 else {"plants": results}
 
     @property
     def table(self) -> Table:
-        """Measures by target and plant, with the paper's rows where the task is the paper's."""
+        """Measures by target and plant, with the paper's rows if the task is from the paper."""
         return tables_of(self.as_json())[0]
 
     @property
@@ -239,7 +239,7 @@ class Evaluations:
         """Return a Matplotlib figure: errors against time (t1), or trajectories from above (t2).
 
         Raises:
-            EvaluationError: The task is measured in episodes, whose motion is not kept.
+            EvaluationError: The task is evaluated in episodes, whose motion is not stored.
         """
         first = self.each[0].result
         if first["task"] not in FORMS:
@@ -264,16 +264,16 @@ def evaluation(
     trials: Sequence[GoalTrial] = (),
     **about: Any,
 ) -> Evaluation:
-    """The evaluation of trials that were measured.
+    """Return the evaluation of trials with their measures.
 
     Args:
-        controller: Who steered, as plain data.
-        task: Name; of T1 and T2 each trial has the name of what it went to.
-        vehicle: As the controller knows it.
-        plant: Where, as plain data.
-        measures: Of each trial.
-        trials: Of T1 and T2.
-        about: What else the result says.
+        controller: Description of the controller, as plain data.
+        task: Name of the task; in T1 and T2 each trial is named after its goal.
+        vehicle: Vehicle in the controller's model.
+        plant: Description of the plant, as plain data.
+        measures: Measures of each trial.
+        trials: Trials of T1 and T2.
+        about: Further entries of the result.
     """
     form = FORMS.get(task)
     if form is None:
@@ -307,15 +307,15 @@ def evaluate(controller: Sequence[str | Path] | str | Path, **arguments: Any) ->
     Example: finssim evaluate run.mcap --task t1 --truth mocap.csv
 
     Args:
-        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper, or a class of your own,
-            FILE.py:CLASS; or records of one controller on a robot (.mcap).
+        controller (DIR|pid|pid-paper|RECORD): A policy's directory, or pid, or pid-paper, or a class of your
+            own, FILE.py:CLASS; or records of one controller on a robot (.mcap).
         arguments: As of `evaluation.evaluate.evaluate_in_plants`.
 
     Returns:
-        The result of the evaluation; of several plants `plants`, one for each, in their order.
+        The result of the evaluation; for several plants as `plants`, in their order.
 
     Raises:
-        EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: As they say.
+        EvaluationError, PolicyError, ControlError, PlantError, VehicleError, OutputError: See these classes.
     """
     return evaluate_in_plants(controller, **arguments).as_json()
 
@@ -334,22 +334,22 @@ def evaluate_in_plants(
     seed: int = 1,
     out: Path | None = None,
 ) -> Evaluations:
-    """Evaluate a controller in every plant; errors as of `evaluate`.
+    """Evaluate a controller in every plant; errors as for `evaluate`.
 
     Args:
         controller: A policy's directory or the name of a controller, or records of one on a robot.
-        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one vehicle. The
-            policy's own if not given, and t1 of a controller that has none.
-        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. That of the policy or of the record if
-            not given, and finsrov of a controller that has none.
+        task (TASK): Task; finssim tasks lists them. Your own: FILE.py:CLASS. For records, a task of one
+            vehicle. If not given, the policy's task, or t1 for a controller without one.
+        vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file. If not given, that of the
+            policy or of the record, or finsrov.
         hydrodynamics (MODEL): Hydrodynamic model: calibrated, simplified or mesh.
-        plant (FILE|NAME): What differs from the vehicle file: nominal (nothing), beyond_cruise, current, foreign,
+        plant (FILE|NAME): Differences from the vehicle file: nominal (none), beyond_cruise, current, foreign,
             held_out, lag, mesh, noise, randomised, sensors, simplified, waves, or a file. May be repeated.
-        observe (FILE|NAME): What is seen in every plant: truth, estimator, sensors or a file of fixes; what the plant
-            says if not given.
-        trajectories (FILE|NAME): What t2 follows: straight, broken, ellipse, lemniscate (all four if not given),
-            circle, figure_eight, helix, or a YAML or CSV file. May be repeated.
-        trials: Trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
+        observe (FILE|NAME): Observation in every plant: truth, estimator, sensors or a file of fixes; that of
+            the plant if not given.
+        trajectories (FILE|NAME): Trajectories for t2: straight, broken, ellipse, lemniscate (all four if not
+            given), circle, figure_eight, helix, or a YAML or CSV file. May be repeated.
+        trials: Number of trials in each plant; if not given, t1's eight setpoints for 60 s, or each trajectory, once.
         truth (TABLE): Truth for scoring records, instead of the robot's own estimate: a table (.csv, .parquet) of
             motion capture, t [s], x, y, z [m] and qx, qy, qz, qw or yaw [rad], or the truth file of finssim pool
             or of finssim ardusub-sitl (.mcap).
@@ -363,18 +363,18 @@ def evaluate_in_plants(
     records = [Path(name) for name in names if str(name).endswith(".mcap")]
     if len(names) > 1 and len(records) < len(names):
         raise EvaluationError(
-            "one controller at a time, or records of one: give a single name, or .mcap files"
+            "expected one controller, or records of one: give a single name, or .mcap files"
         )
     simulated = {"--observe": observe, "--trials": trials}
     unheeded = [name for name, value in simulated.items() if value is not None]
     unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
     unheeded += ["--hydrodynamics"] if hydrodynamics != "calibrated" else []
     if records and unheeded:
-        raise EvaluationError(f"a record was made once and for all: leave {', '.join(unheeded)} out")
+        raise EvaluationError(f"{', '.join(unheeded)} has no effect on a record: omit it")
     if truth is not None and not records:
         raise EvaluationError("--truth is for records: a simulation has its own truth")
     task, vehicle = _subject(Path(names[0]), task, vehicle)
-    task_named(task)  # which refuses one that does not exist
+    task_named(task)  # refuses an unknown task
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
     plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
@@ -396,7 +396,7 @@ def evaluate_in_plants(
 
 
 def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) -> tuple[str, str | Vehicle]:
-    """Return the task and the vehicle of an evaluation: as given, else those of the policy or of the record.
+    """Return the task and the vehicle of an evaluation: as given, otherwise those of the policy or of the record.
 
     Raises:
         EvaluationError: The policy was trained for a vehicle that is not in the catalogue.
@@ -413,7 +413,7 @@ def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) 
             vehicle = catalogue_vehicle(named.name, str(controller)) if named.name in catalogue() else None
             if vehicle is None or vehicle.sha256 != named.sha256:
                 raise EvaluationError(
-                    f"{controller} was trained for a vehicle '{named.name}' that is not the catalogue's: give its file "
+                    f"{controller} was trained for a vehicle '{named.name}' not in the catalogue: give its file "
                     "with --vehicle"
                 )
     return task or "t1", vehicle or "finsrov"
@@ -426,7 +426,7 @@ def _recorded(
     trajectories: Sequence[str | Path],
     truth: Path | None,
 ) -> Evaluation:
-    """The evaluation of records of one controller."""
+    """Return the evaluation of records of one controller."""
     from finssim.evaluation.records import read_record
 
     if len(trajectories) > 1:
@@ -438,7 +438,7 @@ def _recorded(
     if any(pilot != pilots[0] for pilot in pilots):
         names = ", ".join(dict.fromkeys(str(pilot.get("name")) for pilot in pilots))
         raise EvaluationError(
-            f"the records are of several controllers ({names}): evaluate those of one at a time"
+            f"the records are of several controllers ({names}): evaluate each controller separately"
         )
     measures = [
         {"trial": i, "record": trial.path.name, **trial.scores(task, body)} for i, trial in enumerate(trials)
@@ -452,7 +452,7 @@ def _recorded(
 
 
 def _plants(names: Sequence[str | Path]) -> list[PlantChanges]:
-    """Return the plants; each must have a unique name, which separates its results."""
+    """Return the plants; each must have a unique name, which identifies its results."""
     if not names:
         raise EvaluationError("no plant is given: name at least one, such as 'nominal'")
     plants = [load_plant(name) for name in names]
@@ -473,10 +473,11 @@ def evaluate_controller(
     vehicle: str | Vehicle = "finsrov",
     trajectories: Sequence[str | Path] = (),
 ) -> Evaluation:
-    """Run the trials in one plant and measure them; other arguments as `evaluate`.
+    """Run the trials in one plant and evaluate them; other arguments as for `evaluate`.
 
     Args:
-        settings: How many, by default the eight setpoints, or the four trajectories, once; and their worlds.
+        settings: Number of trials, by default each of the eight setpoints or four trajectories once; and
+            their worlds.
     """
     if trajectories and task != "t2":
         raise EvaluationError(f"task '{task}' follows no trajectory: omit it, or evaluate t2")
@@ -509,7 +510,7 @@ def evaluate_controller(
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerTrials(campaign.Job):
-    """Trials of one controller in one plant, as a campaign plays them."""
+    """Trials of one controller in one plant, as a job of a campaign."""
 
     controller: str
     vehicle: str

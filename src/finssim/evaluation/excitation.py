@@ -1,4 +1,5 @@
-"""`finssim excite --pool` and `--robot`: programmes played by the robot's complete software, and their trials."""
+"""Implementation of `finssim excite --pool` and `--robot`: programmes run by the robot's complete software,
+and their trials."""
 
 from __future__ import annotations
 
@@ -53,16 +54,16 @@ from finssim.vehicles.defaults import room
 Array = NDArray[np.float64]
 
 HELD = ("surge", "sway", "heave", "yaw")
-"""Axes that are held while others are excited; roll and pitch right themselves."""
+"""Axes that are held while others are excited; roll and pitch are passively stable."""
 HELD_IN_TURNS = ("heave",)
-"""Axes that are held while the heading is excited: a position cannot be held in axes that turn."""
+"""Axes that are held while the heading is excited: a position cannot be held in rotating axes."""
 
 
 class ProgrammePilot:
-    """Commands a programme open-loop on its axes. The other axes a PID keeps at the guide's pose.
+    """Pilot that commands a programme open-loop on its axes. A PID holds the other axes at the guide's pose.
 
-    Without that, propellers that are not alike turn a vehicle around on a way of two metres. What a fit needs is the
-    wrench that acted, whoever asked for it.
+    Otherwise, unequal propellers would turn a vehicle around within two metres. A fit uses the applied
+    wrench, whichever of the two commanded it.
     """
 
     needs_state = True
@@ -79,15 +80,15 @@ class ProgrammePilot:
     ) -> None:
         """
         Args:
-            programme: What to command; rows of `excitation` may end early, see `room`, and a coast where the programme
-                says how fast the vehicle then rises.
-            vehicle: Whose thrusters; its model gives the gains of the PID.
-            room: Longest way from where the programme began, after which the excitation ends [m].
-            hold: Name of the PID; None leaves the other axes alone.
+            programme: Programme to command; rows of `excitation` may end early, see `room`, and so may a
+                coast if the programme defines an ascent speed.
+            vehicle: Vehicle with the thrusters; its model determines the gains of the PID.
+            room: Largest distance from the start of the programme, after which the excitation ends [m].
+            hold: Name of the PID; None to leave the other axes uncontrolled.
             period: Time between two decisions [s].
 
         Raises:
-            ControlError: Rows and phases differ in number, or an unknown axis or PID.
+            ControlError: The numbers of rows and phases differ, or an axis or the PID is unknown.
         """
         axes, phases = programme.axes, len(programme.phase)
         unknown = [axis for axis in axes if axis not in AXES]
@@ -106,26 +107,26 @@ class ProgrammePilot:
         self.reset()
 
     def reset(self) -> None:
-        """Begin again."""
+        """Reset to the start of the programme."""
         self._memory: Any = self._hold.reset() if self._hold is not None else None
         self._skipped = 0
         self._origin: Array | None = None
         self._rising_since: float | None = None
         self._recorded = ""
         self.phase = ""
-        """The word of the row that was commanded last; empty before and after the programme."""
+        """Phase of the last commanded row; empty before and after the programme."""
         self.fastest = 0.0
-        """Highest speed along the programme's first axis so far, as the robot estimates it [m/s, rad/s]."""
+        """Highest estimated speed along the programme's first axis so far [m/s, rad/s]."""
         self.finished = False
-        """Whether the programme is over."""
+        """True if the programme is over."""
 
     def describe(self) -> dict[str, Any]:
-        """Name, rate and length."""
+        """Return name, rate and duration."""
         length = self._programme.duration
         return {"name": self.name, "kind": "programme", "period_s": self.period, "duration_s": length}
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,); none after the end."""
+        """Return the requested thrusts in canonical order [N], (n,); zero after the end."""
         row, phases = self._row(reading, t), self._programme.phase
         self.finished = self.finished or row >= len(phases)
         if self.finished:
@@ -140,7 +141,7 @@ class ProgrammePilot:
         return self._allocator.allocate(np.clip(tau, -self._limits, self._limits))
 
     def watch(self, runtime: Runtime) -> None:
-        """After every step: the record gets the phases, and the highest speed is kept."""
+        """Record the phases and update the highest speed, after every step."""
         reading = runtime.reading
         if reading is None:
             return
@@ -151,10 +152,10 @@ class ProgrammePilot:
             runtime.recorder.event(reading.time, "phase", self.phase)
 
     def _beside(self, goal: Goal, reading: Measured) -> Goal:
-        """The goal moved along the excited axes to where the vehicle is.
+        """Return the goal shifted along the excited axes to the position of the vehicle.
 
-        Left behind, a way of s metres and a heading error ψ would look like s sin ψ on an axis that is held, and
-        correcting that turns the vehicle further.
+        Otherwise, a distance of s metres and a heading error ψ would appear as an error s sin ψ on a held
+        axis, and correcting it would turn the vehicle further.
         """
         q = np.asarray(goal.quaternion, float)
         away = quat_inverse_rotate(q, np.asarray(reading.position, float) - np.asarray(goal.position, float))
@@ -162,7 +163,7 @@ class ProgrammePilot:
         return replace(goal, position=np.asarray(goal.position, float) + quat_rotate(q, along))
 
     def _row(self, reading: Measured, t: float) -> int:
-        """Return the row to play; excitations and coasts that have done their work are left early."""
+        """Return the row to play; completed excitations and coasts are left early."""
         phases, position = self._programme.phase, np.array(reading.position, float)
         self._origin = position if self._origin is None else self._origin
         row = int(t * self._programme.rate + 1e-6) + self._skipped
@@ -190,15 +191,15 @@ class ProgrammePilot:
 
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Lower and upper corner of the water that a vehicle may be in, world frame [m]."""
+"""Lower and upper corner of the water that a vehicle may use, world frame [m]."""
 
 
 WALL, SURFACE, FLOOR = 0.35, 0.15, 0.12
-"""Water kept between the vehicle's envelope and these at the ends of a run [m]; these three grow with `room`."""
+"""Clearance between the vehicle's envelope and these at the ends of a run [m]; all three are scaled by `room`."""
 STOPPING = {"surge": 0.35, "sway": 0.3, "heave": 0.06}
-"""Share of the room that is kept for the coast after an excitation [m]."""
+"""Fraction of the room that is reserved for the coast after an excitation [-]."""
 LEAST_ROOM = 0.15
-"""Way on which nothing can be learnt [m]."""
+"""Shortest usable distance [m]."""
 
 
 @dataclass(frozen=True)
@@ -206,15 +207,15 @@ class ProgrammeStart:
     """Start of a programme."""
 
     position: tuple[float, float, float]
-    """Body origin, world frame [m]."""
+    """Position of the body origin, world frame [m]."""
     yaw: float
-    """[rad]"""
+    """Heading [rad]."""
     room: float | None
-    """Way after which the excitation ends [m]; None where it goes nowhere."""
+    """Distance after which the excitation ends [m]; None if the programme does not move the vehicle away."""
 
 
 def box_of(surroundings: Basin | Vehicle) -> Box:
-    """The water of a basin, or the workspace of a vehicle, which is taken for walls [m]."""
+    """Return the water of a basin, or the workspace of a vehicle, which is treated as walls [m]."""
     if isinstance(surroundings, Basin):
         half = 0.5 * surroundings.length, 0.5 * surroundings.width
         return (-half[0], -half[1], -surroundings.depth), (*half, 0.0)
@@ -223,17 +224,17 @@ def box_of(surroundings: Basin | Vehicle) -> Box:
 
 
 def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> ProgrammeStart:
-    """The start of a programme: its way then lies in the middle of the water, surge and sway along x.
+    """Return the start of a programme, such that its path is centred in the water, with surge and sway along x.
 
-    One that goes both ways begins in the middle itself, and has half of the way to either side.
+    A programme in both directions starts at the centre, with half of the length on either side.
 
     Args:
-        programme: On one axis; several at once begin in the middle.
-        vehicle: Whose envelope keeps off the walls.
-        box: The water: lower and upper corner [m].
+        programme: Programme on one axis; programmes on several axes start at the centre.
+        vehicle: Vehicle whose envelope must stay clear of the walls.
+        box: Lower and upper corner of the water [m].
 
     Raises:
-        CalibrationError: The water has no room for it.
+        CalibrationError: The water is too small for the programme.
     """
     (x0, y0, z0), (x1, y1, z1) = box
     length, width, height = vehicle.body.size
@@ -244,8 +245,8 @@ def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> ProgrammeStart
     if len(programme.axes) != 1 or axis in ("roll", "pitch", "yaw"):
         return ProgrammeStart((x, y, z), 0.0, 0.5 * (y1 - y0) - 0.5 * math.hypot(length, width))
     column = programme.tau_desired[:, AXES.index(axis)]
-    sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 where it goes both ways
-    # Heading along x for surge; across it for sway, so that its left is where x falls.
+    sign = float(column.max() > 0.0) - float(column.min() < 0.0)  # 0 for both directions
+    # Heading along x for surge; across it for sway, so that its left is towards decreasing x.
     yaw = 0.5 * math.pi if axis == "sway" else 0.0
     if axis == "heave":
         half = 0.5 * (top - bottom)
@@ -256,7 +257,7 @@ def start_of(programme: Programme, vehicle: Vehicle, box: Box) -> ProgrammeStart
     way = half * (2.0 if sign else 1.0) - scale * STOPPING[axis]
     if not way >= LEAST_ROOM:
         raise CalibrationError(
-            f"{programme.name}: the pool leaves {way:.2f} m to go along {axis}, expected {LEAST_ROOM} m or more: use a "
+            f"{programme.name}: the pool has {way:.2f} m of room along {axis}, expected {LEAST_ROOM} m or more: use a "
             "larger pool"
         )
     return ProgrammeStart((x, y, z), yaw, way)
@@ -269,13 +270,13 @@ ESTIMATOR = "error-state"
 def programme_trial(
     programme: Programme, vehicle: Vehicle, start: ProgrammeStart, *, hold: str | None = "pid"
 ) -> RobotTrial:
-    """The trial that plays a programme, and ends with it; its record has the phases.
+    """Return the trial that plays a programme, and ends with it; its record contains the phases.
 
     Args:
-        programme: What to play.
-        vehicle: As the robot knows it.
-        start: Where it begins, and how far it may go.
-        hold: PID that keeps the other axes; None leaves them alone.
+        programme: Programme to play.
+        vehicle: Vehicle in the robot's model.
+        start: Start of the programme, and the distance that is available.
+        hold: PID that holds the other axes; None to leave them uncontrolled.
     """
     pilot = ProgrammePilot(programme, vehicle, room=start.room, hold=hold)
     return RobotTrial(
@@ -294,11 +295,11 @@ def about_programme(programme: Programme, label: str) -> dict[str, Any]:
 
 
 def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
-    """Write the trial of a record, from where its programme began, into a folder of its name.
+    """Write the trial of a record, from the start of its programme, to a folder with its name.
 
     Args:
-        record: MCAP of one programme.
-        folder: Of the trial.
+        record: MCAP file of one programme.
+        folder: Folder of the trial.
         role: fit or held-out.
     """
     trial = read_trials([record], split="phase")[0]
@@ -309,18 +310,18 @@ def write_trial_of(record: Path, folder: Path, role: str) -> Trial:
 
 
 RECORDS = "records"
-"""Folder of the MCAPs beside the trials."""
+"""Folder of the MCAP files beside the trials."""
 PLAN_FILE = "programmes.yaml"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolRun(PoolJob):
-    """A programme, who plays it and where; the row is the role of its trial: fit or held-out."""
+    """Programme with the robot and pool that play it; the row is the role of its trial: fit or held-out."""
 
     programme: Programme
     camera: str = "corners"
     hold: str | None = "pid"
-    """PID that keeps the other axes."""
+    """PID that holds the other axes."""
 
     @property
     def water(self) -> Box:
@@ -333,11 +334,11 @@ def play_programme(run: PoolRun, path: Path) -> dict[str, Any]:
     """Play a programme in its pool.
 
     Args:
-        run: What, who and where; the target is the name of the programme.
-        path: Folder that takes TARGET, the trial, and TARGET.mcap, the record.
+        run: Job with the programme; the target is the name of the programme.
+        path: Folder for TARGET, the trial, and TARGET.mcap, the record.
 
     Returns:
-        `fault` (why the bridge ended it early, or empty), `text` (of `fastest_text`) and the `notes` of the import.
+        `fault` (why the bridge ended it early, or empty), `text` (from `fastest_text`) and the `notes` of the import.
     """
     start_warp()
     record = path / f"{run.target}.mcap"
@@ -372,25 +373,25 @@ def record_programmes(
     console: Console | None = None,
     **pool: Any,
 ) -> dict[str, list[Path]]:
-    """Make trials of programmes, played by the robot's complete software at the start that `start_of` gives each.
+    """Record trials of programmes, played by the robot's complete software from the start that `start_of` returns.
 
     Args:
-        plans: What is played.
-        folders: By role: takes NAME, the trials, and records/NAME.mcap.
-        vehicle: Name or file, as the robot knows it.
-        robot: That plays what has no trial in its folder yet, within the workspace; not opened where nothing is left.
-            None: a virtual pool does.
-        console: Where a robot's state is told; standard error if None.
+        plans: Programmes to play.
+        folders: Folders by role, for NAME, the trials, and records/NAME.mcap.
+        vehicle: Name or file of the vehicle in the robot's model.
+        robot: Robot that plays the programmes without a trial in their folder, within the workspace; it is
+            not opened if none remains. None for a virtual pool.
+        console: Console for the robot's state; standard error if None.
         pool: Arguments of `_in_pool`.
 
     Returns:
-        Folders of the trials by role, in the order of the programmes, without those that were skipped or left out.
+        Folders of the trials by role, in the order of the programmes, without skipped or omitted ones.
 
     Raises:
-        RobotError: It may not be armed, or stopped with nobody there to help.
-        KeyboardInterrupt: Ctrl-C; of a robot the same call goes on.
-        CalibrationError: A programme that the water has no room for, or a role all of whose trials the bridge stopped.
-        GoalError, LinkError, VehicleError, OutputError: As they say.
+        RobotError: The robot may not be armed, or it stopped and no attendant is present.
+        KeyboardInterrupt: Ctrl-C; for a robot the same call continues.
+        CalibrationError: The water is too small for a programme, or the bridge stopped all trials of a role.
+        GoalError, LinkError, VehicleError, OutputError: See these classes.
     """
     if robot is None:
         _in_pool(plans, folders, vehicle, **pool)
@@ -438,7 +439,7 @@ def _on_robot(
 
 
 def fastest_text(programme: Programme, outcome: TrialOutcome) -> str:
-    """Return the greatest speed of a programme, and its duration, as text."""
+    """Return the highest speed of a programme, and its duration, as text."""
     pilot, t = outcome.trial.pilot, outcome.runtime.t
     assert isinstance(pilot, ProgrammePilot)
     unit = "m/s" if programme.axes[0] in AXES[:3] else "rad/s"
@@ -446,17 +447,18 @@ def fastest_text(programme: Programme, outcome: TrialOutcome) -> str:
 
 
 BALLASTED = 0.25
-"""Weight minus buoyancy that the thrusters need not carry [N]."""
+"""Weight minus buoyancy up to which the thrusters need not compensate it [N]."""
 
 
 def trimmed(programme: Programme, vehicle: Vehicle) -> Programme:
-    """The programme with the vehicle's weight less its buoyancy carried by the thrusters, where it is not ballasted.
+    """Return the programme with the vehicle's net buoyancy compensated by the thrusters, unless it is ballasted.
 
-    A BlueROV2 that rises with 2 N is out of a shallow pool before its first step; the fit takes what acted.
+    A BlueROV2 with 2 N of net buoyancy would surface in a shallow pool before its first step; the fit uses
+    the applied wrench.
 
     Args:
-        programme: On any axis.
-        vehicle: Whose weight and displaced volume are known.
+        programme: Programme on any axis.
+        vehicle: Vehicle with known weight and displaced volume.
     """
     net = vehicle.weight - vehicle.buoyancy
     if abs(net) < BALLASTED or "heave" not in vehicle.controlled_axes:
@@ -476,14 +478,15 @@ def _in_pool(
     show: Show = lambda job, result: None,
     **settings: Any,
 ) -> None:
-    """Make trials of programmes in a pool; those that the bridge stopped are left out, and `show` is given their fault.
+    """Record trials of programmes in a pool; those that the bridge stopped are omitted, and `show` receives
+    their fault.
 
     Args:
-        plans, folders, vehicle: As of `record_programmes`.
-        processes: As many as there are processors if None.
-        progress: Told the share that is done and what is left.
-        show: Given each run and its result, of `play_programme`, as soon as there is one.
-        settings: Of every `PoolRun`.
+        plans, folders, vehicle: As for `record_programmes`.
+        processes: Number of processes; the number of processors if None.
+        progress: Function that is called with the completed fraction and the number of remaining runs.
+        show: Function that is called with each run and its result, from `play_programme`, as soon as it is available.
+        settings: Settings of every `PoolRun`.
     """
     runs = [
         PoolRun(row=role, target=programme.name, programme=programme, vehicle=vehicle, **settings)
@@ -492,15 +495,15 @@ def _in_pool(
         if not (folders[role] / programme.name).is_dir()
     ]
     body = load_vehicle(vehicle)
-    for run in runs:  # what cannot be is refused before anything is played
+    for run in runs:  # refuse impossible runs before anything is played
         start_of(run.programme, body, runs[0].water)
     for folder in folders.values():
         folder.mkdir(parents=True, exist_ok=True)
-    beside = next(iter(folders.values()))  # on the same file system a trial moves whole or not at all
+    beside = next(iter(folders.values()))  # on the same file system, moving a trial is atomic
     with tempfile.TemporaryDirectory(prefix=".recording-", dir=beside) as scratch:
 
         def keep(run: PoolRun, result: Mapping[str, Any]) -> None:
-            """Move a trial to its folder as soon as there is one: an interruption then loses no other."""
+            """Move a trial to its folder as soon as it is complete: an interruption then loses no other trial."""
             if not result["fault"]:
                 source, folder = Path(scratch) / result["key"], folders[run.row]
                 (folder / RECORDS).mkdir(parents=True, exist_ok=True)
@@ -528,7 +531,7 @@ class PlanSettings:
     levels: Sequence[str] | None = None
     """(LEVELS) Magnitudes [N, N m]: "5,10" for every axis or "surge=5,10"; may be given several times."""
     from_fit: Annotated[Path | None, "--from"] = None
-    """(FILE|DIR) Report of a calibration, or its fit.json: plays the dive that it recommends next."""
+    """(FILE|DIR) Report of a calibration, or its fit.json: plays the dive that it recommends."""
     repeats: Annotated[int, (1, 100)] = 1
     """Repeats of every programme."""
     coast: float = 30.0
@@ -540,13 +543,13 @@ class PlanSettings:
         """Refuse settings that exclude each other.
 
         Raises:
-            CalibrationError: They do.
+            CalibrationError: Two settings exclude each other.
         """
         if self.from_fit is not None and (self.levels or self.kind != "published"):
-            raise CalibrationError("--from excludes --kind and --levels: the fit gives them")
+            raise CalibrationError("--from excludes --kind and --levels: the fit determines them")
 
     def programmes(self, axes: str, vehicle: Vehicle, seed: int) -> list[Programme]:
-        """Return the programmes, in the order in which to run them; axes and seed as of `programmes`.
+        """Return the programmes, in the order in which to run them; axes and seed as for `programmes`.
 
         Raises:
             CalibrationError: A programme is impossible.
@@ -560,7 +563,7 @@ class PlanSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationSettings:
-    """Settings of the simulation that plays the programmes, in place of a robot."""
+    """Settings of the simulation that plays the programmes, instead of a robot."""
 
     simulate: bool = False
     """Run them in the simulator and write the trials."""
@@ -577,7 +580,7 @@ class SimulationSettings:
         """Refuse settings that exclude each other.
 
         Raises:
-            CalibrationError: They do.
+            CalibrationError: Two settings exclude each other.
         """
         of_pool = self.severity is not None or self.pool_vehicle is not None
         if robot is not None and (self.simulate or self.pool is not None or of_pool):
@@ -609,9 +612,9 @@ def excite(
         axes (AXES): all, or of surge,sway,heave,roll,pitch,yaw separated by commas.
         vehicle (NAME|FILE): Vehicle in the catalogue, or path of a vehicle file.
         out (DIR): Directory of the programmes or trials.
-        plan: Programmes that are played.
+        plan: Programmes to play.
         simulation: Simulation that plays them; without one they are written as tables.
-        robot: The robot that plays them, in place of a simulation.
+        robot: Robot that plays them, instead of a simulation.
         seed: Seed of every random number; equal seeds give equal results.
         as_json: Print one JSON object instead of tables.
 
@@ -619,7 +622,7 @@ def excite(
         The folders of the trials or programmes.
 
     Raises:
-        CalibrationError, RobotError, VehicleError, OutputError: As they say.
+        CalibrationError, RobotError, VehicleError, OutputError: See these classes.
     """
     simulation.check(robot)
     if robot is not None:
@@ -628,7 +631,7 @@ def excite(
         start_warp()
         if axes != "all" or plan.levels or plan.repeats > 1 or simulation.pool is not None:
             raise CalibrationError(
-                f"--kind {MANOEUVRES} takes axes all, without --levels, --repeats and --pool"
+                f"--kind {MANOEUVRES} requires axes all, without --levels, --repeats and --pool"
             )
         folders = _excite_by_course(load_vehicle(vehicle), Path(out), simulate=simulation.simulate, seed=seed)
     else:
@@ -641,7 +644,7 @@ def excite(
 def _excite_in_simulation(
     axes: str, vehicle: str, out: Path, plan: PlanSettings, simulation: SimulationSettings, seed: int
 ) -> list[Path]:
-    """Play programmes in a pool or the simulator, or write them as tables; arguments as of `excite`."""
+    """Play programmes in a pool or the simulator, or write them as tables; arguments as for `excite`."""
     body, pool, simulate = load_vehicle(vehicle), simulation.pool, simulation.simulate
     played = plan.programmes(axes, body, seed)
     if pool is not None:
@@ -667,18 +670,19 @@ def _excite_in_simulation(
 
 
 def _show_left_out(run: PoolRun, result: Mapping[str, Any]) -> None:
-    """Say on standard error which trial is left out, and why."""
+    """Report on standard error which trial is omitted, and why."""
     if result["fault"]:
         text = f"{run.target}: left out: {result['fault']}"
         Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 MANOEUVRES = "manoeuvres"
-"""Kind of excitation of vehicles with fins."""
+"""Kind of excitation for vehicles with fins."""
 
 
 def _excite_by_course(vehicle: Vehicle, out: Path, *, simulate: bool, seed: int) -> list[Path]:
-    """Write the manoeuvres of a vehicle as tables of orders, or run them in the simulator and write the trials."""
+    """Write the manoeuvres of a vehicle as tables of references, or run them in the simulator and write the
+    trials."""
     chosen = manoeuvres(vehicle)
     trials = simulate_manoeuvres(chosen, vehicle, seed=seed) if simulate else []
     with atomic_directory(out, replaces=PLAN_FILE) as folder:
@@ -697,7 +701,7 @@ def _excite_by_course(vehicle: Vehicle, out: Path, *, simulate: bool, seed: int)
 
 
 def _levels(texts: Sequence[str]) -> dict[str, list[float]] | list[float] | None:
-    """Levels by axis from `surge=5,10`, or for every axis from `5,10`."""
+    """Return levels by axis from `surge=5,10`, or for every axis from `5,10`."""
     named: dict[str, list[float]] = {}
     for word in texts:
         axis, _, numbers = word.rpartition("=")
@@ -723,22 +727,22 @@ def excite_on_robot(
     seed: int = 0,
     console: Console | None = None,
 ) -> list[Path]:
-    """Play programmes on a robot, one after the other; what lies in the folder is not played again.
+    """Play programmes on a robot, one after the other; those with a trial in the folder are not repeated.
 
     Args:
-        axes: As for `programmes`.
-        vehicle: Name or file of the vehicle; its workspace is where programmes go to and fro.
-        out: Takes a trial for each programme, `records/NAME.mcap`, and `programmes.yaml`.
-        robot: Which, and how.
-        plan: Programmes that are played.
+        axes: Axes as for `programmes`.
+        vehicle: Name or file of the vehicle; programmes stay within its workspace.
+        out: Folder for a trial of each programme, `records/NAME.mcap`, and `programmes.yaml`.
+        robot: Robot and its options.
+        plan: Programmes to play.
         seed: Seed of a multi-sine's phases.
-        console: Where it is told how it stands; standard error if None.
+        console: Console for the state; standard error if None.
 
     Returns:
         The folders of the trials, without those that were skipped.
 
     Raises:
-        RobotError: The folder is of another plan; and as `record_programmes`.
+        RobotError: The folder belongs to another plan; also as for `record_programmes`.
     """
     start_warp()
     body = load_vehicle(vehicle)

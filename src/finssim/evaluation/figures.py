@@ -1,4 +1,4 @@
-"""Figures of one style, and those that several experiments draw: errors against time, paths, episodes."""
+"""Common style of figures, and figures of several experiments: errors against time, paths, episodes."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ Array = NDArray[np.float64]
 QUARTILES = (0.25, 0.5, 0.75)
 
 LONGEST_OF_THREE = 28
-"""Letters of a label; where one is longer, the legend has two columns."""
+"""Length of a label in characters above which the legend has two columns."""
 DPI = 130
 
 
 ENVELOPE = (
-    "Position error [m] and yaw error [°] against time [s]: median and middle half of the trials; dashed: the limits "
-    "of success; gray: where errors are measured."
+    "Position error [m] and yaw error [°] against time [s]: median and quartiles of the trials; dashed: the limits "
+    "of success; gray: the evaluation window."
 )
 TRACKS = "Paths from above [m] beside their distance to the reference [m] against time [s]."
 """Captions of the two figures of the paper's tasks."""
 
 
 def new_figure(width: float, height: float, title: str = "", layout: Any = "constrained") -> Any:
-    """An empty Matplotlib figure [inch], which is imported here, as it is slow to."""
+    """Return an empty Matplotlib figure of this size [inch]; Matplotlib is imported here because it is slow
+    to import."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,7 +53,7 @@ def new_figure(width: float, height: float, title: str = "", layout: Any = "cons
 
 
 def clean(*panels: Any) -> None:
-    """Two spines, small ticks and a light grid."""
+    """Set two spines, small ticks and a light grid."""
     for axes in panels:
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
@@ -61,13 +62,13 @@ def clean(*panels: Any) -> None:
 
 
 def legend_below(figure: Any, axes: Any, columns: int) -> None:
-    """Draw the legend of one of the panels below them all."""
+    """Draw the legend of one panel below all panels."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def save_figure(figure: Any, path: Path) -> Path:
-    """Write a figure, completely or not at all; the suffix of the path chooses the format.
+    """Write a figure, completely or not at all; the suffix of the path selects the format.
 
     Raises:
         OutputError: The file cannot be written.
@@ -85,18 +86,18 @@ def png(figure: Any) -> bytes:
 
 
 def error_envelope(trials: Sequence[GoalTrial]) -> tuple[Array, Array, Array]:
-    """Pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
+    """Return pointwise quartiles of the errors of one controller's trials, on the 10 Hz evaluation grid.
 
     Args:
-        trials: Of station keeping.
+        trials: Trials of station keeping.
 
     Returns:
-        Time since the start of the hold [s], shape (G,), as long as the shortest grid; lower quartile, median and upper
-        quartile, shape (3, G), of the distance to the goal [m] and of the magnitude of the yaw error [rad]: NaN where
-        more than half of the trials have no value.
+        Time since the start of the hold [s], shape (G,), as long as the shortest grid; lower quartile, median
+        and upper quartile, shape (3, G), of the distance to the goal [m] and of the magnitude of the yaw
+        error [rad]: NaN if more than half of the trials have no value.
 
     Raises:
-        ValueError: There is no trial.
+        ValueError: There are no trials.
     """
     if not trials:
         raise ValueError("an envelope needs at least one trial")
@@ -113,14 +114,14 @@ def error_envelope(trials: Sequence[GoalTrial]) -> tuple[Array, Array, Array]:
 
 
 def draw_envelopes(runs: Mapping[str, Sequence[GoalTrial]], title: str = "") -> Any:
-    """The figure: position error above, yaw error below, a colour for each controller.
+    """Draw the position error above and the yaw error below, with a colour for each controller.
 
-    The success limits are drawn dashed and the evaluation window is gray. Scales are logarithmic, since errors fall
-    from metres to millimetres, and start at 1 mm and 0.01 deg, where smaller errors leave the figure.
+    The success limits are dashed and the evaluation window is gray. Scales are logarithmic, since errors
+    decrease from metres to millimetres, and start at 1 mm and 0.01 deg; smaller errors are not shown.
 
     Args:
         runs: Legend label -> trials of station keeping, of one controller.
-        title: Written above, or left out when empty.
+        title: Title of the figure; omitted if empty.
     """
     figure = new_figure(7.2, 5.6, title)
     above, below = figure.subplots(2, 1, sharex=True)
@@ -145,7 +146,7 @@ def draw_envelopes(runs: Mapping[str, Sequence[GoalTrial]], title: str = "") -> 
 
 
 def _quartiles(x: Array) -> Array:
-    """Quartiles over the first axis among the values there are; NaN where fewer than half are there."""
+    """Return quartiles over the first axis among the finite values; NaN if fewer than half are finite."""
     enough = np.mean(np.isfinite(x), axis=0) >= 0.5
     quartiles = np.full((len(QUARTILES), x.shape[1]), np.nan)
     quartiles[:, enough] = np.nanquantile(x[:, enough], QUARTILES, axis=0)
@@ -153,7 +154,7 @@ def _quartiles(x: Array) -> Array:
 
 
 def _scale(axes: Any, bottom: float, limit: float, label: str) -> None:
-    """Logarithmic from `bottom` to what is drawn, with the success limit in sight."""
+    """Set a logarithmic scale from `bottom` to the largest value, with the success limit visible."""
     top = max((float(np.nanmax(line.get_ydata(), initial=limit)) for line in axes.lines), default=limit)
     axes.set_ylim(bottom, 2.0 * top)
     axes.set_yscale("log")
@@ -168,11 +169,11 @@ def _scale(axes: Any, bottom: float, limit: float, label: str) -> None:
 
 
 def draw_tracking(runs: Mapping[str, Sequence[GoalTrial]], title: str = "") -> Any:
-    """The figure: a row for each trajectory, its way from above on the left, distances to the reference on the right.
+    """Draw a row for each trajectory: its path from above on the left, distances to the reference on the right.
 
     Args:
         runs: Legend label -> trials; each controller's trials of one trajectory are drawn in one colour.
-        title: Written above, or left out when empty.
+        title: Title of the figure; omitted if empty.
     """
     guides = {trial.name: trial.guide for trials in runs.values() for trial in trials}
     figure = new_figure(9.0, 2.4 * len(guides) + 0.8, title)

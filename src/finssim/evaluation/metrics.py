@@ -1,12 +1,12 @@
-"""The paper's measures of station keeping (T1, Table IV) and of trajectory tracking (T2, Table V).
+"""The paper's metrics of station keeping (T1, Table IV) and of trajectory tracking (T2, Table V).
 
-T1: a trial holds one goal for 60 s. Its samples are resampled to 10 Hz; a grid point in a gap of more than 0.25 s
-between samples has no value, and a trial with values at less than 0.9 of the window's points has no late errors. Names
-are the paper's: e_y is the vertical error, the paper's y pointing up.
+T1: a trial holds one goal for 60 s. Its samples are resampled to 10 Hz; a grid point in a gap of more than
+    0.25 s between samples has no value, and a trial with values at less than 0.9 of the window's points has
+    no late errors. Names are the paper's: e_y is the vertical error, as the paper's y axis points up.
 
-T2: the paper reports three errors against the reference at the same time: horizontal RMSE, vertical RMSE and the 95th
-percentile of the distance. The others are those its published configuration names; where that gives no formula, the
-reading is ours and stands here.
+T2: the paper reports three errors against the reference at the same time: horizontal RMSE, vertical RMSE and
+    the 95th percentile of the distance. The other metrics are those named in its published configuration;
+    where it gives no formula, the definition is ours and is documented here.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from finssim.core.rotations import quat_rotate
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
-# What the paper has: its eight setpoints and the start of T1 in our frames, and its results on its real vehicle.
+# Data of the paper: its eight setpoints and the start of T1 in our frames, and its results on its real vehicle.
 
 
 PAPER: Mapping[str, Any] = yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text(encoding="utf-8"))
-"""Everything that the paper's tables say."""
+"""Content of the paper's tables."""
 
 T1_PUBLISHED: Mapping[str, tuple[float, float, float, float]] = PAPER["setpoints"]
 """Name -> (x, y, z [m], yaw [deg]) as published: controller frame, x forward, y up from the surface, z left."""
 
 
 def from_published(setpoint: tuple[float, float, float, float]) -> NDArray[np.float64]:
-    """A setpoint of the paper's controller frame in our world frame.
+    """Return a setpoint of the paper's controller frame in our world frame.
 
-    The controller frame is our world with y and z exchanged, p_c = B p, det B = -1. Positions follow B. Angles turn as
-    axial vectors do, omega_c = det(B) B omega = [-omega_x, -omega_z, -omega_y]: a yaw about the controller's y has the
-    opposite sign of ours about z, so its +90 deg is a turn to the right, our -90 deg.
+    The controller frame is our world with y and z exchanged, p_c = B p, det B = -1. Positions are multiplied by B.
+    Angles transform as axial vectors, omega_c = det(B) B omega = [-omega_x, -omega_z, -omega_y]: a yaw about the
+    controller's y has the opposite sign of ours about z, so its +90 deg is a turn to the right, our -90 deg.
 
     Args:
         setpoint: (x, y up, z left [m], yaw [deg]) in the controller frame.
@@ -63,11 +63,12 @@ T1_START = from_published((0.0, -0.5, 0.0, 0.0))
 
 
 SITE_SIZES = {"pool": 1.0, "tank": 3.0, "open-water": 3.0}
-"""Factor on the setpoints and the start of T1 by site: a metre away in the pool, three in the others."""
+"""Factor on the setpoints and the start of T1 by site: about a metre from the origin in the pool, three
+metres elsewhere."""
 
 
 def in_room(pose: NDArray[np.float64], vehicle: Vehicle, site: str = "pool") -> NDArray[np.float64]:
-    """A published pose [x, y, z [m], yaw [rad]] in the room that this vehicle has: places grow with it, yaw stays."""
+    """Return a published pose [x, y, z [m], yaw [rad]] scaled to the room of this vehicle; the yaw is unchanged."""
     size = room(vehicle.body.size) * SITE_SIZES[site]
     return pose * np.array([size, size, size, 1.0])
 
@@ -75,22 +76,22 @@ def in_room(pose: NDArray[np.float64], vehicle: Vehicle, site: str = "pool") -> 
 KEYS = ("e_p_m", "e_y_m", "e_psi_deg", "success", "trials", "t_s_s", "J_p_m", "J_psi_deg")
 
 PAPER_T1: Mapping[str, Sequence[float | None]] = PAPER["station_keeping"]
-"""Table of T1: the model trained in (DR: domain randomisation) -> the figures in the order of `KEYS`, on hardware."""
+"""Table of T1: training model (DR: domain randomisation) -> the figures in the order of `KEYS`, on hardware."""
 
 
 def paper_row(name: str) -> dict[str, Any]:
-    """One row with the keys of our own results, and `name`."""
+    """Return one row with the keys of our own results, and `name`."""
     return {"name": name, **dict(zip(KEYS, PAPER_T1[name], strict=True))}
 
 
 ERRORS = ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")
-"""Errors that the paper reports of tracking."""
+"""Tracking errors that the paper reports."""
 PAPER_T2: Mapping[str, Mapping[str, Sequence[float]]] = PAPER["tracking"]
 """Table of T2: controller -> trajectory -> the figures in the order of `ERRORS`."""
 
 
 def paper_t2_row(name: str, trajectory: str) -> dict[str, Any] | None:
-    """One controller on one trajectory, with the keys of our own results; None where the paper has none."""
+    """Return one controller on one trajectory, with the keys of our own results; None if the paper has no value."""
     values = PAPER_T2[name].get(trajectory)
     return values and dict(zip(ERRORS, values, strict=True))
 
@@ -98,53 +99,53 @@ def paper_t2_row(name: str, trajectory: str) -> dict[str, Any] | None:
 Array = NDArray[np.float64]
 
 POSITION_TOLERANCE = 0.10
-"""Largest error on each axis that counts as holding the position [m]; in training, `StationKeeping` decides."""
+"""Largest error on each axis for which the position counts as held [m]; in training, `StationKeeping` decides."""
 
 YAW_TOLERANCE = math.radians(10.0)
-"""Largest yaw error that counts as holding the heading [rad]."""
+"""Largest yaw error for which the heading counts as held [rad]."""
 
 SUCCESS_DURATION = 10.0
-"""Time for which both must hold without a break [s]."""
+"""Duration for which both must hold without interruption [s]."""
 
 EVALUATION_WINDOW = (40.0, 60.0)
-"""Part of the trial in which the late errors are taken [s]."""
+"""Time window in which the late errors are evaluated [s]."""
 
 RATE = 10.0
 """Rate of the evaluation grid [Hz]."""
 
 MAX_GAP = 0.25
-"""Longest time between two samples across which values are interpolated [s]."""
+"""Longest interval between two samples that is interpolated [s]."""
 
 MIN_VALID = 0.9
-"""Smallest share of the window's grid points that must have a value."""
+"""Least fraction of the window's grid points that must have a value."""
 
 MEANS = ("e_p_m", "e_y_m", "e_psi_deg", "J_p_m", "J_psi_deg", "t_s_s")
 
 
 def measure_trial(t: ArrayLike, position: ArrayLike, yaw: ArrayLike, goal: ArrayLike) -> dict[str, Any]:
-    """Measures of one trial.
+    """Return the metrics of one trial.
 
-    With e = position - goal and e_psi the yaw error, over the grid points of the evaluation window:
-    e_p = sqrt(mean |e|²), e_y = sqrt(mean e_z²), e_psi = sqrt(mean e_psi²). Success: |e_x|, |e_y|, |e_z| <= 0.10 m and
-    |e_psi| <= 10 deg for 10 s without a break, anywhere in the trial. t_s is when the first such 10 s begin. Jitter is
-    the RMS departure from the mean in those 10 s: J_p = sqrt(mean |p - mean p|²), J_psi likewise.
+    With e = position - goal and e_psi the yaw error, over the grid points of the evaluation window: e_p = sqrt(mean
+    |e|²), e_y = sqrt(mean e_z²), e_psi = sqrt(mean e_psi²). Success: |e_x|, |e_y|, |e_z| <= 0.10 m and |e_psi| <= 10
+    deg for 10 s without interruption, at any time in the trial. t_s is the start of the first such 10 s. Jitter is
+    the RMS deviation from the mean in those 10 s: J_p = sqrt(mean |p - mean p|²), and J_psi accordingly.
 
     Args:
         t: Time since the start of the hold [s], increasing, shape (T,).
         position: Position, world frame [m], shape (T, 3).
         yaw: Heading [rad], wrapped or not, shape (T,).
-        goal: [x, y, z [m], yaw [rad]] held throughout, world frame, shape (4,).
+        goal: Constant goal [x, y, z [m], yaw [rad]], world frame, shape (4,).
 
     Returns:
         `success` (bool); `e_p_m`, `e_y_m`, `e_psi_deg` (None without enough samples); `t_s_s`, `J_p_m`, `J_psi_deg`
-        (None without success); and `valid`, the share of the window's grid points that have a value.
+        (None without success); and `valid`, the fraction of the window's grid points with a value.
 
     Raises:
         ValueError: Times do not increase, or lengths differ.
 
     Note:
         The paper says "jitter" without a formula, and "time to the first satisfaction of the criterion sustained for
-        10 s" without saying which end; these are our readings. The other end is t_s + 10 s.
+        10 s" without stating whether that is its start or its end; we use its start. The end is t_s + 10 s.
     """
     goal = np.asarray(goal, dtype=np.float64)
     grid, position, yaw = resample(t, position, yaw)
@@ -173,20 +174,20 @@ def summarize(
     valid: str = "e_p_m",
     means: Sequence[str] = MEANS,
 ) -> dict[str, Any]:
-    """One controller's row of the table, from the measures of its trials.
+    """Return one controller's row of the table, from the metrics of its trials.
 
-    Each figure is a mean over the trials that have it, errors over all, jitters over the successful; t_s is the median.
-    A trial without errors (it ended early, or its samples are missing) still counts as a trial without success.
+    Each figure is a mean over the trials with a value, errors over all, jitters over the successful ones; t_s is the
+    median. A trial without errors (it ended early, or its samples are missing) still counts as an unsuccessful trial.
 
     Args:
-        trials: What `measure_trial` or `measure_tracking` gave, possibly with more keys.
-        counts: Key of what is counted.
-        valid: Key of an error, which a valid trial has.
+        trials: Results of `measure_trial` or `measure_tracking`, possibly with more keys.
+        counts: Key whose true values are counted.
+        valid: Key of an error that every valid trial has.
         means: Keys of the figures.
 
     Returns:
-        `trials`, `valid` (trials that have errors), `success` or what else is counted, and the figures, None where no
-        trial has one.
+        `trials`, `valid` (trials with errors), `success` or the other counted key, and the figures, None if
+        no trial has a value.
     """
     row: dict[str, Any] = {
         "trials": len(trials),
@@ -201,12 +202,12 @@ def summarize(
 
 
 def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
-    """Position and yaw error.
+    """Return the position and yaw errors.
 
     Args:
-        position: World frame [m], shape (..., 3).
-        yaw: [rad], shape (...,).
-        goal: [x, y, z [m], yaw [rad]], world frame, shape (..., 4).
+        position: Position in the world frame [m], shape (..., 3).
+        yaw: Heading [rad], shape (...,).
+        goal: Goal [x, y, z [m], yaw [rad]], world frame, shape (..., 4).
 
     Returns:
         position - goal, world frame [m], shape (..., 3), and yaw - goal yaw in [-pi, pi) [rad], shape (...,).
@@ -215,15 +216,15 @@ def pose_error(position: Array, yaw: Array, goal: Array) -> tuple[Array, Array]:
 
 
 def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, Array]:
-    """A trial on the 10 Hz evaluation grid, from 0 to 60 s or to its own end if that is later.
+    """Return a trial on the 10 Hz evaluation grid, from 0 to 60 s or to its own end if that is later.
 
-    Values are interpolated linearly, yaw the short way round. Samples that are not finite are left out. A grid point
-    before the first sample, after the last, or between two more than 0.25 s apart is NaN.
+    Values are interpolated linearly, yaw along the shorter arc. Non-finite samples are ignored. A grid point
+    before the first sample, after the last, or between two samples more than 0.25 s apart is NaN.
 
     Args:
         t: Time since the start of the hold [s], increasing, shape (T,).
-        position: World frame [m], shape (T, 3).
-        yaw: [rad], wrapped or not, shape (T,).
+        position: Position in the world frame [m], shape (T, 3).
+        yaw: Heading [rad], wrapped or not, shape (T,).
 
     Returns:
         Grid times [s], shape (G,); position, shape (G, 3); unwrapped yaw, shape (G,).
@@ -248,45 +249,46 @@ def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, 
     before, after = after - 1, np.minimum(after, len(t) - 1)
     nearest = np.where(np.abs(t[before] - grid) <= np.abs(t[after] - grid), t[before], t[after])
     inside = (t[before] <= grid) & (grid <= t[after]) & (t[after] - t[before] <= MAX_GAP)
-    inside |= np.abs(nearest - grid) <= 1e-3  # a sample at the grid point itself, its time rounded as logs do
+    inside |= (
+        np.abs(nearest - grid) <= 1e-3
+    )  # a sample at the grid point itself, with a time rounded by the log
     columns = [np.where(inside, np.interp(grid, t, column), np.nan) for column in (*position.T, yaw)]
     return grid, np.stack(columns[:3], axis=-1), columns[3]
 
 
 def _first_run(held: NDArray[np.bool_], length: int) -> slice | None:
-    """The first `length` consecutive true elements, or None."""
+    """Return the first `length` consecutive true elements, or None."""
     count = np.concatenate([[0], np.cumsum(held)])
     starts = np.flatnonzero(count[length:] - count[:-length] == length)
     return slice(starts[0], starts[0] + length) if len(starts) else None
 
 
 def _rms(x: Array) -> float:
-    """Root mean square of the values there are."""
+    """Return the root mean square of the finite values."""
     return math.sqrt(float(np.nanmean(np.square(x))))
 
 
 DENSE_RATE = 50.0
-"""Samples per second of the reference that a position is projected on [Hz]."""
+"""Rate of the samples of the reference on which a position is projected [Hz]."""
 
 SEARCH_WINDOW = 2.0
-"""A position is projected on the reference at most this long after the last one, and after its own time [s]."""
+"""Longest time after the previous projection, and after the sample's own time, that is searched for a
+projection [s]."""
 SEARCH_WAY = 0.3
-"""Way that is searched ahead at least, however slow the reference is there [m]."""
+"""Least path length that is searched ahead, however slow the reference is there [m]."""
 
 COMPLETE = 0.98
-"""Share of the way that counts as complete."""
-
-"""Smallest share of the duration's samples that must have a position."""
+"""Fraction of the path that counts as complete."""
 
 SATURATED = 0.99
-"""A thruster at this part of its limit is saturated."""
+"""Fraction of its limit above which a thruster counts as saturated."""
 
 MEASURES = (
     *ERRORS,
     *("cross_track_rmse_m", "cross_track_p95_m", "completion"),
     *("energy", "smoothness_per_s", "saturation", "max_tilt_deg"),
 )
-"""Every measure that `measure_tracking` gives."""
+"""All metrics that `measure_tracking` returns."""
 
 
 def measure_tracking(
@@ -298,25 +300,25 @@ def measure_tracking(
     thrust: ArrayLike | None = None,
     limits: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> dict[str, Any]:
-    """Measures of one run, over the samples from the start to the end of the trajectory.
+    """Return the metrics of one run, over the samples from the start to the end of the trajectory.
 
     With e = position - reference at the same time:
 
-        horizontal = sqrt(mean(e_x² + e_y²))    vertical = sqrt(mean e_z²)    p95: 95 % of |e| are smaller
+        horizontal = sqrt(mean(e_x² + e_y²))    vertical = sqrt(mean e_z²)    p95: 95th percentile of |e|
 
-    Cross-track errors are distances to the nearest point of the way (`projected_times`); `completion` is the part of
-    the way, by length, that lies before the last sample's projection.
+    Cross-track errors are distances to the nearest point of the path (`projected_times`); `completion` is the
+    fraction of the path length before the last sample's projection.
 
     Args:
         t: Times since the start of the trajectory [s], increasing, (T,).
         position: Body origin, world frame [m], (T, 3); NaN where unknown.
-        guide: What was to be followed.
+        guide: Reference to follow.
         quaternion: Body to world, xyzw, (T, 4), for the tilt.
-        thrust: Of each thruster [N], (T, n), for energy, smoothness and saturation.
-        limits: Lower and upper limit of each thruster [N], (n,) each; needed with `thrust`.
+        thrust: Thrust of each thruster [N], (T, n), for energy, smoothness and saturation.
+        limits: Lower and upper limit of each thruster [N], (n,) each; required with `thrust`.
 
     Returns:
-        `MEASURES`, None where what they need is missing; `valid`, the share of samples with a position; `complete`.
+        `MEASURES`, None if their inputs are missing; `valid`, the fraction of samples with a position; `complete`.
 
     Raises:
         ValueError: Times do not increase, or lengths differ.
@@ -358,11 +360,11 @@ def _errors(t: Array, position: Array, guide: Guide) -> dict[str, Any]:
 
 
 def projected_times(t: Array, position: Array, guide: Guide) -> Array:
-    """Times at which the reference is nearest to each position, (T,): never backwards, and never far ahead.
+    """Return times at which the reference is nearest to each position, (T,): never decreasing, and never far ahead.
 
-    Both matter where a way crosses or repeats itself. The reference is searched at 50 Hz from the last projection to
-    2 s or 0.3 m after it (it rests at corners, where who is beside it would wait for ever), but not to more than 2 s
-    after the sample's own time. Who stops is projected where he stopped.
+    Both are relevant where a path crosses or repeats itself. The reference is searched at 50 Hz from the last
+    projection to 2 s or 0.3 m after it (the reference rests at corners, where the search would otherwise stop), but
+    not to more than 2 s after the sample's own time. A vehicle that stops is projected to where it stopped.
 
     Args:
         t: Times since the start of the reference [s], increasing, (T,).
@@ -387,7 +389,7 @@ def projected_times(t: Array, position: Array, guide: Guide) -> Array:
 
 
 def _way_share(guide: Guide, time: float) -> float:
-    """Part of the way's length that lies before a time: near a rest, seconds are millimetres."""
+    """Return the fraction of the path length before a time: near a rest, seconds correspond to millimetres."""
     times = np.linspace(0.0, guide.duration, round(guide.duration * DENSE_RATE) + 2)
     length = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(guide.at(times).position, axis=0), axis=-1))]
@@ -399,13 +401,13 @@ def effort_measures(t: Array, thrust: Array, limits: tuple[ArrayLike, ArrayLike]
     """Return measures of the thrusters' effort.
 
         energy = ∫ sum |f|^1.5 dt [N^1.5 s]: up to a factor, a propeller's shaft energy (momentum theory)
-        smoothness = RMS of the thrusts' change per second, as a part of their limits [1/s]; 0 is smoothest
-        saturation = share of samples and thrusters at 99 % of the limit or more
+            smoothness = RMS of the rate of change of the thrusts, relative to their limits [1/s]; 0 is smoothest
+            saturation = fraction of samples and thrusters at 99 % of the limit or more
 
     Args:
-        t: [s], (T,).
-        thrust: [N], (T, n).
-        limits: Lower and upper [N], (n,) each.
+        t: Times [s], (T,).
+        thrust: Thrusts [N], (T, n).
+        limits: Lower and upper limits [N], (n,) each.
     """
     lower, upper = (np.asarray(x, np.float64) for x in limits)
     part = np.where(thrust >= 0.0, thrust / upper, thrust / lower)

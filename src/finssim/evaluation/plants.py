@@ -1,4 +1,4 @@
-"""Plants: what differs, in an evaluation, from the vehicle file and from still water. One YAML file each."""
+"""Plants: differences of an evaluation from the vehicle file and from still water, one YAML file each."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from finssim.vehicles import Vehicle
 SHIPPED = Path(__file__).parent / "plants"
 
 LONGEST_LAG = 5.0
-"""Most that may be added to a thruster's lag or delay [s]: far beyond any motor, and a delay takes memory."""
+"""Largest additional lag or delay of a thruster [s]: far above that of any motor; a delay requires memory."""
 
 
 class PlantError(ValueError):
-    """A plant that is not there, or whose file cannot be used."""
+    """Unknown plant, or plant whose file cannot be used."""
 
 
 class PlantChanges(BaseModel):
-    """Differences of a plant; keys that are left out are as in the vehicle file, in still water, without noise."""
+    """Differences of a plant; omitted keys mean the vehicle file's values, still water, and no noise."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     title: str = ""
     hydrodynamics: str | None = None
-    """calibrated, mesh or simplified."""
+    """Hydrodynamic model: calibrated, mesh or simplified."""
     ranges: Ranges | None = None
-    """Ranges drawn for every trial: a mapping, or the name or file of ranges."""
+    """Ranges from which every trial draws: a mapping, or the name or file of ranges."""
     water: Water | None = None
     """Current (or the table of a profile, beside the file), shear, drift_std, drift_time, depth, waves (or those of a
     spectrum); still if None."""
     noise: MeasurementNoise | None = None
     """Errors of what the controller observes [m, rad, m/s, rad/s]."""
     observe: str | None = None
-    """Observation in place of `noise`: truth, estimator, or sensors, those of the vehicle file with position fixes; or
-    a file of fixes."""
+    """Observation instead of `noise`: truth, estimator, or sensors (those of the vehicle file, with position
+    fixes); or a file of fixes."""
     extra_time_constant: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
-    """Added to every thruster's [s]."""
+    """Time constant that is added to that of every thruster [s]."""
     extra_delay: float = Field(default=0.0, ge=0.0, le=LONGEST_LAG, allow_inf_nan=False)
-    """Added to every thruster's [s]."""
+    """Delay that is added to that of every thruster [s]."""
     held_out: bool = False
-    """True for the looks of a site that are held out of training."""
+    """True for the appearances of a site that are held out of training."""
     vehicle: dict[str, Any] = Field(default_factory=dict)
-    """Dotted path in the vehicle file -> another value, such as body.mass: 12.5."""
+    """Dotted path in the vehicle file -> replacement value, such as body.mass: 12.5."""
 
     @field_validator("ranges", mode="before")
     @classmethod
@@ -66,7 +66,7 @@ class PlantChanges(BaseModel):
     @model_validator(mode="after")
     def _single_view(self) -> PlantChanges:
         if self.observe is not None:
-            observed(self.observe)  # which refuses what there is not
+            observed(self.observe)  # refuses an unknown observation
         if self.observe and self.noise:
             raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
         return self
@@ -75,9 +75,9 @@ class PlantChanges(BaseModel):
         """Return the same plant with another observation.
 
         Raises:
-            PlantError: There is no such way to see.
+            PlantError: The observation is unknown.
         """
-        title = f"{self.title}; seen: {observe}".removeprefix("; ")
+        title = f"{self.title}; observation: {observe}".removeprefix("; ")
         try:
             return PlantChanges.model_validate(
                 {**dict(self), "noise": None, "observe": observe, "title": title}
@@ -86,17 +86,17 @@ class PlantChanges(BaseModel):
             raise PlantError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
     def observe_record(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the description of `observe` in a result, with its numbers, as in a policy's description; empty
-        without one."""
+        """Return the description of `observe` in a result, with its numbers, as in a policy's description;
+        empty if it is None."""
         if self.observe is None:
             return {}
         return {"observe": {"name": self.observe, **seen_with(observed(self.observe), self.changed(vehicle))}}
 
     def changed(self, vehicle: Vehicle) -> Vehicle:
-        """The vehicle with this plant's numbers.
+        """Return the vehicle with this plant's numbers.
 
         Raises:
-            VehicleError: A path is not in the vehicle file, or a value cannot be there.
+            VehicleError: A path is not in the vehicle file, or a value is invalid.
         """
         new = dict(self.vehicle)
         for name, thruster in vehicle.thrusters.items():
@@ -107,7 +107,7 @@ class PlantChanges(BaseModel):
         return vehicle.replace(new) if new else vehicle
 
     def environment_arguments(self) -> dict[str, Any]:
-        """Arguments of `finssim.tasks.Environment`: water, noise, randomization."""
+        """Return the arguments of `finssim.tasks.Environment`: water, noise, randomization."""
         return {
             "water": self.water,
             "noise": observed(self.observe) if self.observe else self.noise,
@@ -117,18 +117,18 @@ class PlantChanges(BaseModel):
     def environment(
         self, agent: Agent, task: Task, vehicle: Vehicle, *, hydrodynamics: str = "calibrated", **options: Any
     ) -> Environment:
-        """Worlds in which an agent acts in this plant.
+        """Return worlds in which an agent acts in this plant.
 
         Args:
-            agent: Who: its action mode and the part of the limits that action 1 stands for.
-            task: What is to be done.
-            vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
-            hydrodynamics: Model, unless the plant names one.
-            options: Of the `Environment`: worlds, seed, ...
+            agent: Agent with its action mode and the fraction of the limits that action 1 represents.
+            task: Task of the agent.
+            vehicle: Vehicle as in its file and in the agent's model; the plant modifies the simulated one.
+            hydrodynamics: Hydrodynamic model, unless the plant names one.
+            options: Options of the `Environment`: worlds, seed, ...
         """
         if self.held_out and not task.world:
             raise PlantError(
-                f"plant '{self.name}' changes what a site looks like, and task '{task.name}' sees none: use another"
+                f"plant '{self.name}' changes the appearance of a site, which task '{task.name}' lacks: use another"
             )
         return Environment(
             replace(task, held_out=True) if self.held_out else task,
@@ -143,15 +143,15 @@ class PlantChanges(BaseModel):
 
 
 def available_plants() -> list[str]:
-    """Names of the plants that ship with FinsSim."""
+    """Return the names of the plants that ship with FinsSim."""
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 
 def load_plant(name_or_path: str | Path) -> PlantChanges:
-    """A plant by name or from a file.
+    """Return a plant by name or from a file.
 
     Raises:
-        PlantError: No such plant, or its file is wrong; names file, key and expectation.
+        PlantError: There is no such plant, or its file is invalid; the message names file, key and expected value.
     """
     path = Path(name_or_path)
     if not path.is_file() and str(name_or_path) in available_plants():

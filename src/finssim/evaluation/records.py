@@ -1,5 +1,5 @@
-"""Motion of a vehicle from its record: demonstrations (`finssim collect RECORD.mcap`), or a trial that is measured as
-in simulation, by the robot's own estimate or by a truth (`finssim evaluate RECORD.mcap`)."""
+"""Motion of a vehicle from its record: demonstrations (`finssim collect RECORD.mcap`), or a trial that is
+evaluated as in simulation, by the robot's own estimate or by a truth (`finssim evaluate RECORD.mcap`)."""
 
 from __future__ import annotations
 
@@ -47,47 +47,47 @@ from finssim.vehicles import Vehicle, load_vehicle
 Array = NDArray[np.float64]
 
 TOPICS = ("thruster_cmd", "odom", "policy_info", "goal", "estimator_status", "thruster_state")
-"""Topics of a demonstration; `events` are read if there are any."""
+"""Topics of a demonstration; `events` are optional."""
 REMEDY = "record a drive with --pool-file and pictures"
 LACKS = {
-    "thruster_cmd": f"nobody commanded: {REMEDY}",
-    "odom": f"it holds no estimate of where it was: {REMEDY}",
+    "thruster_cmd": f"it contains no commands: {REMEDY}",
+    "odom": f"it contains no estimate of the vehicle's position: {REMEDY}",
 }
-"""Topic -> message about a record without it."""
+"""Topic -> message for a record without it."""
 TELEOP = "finssim teleop"
 PERSON = "person"
-"""Mode of a teleoperated vehicle in which its operator steers, and the one it begins in."""
+"""Mode of a teleoperated vehicle in which its operator steers, and its initial mode."""
 NO_GOAL = (0.0, 0.0, 0.0, 0.0)
-"""Goal in the record of a drive by hand without a goal."""
+"""Goal in the record of a manual drive without a goal."""
 
 
 class DriveError(ValueError):
-    """A record or a truth that cannot be learnt from or measured."""
+    """Record or truth that cannot be used for demonstrations or evaluation."""
 
 
 @dataclass(frozen=True)
 class RecordedDecisions:
-    """The N decisions of a record at which there was an estimate, in their order."""
+    """The N decisions of a record for which an estimate is available, in order."""
 
     path: Path
     driver: str
-    """teleop, or the pilot's name."""
+    """Driver: teleop, or the pilot's name."""
     pilot: dict[str, Any]
-    """Pilot as the record describes it; empty if it does not."""
+    """Pilot as described in the record; empty if it is not."""
     period: float
     """Period of the decisions [s]."""
     time: Array
-    """Robot's clock [s], (N,)."""
+    """Times on the robot's clock [s], (N,)."""
     motion: VehicleMotion
-    """Estimated motion, with the thrusts and the pilot's actions, which have size 0 if the record lacks them, as of a
-    person; its times are NaN if the record lacks the guide's start."""
+    """Estimated motion, with the thrusts and the pilot's actions, which have size 0 if the record lacks them,
+    as for a human pilot; its times are NaN if the record lacks the guide's start."""
     guide: str
     """Name of the station or trajectory; empty if the record lacks it."""
     goal: Array
     """Goal of the vehicle: x, y, z [m], yaw [rad], world frame, (N, 4)."""
     stretch: NDArray[np.int64]
-    """Number of the stretch a decision belongs to, (N,): all through it the robot was armed, the estimate ready and
-    the driver at the helm. Negative: in none."""
+    """Number of the interval of each decision, (N,), in which the robot was continuously armed, the estimate
+    ready and the driver steering. Negative outside all intervals."""
 
     @property
     def has_goal(self) -> bool:
@@ -96,15 +96,15 @@ class RecordedDecisions:
 
 
 def read_drive(path: Path, vehicle: Vehicle) -> RecordedDecisions:
-    """Read a record of `finssim teleop` or `finssim run`; one that was cut is read up to the cut.
+    """Read a record of `finssim teleop` or `finssim run`; a truncated record is read up to its end.
 
     Args:
         path: MCAP file.
-        vehicle: It must be the very one that was driven.
+        vehicle: Vehicle, which must be exactly the recorded one.
 
     Raises:
-        RecordError: Not a record.
-        DriveError: Of another vehicle, without an estimate, or nobody commanded.
+        RecordError: The file is not a record.
+        DriveError: The record is of another vehicle, or contains no estimate or no commands.
     """
     with open_record(path) as record:
         _check(record, vehicle)
@@ -116,7 +116,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> RecordedDecisions:
     numbers = dict(zip(steps.tolist(), _stretches(steps, columns, _helm(steps, events, teleop)), strict=True))
     complete = [t for t in sorted(columns["thruster_cmd"]) if all(t in columns[name] for name in TOPICS)]
     if not complete:
-        raise DriveError(f"{path}: no decision at which there was an estimate: no demonstration")
+        raise DriveError(f"{path}: no decision with an estimate, so there is no demonstration")
     rows, time = {name: [columns[name][t] for t in complete] for name in TOPICS}, np.array(complete)
     stretch = np.array([numbers[t] for t in complete])
     first = rows["policy_info"][int(np.argmax(stretch >= 0))]
@@ -140,7 +140,7 @@ def read_drive(path: Path, vehicle: Vehicle) -> RecordedDecisions:
         time=time,
         motion=motion,
         guide=guide,
-        # The goal is level: its quaternion turns about z alone.
+        # The goal is level: its quaternion is a rotation about z alone.
         goal=np.array(
             [(*_xyz(g.position), 2.0 * math.atan2(g.orientation.z, g.orientation.w)) for g in goals]
         ),
@@ -155,7 +155,7 @@ def _check(record: Record, vehicle: Vehicle) -> None:
     if about["vehicle_sha256"] != vehicle.sha256:
         raise DriveError(
             f"{record.path}: is of the vehicle {about['vehicle']} {about['vehicle_sha256'][:12]}, expected "
-            f"{vehicle.name} {vehicle.sha256[:12]}: name the file that was driven with --vehicle"
+            f"{vehicle.name} {vehicle.sha256[:12]}: give the file of the recorded vehicle with --vehicle"
         )
     for name in TOPICS:
         if record.topic(name) not in record.topics:
@@ -164,7 +164,7 @@ def _check(record: Record, vehicle: Vehicle) -> None:
 
 
 def _mapping(record: Record, key: str) -> dict[str, Any]:
-    """A mapping of a record's metadata; empty where it has none."""
+    """Return a mapping from a record's metadata; empty if it is missing."""
     text = record.metadata.get(key, "{}")
     try:
         return dict(json_value(text, DriveError, str(record.path)))
@@ -175,12 +175,12 @@ def _mapping(record: Record, key: str) -> dict[str, Any]:
 
 
 def _helm(steps: Array, events: list[tuple[float, Any]], teleop: bool) -> NDArray[np.bool_]:
-    """Return whether the demonstrator steers at each step: in a drive by hand the person."""
+    """Return whether the demonstrator steers at each step: in a manual drive the human pilot."""
     if not teleop:
         return np.ones(len(steps), dtype=np.bool_)
     changes = [(t, event["text"] == PERSON) for t, event in events if event["kind"] == "mode"]
     times = np.array([-math.inf, *(t for t, _ in changes)])
-    # A press changes who decides from the next step on.
+    # A key press changes the mode from the next step on.
     index = np.searchsorted(times, steps, side="left") - 1
     return np.array([True, *(person for _, person in changes)])[np.maximum(index, 0)]
 
@@ -188,7 +188,7 @@ def _helm(steps: Array, events: list[tuple[float, Any]], teleop: bool) -> NDArra
 def _stretches(
     steps: Array, columns: Mapping[str, Mapping[float, Any]], helm: NDArray[np.bool_]
 ) -> list[int]:
-    """Number of each step's stretch, which every step that may not be learnt from ends; negative there."""
+    """Return the number of each step's interval; a step that cannot be used ends an interval and is negative."""
     states, ready, poses = columns["thruster_state"], columns["estimator_status"], columns["odom"]
     armed = STATES.index("armed")
     fit = helm & np.array(
@@ -206,22 +206,22 @@ def _xyz(v: Any) -> tuple[float, float, float]:
 
 
 NEAR_WRENCH = 0.05
-"""Greatest difference of a wrench from an action, per axis, as a share of the wrench limits, for the action to count as
-known."""
+"""Largest difference of a wrench from that of an action, per axis, relative to the wrench limits, for a valid
+action."""
 FEW = 0.05
-"""Part of the decisions that may be off by more: those at the limits of the thrusters."""
+"""Fraction of the decisions that may exceed it: those at the limits of the thrusters."""
 
 
 def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[np.float32]:
-    """Actions that ask for what was commanded, in [-1, 1], (N, size).
+    """Return the actions that correspond to the commands, in [-1, 1], (N, size).
 
     Args:
         force: Commanded thrusts, along the thrusters' axes, canonical order [N], (N, n).
-        mode: Action mode of that vehicle.
-        vehicle: Its control matrix makes a wrench of thrusts.
+        mode: Action mode for that vehicle.
+        vehicle: Vehicle whose control matrix maps thrusts to a wrench.
 
     Raises:
-        DriveError: More than a few of the commands are none that the mode can ask for.
+        DriveError: Too many of the commands cannot be expressed as actions of the mode.
     """
     f = np.asarray(force, float)
     if mode.wrench:
@@ -237,7 +237,7 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
     if mode.pilot:
         action = before_dead_band(action, axis_dead_band(vehicle, mode.scale))
     action = np.clip(action, -1.0, 1.0)
-    # Compare the wrench that the actions would give with the one that was commanded.
+    # Compare the wrench of the actions with the commanded one.
     limits = np.asarray(vehicle.wrench_limits, float)
     off = np.abs((mode.to_thrusters(action) - f) @ vehicle.control_matrix.T)
     off = np.divide(off, limits, out=np.zeros_like(off), where=limits > 0.0)
@@ -245,7 +245,7 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
     if wrong > FEW:
         worst = int(np.argmax(off.max(axis=0)))
         raise DriveError(
-            f"{mode.name} cannot ask for what was commanded in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
+            f"{mode.name} cannot express the commands in {100.0 * wrong:.0f} % of the decisions ({AXES[worst]} "
             f"is off by up to {off[:, worst].max():.2f} of its limit): give another --action"
         )
     return action.astype(np.float32)
@@ -254,37 +254,38 @@ def actions_of(force: ArrayLike, mode: ActionMode, vehicle: Vehicle) -> NDArray[
 Indices = NDArray[np.int64]
 
 END = "end"
-"""Mark of the end of a stretch, in place of a goal."""
+"""Marker for the pose at the end of an interval, instead of a goal."""
 NEAR = 0.25
-"""A decision may lie so far from the task's grid of times, in parts of its period."""
+"""Largest distance of a decision from the task's time grid, relative to its period."""
 SAME_GOAL = 1.0e-3
-"""Recorded goals that differ by no more are one, or lie on the trajectory [m, rad]."""
+"""Largest difference of recorded goals that count as equal, or as on the trajectory [m, rad]."""
 
 
 def episodes_of(
     drive: RecordedDecisions, observer: Observer, mode: ActionMode, vehicle: Vehicle, *,
     goal: Station | str | None = None,
 ) -> list[Episode]:  # fmt: skip
-    """Demonstrations of a drive; none where it has no stretch of two decisions.
+    """Return demonstrations from a drive; empty if it has no interval of two decisions.
 
-    Rewards are not known: they are NaN. An episode is never `terminated`; its measures are its `length` in steps and
-    `began`, the robot's time of its first decision [s].
+    Rewards are unknown, therefore NaN. An episode is never `terminated`; its metrics are its `length` in
+    steps and `began`, the robot's time of its first decision [s].
 
     Args:
-        drive: What was done.
-        observer: How the task is observed.
-        mode: In which it is acted.
-        vehicle: Which was driven.
-        goal: In place of the recorded one: a station, or `END`; of a task that follows a trajectory its name or file.
+        drive: Recorded decisions.
+        observer: Observer of the task.
+        mode: Action mode.
+        vehicle: Vehicle that was driven.
+        goal: Goal instead of the recorded one: a station, or `END`; for a task with a trajectory, its name or file.
 
     Raises:
-        DriveError: Decisions further apart than the task's, no goal, or commands that the mode cannot ask for.
+        DriveError: Decisions are further apart than the task's, there is no goal, or the mode cannot express
+            the commands.
     """
     task, period = observer.task, observer.task.control_step
     if drive.period > period * (1.0 + 1e-6):
         raise DriveError(
             f"{drive.path}: {drive.driver} decided every {drive.period:g} s, expected at most {period:g} s, the period "
-            f"of {task.name}, so it is not a controller of that task"
+            f"of {task.name}"
         )
     guide_of = _guides(drive, vehicle, task.moving, goal)
     stretches = indices_of(drive, period, split_goals=not task.moving and goal is None)
@@ -317,12 +318,12 @@ def episodes_of(
 
 
 def indices_of(drive: RecordedDecisions, period: float, *, split_goals: bool) -> list[Indices]:
-    """Decisions, one a period, of each stretch that has at least two.
+    """Return decisions at a fixed period, for each interval that has at least two.
 
     Args:
-        drive: What was done.
-        period: [s]
-        split_goals: Whether another goal begins another stretch.
+        drive: Recorded decisions.
+        period: Period of the decisions [s].
+        split_goals: True if a change of goal starts a new interval.
     """
     number = drive.stretch
     changed = np.diff(number) != 0
@@ -334,7 +335,7 @@ def indices_of(drive: RecordedDecisions, period: float, *, split_goals: bool) ->
 
 
 def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
-    """The decisions nearest to a grid of times that begins with the first; a new grid after every gap."""
+    """Return the decisions nearest to a time grid that starts at the first one; a new grid starts after every gap."""
     t = time[run]
     pieces, piece = [], [0]
     while (due := t[piece[0]] + len(piece) * period) <= t[-1] + 1e-6:
@@ -351,7 +352,7 @@ def _on_grid(run: Indices, time: Array, period: float) -> list[Indices]:
 def _guides(
     drive: RecordedDecisions, vehicle: Vehicle, moving: bool, goal: Station | str | None
 ) -> Callable[[Indices], Guide]:
-    """Return a function from the indices of decisions to the guide of a stretch."""
+    """Return a function from the indices of decisions to the guide of an interval."""
     if moving:
         trajectory = trajectory_of(drive, vehicle, None if goal is None else str(goal))
         return lambda rows: trajectory
@@ -362,37 +363,37 @@ def _guides(
         return lambda rows: station_at((*between(rows).position[-1], float(between(rows).yaw[-1])))
     if not drive.has_goal:
         raise DriveError(
-            f"{drive.path}: was driven by hand to no goal: give --goal x,y,z,yaw_deg, where to, or --goal {END}: where "
-            "each stretch ended"
+            f"{drive.path}: was driven by hand without a goal: give --goal x,y,z,yaw_deg, or --goal {END} for the pose "
+            "at the end of each interval"
         )
     return lambda rows: station_at(drive.goal[rows[0]])
 
 
-GIVE = "give the name or the file of what was followed (evaluate --trajectory, collect --goal)"
+GIVE = "give the name or the file of the trajectory (evaluate --trajectory, collect --goal)"
 
 
 def station_at(goal: Sequence[float] | Array) -> Station:
-    """The station of a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
+    """Return the station at a goal: x, y, z [m], yaw [rad], world frame, (4,)."""
     x, y, z, yaw = map(float, goal)
     return Station((x, y, z), yaw)
 
 
 def trajectory_of(drive: RecordedDecisions, vehicle: Vehicle, name: str | None = None) -> Guide:
-    """The trajectory that was followed, checked against the recorded goals.
+    """Return the trajectory that was followed, after checking it against the recorded goals.
 
     Args:
-        drive: What was done.
-        vehicle: Which followed it: a published trajectory is as large as its room.
+        drive: Recorded decisions.
+        vehicle: Vehicle that followed it: a published trajectory is scaled to its room.
         name: Name or file; the recorded name if None.
 
     Raises:
-        DriveError: The record does not tell, or its goals are not on the trajectory.
+        DriveError: The record does not contain the trajectory, or its goals are not on it.
     """
     name = name or drive.guide
     named = name in TRAJECTORIES or name in PUBLISHED_NAMES
-    if name == drive.guide and not named:  # what a record names is no path
+    if name == drive.guide and not named:  # a name from a record is never a path
         raise DriveError(
-            f"{drive.path}: followed '{drive.guide}', which is none of {', '.join(TRAJECTORIES)}: {GIVE}"
+            f"{drive.path}: followed '{drive.guide}', expected one of {', '.join(TRAJECTORIES)}: {GIVE}"
         )
     if np.isnan(drive.motion.t).any():
         raise DriveError(f"{drive.path}: has no start time of its trajectory: not a record of finssim run")
@@ -424,9 +425,9 @@ def collect(
         out (DATASET): Folder of the data set.
         episodes: Number of episodes, counted per agent. Not for records.
         settings: Vehicle, actions, observations, noise and seed.
-        goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the final
-            pose of each interval; for t2 the trajectory.
-        progress: Told the share that is done.
+        goal (GOAL): Goal for records, instead of the recorded one: x,y,z,yaw_deg [m, deg], or end for the
+            final pose of each interval; for t2 the trajectory.
+        progress: Function that is called with the completed fraction.
     """
     records = [Path(word) for word in experts if word.endswith(".mcap")]
     if records and (len(records) < len(experts) or episodes or settings.randomize or settings.disturb):
@@ -438,7 +439,7 @@ def collect(
             records, task, out=out, vehicle=settings.vehicle, action=settings.action, goal=goal
         )
     if len(experts) > 1 or episodes is None or goal is not None:
-        raise DriveError("give one expert and --episodes, and no --goal, which is of records")
+        raise DriveError("give one expert and --episodes, but no --goal, which is for records")
     return collect_episodes(experts[0], task, episodes=episodes, out=out, settings=settings, show=progress)
 
 
@@ -454,7 +455,7 @@ def datasets(places: Sequence[Path]) -> dict[str, Any]:
 
 
 def tables_of(result: Mapping[str, Any]) -> list[Table]:
-    """Return a table of what was collected; or a row for each data set."""
+    """Return a table of the collected demonstrations; or a row for each data set."""
     if "task" in result:
         means = {name: x for name, x in result.get("metrics", {}).items() if x is not None}
         text = f"{result['episodes']} episodes, {result['steps']:,} steps{'; means: ' * bool(means)}"
@@ -482,23 +483,23 @@ def collect_records(
     action: str | None = None,
     goal: str | None = None,
 ) -> dict[str, Any]:
-    """Make demonstrations of records and write them.
+    """Convert records to demonstrations and write them.
 
     Args:
         records: MCAP files of `finssim teleop` or `finssim run`.
-        task: Its name, or FILE.py:CLASS of one's own.
+        task: Name of the task, or FILE.py:CLASS of your own.
         out: Folder of the data set; an earlier one there is replaced.
-        vehicle: Name or file; the very one that was driven.
-        action: Mode; the task's own if None.
-        goal: Where the vehicle should have been, in place of what was recorded: "x,y,z,yaw_deg" or a file, "end" (where
-            each stretch ended); of t2 the trajectory, by name or file.
+        vehicle: Name or file of the vehicle; exactly the recorded one.
+        action: Action mode; the task's own if None.
+        goal: Goal instead of the recorded one: "x,y,z,yaw_deg" or a file, "end" (the pose at which each
+            interval ended); for t2 the trajectory, by name or file.
 
     Returns:
-        What the data set says of itself, with `episodes` and `steps`.
+        The description of the data set, with `episodes` and `steps`.
 
     Raises:
-        DriveError: A record does not fit, or nothing in it can be learnt from.
-        RecordError, ControlError, GoalError, VehicleError, OutputError: As they say.
+        DriveError: A record does not match, or contains no usable demonstration.
+        RecordError, ControlError, GoalError, VehicleError, OutputError: See these classes.
     """
     body = load_vehicle(vehicle)
     watch = Observer(task, body)
@@ -524,7 +525,7 @@ def collect_records(
         names = ", ".join(str(path) for path in records)
         raise DriveError(
             f"{names}: the robot was never armed, its estimate ready and its driver active for two decisions "
-            f"{the_task.control_step:g} s apart towards one goal: no demonstration"
+            f"{the_task.control_step:g} s apart towards one goal, so there is no demonstration"
         )
     described = {
         "task": the_task.name,
@@ -543,36 +544,36 @@ def collect_records(
     return {**described, "episodes": len(demonstrations), "steps": sum(len(e.action) for e in demonstrations)}
 
 
-# A record as a trial, and its scores.
+# Records as trials, with their scores.
 
 
 PUBLISHED = ("t1", "t2")
-"""Tasks that are measured as in the paper; every other one measures itself."""
+"""Tasks that are evaluated as in the paper; every other task provides its own metrics."""
 EARLY = 0.5
-"""A trial that lacks more than this of its end was stopped [s]."""
+"""Missing time at the end of a trial above which it counts as stopped [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrial(GoalTrial):
-    """Content of one record."""
+    """Trial in a record."""
 
     path: Path
     pilot: dict[str, Any]
-    """Pilot as the record describes it."""
+    """Pilot as described in the record."""
     estimate: VehicleMotion
-    """The robot's estimate at its decisions; the motion is the truth, if there is one, or the estimate."""
+    """Robot's estimate at its decisions; `motion` is the truth if available, otherwise the estimate."""
     stopped: bool
-    """True if it ended before its time."""
+    """True if it ended early."""
     duration: float
-    """Up to when it is measured [s]."""
+    """End of the evaluated time [s]."""
     offset: float | None
-    """Added to the truth's times to put them on the robot's clock [s]; None without a truth."""
+    """Offset added to the truth's times to convert them to the robot's clock [s]; None without a truth."""
 
     def scores(self, task: str, vehicle: Vehicle) -> dict[str, Any]:
-        """`measures` of T1 and T2 or what the task measures of itself, and how far the estimate was from the truth.
+        """Return `measures` for T1 and T2, otherwise the task's own metrics, and the error of the estimate.
 
         Raises:
-            ControlError: The task cannot score what was played elsewhere.
+            ControlError: The task cannot score trials that were recorded elsewhere.
         """
         if task in PUBLISHED:
             fault = "ended early" if self.stopped else ""
@@ -587,10 +588,10 @@ class RecordedTrial(GoalTrial):
         }
 
     def _scored(self, task: Task, vehicle: Vehicle) -> tuple[dict[str, float | None], str]:
-        """Return the task's measures of an episode of one vehicle that was played elsewhere.
+        """Return the task's metrics of an episode of one vehicle that was recorded elsewhere.
 
         Returns:
-            Its metrics, None where there is none; and why there are none, in a sentence, which counts without success.
+            The metrics, None if undefined; and a sentence with the reason if they are, which counts as no success.
         """
         motion, actions = self.motion, self.estimate.action
         size = 0 if actions is None else actions.shape[1]
@@ -620,36 +621,36 @@ def read_record(
     truth: Path | None = None,
     duration: float = DURATION,
 ) -> RecordedTrial:
-    """The trial of a record, from the start of its guide's time.
+    """Return the trial in a record, from the start of its guide's time.
 
     Args:
         path: MCAP file of `finssim run`, `experiment --robot` or the ROS 2 graph.
-        task: Of one vehicle: its name, or FILE.py:CLASS of one's own.
-        vehicle: The very one that was driven.
-        guide: What was followed, of a task that follows a reference; by the record's own words if None.
-        truth: Truth file of a virtual pool, record of `finssim ardusub-sitl --truth` (.mcap), or a table (.csv,
-            .parquet) of motion capture, world frame: columns t [s], x, y, z of the body origin [m], and qx, qy, qz, qw
-            or yaw [rad]. Its clock may be any: it is laid over the robot's where the distance between the two motions
-            is least.
-        duration: Of a trial of t1 [s].
+        task: Task of one vehicle: its name, or FILE.py:CLASS of your own.
+        vehicle: Vehicle; exactly the recorded one.
+        guide: Reference of a task that follows one; that named in the record if None.
+        truth: Truth file of a virtual pool, record of `finssim ardusub-sitl --truth` (.mcap), or a table
+            (.csv, .parquet) of motion capture, world frame: columns t [s], x, y, z of the body origin [m],
+            and qx, qy, qz, qw or yaw [rad]. Its clock is arbitrary: it is aligned with the robot's such that
+            the distance between the two motions is least.
+        duration: Duration of a trial of t1 [s].
 
     Raises:
-        DriveError: A task of several vehicles, a record of a drive by hand, of several goals, without what the task
-            needs, or a truth of another run.
+        DriveError: The task has several vehicles, the record is of a manual drive, has several goals or lacks
+            data that the task requires, or the truth is of another run.
         RecordError, ControlError: The record or the task cannot be used.
         CalibrationError, TruthError: The truth cannot be read.
     """
     fitted = fitted_task(task, vehicle)
     if len(fitted.vehicles) > 1:
         raise DriveError(
-            f"task '{task}' has {len(fitted.vehicles)} vehicles and {path} is of one: finssim pool --task and "
+            f"task '{task}' has {len(fitted.vehicles)} vehicles but {path} contains one: finssim pool --task and "
             "python -m studies.stack score it during the run"
         )
     drive = read_drive(path, vehicle)
     steered = drive.stretch >= 0
     t = drive.motion.t
     if not (steered & (t >= 0.0)).any():
-        raise DriveError(f"{path}: the robot was never armed with its state known: nothing was done in it")
+        raise DriveError(f"{path}: the robot was never armed with a known state, so it contains no trial")
     if task not in PUBLISHED and not np.size(drive.motion.action):
         raise DriveError(
             f"{path}: lacks the pilot's actions in [-1, 1], which '{task}' scores: record a run of this version"
@@ -680,7 +681,7 @@ def read_record(
 
 
 def _goal_history(drive: RecordedDecisions, steered: NDArray[np.bool_], duration: float) -> Trajectory:
-    """Return the course of a moving goal by the record; held after its end, up to a time [s].
+    """Return the recorded course of a moving goal, held constant after its end, up to a given time [s].
 
     Raises:
         DriveError: There was no goal.
@@ -699,23 +700,23 @@ def _goal_history(drive: RecordedDecisions, steered: NDArray[np.bool_], duration
 def _goals(drive: RecordedDecisions, steered: NDArray[np.bool_]) -> Array:
     """Return the goals of the vehicle, by decision."""
     if not drive.has_goal:
-        raise DriveError(f"{drive.path}: was driven by hand to no goal: a record of finssim run has one")
+        raise DriveError(f"{drive.path}: was driven by hand without a goal: a record of finssim run has one")
     return drive.goal[steered & (drive.motion.t >= 0.0)]
 
 
 def _station(drive: RecordedDecisions, steered: NDArray[np.bool_], task: str) -> Guide:
-    """The one goal that was held, or the dock."""
+    """Return the single goal that was held, or the dock."""
     goals = _goals(drive, steered)
     if float(np.abs(goals - goals[0]).max()) > SAME_GOAL:
         raise DriveError(
-            f"{drive.path}: its goal moves, and '{task}' has one: measure it with --task t2 or t3, or record each "
-            "station separately"
+            f"{drive.path}: the recorded goal moves, but '{task}' expects a fixed goal: use --task t2 or t3, or record "
+            "each station separately"
         )
     return station_at(goals[0])
 
 
 def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
-    """Name of the published setpoint that a station is, else its numbers."""
+    """Return the name of the published setpoint that a station equals, otherwise its numbers."""
     start = guide.at(0.0)
     goal = np.array([*start.position, float(start.yaw)])
     published = {name: in_room(pose, vehicle) for name, pose in T1_SETPOINTS.items()}
@@ -724,7 +725,7 @@ def _setpoint(guide: Guide, vehicle: Vehicle) -> str:
 
 
 def _states(odometry: Sequence[Any]) -> dict[str, Array]:
-    """Return position, quaternion and nu of messages of odometry, as `VehicleMotion` takes them."""
+    """Return position, quaternion and nu from odometry messages, in the form of `VehicleMotion`."""
     poses, twists = ([getattr(m, k) for m in odometry] for k in ("pose", "twist"))
     return {
         "position": np.array([_xyz(p.pose.position) for p in poses]),
@@ -734,7 +735,7 @@ def _states(odometry: Sequence[Any]) -> dict[str, Array]:
 
 
 def _truth(path: Path, drive: RecordedDecisions, until: float) -> tuple[VehicleMotion, float]:
-    """The true motion from the guide's start to a time after it [s], and what was added to its times."""
+    """Return the true motion from the guide's start to a time after it [s], and the offset added to its times."""
     motion = _table(path)
     try:
         offset = clock_offset(drive.time, drive.motion.position, motion.t, motion.position)
@@ -745,13 +746,13 @@ def _truth(path: Path, drive: RecordedDecisions, until: float) -> tuple[VehicleM
 
 
 def _table(path: Path) -> VehicleMotion:
-    """A truth, by its own clock."""
+    """Return a truth, on its own clock."""
     if path.suffix.lower() == ".mcap":
         with open_record(path) as record:
             entries = list(record.messages(("odom",)))
         if len(entries) < 2:
             raise DriveError(
-                f"{path}: holds no motion: give the file that finssim ardusub-sitl --truth wrote"
+                f"{path}: contains no motion: give the file that finssim ardusub-sitl --truth wrote"
             )
         return VehicleMotion(t=np.array([e.time for e in entries]), **_states([e.message for e in entries]))
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet"):
@@ -767,7 +768,7 @@ def _table(path: Path) -> VehicleMotion:
         )
     names = ("t", "x", "y", "z", *(attitude if turned else ("yaw",)))
     rows = np.stack([columns[name] for name in names], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]  # a body that the cameras did not see has empty cells
+    rows = rows[np.isfinite(rows).all(axis=1)]  # a body that the cameras lost has empty cells
     if len(rows) < 2 or np.any(np.diff(rows[:, 0]) <= 0.0):
         raise DriveError(f"{path}: {len(rows)} rows with all numbers, expected 2 or more with t increasing")
     quaternion = rows[:, 4:8] if turned else quat_from_yaw(rows[:, 4])

@@ -1,5 +1,5 @@
-"""Trials by the robot's complete software, on a robot or in the virtual pool: waiting, way to the start, trial, record
-and measures."""
+"""Trials by the robot's complete software, on a robot or in the virtual pool: waiting, approach to the start,
+trial, record and evaluation."""
 
 from __future__ import annotations
 
@@ -49,37 +49,38 @@ from finssim.vehicles import Vehicle, load_vehicle
 from finssim.vehicles.defaults import room, vehicle_at
 
 GETTING_READY = 10.0
-"""Longest time until the estimator knows where the vehicle is, and it is armed [s]."""
+"""Longest time until the estimator is ready and the vehicle is armed [s]."""
 NEAR, TURNED = 0.10, math.radians(10.0)
 EXACTLY = (NEAR, TURNED, 0.05, math.radians(5.0), 2.0)
-"""A vehicle is at its start within this of it [m, rad] and no faster than this [m/s, rad/s] for so long [s]."""
+"""Bounds within which a vehicle is at its start: position and heading error [m, rad], speeds [m/s, rad/s],
+and duration [s]."""
 ROUGHLY = (0.15, math.radians(20.0), 0.1, math.inf, 10.0)
-"""Bounds if the start need not be exact: a PID tuned from guesses may circle its goal forever."""
+"""Bounds if the start need not be exact: a PID tuned with guessed parameters may circle its goal forever."""
 AFLOAT = (0.30, math.radians(20.0), 0.4, math.inf, 2.0)
-"""Bounds in open water, where waves leave nothing at rest."""
+"""Bounds in open water, where waves prevent the vehicle from being at rest."""
 APPROACH = 60.0
-"""Longest way to a start, and longest wait for the vehicle without an attendant [s]."""
+"""Longest travel time to a start, and longest wait for the vehicle without an attendant [s]."""
 
 
 def start_bounds(site: str, exact: bool) -> tuple[tuple[float, ...], ...]:
-    """Return the bounds [m, rad, m/s, rad/s] that are near enough to a start, any of them.
+    """Return the alternative bounds [m, rad, m/s, rad/s] within which a vehicle is close enough to its start.
 
-    They are `EXACTLY`, in open water `AFLOAT`; `ROUGHLY` unless exact.
+    They are `EXACTLY`, in open water `AFLOAT`; if not `exact`, also `ROUGHLY`.
     """
     near = AFLOAT if site == "open-water" else EXACTLY
     return (near,) if exact else (near, ROUGHLY)
 
 
 Ended = Literal["over", "fault", "skipped", "interrupted", "not there"]
-"""End of a trial: by itself, by the bridge, by the operator, by Ctrl-C, or before its start was reached."""
+"""End of a trial: regular, by the bridge, by the operator, by Ctrl-C, or before its start was reached."""
 
 
 class Attendant(Protocol):
-    """The person beside the water."""
+    """Operator beside the water."""
 
     def keys(self) -> Sequence[str]:
-        """Return the keys pressed since the last call: enter continues, x or space stops the thrusters, s skips, q
-        ends; never waits."""
+        """Return the keys pressed since the last call, without waiting: enter continues, x or space stops the
+        thrusters, s skips, q ends."""
 
     def line(self, text: str) -> None:
         """Show the current state; called at every step."""
@@ -87,17 +88,17 @@ class Attendant(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotTrial:
-    """A trial to play. A new one for every attempt, since pilots have memory."""
+    """Trial to play, created anew for every attempt, since pilots have memory."""
 
     name: str
     pilot: Pilot
     guide: Guide
     duration: float
-    """Longest, from arming [s]."""
+    """Longest duration, from arming [s]."""
     over: Callable[[Runtime], bool]
-    """Function that returns whether it has reached its end."""
+    """Function that returns whether the trial has reached its end."""
     watch: Callable[[Runtime], None] = lambda runtime: None
-    """Looks on after every step of the trial itself."""
+    """Function that is called after every step of the trial itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,14 +108,14 @@ class TrialOutcome:
     trial: RobotTrial
     runtime: Runtime
     fault: str
-    """Reason why it ended before its time, or never began; empty if it did neither."""
+    """Reason why it ended early, or never started; empty if neither happened."""
     ended: Ended = "over"
     begun: bool = True
-    """True if the trial was started, not only the way to its start."""
+    """True if the trial itself was started, not only the approach to its start."""
 
 
 def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
-    """Return why a started trial ended before its time; empty if it did not."""
+    """Return the reason why a started trial ended early; empty if it did not."""
     if runtime.bridge.state == "fault":
         return runtime.bridge.reason
     if math.isnan(runtime.started):
@@ -123,7 +124,7 @@ def fault_of(trial: RobotTrial, runtime: Runtime) -> str:
 
 
 class TrialStages:
-    """Waits for the vehicle and its attendant, sees it to the start, hands over to the trial, and ends it."""
+    """Stages of a trial: wait for the vehicle and its attendant, approach the start, run the trial, and end it."""
 
     def __init__(
         self,
@@ -137,20 +138,20 @@ class TrialStages:
         recorder: Recorder | None = None,
     ) -> None:
         """
-        Args:
-            trial: What to do.
-            vehicle: As the robot knows it.
-            start: Where the trial begins.
-            bounds: Bounds as of `start_bounds`, any of which is near enough.
-            by_hand: Somebody carries it there, and presses enter. False: the tuned PID steers it there.
-            attendant: Nobody is asked if None: the way to the start begins as soon as the state is known.
-            recorder: Takes down the trial itself, not the way to its start.
+        trial: Trial to play.
+        vehicle: Vehicle in the robot's model.
+        start: Start of the trial.
+        bounds: Alternative bounds that are close enough, as of `start_bounds`.
+        by_hand: True if the operator carries the vehicle to the start and presses enter; False: the tuned PID
+            steers it there.
+        attendant: Operator; None to start the approach as soon as the state is known, without confirmation.
+        recorder: Recorder of the trial itself, without the approach.
         """
         self._trial, self._vehicle, self._start, self._bounds = trial, vehicle, start, bounds
         self._by_hand, self._attendant, self._recorder = by_hand, attendant, recorder
         self._stage: Callable[[Runtime, Reading, float], bool] = self._wait
         self._since = math.nan
-        """When the stage began [s]."""
+        """Start time of the stage [s]."""
         self._near_since: dict[tuple[float, ...], float] = {}
         self._ended: Ended = "interrupted"
         self._reason = ""
@@ -160,8 +161,8 @@ class TrialStages:
         """Play the trial.
 
         Args:
-            drive: Runs the robot's software on its wires, or in lock-step with a world.
-            perception: Estimates the state of the vehicle.
+            drive: Driver that runs the robot's software on its wires, or in lock-step with a world.
+            perception: Estimator of the vehicle's state.
         """
         idle = WrenchPilot(lambda: np.zeros(6), self._vehicle, name="idle")
         runtime = Runtime(self._vehicle, perception, idle, self._start, arm=False)
@@ -173,13 +174,13 @@ class TrialStages:
         )
 
     def _look(self, runtime: Runtime) -> None:
-        """After every step."""
+        """Call the trial's `watch` after every step."""
         if self._begun:
             self._trial.watch(runtime)
 
     def _over(self, runtime: Runtime) -> bool:
-        """Return whether to end, and change from stage to stage."""
-        assert runtime.reading is not None  # a step has been made
+        """Return whether to end, and switch between stages."""
+        assert runtime.reading is not None  # a step has been executed
         now = runtime.reading.time
         self._since = now if math.isnan(self._since) else self._since
         if runtime.bridge.state == "fault":
@@ -208,7 +209,7 @@ class TrialStages:
         """Wait with disabled thrusters until the state is known and the attendant starts the trial."""
         keys = self._keys()
         if now == self._since:
-            return False  # what was pressed before anybody was asked means nothing
+            return False  # keys pressed before the prompt are ignored
         if "s" in keys:
             return self._end("skipped", "skipped by the operator")
         if "q" in keys:
@@ -216,13 +217,11 @@ class TrialStages:
         if not reading.ready:
             self._line(f"waiting for the vehicle: {reading.reason}")
             if self._attendant is None and now - self._since > APPROACH:
-                return self._end(
-                    "not there", f"its state is not known after {APPROACH:g} s: {reading.reason}"
-                )
+                return self._end("not there", f"its state is unknown after {APPROACH:g} s: {reading.reason}")
         elif not self.there(reading, now) and self._by_hand:
             self._line(f"bring it to its start: {self._way(reading)}")
         elif self._attendant is not None and not {"\r", "\n"} & set(keys):
-            action = "play" if self._by_hand else "let it go to its start and play"
+            action = "play" if self._by_hand else "drive it to its start and play"
             self._line(f"enter: {action}; s: skip; q: end; {self._way(reading)}")
         elif self._by_hand:
             self._begin(runtime, now)
@@ -233,7 +232,7 @@ class TrialStages:
         return False
 
     def _approach(self, runtime: Runtime, reading: Reading, now: float) -> bool:
-        """The PID steers to the start."""
+        """Steer to the start with the PID."""
         if self._stopped(runtime, now):
             return True
         self._line(f"on the way to its start: {self._way(reading)}; x: stop")
@@ -243,13 +242,13 @@ class TrialStages:
             reason = runtime.refusal or self._way(reading)
             return self._end(
                 "not there",
-                f"not at its start after {APPROACH:g} s: {reason}; is something in its way, or was it let in "
+                f"not at its start after {APPROACH:g} s: {reason}; is it obstructed, or was its initial position "
                 "elsewhere?",
             )
         return False
 
     def _begin(self, runtime: Runtime, now: float) -> None:
-        """Hand over to the trial: disarmed, and armed again for its pilot."""
+        """Hand over to the trial: disarm, and arm again for its pilot."""
         runtime.hand_over(now, self._trial.pilot, self._trial.guide, arm=True, recorder=self._recorder)
         self._stage, self._since, self._begun = self._play, now, True
 
@@ -264,7 +263,7 @@ class TrialStages:
         return (late or t > self._trial.duration + GETTING_READY) and self._end("not there")
 
     def there(self, reading: Reading, now: float) -> bool:
-        """Return whether the vehicle has been at its start, at rest, for long enough. `now` is the time [s]."""
+        """Return whether the vehicle has been at rest at its start for long enough. `now` is the time [s]."""
         off = (
             float(np.abs(reading.position - self._start.position).max()),
             abs(self._turn(reading)),
@@ -282,7 +281,7 @@ class TrialStages:
         return float(wrap_angle(self._start.yaw - quat_yaw(reading.quaternion)))
 
     def _way(self, reading: Reading) -> str:
-        """The remaining way."""
+        """Return the remaining distance as text."""
         x, y, z = self._start.position - reading.position
         return f"({x:+.2f}, {y:+.2f}, {z:+.2f}) m and {math.degrees(self._turn(reading)):+.0f}° to go"
 
@@ -292,30 +291,30 @@ ABORTED = "aborted"
 
 
 class RobotError(ValueError):
-    """Trials on a robot cannot be made, or cannot continue."""
+    """Trials on a robot cannot be started or continued."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnRobot:
-    """A robot, and how trials are made on it."""
+    """Robot, and the options of trials on it."""
 
     wiring: Wiring
-    """Connection of the robot; a virtual pool in a separate process is another one."""
+    """Connection of the robot; a virtual pool in a separate process is one, too."""
     pool_file: Path | None
-    """Camera, water and frames; None: no camera looks, position fixes come by wire."""
+    """Pool file with camera, water and frames; None without a camera, if position fixes arrive over the link."""
     site: str = "pool"
     """Site that determines its equipment: pool, tank or open-water."""
     arm: bool = False
-    """Thrusters may turn; trials are refused without it."""
+    """True if thrusters may turn; trials are refused without it."""
     by_hand: bool = False
-    """True if a person carries the vehicle to every start; False: the tuned PID steers it there."""
+    """True if the operator carries the vehicle to every start; False: the tuned PID steers it there."""
     unattended: bool = False
-    """True without an attendant: trials begin as soon as the state is known, and a fault ends the session."""
+    """True without an attendant: trials start as soon as the state is known, and a fault ends the session."""
     attendant: Attendant | None = None
-    """The person beside it; None: whoever is at the terminal's keyboard."""
+    """Operator; None: the person at the terminal's keyboard."""
     let_in: tuple[float, float] | None = None
-    """Position of the vehicle when the session begins, x and y, world frame [m]: dead reckoning continues from there
-    through all trials. None: a camera or position fixes locate it."""
+    """Initial position of the vehicle in the session, x and y, world frame [m]: dead reckoning continues from
+    there through all trials. None: a camera or position fixes locate it."""
 
     @property
     def title(self) -> str:
@@ -323,12 +322,12 @@ class OnRobot:
         return f"{self.wiring.robot}{', lock-step' if self.wiring.lockstep else ''}"
 
     def equipped(self, vehicle: Vehicle) -> Vehicle:
-        """The vehicle as it is there, where its file does not say more."""
+        """Return the vehicle with the equipment of the site, unless its file defines more."""
         return vehicle_at(self.site, vehicle, navigation=self.wiring.robot.startswith("mavlink"))
 
     @property
     def options(self) -> str:
-        """Words of a command line that name it."""
+        """Options of a command line that select it."""
         wiring = self.wiring
         tokens = ["--robot", wiring.robot, "--pool-file", str(self.pool_file or "none")]
         tokens += ["--site", self.site] if self.site != "pool" else []
@@ -351,12 +350,11 @@ def robot_or_none(
     unattended: bool = False,
     let_in: str | None = None,
 ) -> OnRobot | None:
-    """Return the robot that options name; None without a robot and without options of one.
+    """Return the robot that options select; None without a robot and without options for one.
 
     Args:
         robot (ADDRESS): Run on this robot: its motor controller's udp://HOST:PORT or serial:DEVICE, its autopilot's
-            mavlink://KIND:ADDRESS, or pool or mavlink for the virtual pool on this machine. With --lockstep:
-            pool, mavlink, or HOST:PORT.
+            --lockstep: pool, mavlink, or HOST:PORT.
         pool_file (FILE|none): Pool file of that robot: camera, water plane and frames (.yaml); none if position
             fixes arrive over the link.
         site (NAME): Site of that robot, which sets its sensors: pool (default), tank or open-water.
@@ -368,12 +366,12 @@ def robot_or_none(
         by_hand: The vehicle is carried to the start of each trial by hand; by default the tuned PID steers it
             there.
         unattended: Start each trial without waiting for enter; a fault ends the session.
-        let_in (X,Y): Position of the vehicle at the start of the command, world frame [m], known to 5 cm: start of
-            dead reckoning by DVL and compass through all trials. With --pool-file none.
+        let_in (X,Y): Position of the vehicle at the start of the command, world frame [m], known to 5 cm:
+            start of dead reckoning by DVL and compass through all trials. Requires --pool-file none.
 
     Raises:
-        GoalError: --let-in is no place.
-        RobotError: Something tells of a robot and none is named, or it has no pool file.
+        GoalError: --let-in is not a position.
+        RobotError: Options for a robot are given without one, or it has no pool file.
     """
     if robot is None:
         stated = (arm, by_hand, unattended, lockstep, pool_file, pictures, site, let_in)
@@ -391,7 +389,7 @@ def robot_or_none(
     file = None if pool_file == "none" else Path(pool_file)
     if let_in is not None and file is not None:
         raise RobotError(
-            "--let-in is for dead reckoning, and a camera locates the vehicle: give --pool-file none"
+            "--let-in is for dead reckoning, but a camera locates the vehicle: give --pool-file none"
         )
     return OnRobot(
         wiring=wiring, pool_file=file, site=site or "pool", arm=arm, by_hand=by_hand, unattended=unattended,
@@ -400,7 +398,7 @@ def robot_or_none(
 
 
 class _Screen:
-    """A terminal: one line that changes, and keys."""
+    """Terminal with a status line and keys."""
 
     def __init__(self, keyboard: Keyboard, status: Status) -> None:
         self._keyboard, self._status, self._newest = keyboard, status, -math.inf
@@ -417,7 +415,7 @@ class _Screen:
 
 @dataclass(frozen=True)
 class Session:
-    """An open robot; made by `session`."""
+    """Open robot, created by `session`."""
 
     robot: OnRobot
     vehicle: Vehicle
@@ -428,13 +426,13 @@ class Session:
 
     @property
     def equipped(self) -> Vehicle:
-        """The vehicle as it is equipped where it is."""
+        """Vehicle as equipped for the site."""
         return self.robot.equipped(self.vehicle)
 
     @cached_property
     def _reckoning(self) -> Perception:
-        """Return the perception of a robot with dead reckoning: one for all trials, so that its state is carried from
-        each to the next."""
+        """Return the perception of a robot with dead reckoning: one for all trials, so that its state is kept
+        from trial to trial."""
         return Perception(self.equipped, None, mode="error-state", let_in=self.robot.let_in)
 
     def notify(self, text: str) -> None:
@@ -452,24 +450,26 @@ class Session:
         perception: Callable[[], Perception] | None = None,
         about: Mapping[str, Any] | None = None,
     ) -> TrialOutcome | None:
-        """Play a trial until it is done, the operator skips it, or it cannot be.
+        """Play a trial until it is complete, the operator skips it, or it fails.
 
         Args:
-            make: The trial, anew for every attempt.
-            start: Where it begins.
-            record: File of its record, made once it is done; records of attempts that do not count go to `aborted/`.
-            counts: Whether a trial that the bridge stopped counts as it is; it is played again if not. One that the
+            make: Function that creates the trial anew for every attempt.
+            start: Start of the trial.
+            record: File of its record, written once it is complete; records of attempts that do not count go
+                to `aborted/`.
+            counts: True if a trial that the bridge stopped counts; otherwise it is repeated. A trial that the
                 operator stopped never counts.
-            exact: Whether the vehicle must be at its start and at rest, however long that takes: to 10 cm, in open
-                water to 30 cm and at a speed of waves.
-            perception: Otherwise than by default, made anew for every attempt; not of a robot that was let in.
+            exact: True if the vehicle must be at rest at its start, however long that takes: within 10 cm, in
+                open water within 30 cm and at a speed of waves.
+            perception: Function that creates another perception for every attempt; not for a robot with dead
+                reckoning.
             about: Metadata of the record.
 
         Returns:
-            How it went; None if it was skipped.
+            The outcome; None if the trial was skipped.
 
         Raises:
-            RobotError: It cannot be played, and nobody is there to help.
+            RobotError: The trial cannot be played, and no attendant is present.
             KeyboardInterrupt: Ctrl-C, or the operator ended the session.
         """
         while True:
@@ -515,10 +515,10 @@ class Session:
                 raise RobotError(
                     f"{trial.name}: {outcome.fault}: check the vehicle, then repeat the command, which continues here"
                 )
-            self.notify(f"{trial.name}: {outcome.fault}: once more, or s to skip it")
+            self.notify(f"{trial.name}: {outcome.fault}: repeat it, or press s to skip it")
 
     def _put_away(self, partial: Path, record: Path, outcome: TrialOutcome) -> None:
-        """Keep the record of a started trial; nothing was recorded of one that was not."""
+        """Keep the record of a started trial; delete that of a trial that did not start."""
         if not outcome.begun:
             partial.unlink(missing_ok=True)
             return
@@ -533,13 +533,13 @@ def session(robot: OnRobot, vehicle: Vehicle, *, console: Console | None = None)
     """Open a robot for trials.
 
     Args:
-        robot: Which, and how.
-        vehicle: As its file has it.
-        console: Where it is told how it stands; standard error if None.
+        robot: Robot and its options.
+        vehicle: Vehicle as in its file.
+        console: Console for the state; standard error if None.
 
     Raises:
-        RobotError: It may not be armed, or nobody is there to press keys.
-        LinkError, LockstepError, LocalizationError: It cannot be reached, or its pool file cannot be used.
+        RobotError: The robot may not be armed, or keys cannot be read.
+        LinkError, LockstepError, LocalizationError: The robot cannot be reached, or its pool file cannot be used.
         VehicleError: There is no such site.
     """
     if not robot.arm:
@@ -563,14 +563,14 @@ def session(robot: OnRobot, vehicle: Vehicle, *, console: Console | None = None)
 
 
 def take_folder(file: Path, about: Mapping[str, Any]) -> None:
-    """Start a folder in which results stay as they are made, or continue one with equal settings.
+    """Start a folder in which results are stored as they are completed, or continue one with equal settings.
 
     Args:
-        file: In the folder, which may be new: takes the settings.
-        about: Plain data.
+        file: File of the settings, in a folder that may be new.
+        about: Settings as plain data.
 
     Raises:
-        RobotError: It holds somebody's files, or is of other settings.
+        RobotError: The folder contains foreign files, or belongs to other settings.
     """
     text, out = yaml_text(dict(about)), file.parent
     if not out.exists() or not any(out.iterdir()):
@@ -587,7 +587,7 @@ def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
     """Refuse starts outside the workspace of a vehicle before anything is armed.
 
     Raises:
-        GoalError: One is; says which.
+        GoalError: A start is outside; the message names it.
     """
     body = load_vehicle(vehicle)
     for name, start in starts.items():
@@ -598,7 +598,7 @@ def check_starts(starts: Mapping[str, Station], vehicle: str | Vehicle) -> None:
 
 
 HARDWARE = "hardware"
-"""Replacement of the severity of a pool and of its camera's mode, on a robot."""
+"""Replacement for the severity of a pool and for its camera's mode, on a robot."""
 
 
 class FirmwareTrials(NamedTuple):
@@ -615,12 +615,13 @@ FIRMWARES = {
     "ardusub": FirmwareTrials("pilot6", "tank", "none"),
     "ardusub-own": FirmwareTrials("pilot6", "tank", "none"),
 }
-"""Firmwares: a controller that takes shaft speeds, in the pool under a camera; an autopilot that takes axes, in a tank
-by Doppler log, depth and compass; or one whose log nobody else hears, by its own position."""
+"""Firmwares: a controller that accepts shaft speeds, in the pool under a camera; an autopilot that accepts
+axis commands, in a tank with Doppler log, depth and compass; or one whose log is not shared, with its own
+position estimate."""
 
 
 def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> str:
-    """Return the name of the firmware, or that of a robot's address.
+    """Return the name of the firmware, or that for a robot's address.
 
     Raises:
         ValueError: There is no such firmware.
@@ -636,26 +637,26 @@ def firmware_of(name: str, vehicle: Vehicle, robot: OnRobot | None = None) -> st
 
 @dataclass(frozen=True, kw_only=True)
 class PoolJob(campaign.Job):
-    """A trial of the robot's complete software in a pool, whose vehicle it knows only approximately."""
+    """Trial of the robot's complete software in a pool, with a vehicle that it knows only approximately."""
 
     vehicle: str | Vehicle = "finsrov"
-    """The vehicle, its name or file, as controller and localization know it."""
+    """Vehicle, its name or file, in the model of controller and localization."""
     pool_vehicle: str | Vehicle = "finsrov"
-    """The vehicle, its name or file, around which the pool's own is drawn."""
+    """Vehicle, its name or file, around which the pool's own is drawn."""
     severity: str = "realistic"
-    """nominal, realistic or hard."""
+    """Severity: nominal, realistic or hard."""
     camera: str = "pictures"
-    """pictures (drawn and searched for tags) or corners (of the tags, with noise)."""
+    """Output of the camera: pictures (rendered and searched for tags) or corners (of the tags, with noise)."""
     site: str = "pool"
-    """pool, tank or open-water."""
+    """Site: pool, tank or open-water."""
     firmware: str = "mcu"
-    """mcu, ardusub or ardusub-own: an autopilot, on whose vehicle a Doppler log and a compass take the camera's
-    place."""
+    """Firmware: mcu, ardusub or ardusub-own: an autopilot, on whose vehicle a Doppler log and a compass
+    replace the camera."""
 
     def plan(self, seed: int) -> PoolPlan:
         """Return the plan of its pool, with a seed for noise.
 
-        An autopilot has an origin; one that locates itself has heard its Doppler log for half a minute.
+        An autopilot has an origin; one with its own position estimate has received its Doppler log for half a minute.
         """
         camera: Any = "none" if self.aided else self.camera
         plan = make_plan(
@@ -674,35 +675,35 @@ class PoolJob(campaign.Job):
         return self.firmware != "mcu"
 
     def equipped(self) -> Vehicle:
-        """The vehicle as the robot knows it there."""
+        """Return the vehicle in the robot's model, as equipped for the site."""
         return vehicle_at(self.site, load_vehicle(self.vehicle), navigation=self.aided)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotJob(PoolJob):
-    """A controller and what it is to do: a setpoint of T1 or a trajectory of T2."""
+    """Controller and its goal: a setpoint of T1 or a trajectory of T2."""
 
     controller: str
     """Policy directory, or the name of a PID."""
     fusion: bool = True
-    """True if the controller observes the fused state, False: the latest reading of each sensor."""
+    """True if the controller observes the fused state, False if it observes the latest reading of each sensor."""
     position_noise: float = 0.0
-    """Added to what the controller sees, per axis [m]."""
+    """Noise added to the controller's observation, per axis [m]."""
     yaw_noise: float = 0.0
-    """Added to what the controller sees [rad]."""
+    """Noise added to the controller's observation [rad]."""
     estimator: str = "error-state"
-    """Model of the filter: error-state, with the IMU's accelerations, or constant-velocity, the paper's."""
+    """Model of the filter: error-state, with the IMU's accelerations, or constant-velocity, as in the paper."""
     duration: float = 60.0
-    """[s]; of T2 the trajectory's own."""
+    """Duration [s]; for T2 that of the trajectory."""
 
     @property
     def task(self) -> str:
-        """t1 or t2."""
+        """Name of the task, t1 or t2."""
         return "t1" if self.target in T1_SETPOINTS else "t2"
 
 
 def noise_seed(*labels: Any) -> int:
-    """A seed of what a trial is called: trials of other names never share noise."""
+    """Return a seed from the labels of a trial: trials with other labels never share noise."""
     return zlib.crc32(" ".join(map(str, labels)).encode()) & 0x7FFFFFFF
 
 
@@ -717,21 +718,21 @@ def play_in_pool(
     recorder: Recorder | None = None,
     **estimator: Any,
 ) -> TrialOutcome:
-    """Play a trial by the robot's complete software in lock-step with a pool.
+    """Play a trial with the robot's complete software in lock-step with a pool.
 
     Args:
-        trial: What to do.
-        start: Where the vehicle is, at rest.
-        vehicle: As the robot knows it.
-        plan: Of the pool and the vehicle in it.
-        seed: Of the noise.
-        truth: File of the truth; none if None.
-        recorder: Takes it down.
+        trial: Trial to play.
+        start: Initial pose of the vehicle, at rest.
+        vehicle: Vehicle in the robot's model.
+        plan: Plan of the pool and the vehicle in it.
+        seed: Seed of the noise.
+        truth: File for the truth; none if None.
+        recorder: Recorder of every message.
         estimator: Options of `Perception`.
     """
     world = plan.standing(start, seed=seed, truth=truth)
     if plan.firmware == "ardusub":
-        # Dead reckoning counts from the start, whose position is exact.
+        # Dead reckoning starts at the start, whose position is exact.
         estimator = {"mode": "error-state", "let_in": start.position[:2], **estimator}
     perception = Perception(vehicle, plan.calibrated, **estimator)
     runtime = Runtime(vehicle, perception, trial.pilot, trial.guide, arm=True, recorder=recorder)
@@ -745,15 +746,15 @@ def play_in_pool(
 
 
 def job_trial(job: RobotJob, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotTrial, Station]:
-    """The trial of a job, which ends when its time is over, and where it starts.
+    """Return the trial of a job, which ends after its duration, and its start.
 
     Args:
-        job: Who, and to what.
-        vehicle: As the robot knows it.
-        seed: Of noise on what the pilot sees.
+        job: Job with the controller and its goal.
+        vehicle: Vehicle in the robot's model.
+        seed: Seed of noise on the pilot's observation.
 
     Raises:
-        PolicyError, ControlError: The controller does not fit the vehicle or the task.
+        PolicyError, ControlError: The controller does not match the vehicle or the task.
     """
     standing = load_vehicle(job.pool_vehicle)
     guide = guide_of(job.target, standing, site=job.site)
@@ -777,7 +778,7 @@ def job_trial(job: RobotJob, vehicle: Vehicle, *, seed: int = 0) -> tuple[RobotT
 
 
 class _Estimates:
-    """Estimates of the robot, at the period of the series."""
+    """Estimates of the robot, at the period of the time series."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, Any, Any]] = []
@@ -789,7 +790,7 @@ class _Estimates:
         self._rows.append((t, reading.position, reading.quaternion))
 
     def motion(self) -> VehicleMotion:
-        """All of it."""
+        """Return the complete motion."""
         t, position, quaternion = zip(*self._rows, strict=True) if self._rows else ((), (), ())
         columns = (np.reshape(x, (-1, n)) for x, n in ((position, 3), (quaternion, 4)))
         return VehicleMotion(t=np.array(t), **dict(zip(("position", "quaternion"), columns, strict=True)))
@@ -799,11 +800,11 @@ def play(job: RobotJob, path: Path) -> dict[str, Any]:
     """Play a job in its pool.
 
     Args:
-        job: Who, where and what.
-        path: PATH.npz takes the true motion.
+        job: Job to play.
+        path: Path of the true motion, without the suffix .npz.
 
     Returns:
-        The measures as of `play_trial`.
+        The measures, as from `play_trial`.
     """
     result, trial = play_trial(job)
     trial.motion.write(path)
@@ -811,14 +812,14 @@ def play(job: RobotJob, path: Path) -> dict[str, Any]:
 
 
 def play_trial(job: RobotJob) -> tuple[dict[str, Any], GoalTrial]:
-    """Play a job in its pool and measure it by the true motion.
+    """Play a job in its pool and evaluate it by the true motion.
 
     Args:
-        job: Who, where and what.
+        job: Job to play.
 
     Returns:
-        The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the estimate
-        against the truth, rms) and how the robot's loop did; and the trial with its motion.
+        The measures of its task, `fault` (why the bridge stopped it, or empty), `localization` (errors of the
+        estimate relative to the truth, rms) and the timing of the robot's loop; and the trial with its motion.
     """
     start_warp()
     began, seed = time.perf_counter(), noise_seed(job.seed, job.target)
@@ -850,7 +851,7 @@ def play_trial(job: RobotJob) -> tuple[dict[str, Any], GoalTrial]:
 def _measured(
     job: RobotJob, motion: VehicleMotion, outcome: TrialOutcome, began: float
 ) -> tuple[dict[str, Any], GoalTrial]:
-    """Return the measures of a trial and the trial with its motion."""
+    """Return the measures of a trial, and the trial with its motion."""
     trial = GoalTrial(name=job.target, guide=outcome.trial.guide, motion=motion)
     limits = load_vehicle(job.vehicle).force_limits
     result = {
@@ -866,11 +867,11 @@ def _measured(
 
 
 def played_trial(result: Mapping[str, Any], folder: Path) -> GoalTrial:
-    """The trial of a result, with its motion.
+    """Return the trial of a result, with its motion.
 
     Args:
-        result: As `run_jobs` returns it.
-        folder: Where `run_jobs` left the motions.
+        result: Result from `run_jobs`.
+        folder: Folder in which `run_jobs` stored the motions.
     """
     target = result["job"]["target"]
     guide = guide_of(target, size=result.get("room", 1.0))
@@ -885,23 +886,24 @@ def play_jobs(
     console: Console | None = None,
     **options: Any,
 ) -> list[dict[str, Any]]:
-    """Play in their pools, or on a robot, what has no result yet, scored by the truth or by the robot's own estimate.
+    """Play the jobs without a result, in their pools or on a robot, scored by the truth or by the robot's own
+    estimate.
 
-    Of a robot: a trial that the bridge stopped counts; with nobody beside the water nothing is played after it. Those
-    that are skipped are left out.
+    On a robot, a trial that the bridge stopped counts; without an attendant, nothing is played after it.
+    Skipped trials are omitted.
 
     Args:
-        jobs: On a robot of one vehicle; plant 0, severity and camera `HARDWARE`.
-        folder: Takes KEY.json, KEY.npz and, of a robot, KEY.mcap of each, made if missing.
-        robot: Which, and how; not opened where nothing is left to play. None: in pools.
-        console: Where it is told how it stands; standard error if None.
-        options: Of `run_jobs`, for pools.
+        jobs: Jobs; on a robot, of one vehicle, with plant 0, and severity and camera `HARDWARE`.
+        folder: Folder for KEY.json, KEY.npz and, on a robot, KEY.mcap of each job, created if missing.
+        robot: Robot and its options; it is not opened if no job remains. None for pools.
+        console: Console for the state; standard error if None.
+        options: Options of `run_jobs`, for pools.
 
     Raises:
-        RobotError: A trial was stopped, and nobody is there to look at the vehicle; the next call goes on. Or every
-            trial was skipped.
-        GoalError: A start or a goal lies outside the workspace.
-        PolicyError, ControlError: A controller does not fit the vehicle.
+        RobotError: A trial was stopped, and no attendant is present to check the vehicle; the next call
+            continues. Or every trial was skipped.
+        GoalError: A start or a goal is outside the workspace.
+        PolicyError, ControlError: A controller does not match the vehicle.
         KeyboardInterrupt: Ctrl-C, or the operator ended the session.
     """
     if robot is None:
@@ -918,7 +920,7 @@ def play_jobs(
         console.print(f"  {held}", highlight=False, markup=False)
         if result["fault"] and robot.unattended:
             raise RobotError(
-                f"{job.row}, {job.target}: stopped, which counts: {result['fault']}: check the "
+                f"{job.row}, {job.target}: stopped (the trial counts): {result['fault']}: check the "
                 "vehicle, then repeat the command, which continues with the next trial"
             )
 
@@ -937,7 +939,7 @@ def play_jobs(
 
 
 def _play_on_robot(job: RobotJob, path: Path, opened: Session) -> dict[str, Any] | None:
-    """One job; PATH.mcap takes the record, PATH.npz the estimate of the motion. None if it was skipped."""
+    """Play one job; PATH.mcap is the record, PATH.npz the estimated motion. Return None if it was skipped."""
     began, vehicle, record = time.perf_counter(), opened.vehicle, path.with_name(f"{path.name}.mcap")
     trial, start = job_trial(job, vehicle, seed=job.seed)
     outcome = opened.trial(

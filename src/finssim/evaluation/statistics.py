@@ -1,6 +1,6 @@
 """Bootstrap intervals of figures over clusters of trials, and of paired differences.
 
-A score that was not reached is infinitely bad: +inf where less is better, -inf where more is.
+A score that was not reached is infinitely bad: +inf if less is better, -inf if more is.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RESAMPLES = 2000
 SEED = 20260903
 
 Figure = dict[str, Any]
-"""`value`, `ci95` (interval of 95 % of redrawn figures) and `count`, the number of trials; None: infinite."""
+"""`value`, `ci95` (95 % interval of the resampled figures) and `count`, the number of trials; None means infinite."""
 
 
 def _figure(value: float, bounds: Array, count: int) -> Figure:
@@ -29,14 +29,14 @@ def _figure(value: float, bounds: Array, count: int) -> Figure:
 
 
 def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike]) -> Array:
-    """Return the interval that contains 95 % of `RESAMPLES` redrawn figures.
+    """Return the interval that contains 95 % of `RESAMPLES` resampled figures.
 
     Args:
-        redraw: Draws the data with replacement and returns its figure, or figures.
+        redraw: Function that draws the data with replacement and returns its figure, or figures.
 
     Returns:
-        2.5 and 97.5 %, (2, ...), in the unit of the figures, each one of the redrawn figures: nothing lies between a
-        finite and an infinite one.
+        2.5 and 97.5 % quantiles, (2, ...), in the unit of the figures; each is one of the resampled figures,
+        as there is no value between a finite and an infinite one.
     """
     random = np.random.default_rng(SEED)
     drawn = np.array([redraw(random) for _ in range(RESAMPLES)], float)
@@ -46,23 +46,23 @@ def bootstrap(redraw: Callable[[np.random.Generator], ArrayLike]) -> Array:
 def with_interval(
     values: Mapping[Hashable, Sequence[float]], statistic: Statistic = np.mean
 ) -> Figure | None:
-    """Return a statistic over all values and its interval from redrawing whole clusters.
+    """Return a statistic over all values, and its interval from resampling complete clusters.
 
-    Trials of one plant and seed share their vehicle, camera, water and network, so they are no independent draws: the
-    bootstrap draws whole clusters with replacement.
+    Trials of one plant and seed share their vehicle, camera, water and network, so they are not independent
+    draws: the bootstrap draws complete clusters with replacement.
 
     Args:
-        values: Cluster -> its values, all in one unit.
+        values: Cluster -> its values, all in the same unit.
         statistic: Function of all values.
 
     Returns:
-        None without any value.
+        The figure; None if there are no values.
     """
     groups = [np.asarray(group, float) for group in values.values() if len(group)]
     if not groups:
         return None
     alike = len({len(group) for group in groups}) == 1
-    table: Any = np.stack(groups) if alike else groups  # thousands of small arrays are slow to put together
+    table: Any = np.stack(groups) if alike else groups  # many small arrays are slow to concatenate
 
     def redraw(random: np.random.Generator) -> Any:
         drawn = random.integers(len(groups), size=len(groups))
@@ -79,7 +79,7 @@ def paired_difference(
 
     Args:
         ours: (plant, seed, target) -> figure of the reference.
-        theirs: The same of the row that is compared with it, in the same unit.
+        theirs: The same for the row that is compared with it, in the same unit.
     """
     clusters: dict[Hashable, list[float]] = {}
     for pair in sorted(ours.keys() & theirs.keys()):

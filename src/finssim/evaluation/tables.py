@@ -1,4 +1,4 @@
-"""A table as a person reads it: on a screen, as Markdown, as HTML. Rows of the paper's own are gray in each."""
+"""Tables for terminals, Markdown and HTML. Rows from the paper are gray in each."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from finssim.core.files import atomic_write
 from finssim.core.page import html_code, html_page, html_picture, html_section, html_table
 
 Rows = Sequence[Sequence[str] | None]
-"""Cells of each row; None: a line between two rows."""
+"""Cells of each row; None is a separator between two rows."""
 
 WIDE = 160
-"""Columns of a screen that has room for intervals."""
+"""Terminal width from which intervals are shown [columns]."""
 
 
 def paper(row: Sequence[str]) -> bool:
-    """Return whether a row is the paper's own."""
+    """Return whether a row is from the paper."""
     return row[0].lstrip().startswith("paper")
 
 
 def console_table(
     heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0,), whole: Sequence[int] = (), **options: Any
 ) -> rich.table.Table:
-    """A table for a console, none of whose cells is taken for markup.
+    """Return a table for a console, whose cells are not interpreted as markup.
 
     Args:
-        heads: Of the columns.
-        rows: Cells as text; those of the paper are gray, one named "all" is bold.
-        left: Columns that are aligned to the left.
-        whole: Columns whose cells are never broken.
-        options: Of `rich.table.Table`.
+        heads: Headings of the columns.
+        rows: Cells as text; those from the paper are gray, one named "all" is bold.
+        left: Left-aligned columns.
+        whole: Columns whose cells are never wrapped.
+        options: Options of `rich.table.Table`.
     """
     table = rich.table.Table(
         **{
@@ -70,7 +70,7 @@ def markdown_table(heads: Sequence[str], rows: Rows, *, left: Sequence[int] = (0
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Table of an experiment with its text, or the text alone."""
+    """Table of an experiment with its text, or text alone."""
 
     title: str
     headline: str = ""
@@ -80,13 +80,13 @@ class Table:
     note: str = ""
     sentences: Sequence[str] = ()
     left: Sequence[int] = (0,)
-    """Columns that are aligned to the left."""
+    """Left-aligned columns."""
     whole: Sequence[int] = ()
-    """Columns whose cells are never broken on a screen."""
+    """Columns whose cells are never wrapped on a terminal."""
     intervals: bool = False
-    """True if a narrow screen shows the intervals of cells too."""
+    """True if the intervals are also shown on a narrow terminal."""
     pictures: Mapping[str, str] = field(default_factory=dict)
-    """File beside the page -> what it shows."""
+    """Picture file beside the page -> its caption."""
 
     def __str__(self) -> str:
         return markdown_of([self])
@@ -96,7 +96,7 @@ class Table:
 
 
 def print_tables(tables: Sequence[Table], console: Console) -> None:
-    """Print tables on a screen; one that is narrow shows no intervals, unless the table asks for them."""
+    """Print tables on a terminal; a narrow one omits intervals, unless the table requires them."""
     for table in tables:
         if text := table.headline or table.title:
             console.print(Text(text, style="" if table.headline or len(tables) == 1 else "bold"))
@@ -112,7 +112,7 @@ def print_tables(tables: Sequence[Table], console: Console) -> None:
 
 
 def markdown_of(tables: Sequence[Table]) -> str:
-    """The page of some tables."""
+    """Return some tables as a Markdown page."""
     parts = []
     for k, table in enumerate(tables):
         parts += [f"{'##' if k else '#'} {table.title[:1].upper()}{table.title[1:]}", table.headline]
@@ -123,7 +123,7 @@ def markdown_of(tables: Sequence[Table]) -> str:
 
 
 def html_of(tables: Sequence[Table], folder: Path) -> list[str]:
-    """Return the sections of a page; pictures that are in the folder are inside them."""
+    """Return the sections of a page; pictures in the folder are embedded."""
     sections = []
     for table in tables:
         rows = []
@@ -159,15 +159,15 @@ def write_page(
     first: Mapping[str, str] | None = None,
     last: Mapping[str, Sequence[str]] | None = None,
 ) -> None:
-    """Write a report as one HTML file that loads nothing: a picture, its sentences, and sections that fold.
+    """Write a report as one self-contained HTML file: a picture, its text, and foldable sections.
 
     Args:
-        path: The file; pictures are beside it.
-        title: Plain text.
-        tables: Its sections.
-        lead: Paragraphs after the first picture; the headline of the first table if there are none.
+        path: File to write; pictures are beside it.
+        title: Title, plain text.
+        tables: Sections of the page.
+        lead: Paragraphs after the first picture; the headline of the first table if empty.
         first: Picture -> caption; the first picture of the tables if None. It is not repeated in its section.
-        last: Title -> lines of code, in sections that are folded at first.
+        last: Title -> lines of code, in sections that are initially folded.
     """
     if first is None:
         first = dict(next((list(t.pictures.items())[:1] for t in tables if t.pictures), []))
@@ -186,16 +186,15 @@ def write_page(
 
 
 Columns = Mapping[str, tuple[str, str] | tuple[str, str, float]]
-"""Key of a result -> heading, format, and a factor where its unit is another; without a format it is a count of trials.
-"""
+"""Key of a result -> heading, format, and a factor if its unit differs; an empty format means a count of trials."""
 
 
 def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: float = 1.0) -> str:
-    """A figure as text, with its interval in brackets where it has one; – where there is none.
+    """Return a figure as text, with its interval in brackets if it has one; – if there is none.
 
-    An interval whose ends are equal, such as that of one plant and one seed, is left out.
+    An interval with equal ends, such as that of one plant and one seed, is omitted.
 
-    `factor` takes the unit of the figure to that of the text.
+    `factor` converts the unit of the figure to that of the text.
     """
     value = figure["value"] if isinstance(figure, Mapping) else figure
     if value is None:
@@ -207,7 +206,7 @@ def figure_text(figure: Mapping[str, Any] | float | None, form: str, factor: flo
 
 
 def cells(row: Mapping[str, Any], columns: Columns) -> list[str]:
-    """A row's figures as text, in the order of the columns.
+    """Return a row's figures as text, in the order of the columns.
 
     A column has a heading with its unit, a format, and a factor.
     """

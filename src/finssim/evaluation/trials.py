@@ -1,7 +1,7 @@
-"""Trials: motion of a vehicle to a goal, measured in the same way wherever it was played, and trials in the simulator.
+"""Trials: motion of a vehicle to a goal, evaluated equally wherever it was recorded, and trials in the simulator.
 
-In the simulator there is one world for each trial, all stepped together: station keeping, tracking, and episodes of any
-task from start to end.
+In the simulator there is one world for each trial, and all are stepped together: station keeping, tracking,
+and episodes of any task from start to end.
 """
 
 from __future__ import annotations
@@ -48,33 +48,33 @@ Array = NDArray[np.float64]
 Show = Callable[[float], None]
 
 DURATION = 60.0
-"""Length of a trial of station keeping [s]."""
+"""Duration of a trial of station keeping [s]."""
 PERIOD = 0.1
-"""Between the samples of a motion that is kept [s]."""
+"""Interval between the samples of a stored motion [s]."""
 PHYSICS_STEP = 0.025
 """Longest physics step [s]."""
 T2_TRAJECTORIES = ("straight", "broken", "ellipse", "lemniscate")
-"""The four of the paper's table."""
+"""Trajectories of the paper's table."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleMotion:
-    """Samples of a vehicle's motion in the order of their times; world frame, SI, NaN where unknown."""
+    """Samples of a vehicle's motion in chronological order; world frame, SI, NaN where unknown."""
 
     t: Array
-    """Time since the guide's start [s], (T,)."""
+    """Times since the guide's start [s], (T,)."""
     position: Array
     """Body origin [m], (T, 3)."""
     quaternion: Array
     """Body to world, xyzw, (T, 4)."""
     nu: Array | None = None
-    """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None where it is not measured."""
+    """Velocity of the body origin, body frame [m/s, rad/s], (T, 6); None if it is not measured."""
     thrust: Array | None = None
-    """Thrust of each thruster [N], (T, n); None if it is not known."""
+    """Thrust of each thruster [N], (T, n); None if unknown."""
     action: Array | None = None
-    """Action of the agent from then on, in [-1, 1], (T, size); None if it is not known."""
+    """Action of the agent from each time on, in [-1, 1], (T, size); None if unknown."""
     heading_only: bool = False
-    """True if roll and pitch are not known."""
+    """True if roll and pitch are unknown."""
 
     @property
     def yaw(self) -> Array:
@@ -82,15 +82,15 @@ class VehicleMotion:
         return np.asarray(quat_yaw(self.quaternion))
 
     def between(self, rows: NDArray[Any]) -> VehicleMotion:
-        """Some of the samples: a mask or indices of (T,)."""
+        """Return some of the samples, selected by a mask or indices of (T,)."""
         arrays = {
             field.name: getattr(self, field.name) for field in fields(self) if field.name != "heading_only"
         }
         return replace(self, **{name: None if x is None else x[rows] for name, x in arrays.items()})
 
     def at(self, t: float) -> Track:
-        """Return the state of the vehicle at a time [s], between the samples; velocities that are not measured are
-        differences over a `PERIOD` to either side."""
+        """Return the interpolated state of the vehicle at a time [s]; unmeasured velocities are finite
+        differences over ± `PERIOD`."""
         position, quaternion = self._pose(t)
         if self.nu is not None:
             return Track(position, quaternion, interpolated(t, self.t, self.nu))
@@ -101,7 +101,7 @@ class VehicleMotion:
         return Track(position, quaternion, np.concatenate([linear, turn]) / max(last - first, 1e-9))
 
     def action_at(self, t: float) -> Array:
-        """The action from a time on [s], by the last decision before it; empty where not known."""
+        """Return the action at a time [s], from the last decision before it; empty if unknown."""
         if self.action is None or t < self.t[0] - 1e-3:
             return np.zeros(0)
         action: Array = self.action[int(np.searchsorted(self.t, t + 1e-3)) - 1]
@@ -114,28 +114,29 @@ class VehicleMotion:
         return interpolated(t, self.t, self.position), q / np.linalg.norm(q)
 
     def write(self, path: Path) -> None:
-        """Write PATH.npz."""
+        """Write the motion to PATH.npz."""
         arrays = {name: x for name, x in vars(self).items() if isinstance(x, np.ndarray)}
         with atomic_write(path.with_name(f"{path.name}.npz")) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def read(cls, path: Path) -> VehicleMotion:
-        """Read PATH.npz, which a trial leaves for figures, at 10 Hz."""
+        """Read PATH.npz, which a trial writes for figures, at 10 Hz."""
         with np.load(path.with_name(f"{path.name}.npz")) as file:
             return cls(**{field.name: file[field.name] for field in fields(cls) if field.name in file.files})
 
 
 def interpolated(t: ArrayLike, times: Array, columns: Array) -> Array:
-    """Columns (T, n) between their times (T,), at one time (n,) or at several (k, n).
+    """Return columns (T, n) interpolated between their times (T,), at one time (n,) or at several (k, n).
 
-    The units of times and columns are kept.
+    The units of times and columns are unchanged.
     """
     return np.stack([np.interp(t, times, column) for column in columns.T], axis=-1)
 
 
 def localization_errors(truth: VehicleMotion, estimate: VehicleMotion) -> dict[str, float] | None:
-    """Errors of an estimate at its own times: rms in 3-D and horizontally [m], and in heading [°]; None without any."""
+    """Return errors of an estimate at its own times: rms in 3-D and horizontally [m], and in heading [°];
+    None if there are no common times."""
     t = estimate.t
     inside = (t >= truth.t[:1].max(initial=0.0)) & (t <= truth.t[-1:].max(initial=-1.0))
     inside &= np.isfinite(estimate.position).all(axis=1)
@@ -158,7 +159,7 @@ class GoalTrial:
     """Name of its setpoint or trajectory."""
     guide: Guide
     motion: VehicleMotion
-    """Motion that is measured, from the guide's start."""
+    """Motion that is evaluated, from the guide's start."""
 
     @property
     def goal(self) -> Array:
@@ -169,13 +170,13 @@ class GoalTrial:
     def measures(
         self, task: str, limits: tuple[ArrayLike, ArrayLike], *, stopped: bool = False
     ) -> dict[str, Any]:
-        """Return the result of `measure_trial` for T1, with its goal and `effort_measures` if thrusts are known; or
-        that of `measure_tracking` for T2, with `success`.
+        """Return the result of `measure_trial` for T1, with its goal, and `effort_measures` if thrusts are
+        known; or that of `measure_tracking` for T2, with `success`.
 
         Args:
             task: t1 or t2.
             limits: Lower and upper limit of each thruster [N], (n,) each.
-            stopped: Whether it ended before its time: errors of half a way say nothing of the other half.
+            stopped: True if it ended early: errors on part of a path are not representative of the complete path.
         """
         motion = self.motion
         if task == "t1":
@@ -196,20 +197,20 @@ class GoalTrial:
 
 
 def follows(task: Task) -> bool:
-    """Return whether it follows a reference that is known ahead."""
+    """Return whether the task follows a reference that is known in advance."""
     return hasattr(task, "knot_spacing")
 
 
 def guide_of(
     target: str | Path, vehicle: Vehicle | None = None, *, size: float = 1.0, site: str = "pool"
 ) -> Guide:
-    """A published setpoint by its name, or a trajectory by name or file.
+    """Return a published setpoint by its name, or a trajectory by name or file.
 
     Args:
-        target: What is to be done.
-        vehicle: In whose room; one that cannot follow the trajectory is refused.
-        size: Factor on lengths, of the room where no vehicle is named: 1 for FinsROV.
-        site: By which setpoints grow, where a vehicle is named.
+        target: Name of the setpoint or trajectory, or file of the trajectory.
+        vehicle: Vehicle whose room determines the size; a vehicle that cannot follow the trajectory is refused.
+        size: Factor on lengths, if no vehicle is given: 1 for FinsROV.
+        site: Site that scales setpoints, if a vehicle is given.
     """
     if str(target) in T1_SETPOINTS:
         size = size if vehicle is None else room(vehicle.body.size) * SITE_SIZES[site]
@@ -222,23 +223,23 @@ def guide_of(
 
 @dataclass(frozen=True, kw_only=True)
 class TrialSettings:
-    """Number of trials, all at once, and their worlds."""
+    """Number of parallel trials, and their worlds."""
 
     trials: int | None = None
-    """How many; if None one for each guide, or `EPISODES`."""
+    """Number of trials; if None one for each guide, or `EPISODES`."""
     seed: int = 1
     """Seed of everything that the plant draws."""
     hydrodynamics: str = "calibrated"
-    """Model, unless the plant names one."""
+    """Hydrodynamic model, unless the plant names one."""
     record: Path | None = None
-    """New folder for every state, command and thrust; none if None."""
+    """New folder for all states, commands and thrusts; none if None."""
     crash_directory: Path = Path("finssim-frozen")
-    """Directory of the last states of a world that broke."""
+    """Directory for the last states of a world that diverged."""
 
     def environment(
         self, agent: Agent, task: Task, vehicle: Vehicle, plant: PlantChanges, worlds: int, **options: Any
     ) -> Environment:
-        """Return so many worlds of a plant; arguments as of `run_trials`, options of `Environment`."""
+        """Return a number of worlds of a plant; arguments as for `run_trials`, options of `Environment`."""
         return plant.environment(
             agent, task, vehicle, worlds=worlds, seed=self.seed, hydrodynamics=self.hydrodynamics,
             crash_directory=self.crash_directory, **options,
@@ -259,19 +260,19 @@ def run_trials(
     guides: Sequence[Guide] | None = None,
     show: Show = lambda part: None,
 ) -> list[GoalTrial]:
-    """Run trials of T1, each 60 s from the published start, level and at rest; or of T2, from rest on the first pose.
+    """Run trials of T1, each 60 s from the published start, level and at rest; or of T2, from rest at the first pose.
 
     Args:
-        agent: Who acts.
-        task: Its observation is what the agent sees.
-        vehicle: As its file has it and the agent knows it; the plant changes what it delivers.
-        plant: What differs.
-        settings: How many, and their worlds.
-        guides: Setpoints or trajectories, in turn; the published ones if None.
-        show: Called with the part done.
+        agent: Agent that acts.
+        task: Task with the agent's observation.
+        vehicle: Vehicle as in its file and in the agent's model; the plant modifies the simulated one.
+        plant: Differences of the plant.
+        settings: Number of trials, and their worlds.
+        guides: Setpoints or trajectories, used in turn; the published ones if None.
+        show: Function that is called with the completed fraction.
 
     Returns:
-        The trials; from the moment that its world broke the numbers of one are NaN.
+        The trials; after its world diverged, the numbers of a trial are NaN.
     """
     moving = follows(task)
     ways = guides or [guide_of(name, vehicle) for name in (T2_TRAJECTORIES if moving else T1_SETPOINTS)]
@@ -296,7 +297,7 @@ def run_trials(
     episode = state.episode.numpy().copy()
     goal: Callable[[float], Goal] = (lambda t: _goals(chosen, t)) if moving else (lambda t: first)
     for k, _ in rollout(agent, environment, steps, goal, record=settings.record):
-        same = state.episode.numpy() == episode  # a world that broke has started over
+        same = state.episode.numpy() == episode  # a world that diverged has restarted
         for name, column in columns.items():
             column[k, same] = getattr(state, name).numpy()[same, 0, : widths[name]]
         show(k / steps)
@@ -312,7 +313,7 @@ def run_trials(
 
 
 def _goals(guides: Sequence[Guide], t: float) -> Goal:
-    """The goals of all trials at one time."""
+    """Return the goals of all trials at one time."""
     references = [guide.at(t) for guide in guides]
     position, velocity, yaw = (
         np.stack([getattr(reference, name) for reference in references])
@@ -323,7 +324,7 @@ def _goals(guides: Sequence[Guide], t: float) -> Goal:
 
 
 EPISODES = 64
-"""Unless another number is requested: an interval of a rate is then some ±0.12."""
+"""Default number of episodes: the interval of a rate is then about ±0.12."""
 LABELS = ("trial", "record", "fault", "localization", "clock_offset_s")
 """Keys of a trial's row besides its metrics."""
 
@@ -341,13 +342,13 @@ def run_episodes(
     *,
     show: Show = lambda part: None,
 ) -> list[dict[str, Any]]:
-    """Run one episode in each world to its end; starts and goals are those of training, drawn with the seed.
+    """Run one episode in each world to its end; starts and goals are drawn as in training, with the seed.
 
-    Arguments as `run_trials`; several agents of a world share one agent, and every vehicle of it is the same.
+    Arguments as for `run_trials`; several agents of a world share one agent, and all its vehicles are equal.
 
     Returns:
-        `trial` and the `Task.metrics` of each episode; None where there is none, such as a time never reached, or a
-        world that broke.
+        `trial` and the `Task.metrics` of each episode; None if undefined, such as a time never reached, or
+        for a world that diverged.
 
     Raises:
         EpisodeError: The agent acts at another rate than the task.
@@ -369,7 +370,7 @@ def run_episodes(
             continue
         ended = running & (step.terminated | step.truncated)
         if ended.any():
-            # A broken world is terminated but not done; after its restart, it is not frozen any more.
+            # A diverged world is terminated but not done; after its restart, it is not frozen any more.
             complete = ended & (environment.arrays.done.numpy() != 0)
             for name, values in task.metrics(environment.arrays).items():
                 metrics[name][complete] = values[complete]
@@ -384,10 +385,10 @@ def run_episodes(
 
 
 def summarize_episodes(trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One controller's row: means over the episodes, and where a bootstrap over them puts each mean.
+    """Return one controller's row: means over the episodes, with their bootstrap intervals.
 
     Returns:
-        `trials`, `valid` (episodes whose world did not break), `metrics` (name -> figure) and `per_trial`.
+        `trials`, `valid` (episodes whose world did not diverge), `metrics` (name -> figure) and `per_trial`.
     """
     metrics: dict[str, Any] = {}
     for name in (name for name in trials[0] if name not in LABELS):

@@ -171,7 +171,7 @@ def test_the_plant_of_held_out_looks_is_for_tasks_that_see():
     servo = agent_for("light-servo", vehicle, CameraDocking())
     env = plant.environment(servo, CameraDocking(), vehicle, worlds=8, seed=1)
     assert set(env.sight.batch.drawn[:, -1]) <= {3.0, 4.0}
-    with pytest.raises(PlantError, match="task 't1' sees none"):
+    with pytest.raises(PlantError, match="task 't1' lacks"):
         plant.environment(agent_for("pid", vehicle, make("t1").task), make("t1").task, vehicle)
 
 
