@@ -145,7 +145,7 @@ def test_tables_rise_with_the_pulse_and_stand_still_about_neutral():
     [
         ({"autopilot.frame": "VECTORED_6DOFF"}, "VECTORED_6DOF"),
         ({"autopilot.frame": "VECTORED"}, "6 motors"),
-        ({"autopilot.directions": [-1]}, "motor 1 pushes thruster 'T1' against"),
+        ({"autopilot.directions": [-1]}, "motor 1 pushes thruster 'T1' opposite"),
         ({"autopilot.gain": 1.5}, "gain"),
         ({"autopilot.frame": [[0, 0, 1]]}, "6 long"),
     ],

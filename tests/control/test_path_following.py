@@ -44,7 +44,7 @@ def test_the_path_of_a_trajectory_has_its_points_and_length():
     ("points", "radius", "words"),
     [
         ([[0, 0, 0]], 1.0, "two or more rows"),
-        ([[0, 0, 0], [0, 0, 0]], 1.0, "waypoints 1 and 2 are one point"),
+        ([[0, 0, 0], [0, 0, 0]], 1.0, "waypoints 1 and 2 are the same point"),
         ([[0, 0, 0], [1, 0, math.nan]], 1.0, "finite"),
         ([[0, 0, 0], [1, 0, 0]], 0.0, "radius of acceptance is 0.0"),
     ],

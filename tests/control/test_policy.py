@@ -115,12 +115,12 @@ def observation_with(entry: int, **changes):
         ),
         (
             {"task": observation_with(1, name="roll_rate")},
-            "schema does not fit: observation.entries[1].name is 'yaw_rate'",
+            "schema does not match: observation.entries[1].name is 'yaw_rate'",
         ),
         ({"task": TASK | {"name": "docking"}}, "trained for task 'hold', but this is 'docking'"),
         (
             {"mode": MODE | {"limits": [18.6, 7.1]}},
-            "does not fit: action.limits[1] is 6.9 in the policy and 7.1 here",
+            "does not match: action.limits[1] is 6.9 in the policy and 7.1 here",
         ),
         (
             {"mode": MODE | {"mode": "thruster2"}},
@@ -264,7 +264,7 @@ def test_a_picture_that_is_not_the_policys_is_refused(tmp_path, picture):
     policy = Policy.load(seeing(tmp_path / "policy"))
     row = np.zeros((1, policy.description.observation.size), np.float32)
     assert policy.step(None, row, {"front_camera": np.zeros((1, 27, 48, 3), np.uint8)})[0].shape == (1, 6)
-    with pytest.raises(PolicyError, match="the policy sees front_camera: it is given"):
+    with pytest.raises(PolicyError, match="the policy requires picture front_camera: it received"):
         policy.step(None, row, {} if picture is None else {"front_camera": picture})
 
 

@@ -72,13 +72,16 @@ def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
     """None, or other rows; one for a policy that has none; and a network that remembers otherwise than is said."""
     run, seen = Policy.load(policy), np.zeros((2, 16))
     with pytest.raises(
-        PolicyError, match=r"given no memory, expected one of shape \(2, 16\): begin with what reset"
+        PolicyError,
+        match=r"received no memory, expected one of shape \(2, 16\): start with the result of reset",
     ):
         run.act(seen)
-    with pytest.raises(PolicyError, match=r"given one of shape \(3, 16\), expected one of shape \(2, 16\)"):
+    with pytest.raises(
+        PolicyError, match=r"received one of shape \(3, 16\), expected one of shape \(2, 16\)"
+    ):
         run.step(run.reset(3), seen)
     plain = Policy.load(written(nn.Sequential(nn.Linear(16, 6)), tmp_path / "plain", StationKeeping(), 6))
-    with pytest.raises(PolicyError, match=r"given one of shape \(2, 16\), expected no memory"):
+    with pytest.raises(PolicyError, match=r"received one of shape \(2, 16\), expected no memory"):
         plain.step(run.reset(2), seen)
     told = yaml.safe_load((policy / "policy.yaml").read_text())
     assert told["memory"] == 16 and plain.description.memory == 0

@@ -95,7 +95,7 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
     [
         ({"vehicle": {"name": "finsrov", "sha256": "0" * 64}}, "trained for vehicle finsrov 000000000000"),
         ({"task": "t9"}, "unknown task 't9'"),
-        ({"task": "t2"}, "observation schema does not fit"),
+        ({"task": "t2"}, "observation schema does not match"),
         (
             {"action": {**action_mode("wrench4", VEHICLE).describe(), "limits": [1.0] * 6}},
             r"wrench4.limits\[0\] is 1.0 in the policy and",

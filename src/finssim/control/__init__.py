@@ -1,4 +1,4 @@
-"""Control: wrench allocation, action modes and the PID baseline, the same in simulation and on the robot."""
+"""Control: wrench allocation, action modes and the PID baseline, identical in simulation and on the robot."""
 
 from typing import TYPE_CHECKING
 
@@ -33,4 +33,4 @@ __getattr__, __dir__ = exports(__name__)
 
 
 class ControlError(ValueError):
-    """A controller, an action mode or an allocation refuses its arguments; the message states what to change."""
+    """Invalid arguments of a controller, an action mode or an allocation; the message states what to change."""

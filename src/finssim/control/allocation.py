@@ -1,18 +1,18 @@
-"""Wrench allocation: the thrusts that come nearest to a wanted wrench within the thrusters' limits, solved exactly.
+"""Wrench allocation: the thrusts closest to a requested wrench within the thrusters' limits, solved exactly.
 
     min_f ||W (B f - tau)||^2 + lambda ||f||^2   with   f- <= f <= f+                  (paper, eq. 18)
 
-With H = B' W^2 B + lambda I and the unconstrained optimum f0 = H^-1 B' W^2 tau, the problem is
-min (f - f0)' H (f - f0) in the box. Once the set C of thrusters that sit at a limit is known, displaced there by
-d = f_C - f0_C, everything else is linear in d:
+With H = B' W^2 B + lambda I and the unconstrained optimum f0 = H^-1 B' W^2 tau, the problem is min (f - f0)'
+H (f - f0) within the limits. Once the set C of thrusters at a limit is known, displaced to it by d = f_C -
+f0_C, all other quantities are linear in d:
 
     thrust of the others   f_F = f0_F - H_FF^-1 H_FC d
     multipliers at limits  mu  = (H_CC - H_CF H_FF^-1 H_FC) d
 
-Eight thrusters have 256 such sets, so one 8x8 table per set (`tables`) holds both maps. The
-search for the right set is principal pivoting: change every thruster that breaks its optimality condition at once
-(Judice and Pires, 1994), and one at a time (Murty's rule, which cannot cycle) when that stops making progress.
-The entries of the tables stay of order one however small lambda is, which is what lets float32 solve the problem.
+For eight thrusters there are 256 such sets, and one 8x8 table per set (`tables`) contains both maps. The
+correct set is found by principal pivoting: change all thrusters that violate their optimality condition
+together (Judice and Pires, 1994), and one at a time (Murty's rule, which cannot cycle) when that no longer
+makes progress. The entries of the tables are of order one for any lambda, so that float32 suffices.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
@@ -29,25 +29,26 @@ from finssim.control import ControlError
 from finssim.core.quiet import start_warp
 from finssim.physics.types import MAX_THRUSTERS, vec6, vec8
 
-# The tables that wrench allocation looks up, computed once per vehicle in float64.
+# The lookup tables of the allocation, computed once per vehicle in float64.
 
 
 Array = npt.NDArray[np.float64]
 
 REGULARISATION = 1e-4
-"""Default lambda, as a fraction of the mean non-zero eigenvalue of B' W^2 B: wrenches within reach are met to 1e-4."""
+"""Default lambda, relative to the mean non-zero eigenvalue of B' W^2 B: feasible wrenches are met to 1e-4."""
 
 
 def regularisation_weight(
     B: npt.ArrayLike, weights: npt.ArrayLike, regularisation: float = REGULARISATION
 ) -> float:
-    """lambda [1/N^2] of the objective: `regularisation` times the mean non-zero eigenvalue of B' W^2 B."""
+    """Return lambda [1/N^2] of the objective: `regularisation` times the mean non-zero eigenvalue of B' W^2 B."""
     WB = np.asarray(weights, float)[:, None] * np.asarray(B, float)
     return regularisation * float(np.sum(WB**2)) / float(np.linalg.matrix_rank(WB))
 
 
 class Tables(NamedTuple):
-    """Fields of `allocation.AllocationData` for one vehicle type, padded with absent thrusters (no gain, no thrust)."""
+    """Fields of `allocation.AllocationData` for one vehicle type, padded with missing thrusters (no gain, no
+    thrust)."""
 
     gain: npt.NDArray[np.float32]
     """Columns of H^-1 B' W^2 [N per N or N m], (6, 8)."""
@@ -69,10 +70,10 @@ def tables(
     weights: npt.ArrayLike,
     regularisation: float = REGULARISATION,
 ) -> Tables:
-    """Tables of one vehicle type; arguments as one entry of `allocation.allocation_data`.
+    """Return the tables of one vehicle type; arguments as one entry of `allocation.allocation_data`.
 
     Raises:
-        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+        ControlError: Shapes are wrong, limits exclude zero, or the problem is singular.
     """
     B, W = np.asarray(B, float), np.asarray(weights, float)
     low, high = np.asarray(lower, float), np.asarray(upper, float)
@@ -95,7 +96,7 @@ def tables(
     gain = np.zeros((6, MAX_THRUSTERS))
     gain[:, :n] = np.linalg.solve(H, WB.T * W).T
 
-    # One system of n equations for every set of clamped thrusters C: H_FF X = -H_FC for the free, X = 0 for the others.
+    # One system of n equations for each set of clamped thrusters C: H_FF X = -H_FC for free ones, X = 0 for the others.
     C = (np.arange(1 << n)[:, None] >> np.arange(n)) & 1 == 1
     F, I = ~C, np.eye(n)
     right = np.where(F[:, :, None] & C[:, None, :], -H, 0.0)
@@ -107,7 +108,7 @@ def tables(
 
 
 def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Limits as eight float32, rounded so that none lies outside its float64 value."""
+    """Return limits as eight float32 values, rounded such that none is outside its float64 value."""
     rounded = np.zeros(MAX_THRUSTERS, np.float32)
     nearest = limits.astype(np.float32)
     beyond = np.abs(nearest.astype(float)) > np.abs(limits)
@@ -116,25 +117,26 @@ def _toward_zero(limits: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
 
 
 BLOCK_PATIENCE = wp.constant(3)
-"""Block pivots without progress before single pivots take over."""
+"""Number of block pivots without progress after which single pivots are used."""
 
 MAX_PIVOTS = wp.constant(512)
-"""Bound on the pivots of one allocation. Of two million wrenches on vehicles' layouts none needed more than 7, of
-twenty million on random thruster matrices none more than 103."""
+"""Bound on the pivots of one allocation. Among two million wrenches on vehicles' layouts none needed more
+than 7, among twenty million on random thruster matrices none more than 103."""
 
 TOLERANCE = wp.constant(2.0e-6)
-"""Rounding allowed in a free thruster's limit, relative to the unlimited thrusts (float32 carries 6e-8).
+"""Rounding tolerance of a free thruster's limit, relative to the unlimited thrusts (float32 has 6e-8).
 
-The multipliers need none: a thruster clamped for exceeding its limit by this much has a multiplier of the right sign.
+The multipliers need none: a thruster clamped for exceeding its limit by this much has a multiplier of the
+correct sign.
 """
 
 
 @wp.struct
 class AllocationData:
-    """Tables of each vehicle type that `allocate` uses; built by `allocation_data`, with the type as first index."""
+    """Tables of each vehicle type for `allocate`, built by `allocation_data`, with the type as first index."""
 
     gain: wp.array2d(dtype=vec8)
-    """Columns of H^-1 B' W^2: thrust per unit of wanted wrench [N/N, N/(N m)], (vehicles, 6)."""
+    """Columns of H^-1 B' W^2: thrust per unit of requested wrench [N/N, N/(N m)], (vehicles, 6)."""
 
     clamped: wp.array3d(dtype=vec8)
     """Columns of the map d -> (f_F - f0_F, mu) for every set C (bit i: thruster i at a limit), (vehicles, 256, 8)
@@ -149,7 +151,7 @@ class AllocationData:
 
 @wp.func
 def clip(f: vec8, lower: vec8, upper: vec8) -> vec8:
-    """Return `f` moved exactly onto the bounds it exceeds, all in one unit; NaN stays NaN."""
+    """Return `f` with exceeded bounds replaced by the exact bounds, all in one unit; NaN stays NaN."""
     g = f
     for i in range(MAX_THRUSTERS):
         g[i] = wp.where(f[i] < lower[i], lower[i], wp.where(f[i] > upper[i], upper[i], f[i]))
@@ -158,12 +160,12 @@ def clip(f: vec8, lower: vec8, upper: vec8) -> vec8:
 
 @wp.func
 def unconstrained(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
-    """Optimum without limits, f0 = H^-1 B' W^2 tau [N].
+    """Return the optimum without limits, f0 = H^-1 B' W^2 tau [N].
 
     Args:
-        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
+        tau: Requested wrench about the reference point of B, body frame [N, N m].
         vehicle: Vehicle type, first index into `data`.
-        data: From `allocation_data`.
+        data: Tables from `allocation_data`.
     """
     f0 = vec8()
     for j in range(6):
@@ -173,7 +175,7 @@ def unconstrained(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
 
 @wp.func
 def bounded(f0: vec8, vehicle: int, data: AllocationData) -> vec8:
-    """Minimiser of (f - f0)' H (f - f0) within the limits, by principal pivoting [N]."""
+    """Return the minimiser of (f - f0)' H (f - f0) within the limits, by principal pivoting [N]."""
     lower = data.lower[vehicle]
     upper = data.upper[vehicle]
     size = float(0.0)
@@ -197,7 +199,7 @@ def bounded(f0: vec8, vehicle: int, data: AllocationData) -> vec8:
                 f[j] = bound
                 y += data.clamped[vehicle, clamped, j] * (bound - f0[j])
 
-        # A free thruster must be within its limits; one at a limit must be pressed against it (mu <= 0 at the upper).
+        # A free thruster must be within its limits; one at a limit presses against it (mu <= 0 at the upper limit).
         want_lower = int(0)
         want_upper = int(0)
         broken = int(0)
@@ -239,7 +241,7 @@ def bounded(f0: vec8, vehicle: int, data: AllocationData) -> vec8:
 
 @wp.func
 def highest_bit(mask: int) -> int:
-    """The highest of the bits set in an 8-bit mask, alone."""
+    """Return the highest bit that is set in an 8-bit mask."""
     bit = int(128)
     while bit & mask == 0 and bit > 1:
         bit >>= 1
@@ -248,15 +250,15 @@ def highest_bit(mask: int) -> int:
 
 @wp.func
 def allocate(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
-    """Thrusts nearest to a wanted wrench within the limits (paper, eq. 18), for one vehicle.
+    """Return the thrusts closest to a requested wrench within the limits (paper, eq. 18), for one vehicle.
 
     Args:
-        tau: Wanted wrench about the point that B was computed for, body frame [N, N m].
+        tau: Requested wrench about the reference point of B, body frame [N, N m].
         vehicle: Vehicle type, first index into `data`.
-        data: From `allocation_data`.
+        data: Tables from `allocation_data`.
 
     Returns:
-        Thrusts in the canonical order [N], never outside the limits. A wrench holding NaN gives NaN.
+        Thrusts in the canonical order [N], never outside the limits. A wrench with NaN results in NaN.
     """
     f0 = unconstrained(tau, vehicle, data)
     excess = wp.max(wp.max(f0 - data.upper[vehicle]), wp.max(data.lower[vehicle] - f0))
@@ -267,12 +269,12 @@ def allocate(tau: vec6, vehicle: int, data: AllocationData) -> vec8:
 
 @wp.kernel(enable_backward=False)
 def allocate_row(tau: wp.array(dtype=vec6), data: AllocationData, f: wp.array(dtype=vec8)):
-    """`allocate` for the first vehicle type.
+    """Run `allocate` for the first vehicle type.
 
     Args:
-        tau: Wanted wrenches, body frame [N, N m], (N,).
-        data: From `allocation_data`.
-        f: Thrusts out, canonical order [N], (N,).
+        tau: Requested wrenches, body frame [N, N m], (N,).
+        data: Tables from `allocation_data`.
+        f: Resulting thrusts, canonical order [N], (N,).
     """
     i = wp.tid()
     f[i] = allocate(tau[i], 0, data)
@@ -286,18 +288,19 @@ def allocation_data(
     regularisation: float = REGULARISATION,
     device: Any = "cpu",
 ) -> AllocationData:
-    """Tables of one or more vehicle types for `allocate`; every sequence has one entry per type.
+    """Return the tables of one or more vehicle types for `allocate`; every sequence has one entry per type.
 
     Args:
-        B: Thruster matrices, wrench = B f about the commanded point in the body frame [-, m], (6, n) with n <= 8 each.
+        B: Thruster matrices, wrench = B f about the reference point in the body frame [-, m], (6, n) with n
+            <= 8 each.
         lower: Least thrusts f- [N], (n,) each, at most zero.
         upper: Greatest thrusts f+ [N], (n,) each, at least zero.
-        weights: Diagonals of W [1/N, 1/(N m)], (6,) each: 1/wrench limit, and zero for an axis that does not matter.
-        regularisation: lambda as a fraction of the mean non-zero eigenvalue of B' W^2 B (so it has no unit).
-        device: Warp device that holds the tables.
+        weights: Diagonals of W [1/N, 1/(N m)], (6,) each: 1/wrench limit, and zero for an irrelevant axis.
+        regularisation: lambda relative to the mean non-zero eigenvalue of B' W^2 B (dimensionless).
+        device: Warp device of the tables.
 
     Raises:
-        ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+        ControlError: Shapes are wrong, limits exclude zero, or the problem is singular.
     """
     if not len(B) == len(lower) == len(upper) == len(weights) > 0:
         raise ControlError(
@@ -317,10 +320,10 @@ def allocation_data(
 
 
 class Allocator:
-    """Thrusts nearest to wanted wrenches within the limits of one vehicle's thrusters (paper, eq. 18).
+    """Allocator of wrenches to thrusts within the limits of one vehicle's thrusters (paper, eq. 18).
 
     Note:
-        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+        It runs on the CPU and reuses its launch buffers, so each instance must be used by one thread only.
     """
 
     def __init__(
@@ -331,10 +334,10 @@ class Allocator:
         weights: npt.ArrayLike,
         regularisation: float = REGULARISATION,
     ) -> None:
-        """Precomputes the tables of one vehicle; arguments as one entry of `allocation_data`.
+        """Precompute the tables of one vehicle; arguments as one entry of `allocation_data`.
 
         Raises:
-            ControlError: Wrong shapes, limits that exclude zero, or numbers that make the problem singular.
+            ControlError: Shapes are wrong, limits exclude zero, or the problem is singular.
         """
         self.data = allocation_data([B], [lower], [upper], [weights], regularisation)
         self.B: Array = np.array(B, float)
@@ -345,7 +348,7 @@ class Allocator:
 
     @classmethod
     def from_vehicle(cls, vehicle: Any, regularisation: float = REGULARISATION) -> Allocator:
-        """Allocator about `vehicle.wrench_reference`, weighing each axis by its wrench limit.
+        """Return the allocator about `vehicle.wrench_reference`, with each axis weighted by its wrench limit.
 
         `regularisation` is a weight.
 
@@ -363,13 +366,13 @@ class Allocator:
         return int(self.B.shape[1])
 
     def allocate(self, tau: npt.ArrayLike) -> Array:
-        """Thrusts [N], (..., n), never outside the limits, for wanted wrenches.
+        """Return the thrusts [N], (..., n), never outside the limits, for requested wrenches.
 
         Args:
-            tau: Wrenches about the point of B, body frame [N, N m], (..., 6).
+            tau: Wrenches about the reference point of B, body frame [N, N m], (..., 6).
 
         Raises:
-            ControlError: The last axis is not 6 long, or a number is not finite.
+            ControlError: The last axis does not have length 6, or a number is not finite.
         """
         requested = np.asarray(tau, float)
         if requested.shape[-1:] != (6,):
@@ -379,19 +382,21 @@ class Allocator:
         return self._launch(requested)[..., : self.thrusters]
 
     def achieved(self, f: npt.ArrayLike) -> Array:
-        """Wrench B f that thrusts produce, about the point of B, body frame [N, N m], (..., n) -> (..., 6)."""
+        """Return the wrench B f of thrusts, about the reference point of B, body frame [N, N m], (..., n) ->
+        (..., 6)."""
         return np.asarray(f, float) @ self.B.T
 
 
 class RowLaunch:
-    """A kernel (rows, data, thrusts) over rows of numbers, on the CPU: one for each vehicle or time.
+    """Kernel (rows, data, thrusts) over rows of numbers, on the CPU: one row for each vehicle or time.
 
-    A call writes the rows, launches, and reads the thrusts. The launch of the latest number of rows is recorded.
+    A call writes the rows, launches the kernel, and reads the thrusts. The launch for the latest number of
+    rows is recorded.
     """
 
     def __init__(self, kernel: Any, dtype: Any, data: Any) -> None:
         """Args:
-        kernel: Takes an array of vectors, `data` and an array of vec8.
+        kernel: Kernel with an array of vectors, `data` and an array of vec8 as arguments.
         dtype: Warp type of the vectors.
         data: Warp struct on the CPU.
         """
@@ -399,7 +404,7 @@ class RowLaunch:
         self._record(1)  # a robot's first decision must not wait for the compiler
 
     def __call__(self, rows: npt.ArrayLike) -> Array:
-        """Thrusts [N], (..., 8), for rows (..., m); what a vector holds beyond m is zero."""
+        """Return thrusts [N], (..., 8), for rows (..., m); components of a vector beyond m are zero."""
         rows = np.asarray(rows, float)
         flat = rows.reshape(-1, rows.shape[-1])
         if len(flat) != self._count:
@@ -409,7 +414,7 @@ class RowLaunch:
         return self._thrusts.astype(float).reshape(*rows.shape[:-1], MAX_THRUSTERS)
 
     def _record(self, count: int) -> None:
-        """Arrays and launch of so many rows; compiles the kernel where that was not done before."""
+        """Create arrays and launch for a number of rows; compile the kernel if necessary."""
         self._count = count
         self._arrays = [wp.zeros(count, dtype=kind, device="cpu") for kind in (self._dtype, vec8)]
         inputs = [self._arrays[0], self._data, self._arrays[1]]
@@ -418,10 +423,11 @@ class RowLaunch:
 
 
 def axis_weights(wrench_limits: npt.ArrayLike) -> Array:
-    """Diagonal of W [1/N, 1/(N m)], (6,): one over each wrench limit, and zero on an axis with no authority.
+    """Return the diagonal of W [1/N, 1/(N m)], (6,): the inverse of each wrench limit, and zero on an axis
+    without authority.
 
-    Where thrusters saturate, W decides which axis gives way: an error counts as a part of its axis's limit, and no axis
-    has priority.
+    If thrusters saturate, W determines the errors of the axes: an error is weighted relative to the limit of
+    its axis, and no axis has priority.
 
     Args:
         wrench_limits: Largest wrench on each axis alone, body axes [N, N m], (6,).

@@ -1,8 +1,10 @@
-"""ArduSub's mixer: a pilot's six axes to pulses and thrusts of the motors, and back.
+"""ArduSub's mixer: conversion of a pilot's six axes to pulses and thrusts of the motors, and back.
 
-out = rpy + linear, limited as the frame does it,   pulse = 1500 + 400 direction out,   T = c± ω|ω|, ω = ESC(pulse)
+out = rpy + linear, limited by the rule of the frame,   pulse = 1500 + 400 direction out,   T = c± ω|ω|, ω =
+ESC(pulse)
 
-The batch mixes for all worlds, the robot and the virtual firmware for one, by the same function and the same numbers.
+The batch mixes for all worlds, the robot and the virtual firmware for one vehicle, with the same function and
+numbers.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
@@ -25,13 +27,13 @@ __all__ = ["FULL", "NEUTRAL", "Mixer", "MixerData", "mix", "mixed_thrusts", "mix
 Array = npt.NDArray[np.float64]
 
 NEUTRAL, FULL = 1500.0, 400.0
-"""Pulse width of no thrust, and of full output from there [µs]."""
+"""Pulse width of zero thrust, and its change to full output [µs]."""
 PULSES = np.arange(NEUTRAL - FULL, NEUTRAL + FULL + 1.0)
-"""Pulse widths of the tables of thrust [µs], (801,)."""
+"""Pulse widths of the thrust tables [µs], (801,)."""
 RULES = {"VECTORED": 1, "VECTORED_6DOF": 2}
-"""Frame -> the rule that limits the outputs of its motors; other frames, rule 0, clip each output separately."""
+"""Frame -> rule that limits the outputs of its motors; other frames, with rule 0, clip each output separately."""
 CORRECTIONS, NEAR = 20, 1e-4
-"""Most rounds of `Mixer.demands`, and how near the outputs have to come [-]."""
+"""Largest number of iterations of `Mixer.demands`, and tolerance of the outputs [-]."""
 
 FROM_BODY = np.zeros((6, 6))
 """Surge, sway, heave, roll, pitch, yaw (forward, left, up) -> `DEMANDS` (forward, right, down), (6, 6)."""
@@ -41,7 +43,7 @@ for _row, (_axis, _sign) in enumerate([(3, 1.0), (4, -1.0), (5, -1.0), (2, 1.0),
 
 @wp.struct
 class MixerData:
-    """Numbers of each vehicle that `mix` and `mixed_thrusts` use; built by `mixer_data`, with the vehicle as first
+    """Numbers of each vehicle for `mix` and `mixed_thrusts`, built by `mixer_data`, with the vehicle as first
     index."""
 
     factors: wp.array2d(dtype=vec8)
@@ -58,15 +60,16 @@ class MixerData:
 
 @wp.func
 def mix(demand: vec6, vehicle: int, data: MixerData) -> vec8:
-    """Outputs of the motors before directions [-1, 1]      (ArduPilot, AP_Motors6DOF::output_armed_stabilizing_*).
+    """Return the outputs of the motors before directions [-1, 1]      (ArduPilot,
+    AP_Motors6DOF::output_armed_stabilizing_*).
 
-    VECTORED clips each sum, and limits the forward demand of the rear pair (in the direction of travel) to
-    1 - |throttle|; VECTORED_6DOF divides verticals and horizontals each by their largest sum above 1.
+    VECTORED clips each sum, and limits the forward demand of the rear pair (in the direction of travel) to 1 -
+    |throttle|; VECTORED_6DOF divides vertical and horizontal motors each by their largest sum if it exceeds 1.
 
     Args:
-        demand: Of `DEMANDS` [-1, 1]; those beyond saturate.
+        demand: Demands in the order of `DEMANDS` [-1, 1]; larger ones saturate.
         vehicle: First index into `data`.
-        data: From `mixer_data`.
+        data: Numbers from `mixer_data`.
     """
     d = vec6()
     for k in range(6):
@@ -96,12 +99,12 @@ def mix(demand: vec6, vehicle: int, data: MixerData) -> vec8:
 
 @wp.func
 def mixed_thrusts(demand: vec6, vehicle: int, data: MixerData) -> vec8:
-    """Steady thrusts that demands give, canonical order [N].
+    """Return the steady thrusts for demands, canonical order [N].
 
     Args:
-        demand: Of `DEMANDS` [-1, 1]; those beyond saturate.
+        demand: Demands in the order of `DEMANDS` [-1, 1]; larger ones saturate.
         vehicle: First index into `data`.
-        data: From `mixer_data`.
+        data: Numbers from `mixer_data`.
     """
     out, f = mix(demand, vehicle, data), vec8()
     for k in range(data.factors.shape[1]):
@@ -115,40 +118,41 @@ def mixed_thrusts(demand: vec6, vehicle: int, data: MixerData) -> vec8:
 
 @wp.kernel(enable_backward=False)
 def mix_row(demand: wp.array(dtype=vec6), data: MixerData, out: wp.array(dtype=vec8)):
-    """`mix` for the first vehicle.
+    """Run `mix` for the first vehicle.
 
     Args:
-        demand: Of `DEMANDS` [-1, 1], (N,).
-        data: From `mixer_data`.
-        out: Outputs before directions [-1, 1], by motor, (N,); written.
+        demand: Demands in the order of `DEMANDS` [-1, 1], (N,).
+        data: Numbers from `mixer_data`.
+        out: Resulting outputs before directions [-1, 1], by motor, (N,).
     """
     i = wp.tid()
     out[i] = mix(demand[i], 0, data)
 
 
 def autopilot_of(vehicle: Any) -> Autopilot:
-    """The autopilot section of a vehicle.
+    """Return the autopilot section of a vehicle.
 
     Raises:
-        ControlError: The file has none, or a thruster no `esc`.
+        ControlError: The file has no autopilot, or a thruster has no `esc`.
     """
     autopilot: Autopilot | None = getattr(vehicle, "autopilot", None)
     if autopilot is None:
         raise ControlError(
-            f"{vehicle.name} has no 'autopilot' section, so axes cannot become pulses: give its file one, "
+            f"{vehicle.name} has no 'autopilot' section, so axes cannot be converted to pulses: add one to its file, "
             "'autopilot: {frame: VECTORED_6DOF}'"
         )
     bare = [name for name, thruster in vehicle.thrusters.items() if thruster.esc is None]
     if bare:
         raise ControlError(
-            f"{vehicle.name}: thruster '{bare[0]}' has no 'esc' section, so pulses cannot become thrusts: fit one with "
-            "'finssim calibrate thruster'"
+            f"{vehicle.name}: thruster '{bare[0]}' has no 'esc' section, so pulses cannot be converted to thrusts: fit "
+            "one with 'finssim calibrate thruster'"
         )
     return autopilot
 
 
 def thrust_tables(vehicle: Any) -> Array:
-    """Steady thrust of each thruster at the pulses of `PULSES` and the autopilot's voltage [N], (n, 801)."""
+    """Return the steady thrust of each thruster at the pulses of `PULSES` and the autopilot's voltage [N],
+    (n, 801)."""
     autopilot = autopilot_of(vehicle)
     return np.stack(
         [
@@ -159,14 +163,15 @@ def thrust_tables(vehicle: Any) -> Array:
 
 
 def dead_band(vehicle: Any) -> float:
-    """Output up to which no motor of a vehicle turns, either way, at the autopilot's voltage [-]."""
+    """Return the output up to which no motor of a vehicle turns in either direction, at the autopilot's
+    voltage [-]."""
     voltage = autopilot_of(vehicle).voltage
     edges = [t.esc.dead_band(voltage) for t in vehicle.thrusters.values()]
     return float(np.abs(np.array(edges) - NEUTRAL).max() / FULL)
 
 
 def motors_of(vehicle: Any) -> npt.NDArray[np.int64]:
-    """Motor of each thruster, canonical order, from 0, (n,)."""
+    """Return the motor of each thruster, canonical order, from 0, (n,)."""
     thrusters = vehicle.thrusters.values()
     return np.array([k if t.motor_index is None else t.motor_index for k, t in enumerate(thrusters)])
 
@@ -175,7 +180,7 @@ def mixer_data(vehicles: Sequence[Any], device: Any = "cpu") -> MixerData:
     """Return the numbers of `mix` and `mixed_thrusts` for vehicles with equal numbers of thrusters.
 
     Raises:
-        ControlError: One has no `autopilot`, or thrusters without `esc`.
+        ControlError: A vehicle has no `autopilot`, or thrusters without `esc`.
     """
     autopilots = [autopilot_of(vehicle) for vehicle in vehicles]
     data = _frames(autopilots, device)
@@ -195,15 +200,15 @@ def _frames(autopilots: Sequence[Autopilot], device: Any = "cpu") -> MixerData:
 
 
 class Mixer:
-    """The mixer of one vehicle, from NumPy.
+    """Mixer of one vehicle, for use with NumPy.
 
     Note:
-        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+        It runs on the CPU and reuses its launch buffers, so each instance must be used by one thread only.
     """
 
     def __init__(self, autopilot: Autopilot) -> None:
         """Args:
-        autopilot: Its frame and directions.
+        autopilot: Autopilot with its frame and directions.
         """
         self.autopilot = autopilot
         self.directions = autopilot.signs(len(autopilot.factors))
@@ -215,10 +220,10 @@ class Mixer:
 
     @classmethod
     def of(cls, vehicle: Any) -> Mixer:
-        """The mixer of a vehicle's `autopilot`.
+        """Return the mixer of a vehicle's `autopilot`.
 
         Raises:
-            ControlError: It has none, or thrusters without `esc`.
+            ControlError: The vehicle has no autopilot, or thrusters without `esc`.
         """
         mixer = cls(autopilot_of(vehicle))
         mixer._motor, mixer._tables = motors_of(vehicle), thrust_tables(vehicle)
@@ -226,35 +231,35 @@ class Mixer:
 
     @classmethod
     def of_frame(cls, frame: str, directions: Sequence[Any] = ()) -> Mixer:
-        """The mixer of a frame by name; MOT_n_DIRECTION of each motor is 1 where not given."""
+        """Return the mixer of a frame by name; MOT_n_DIRECTION of each motor is 1 if not given."""
         return cls(Autopilot(frame=frame, directions=tuple(directions)))
 
     def outputs(self, demands: npt.ArrayLike) -> Array:
-        """Outputs of the motors before directions [-1, 1], (..., motors).
+        """Return the outputs of the motors before directions [-1, 1], (..., motors).
 
         Args:
-            demands: Of `DEMANDS` in [-1, 1], (..., 6).
+            demands: Demands in the order of `DEMANDS` in [-1, 1], (..., 6).
         """
         return self._launch(demands)[..., : len(self.directions)]
 
     def pulses(self, demands: npt.ArrayLike) -> Array:
-        """Pulse widths of motors 1, 2, ... [µs], (..., motors), for demands (..., 6)."""
+        """Return the pulse widths of motors 1, 2, ... [µs], (..., motors), for demands (..., 6)."""
         return NEUTRAL + FULL * self.directions * self.outputs(demands)
 
     def demands(self, force: npt.ArrayLike) -> Array:
-        """The demands whose thrusts come nearest to these, within [-1, 1], (6,).
+        """Return the demands whose thrusts are closest to the given ones, within [-1, 1], (6,).
 
-        Outputs that lie in the dead band are free within it; each round steps by the pseudo-inverse of the factors
-        towards the outputs that are wanted.
+        Outputs in the dead band are free within it; each iteration steps by the pseudo-inverse of the factors
+        towards the required outputs.
 
         Args:
-            force: Along the thrusters' axes, canonical order [N], (n,); 0 is a motor that stands.
+            force: Thrusts along the thrusters' axes, canonical order [N], (n,); 0 means that a motor is at rest.
         """
         assert self._motor is not None and self._tables is not None  # made by `of`
         low, high = np.zeros((2, len(self._motor)))
         for motor, table, thrust in zip(self._motor, self._tables, np.asarray(force, float), strict=True):
             rising = 1.0 if table[-1] > table[0] else -1.0
-            if thrust == 0.0:  # anywhere in the dead band
+            if thrust == 0.0:  # any value in the dead band
                 pulses = PULSES[table == 0.0][[0, -1]]
             else:
                 pulses = np.interp(np.full(2, rising * thrust), rising * table, PULSES)

@@ -1,4 +1,4 @@
-"""The model of a vehicle as six uncoupled axes."""
+"""Model of a vehicle as six uncoupled axes."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class AxisModel:
     """Six uncoupled axes m x'' + (d1 + d2 |x'|) x' + k x = tau about the wrench reference, body frame."""
 
     inertia: Array
-    """m, rigid body and added mass [kg, kg m^2], (6,)."""
+    """Inertia m, rigid body and added mass [kg, kg m^2], (6,)."""
     linear_damping: Array
-    """d1 [N s/m, N m s], (6,)."""
+    """Linear damping d1 [N s/m, N m s], (6,)."""
     quadratic_damping: Array
-    """d2 [N s^2/m^2, N m s^2], (6,)."""
+    """Quadratic damping d2 [N s^2/m^2, N m s^2], (6,)."""
     stiffness: Array
-    """k of roll and pitch about level, zero elsewhere [N m/rad], (6,)."""
+    """Stiffness k of roll and pitch about level attitude, zero elsewhere [N m/rad], (6,)."""
 
     def damping(self, nu: npt.ArrayLike) -> Array:
-        """d1 + d2 |nu| [N s/m, N m s], (..., 6).
+        """Return d1 + d2 |nu| [N s/m, N m s], (..., 6).
 
         Args:
             nu: Velocity of the wrench reference, body frame [m/s, rad/s], (..., 6).
@@ -37,7 +37,7 @@ class AxisModel:
         return np.asarray(self.linear_damping + self.quadratic_damping * np.abs(np.asarray(nu, float)))
 
     def terminal_speed(self, tau: Array) -> Array:
-        """Positive root of d1 v + d2 v^2 = tau, infinite without damping [m/s, rad/s], (6,).
+        """Return the positive root of d1 v + d2 v^2 = tau, infinite without damping [m/s, rad/s], (6,).
 
         Args:
             tau: Magnitude of the wrench on every axis, body frame [N, N m], (6,).
@@ -49,7 +49,7 @@ class AxisModel:
             )
 
     def coriolis(self, nu: npt.ArrayLike) -> Array:
-        """C(nu) nu of the diagonal inertia, Munk moment included [N, N m], (..., 6).
+        """Return C(nu) nu of the diagonal inertia, including the Munk moment [N, N m], (..., 6).
 
         omega x (m v), and omega x (I omega) + v x (m v)                                        (Fossen 2021, eq. 6.43)
 
@@ -63,7 +63,7 @@ class AxisModel:
 
 
 def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel:
-    """The diagonal of a vehicle's model at its wrench reference.
+    """Return the diagonal of a vehicle's model at its wrench reference.
 
     Raises:
         ControlError: The set has no coefficients (it is a mesh), or the vehicle has no thrusters.
@@ -72,13 +72,13 @@ def axis_model(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> AxisModel
     chosen = vehicle.hydrodynamic_set(hydrodynamics)
     if not vehicle.thrusters:
         raise ControlError(
-            f"{vehicle.name} has no thrusters to control its axes with: command its other actuators, or take a "
+            f"{vehicle.name} has no thrusters to control its axes: command its other actuators, or use a "
             "vehicle with thrusters"
         )
     if not isinstance(chosen, HydrodynamicSet):
         raise ControlError(
-            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients to place poles with: "
-            "name one that does"
+            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients for the placement of "
+            "poles: name one with coefficients"
         )
     reference = np.asarray(vehicle.wrench_reference, float)
     arm = np.asarray(chosen.reference_point, float) - reference

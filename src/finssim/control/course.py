@@ -1,20 +1,21 @@
-"""The autopilot of vehicles that must move to steer: speed, course over ground, and depth or pitch.
+"""Autopilot of vehicles that must move to steer: speed, course over ground, and depth or pitch.
 
-A linear model over speed (`finssim.sim.free_motion.linear_model`) gives its gains. About level motion at a speed U the
-state is
+Its gains follow from a linear model at several speeds (`finssim.sim.free_motion.linear_model`). About level
+motion at a speed U the state is
 
     x = (u - U, v, w, p, q, r, roll, pitch, heading, z, integrals of the errors of speed, heading, and depth or pitch)
 
-with heading' = r and z' = w - U pitch (z up; pitch is positive with the bow down). Wrenches (X, K, M, N) reach the
-vehicle behind the lag of its actuators. The feedback of x and of what is on its way minimises the sum of
-(error / scale)² + (wrench / limit)²: a linear-quadratic regulator with integral action (Anderson and Moore 1990). The
-bounded allocation of `finssim.control.allocation` then gives the channels nearest to the demand within the travel of
-the fins and the limits of thrust, for a cruciform tail, an X tail or any other. Between the speeds of the model
-everything is interpolated. An integral rests while the channels cannot follow it.
+with heading' = r and z' = w - U pitch (z up; pitch is positive bow down). Wrenches (X, K, M, N) reach the
+vehicle after the lag of its actuators. The feedback of x and of the lagged wrench minimises the sum of (error
+/ scale)² + (wrench / limit)²: a linear-quadratic regulator with integral action (Anderson and Moore 1990).
+The bounded allocation of `finssim.control.allocation` then computes the channels closest to the demand within
+the range of the fins and the limits of thrust, for a cruciform tail, an X tail or any other. Between the
+speeds of the model all numbers are interpolated. An integral is held while the channels cannot follow it.
 
-A current moves the vehicle over the ground, not through the water. Sway and heave through the water, which are fed
-back, are therefore the model's own, driven by the measured rates and the commands. What they leave of the measured sway
-is taken for the current, constant in the world; the wanted heading makes it good for the wanted course over ground.
+A current moves the vehicle over the ground, not through the water. Sway and heave through the water, which
+are fed back, are therefore those of the model, driven by the measured rates and the commands. Their
+difference from the measured sway is attributed to the current, constant in the world; the commanded heading
+compensates it to achieve the requested course over ground.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator,index"
 
@@ -39,7 +40,7 @@ from finssim.vehicles.capability import coefficients_of, terminal_speeds
 Array = npt.NDArray[np.float64]
 
 AXES = (0, 3, 4, 5)
-"""Axes of the wrench that are demanded: surge, roll, pitch, yaw."""
+"""Axes of the demanded wrench: surge, roll, pitch, yaw."""
 SCALES = {
     0: 0.3,
     6: math.radians(30.0),
@@ -47,36 +48,39 @@ SCALES = {
     8: math.radians(15.0),
     9: 1.0,
 }
-"""Error of a state whose cost equals that of a whole limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
+"""Error of a state whose cost equals that of the full limit: speed [m/s], roll, pitch, heading [rad], depth [m]."""
 INTEGRAL_TIME = 6.0
-"""The integral of an error costs as much as the error when that has lasted this long [s]."""
+"""Duration after which the integral of a constant error costs as much as the error [s]."""
 STEEPEST = math.radians(25.0)
-"""Greatest pitch that is asked for [rad]."""
+"""Largest commanded pitch [rad]."""
 WIDEST = math.radians(60.0)
-"""Greatest error of the heading that is acted on [rad]."""
+"""Largest heading error in the feedback; larger ones are clipped [rad]."""
 CURRENT_TIME = 3.0
-"""Time constant with which the current is followed [s]."""
+"""Time constant of the current estimate [s]."""
 TURNING = 0.15
-"""Yaw rate at which it is followed half as fast, since the model of a turn is not exact [rad/s]."""
+"""Yaw rate at which the current estimate is updated at half the rate, since the model of a turn is not exact
+[rad/s]."""
 LEAST_DAMPING = 0.3
-"""Rate at which the model's sway and heave die out at least [1/s]; cross-flow drag is not in a linear model."""
+"""Least decay rate of the model's sway and heave [1/s]; a linear model lacks cross-flow drag."""
 MOST_CRAB = math.radians(45.0)
-"""Greatest angle between heading and course that makes good a current [rad]."""
+"""Largest angle between heading and course to compensate a current [rad]."""
 INDEPENDENT = 0.2
-"""Part of an axis' wrench that has to be left without the others, for the axis to be controlled [-]."""
+"""Fraction of an axis' wrench that must remain with the other axes at zero, for the axis to be controlled [-]."""
 CAUTION = 1.0
-"""Part of an axis' limit that an error of heading, depth or pitch may ask for; the rest is for an unstable hull [-]."""
+"""Fraction of an axis' limit that an error of heading, depth or pitch may demand; the remainder stabilises
+the hull [-]."""
 SHORT = 0.02
-"""Part of an axis' limit by which a wrench falls short if its integral rests [-]."""
+"""Fraction of an axis' limit by which a wrench may fall short before its integral is held [-]."""
 SHORTEST_LAG = 0.05
-"""Time constant of an actuator that states less [s]."""
+"""Least time constant of an actuator [s]."""
 
 SLOWEST, FASTEST, SPEEDS = 0.5, 0.95, 6
-"""Speeds of the gains, as shares of top speed, and their number; the least and the greatest that an action asks for."""
+"""Slowest and fastest speed of the gains, relative to top speed, and the number of speeds; also the range of
+an action's speed."""
 USUAL_TOP = 2.0
-"""Top speed of a vehicle whose model states none [m/s]."""
+"""Top speed of a vehicle whose model does not determine it [m/s]."""
 FARTHEST = 5.0
-"""Change of depth that an action of 1 asks for [m]."""
+"""Change of depth for an action of 1 [m]."""
 
 STATES = 13
 Memory = wp.types.vector(length=11, dtype=float)
@@ -85,21 +89,21 @@ Wrench4 = wp.types.vector(length=len(AXES), dtype=float)
 
 
 class LinearModel(NamedTuple):
-    """A vehicle with c channels about level motion at n speeds, body frame.
+    """Linear model of a vehicle with c channels about level motion at n speeds, body frame.
 
     Channels are in their own units: thrust [N], angle [rad], volume [m³] or position [m].
     """
 
     speeds: Array
-    """Surge U, in equal steps [m/s], (n,)."""
+    """Surge velocity U, in equal steps [m/s], (n,)."""
     A: Array
     """State matrix A of x' = A x + B (channels - trim), with x = (nu, roll, pitch) [m/s, rad/s, rad], (n, 8, 8)."""
     B: Array
     """Acceleration per unit of a channel [m/s² or rad/s²], (n, 8, c)."""
     trim: Array
-    """Channels that hold the speed [N], (n, c); those other than thrusts are 0."""
+    """Channels that hold the speed [N], (n, c); channels other than thrusts are 0."""
     rest: Array
-    """Acceleration that the trim leaves, such as by buoyancy [m/s², rad/s²], (n, 6)."""
+    """Acceleration that remains at the trim, for example by buoyancy [m/s², rad/s²], (n, 6)."""
     inertia: Array
     """Mass matrix with the added mass, about the body origin [kg, kg m, kg m²], (6, 6)."""
     lower: Array
@@ -111,28 +115,29 @@ class LinearModel(NamedTuple):
 
     @property
     def travel(self) -> Array:
-        """Half the travel of each channel, in its unit, (c,)."""
+        """Half the range of each channel, in its unit, (c,)."""
         return 0.5 * (self.upper - self.lower)
 
 
 @wp.struct
 class CourseData:
-    """Numbers of each vehicle that `steer` uses, built by `course_data`: first index the vehicle, second the speed."""
+    """Numbers of each vehicle for `steer`, built by `course_data`: the first index is the vehicle, the second
+    the speed."""
 
     first: wp.array(dtype=float)
     """Least speed [m/s]."""
     spacing: wp.array(dtype=float)
     """Step between speeds [m/s]."""
     gains: wp.array3d(dtype=Row)
-    """Feedback of the state and of the wrench on its way, by axis: for depth, then for pitch, (vehicles, 2 n, 4)."""
+    """Feedback of the state and of the lagged wrench, by axis: for depth, then for pitch, (vehicles, 2 n, 4)."""
     slip: wp.array3d(dtype=Row)
-    """Acceleration of sway and heave by state and wrench on its way [m/s² per their units], (vehicles, n, 2)."""
+    """Acceleration of sway and heave by state and lagged wrench [m/s² per their units], (vehicles, n, 2)."""
     rest: wp.array2d(dtype=wp.vec2)
-    """Acceleration of sway and heave that the trim leaves [m/s²], (vehicles, n)."""
+    """Acceleration of sway and heave that remains at the trim [m/s²], (vehicles, n)."""
     reach: wp.array2d(dtype=Wrench4)
-    """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
+    """Limits of the errors in the feedback: speed [m/s], pitch, heading [rad], height [m], (vehicles, 2 n)."""
     slack: wp.array2d(dtype=Wrench4)
-    """Wrench that may be missing while integrals grow [N, N m], (vehicles, n)."""
+    """Missing wrench up to which integrals are updated [N, N m], (vehicles, n)."""
     hold: wp.array2d(dtype=float)
     """Surge force of the trim [N], (vehicles, n)."""
     trim: wp.array2d(dtype=vec8)
@@ -140,24 +145,24 @@ class CourseData:
     columns: wp.array3d(dtype=Wrench4)
     """Wrench (X, K, M, N) by channel, (vehicles, n, 8) [N or N m per unit of the channel]."""
     share: wp.array(dtype=Wrench4)
-    """Share of its way that a wrench goes in a period behind its lag [-], (vehicles,)."""
+    """Fraction of its change that a wrench with lag completes in one period [-], (vehicles,)."""
     travel: wp.array(dtype=vec8)
-    """Half the travel of each channel, in its unit, (vehicles,)."""
+    """Half the range of each channel, in its unit, (vehicles,)."""
     allocation: AllocationData
-    """Allocation to parts of `travel` from the trim; its vehicle type is vehicle * n + speed."""
+    """Allocation to fractions of `travel` from the trim; its vehicle type is vehicle * n + speed."""
     period: float
-    """Time between two commands [s]."""
+    """Interval between two commands [s]."""
 
 
 @wp.struct
 class CourseOrder:
-    """Order to the autopilot."""
+    """Reference of the autopilot."""
 
-    speed: float  # wanted surge [m/s]
-    turn: float  # wanted course less the present course over ground, counter-clockwise from above [rad]
-    rise: float  # wanted height less the present one [m]; without effect where the pitch is held
-    pitch: float  # wanted pitch, positive with the bow down [rad]; where the depth is held, slope of the way
-    by_pitch: int  # 1: hold the pitch; 0: hold the depth
+    speed: float  # requested surge velocity [m/s]
+    turn: float  # requested minus present course over ground, counter-clockwise from above [rad]
+    rise: float  # requested minus present height [m]; unused if the pitch is held
+    pitch: float  # requested pitch, positive bow down [rad]; if the depth is held, slope of the path
+    by_pitch: int  # 1 to hold the pitch; 0 to hold the depth
 
 
 @wp.struct
@@ -167,19 +172,19 @@ class CourseAnswer:
     channels: vec8
     """Commands, in the units of the channels."""
     memory: Memory
-    """Integrals of speed [m], of course [rad s], and of depth [m s] or pitch [rad s]; the wrench on its way [N, N m];
-    sway and heave through the water [m/s]; and the current, world x and y [m/s]."""
+    """Integrals of speed [m], of course [rad s], and of depth [m s] or pitch [rad s]; the lagged wrench [N, N
+    m]; sway and heave through the water [m/s]; and the current, world x and y [m/s]."""
 
 
 @wp.func
 def between(low: Any, high: Any, share: float):
-    """Return what lies a share of the way from `low` to `high`."""
+    """Return the interpolation between `low` and `high` at a fraction `share`."""
     return low + share * (high - low)
 
 
 @wp.func
 def nothing_known() -> Memory:
-    """Return the memory at the start [m, rad s, N, N m, m/s]: no current is known."""
+    """Return the initial memory [m, rad s, N, N m, m/s], with an unknown current."""
     memory = Memory()
     memory[9] = wp.nan
     return memory
@@ -187,29 +192,29 @@ def nothing_known() -> Memory:
 
 @wp.struct
 class LevelMotion:
-    """Motion of a vehicle over ground, in the level."""
+    """Horizontal motion of a vehicle over ground."""
 
-    heading: float  # of the bow [rad]
+    heading: float  # heading of the bow [rad]
     ahead: wp.vec2  # unit vector along the heading
     left: wp.vec2  # unit vector to the left of it
     way: wp.vec2  # velocity over ground, world x and y [m/s]
-    current: wp.vec2  # of the water, world x and y [m/s]
-    surge: float  # speed ahead through the water [m/s]
+    current: wp.vec2  # velocity of the water, world x and y [m/s]
+    surge: float  # forward speed through the water [m/s]
 
 
 @wp.struct
 class Place:
-    """Place of a vehicle among the speeds of its model."""
+    """Interpolation point of a vehicle's speed among those of its model."""
 
-    k: int  # number of the speed below
-    s: float  # part of the way from there to the next [-]
-    row: int  # row of the gains of the speed below, for depth or for pitch
-    reach: Wrench4  # greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m]
+    k: int  # index of the next lower speed
+    s: float  # fraction of the interval from there to the next speed [-]
+    row: int  # row of the gains of the lower speed, for depth or for pitch
+    reach: Wrench4  # limits of the errors: speed [m/s], pitch, heading [rad], height [m]
 
 
 @wp.func
 def level_motion(q: wp.quat, nu: vec6, memory: Memory) -> LevelMotion:
-    """Return the motion in the level, from the twist over ground nu, body frame [m/s, rad/s], and the memory of
+    """Return the horizontal motion, from the twist over ground nu, body frame [m/s, rad/s], and the memory of
     `steer`."""
     bow = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
     ground = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2]))
@@ -230,14 +235,16 @@ def level_motion(q: wp.quat, nu: vec6, memory: Memory) -> LevelMotion:
 
 @wp.func
 def among_speeds(speed: float, vehicle: int, data: CourseData) -> float:
-    """Return the place of a speed [m/s] among those of a vehicle's model: 0 is the least, 1 the next [-]."""
+    """Return the fractional index of a speed [m/s] among those of a vehicle's model: 0 is the lowest, 1 the
+    next [-]."""
     count = data.trim.shape[1]
     return wp.clamp((speed - data.first[vehicle]) / data.spacing[vehicle], 0.0, float(count - 1))
 
 
 @wp.func
 def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Place:
-    """Return the place of a speed through the water [m/s]; `by_pitch` is 1 where the pitch is held, else 0."""
+    """Return the interpolation point of a speed through the water [m/s]; `by_pitch` is 1 to hold the pitch,
+    otherwise 0."""
     count = data.trim.shape[1]
     place = among_speeds(surge, vehicle, data)
     found = Place()
@@ -250,7 +257,7 @@ def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Pla
 
 @wp.func
 def heading_error(order: CourseOrder, level: LevelMotion, vehicle: int, data: CourseData) -> float:
-    """Return the heading less that which gives the wanted course in the current [rad]; not wrapped."""
+    """Return the heading minus the one that achieves the requested course in the current [rad]; not wrapped."""
     least = data.first[vehicle]
     course = float(level.heading)
     if wp.dot(level.way, level.ahead) > 0.5 * least:
@@ -263,15 +270,15 @@ def heading_error(order: CourseOrder, level: LevelMotion, vehicle: int, data: Co
 
 @wp.func
 def errors_of(order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4) -> Row:
-    """Return the state that is fed back, and the wrench on its way [m/s, rad/s, rad, m, N, N m].
+    """Return the state in the feedback, and the lagged wrench [m/s, rad/s, rad, m, N, N m].
 
     Args:
-        order: As of `steer`, like the next three.
+        order: Reference, as for `steer`.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
-        memory: From the command before [m, rad s, N, N m, m/s].
-        off: Error of the heading [rad].
-        reach: Greatest errors that are acted on [m/s, rad, rad, m].
+        memory: Memory after the previous command [m, rad s, N, N m, m/s].
+        off: Heading error [rad].
+        reach: Limits of the errors [m/s, rad, rad, m].
     """
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
     x = Row()
@@ -293,7 +300,7 @@ def errors_of(order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, off: flo
 
 @wp.func
 def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) -> Wrench4:
-    """Return the wrench (X, K, M, N) that is wanted [N, N m]; the wanted surge `speed` is in [m/s]."""
+    """Return the demanded wrench (X, K, M, N) [N, N m]; the requested surge velocity `speed` is in [m/s]."""
     k = at.k
     goal = among_speeds(speed, vehicle, data)
     k_goal = wp.min(int(goal), data.trim.shape[1] - 2)
@@ -310,9 +317,9 @@ def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) ->
 def grown_integrals(
     order: CourseOrder, x: Row, short: Wrench4, memory: Memory, at: Place, vehicle: int, data: CourseData
 ) -> Memory:
-    """Return the memory with the errors added to its integrals, each unless the channels cannot follow it.
+    """Return the memory with updated integrals, except those that the channels cannot follow.
 
-    The wrench that falls `short` is in [N, N m]; `x` as of `errors_of`; the memory is that of `steer`.
+    The missing wrench `short` is in [N, N m]; `x` is the result of `errors_of`; the memory is that of `steer`.
     """
     after = memory
     reach = at.reach
@@ -331,15 +338,15 @@ def grown_integrals(
 def steer(
     order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
 ) -> CourseAnswer:
-    """Return the channels that carry out an order, and the memory for the next.
+    """Return the channels that execute a reference, and the memory for the next call.
 
     Args:
-        order: What is wanted.
+        order: Reference.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
-        memory: From the command before [m, rad s, N, N m, m/s]; `nothing_known` at the start.
+        memory: Memory after the previous command [m, rad s, N, N m, m/s]; `nothing_known` initially.
         vehicle: First index into `data`.
-        data: From `course_data`.
+        data: Numbers from `course_data`.
     """
     level = level_motion(q, nu, memory)
     at = place_of(level.surge, order.by_pitch, vehicle, data)
@@ -379,15 +386,15 @@ def steer(
 def order_of(
     speed: float, turn: float, dive: float, by_pitch: int, vehicle: int, data: CourseData
 ) -> CourseOrder:
-    """Return the order of an action of mode `course` or `course_pitch`.
+    """Return the reference for an action of mode `course` or `course_pitch`.
 
     Args:
-        speed: Part of the way from the middle speed to the greatest, or to the least below 0 [-].
-        turn: Part of `WIDEST` to turn the course, counter-clockwise from above [-].
-        dive: Part of `FARTHEST` to go down, or of `STEEPEST` to point the bow down [-].
+        speed: Fraction of the range from the middle speed to the greatest, or to the least if negative [-].
+        turn: Fraction of `WIDEST` by which to turn the course, counter-clockwise from above [-].
+        dive: Fraction of `FARTHEST` to descend, or of `STEEPEST` to pitch the bow down [-].
         by_pitch: 1: pitch; 0: depth.
         vehicle: First index into `data`.
-        data: From `course_data`.
+        data: Numbers from `course_data`.
     """
     order = CourseOrder()
     whole = data.spacing[vehicle] * float(data.trim.shape[1] - 1)
@@ -411,16 +418,16 @@ def steer_rows(
     channels: wp.array(dtype=vec8),
     after: wp.array(dtype=Memory),
 ):
-    """`steer` for the first vehicle, row by row.
+    """Run `steer` for the first vehicle, row by row.
 
     Args:
-        orders: What is wanted, (N,).
+        orders: References, (N,).
         q: Attitudes, body to world, (N,).
         nu: Velocities over ground, body frame [m/s, rad/s], (N,).
-        memory: From the command before [m, rad s, N, N m, m/s], (N,).
-        data: From `course_data`.
-        channels: Written: commands, in the units of the channels [N, rad, m³, m], (N,).
-        after: Written: memory for the next command [m, rad s, N, N m, m/s], (N,).
+        memory: Memory after the previous command [m, rad s, N, N m, m/s], (N,).
+        data: Numbers from `course_data`.
+        channels: Resulting commands, in the units of the channels [N, rad, m³, m], (N,).
+        after: Resulting memory for the next command [m, rad s, N, N m, m/s], (N,).
     """
     i = wp.tid()
     answer = steer(orders[i], q[i], nu[i], memory[i], 0, data)
@@ -429,7 +436,8 @@ def steer_rows(
 
 
 def top_speed(vehicle: Vehicle, hydrodynamics: str) -> float:
-    """Return the top speed ahead by a hydrodynamic set [m/s]; `USUAL_TOP` where it has no coefficients or no end."""
+    """Return the top speed ahead for a hydrodynamic set [m/s]; `USUAL_TOP` if it has no coefficients or no
+    finite speed."""
     if not isinstance(vehicle.hydrodynamics[hydrodynamics], HydrodynamicSet):
         return USUAL_TOP
     reached = float(terminal_speeds(vehicle, hydrodynamics)[0])
@@ -437,7 +445,7 @@ def top_speed(vehicle: Vehicle, hydrodynamics: str) -> float:
 
 
 def course_speeds(vehicle: Vehicle) -> Array:
-    """Return the speeds of a vehicle's autopilot, the least and the greatest at the ends [m/s], (n,)."""
+    """Return the speeds of a vehicle's autopilot, from the lowest to the highest [m/s], (n,)."""
     top = top_speed(vehicle, coefficients_of(vehicle))
     return np.linspace(SLOWEST * top, FASTEST * top, SPEEDS)
 
@@ -448,13 +456,14 @@ class Tuning(NamedTuple):
     gains: Array
     """Feedback of the state [N or N m per its unit], for depth and then for pitch, (2 n, 4, 17)."""
     slip: Array
-    """Acceleration of sway and heave by the state and the wrench on its way [m/s² per their units], (n, 2, 17)."""
+    """Acceleration of sway and heave by the state and the lagged wrench [m/s² per their units], (n, 2, 17)."""
     reach: Array
-    """Greatest errors that are acted on: speed [m/s], pitch, heading [rad], height [m], (2 n, 4)."""
+    """Limits of the errors in the feedback: speed [m/s], pitch, heading [rad], height [m], (2 n, 4)."""
     columns: Array
     """Wrench (X, K, M, N) per unit of a channel [N or N m], (n, 4, c)."""
     limits: Array
-    """Wrench of each of the four axes at half the travel of the channels, 0 of one not controlled [N, N m], (n, 4)."""
+    """Wrench on each of the four axes at half the range of the channels, 0 for an uncontrolled axis [N, N m],
+    (n, 4)."""
     weights: Array
     """Weights of the six axes in the allocation [1/N, 1/(N m)], (n, 6)."""
     lag: Array
@@ -466,18 +475,18 @@ def tuned(model: LinearModel, name: str) -> Tuning:
 
     Args:
         model: The model.
-        name: Of the vehicle, for messages.
+        name: Name of the vehicle, for messages.
 
     Raises:
-        ControlError: Its actuators do not control surge, pitch and yaw, or what they do not control is unstable.
+        ControlError: Its actuators do not control surge, pitch and yaw, or an uncontrolled motion is unstable.
     """
     wrenches = model.inertia @ model.B[:, :6]
     columns = wrenches[:, AXES]
     limits = _authority(columns * model.travel)
     if not (limits[:, [0, 2, 3]] > 0.0).all():
         raise ControlError(
-            f"{name}: its actuators do not control surge, pitch and yaw, each without the others, as the autopilot "
-            "needs: take a vehicle with fins or thrusters for them"
+            f"{name}: its actuators do not control surge, pitch and yaw independently of each other, as the autopilot "
+            "requires: use a vehicle with fins or thrusters for them"
         )
     share = (columns[-1] * model.travel) ** 2
     lag = np.divide(
@@ -505,16 +514,16 @@ def tuned(model: LinearModel, name: str) -> Tuning:
 
 
 def _authority(wrench: Array) -> Array:
-    """Return what each of the four axes gets with the others left alone, 0 where that is not possible, (n, 4).
+    """Return the wrench that each of the four axes can reach without wrench on the others, 0 if impossible, (n, 4).
 
     Args:
-        wrench: Of every channel at half its travel [N, N m], (n, 4, c).
+        wrench: Wrench of every channel at half its range [N, N m], (n, 4, c).
     """
     found = np.zeros(wrench.shape[:2])
     for i, rows in enumerate(wrench):
         scaled = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
         for axis in range(4):
-            others = scaled[[k for k in (0, 2, 3) if k != axis]]  # roll is controlled where it can be
+            others = scaled[[k for k in (0, 2, 3) if k != axis]]  # roll is controlled if possible
             free = scaled[axis] - others.T @ np.linalg.lstsq(others.T, scaled[axis], rcond=1e-6)[0]
             if np.linalg.norm(free) > INDEPENDENT:
                 found[i, axis] = np.abs(rows[axis, np.abs(free) > 1e-9]).sum()
@@ -532,7 +541,7 @@ def _regulator(
     mix = model.travel[:, None] * np.linalg.pinv(weighted, rcond=1e-6)[:, AXES] * weights[list(AXES)]
     A, B, Q = np.zeros((n + 4, n + 4)), np.zeros((n + 4, 4)), np.zeros(n + 4)
     A[:8, :8] = model.A[i]
-    A[0, 1:8] = A[1:8, 0] = 0.0  # the speed is for the thrust, the rest for the fins
+    A[0, 1:8] = A[1:8, 0] = 0.0  # speed is controlled by thrust, the other states by the fins
     A[8, 5] = 1.0
     A[9, 2], A[9, 7] = 1.0, -model.speeds[i]
     A[[10, 11, 12], [0, 8, 7 if by_pitch else 9]] = 1.0
@@ -546,14 +555,14 @@ def _regulator(
     driven = np.flatnonzero(limits > 0.0)
     dropped = {n + k for k in range(4) if k not in driven} | ({9} if by_pitch else set())
     if 1 not in driven:
-        dropped |= {3, 6}  # roll is left to the water
+        dropped |= {3, 6}  # roll is not controlled
     kept = np.array([k for k in range(n + 4) if k not in dropped])
     a, b, r = A[np.ix_(kept, kept)], B[np.ix_(kept, driven)], np.diag(limits[driven] ** -2)
     try:
         P = solve_continuous_are(a, b, np.diag(Q[kept]), r)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ControlError(
-            f"{name}: at {model.speeds[i]:.3g} m/s something is unstable that its actuators do not control"
+            f"{name}: at {model.speeds[i]:.3g} m/s a motion that its actuators do not control is unstable"
         ) from error
     gains = np.zeros((4, n + 4))
     gains[np.ix_(driven, kept)] = np.linalg.solve(r, b.T @ P)
@@ -565,16 +574,16 @@ def _regulator(
 def course_data(
     models: Sequence[LinearModel], names: Sequence[str], period: float, device: Any = "cpu"
 ) -> CourseData:
-    """Return the numbers of the autopilots of one or more vehicles, which have equally many speeds.
+    """Return the numbers of the autopilots of one or more vehicles, with equal numbers of speeds.
 
     Args:
         models: Linear model of each vehicle.
-        names: Of the vehicles.
-        period: Time between two commands [s].
+        names: Names of the vehicles.
+        period: Interval between two commands [s].
         device: Warp device.
 
     Raises:
-        ControlError: A vehicle cannot be steered so.
+        ControlError: A vehicle cannot be steered in this way.
     """
     found = [tuned(model, name) for model, name in zip(models, names, strict=True)]
     data = CourseData()
@@ -603,7 +612,7 @@ def course_data(
     data.columns = stored([np.swapaxes(padded(one.columns), 1, 2) for one in found], Wrench4)
     data.share = stored([1.0 - np.exp(-period / one.lag) for one in found], Wrench4)
     data.travel = stored([padded(model.travel) for model in models], vec8)
-    rows = []  # in parts of the travel: the channels have different units
+    rows = []  # relative to the range: the channels have different units
     for model, one in zip(models, found, strict=True):
         for i, trim in enumerate(model.trim):
             low, high = (model.lower - trim) / model.travel, (model.upper - trim) / model.travel
@@ -616,18 +625,18 @@ def course_data(
 
 
 class CoursePilot:
-    """The autopilot of one vehicle, for one of it or for a batch; its memory is an argument and a result."""
+    """Autopilot of a vehicle, for one or for a batch of them; its memory is an argument and a result."""
 
     def __init__(self, model: LinearModel, name: str, period: float) -> None:
         """Tune the autopilot.
 
         Args:
-            model: Of the vehicle.
-            name: Of the vehicle.
-            period: Time between two commands [s].
+            model: Linear model of the vehicle.
+            name: Name of the vehicle.
+            period: Interval between two commands [s].
 
         Raises:
-            ControlError: The vehicle cannot be steered so, or the period is not positive.
+            ControlError: The vehicle cannot be steered in this way, or the period is not positive.
         """
         if not period > 0.0:
             raise ControlError(f"period is {period}, expected a positive time in seconds")
@@ -635,7 +644,7 @@ class CoursePilot:
         self.data = course_data([model], [name], period)
 
     def reset(self, n: int = 1) -> Array:
-        """Return the memory of n vehicles at the start [m, rad s, N, N m, m/s], (n, 11)."""
+        """Return the initial memory of n vehicles [m, rad s, N, N m, m/s], (n, 11)."""
         memory = np.zeros((n, 11))
         memory[:, 9] = np.nan
         return memory
@@ -653,12 +662,12 @@ class CoursePilot:
         """Return the channels [N, rad, m³, m], (n, c), and the memory for the next command, (n, 11).
 
         Args:
-            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 11).
+            memory: Memory from `reset` or after the previous command [m, rad s, N, N m, m/s], (n, 11).
             measured: The vehicles' states, with n rows.
-            speed: Wanted surge [m/s], (n,).
-            course: Wanted course over ground, counter-clockwise from the world's x axis [rad], (n,).
-            depth: Wanted depth below the surface [m], (n,); None: hold the pitch.
-            pitch: Wanted pitch, positive with the bow down [rad], (n,); with a depth, slope of the way.
+            speed: Requested surge velocity [m/s], (n,).
+            course: Requested course over ground, counter-clockwise from the world's x axis [rad], (n,).
+            depth: Requested depth below the surface [m], (n,); None to hold the pitch.
+            pitch: Requested pitch, positive bow down [rad], (n,); with a depth, slope of the path.
         """
         q, nu = (np.atleast_2d(np.asarray(x, float)) for x in (measured.quaternion, measured.nu))
         ground = quat_rotate(q, nu[:, :3])
@@ -679,13 +688,13 @@ class CoursePilot:
     def act(
         self, memory: Array, measured: Measured, action: npt.ArrayLike, *, by_pitch: bool
     ) -> tuple[Array, Array]:
-        """Return channels and memory as `command` does, for actions of mode `course` or `course_pitch`.
+        """Return channels and memory like `command`, for actions of mode `course` or `course_pitch`.
 
         Args:
-            memory: From `reset` or the command before [m, rad s, N, N m, m/s], (n, 11).
+            memory: Memory from `reset` or after the previous command [m, rad s, N, N m, m/s], (n, 11).
             measured: The vehicles' states, with n rows.
-            action: Speed, change of course, and dive, as of `order_of` [-], (n, 3).
-            by_pitch: Whether the third is pitch; else depth.
+            action: Speed, change of course, and dive, as for `order_of` [-], (n, 3).
+            by_pitch: True if the third component is pitch, False if it is depth.
         """
         speed, turn, dive = np.clip(np.atleast_2d(np.asarray(action, float)), -1.0, 1.0).T
         orders = self._orders(len(speed))

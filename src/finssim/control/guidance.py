@@ -1,4 +1,4 @@
-"""References over time, the readings that a controller receives, and errors to the goal."""
+"""References over time, inputs of pose controllers, and errors relative to the goal."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from finssim.core.rotations import (
     wrap_angle,
 )
 
-# What every pose controller is given and how far it is from its goal; the interface controllers share.
+# Inputs of every pose controller, its error, and the common interface of controllers.
 
 
 Array = npt.NDArray[np.float64]
 
 
 class Measured(Protocol):
-    """A vehicle's state as a controller reads it; any object with these attributes will do."""
+    """State of a vehicle as the input of a controller; any object with these attributes is accepted."""
 
     @property
     def position(self) -> Any:
-        """Body origin, world frame [m], (..., 3)."""
+        """Position of the body origin, world frame [m], (..., 3)."""
 
     @property
     def quaternion(self) -> Any:
-        """Body to world, xyzw, (..., 4)."""
+        """Attitude, body to world, xyzw, (..., 4)."""
 
     @property
     def nu(self) -> Any:
@@ -44,21 +44,21 @@ class Measured(Protocol):
 
 @dataclass(frozen=True)
 class Track:
-    """The state of something that moves, or of n of them, such as another vehicle; it is a `Measured`."""
+    """State of one or n moving objects, such as another vehicle; it is a `Measured`."""
 
     position: Array
-    """Its origin, world frame [m], (..., 3)."""
+    """Position of the origin, world frame [m], (..., 3)."""
     quaternion: Array
-    """Body to world, xyzw, (..., 4)."""
+    """Attitude, body to world, xyzw, (..., 4)."""
     nu: Array
-    """Body frame [m/s, rad/s], (..., 6)."""
+    """Velocity, body frame [m/s, rad/s], (..., 6)."""
     time: float = math.nan
-    """Time of the measurement [s]; NaN if it is not known."""
+    """Time of the measurement [s]; NaN if unknown."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Readings as plain arrays; fields that are not needed may be left out."""
+    """Measurements as plain arrays; fields that are not needed may be omitted."""
 
     observation: Any
     """Observation of the task, in the order and the units of its parts, (..., n)."""
@@ -74,12 +74,12 @@ class Known:
 
 @dataclass(frozen=True)
 class Goal:
-    """The pose to hold, and how it moves."""
+    """Pose to hold, and its motion."""
 
     position: Any
     """Position of the body origin, world frame [m], (..., 3)."""
     quaternion: Any
-    """Attitude the body should have, body to world, xyzw, (..., 4)."""
+    """Requested attitude, body to world, xyzw, (..., 4)."""
     velocity: Any = (0.0, 0.0, 0.0)
     """Velocity of the goal, world frame [m/s], (..., 3)."""
     acceleration: Any = (0.0, 0.0, 0.0)
@@ -91,34 +91,36 @@ class Controller(Protocol):
 
     @property
     def period(self) -> float:
-        """Time between two calls of `command` [s]."""
+        """Interval between two calls of `command` [s]."""
 
     def reset(self, n: int | None = None) -> Any:
-        """Memory at the start, for one vehicle or for a batch of n."""
+        """Return the initial memory, for one vehicle or for a batch of n."""
 
     def command(self, memory: Any, measured: Measured, goal: Goal) -> tuple[Array, Any]:
-        """Wanted wrench about `vehicle.wrench_reference`, body frame [N, N m], (..., 6), and the memory after."""
+        """Return the requested wrench about `vehicle.wrench_reference`, body frame [N, N m], (..., 6), and
+        the new memory."""
 
 
 class TrackingError(NamedTuple):
-    """Goal minus measured, in the measured body's axes."""
+    """Difference between goal and measurement, in the measured body's axes."""
 
     pose: Array
-    """Three distances of a body point to its goal [m], then tilt about x and y and heading [rad], (..., 6)."""
+    """Distances of a body point to its goal along three axes [m], then tilt about x and y and heading [rad],
+    (..., 6)."""
     velocity: Array
     """Velocity of the goal, body frame; its angular part is zero [m/s, rad/s], (..., 6)."""
 
 
 def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> TrackingError:
-    """Error of a body point's position and of the attitude.
+    """Return the error of a body point's position and of the attitude.
 
-    The rotation to the goal is split into a turn about the body's z (heading error, wrapped) and a tilt without any
-    turn about z, so that half a turn to make does not disturb the levelling.
+    The rotation to the goal is split into a rotation about the body's z axis (heading error, wrapped) and a
+    tilt without rotation about z, so that a large heading error does not affect the levelling.
 
     Args:
-        measured: Where the vehicle is.
-        goal: Where it should be.
-        point: The body point, body frame [m], (3,).
+        measured: State of the vehicle.
+        goal: Goal of the vehicle.
+        point: Body point, body frame [m], (3,).
     """
     q, q_goal = np.asarray(measured.quaternion, float), np.asarray(goal.quaternion, float)
     to_goal = np.asarray(goal.position, float) - np.asarray(measured.position, float)
@@ -136,7 +138,7 @@ def tracking_error(measured: Measured, goal: Goal, point: npt.ArrayLike) -> Trac
 
 
 def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
-    """Twist of the body at a body point: v + omega x r and omega, body frame [m/s, rad/s], (..., 6).
+    """Return the twist of the body at a body point: v + omega x r and omega, body frame [m/s, rad/s], (..., 6).
 
     Args:
         nu: Twist of the body origin, body frame [m/s, rad/s], (..., 6).
@@ -147,25 +149,25 @@ def velocity_at(nu: npt.ArrayLike, point: npt.ArrayLike) -> Array:
 
 
 DIFFERENCE = 0.05
-"""Half the time across which an acceleration is taken [s]: a controller's period."""
+"""Half the interval of the finite difference for an acceleration [s]: a controller's period."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The wanted motion at one time or, with a leading batch, at several."""
+    """Requested motion at one time or, with a leading batch dimension, at several."""
 
     position: Array
-    """Body origin, world frame [m], (..., 3)."""
+    """Position of the body origin, world frame [m], (..., 3)."""
     velocity: Array
-    """World frame [m/s], (..., 3)."""
+    """Velocity, world frame [m/s], (..., 3)."""
     yaw: Array
-    """Wanted heading [rad], (...)."""
+    """Requested heading [rad], (...)."""
     progress: Array
-    """Part of the way in [0, 1], (...)."""
+    """Fraction of the path in [0, 1], (...)."""
 
 
 class Guide(Protocol):
-    """A wanted motion; time counts from its start."""
+    """Requested motion; time counts from its start."""
 
     @property
     def name(self) -> str:
@@ -173,20 +175,20 @@ class Guide(Protocol):
 
     @property
     def duration(self) -> float:
-        """[s]; infinite for a station."""
+        """Duration [s]; infinite for a station."""
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """The reference at times since the start [s], (...); held at the ends beyond them."""
+        """Return the reference at times since the start [s], (...); it is constant before and after the duration."""
 
 
 @dataclass(frozen=True)
 class Station:
-    """One pose to reach and hold."""
+    """Pose to reach and hold."""
 
     position: tuple[float, float, float]
-    """World frame [m]."""
+    """Position in the world frame [m]."""
     yaw: float
-    """[rad]"""
+    """Heading [rad]."""
     name: str = "station"
     duration: float = math.inf
     """Time to hold the pose [s]."""
@@ -199,7 +201,7 @@ class Station:
 
 
 def goal_at(guide: Guide, t: float) -> Goal:
-    """The level pose, velocity and acceleration that a pose controller is given at a time since the start [s]."""
+    """Return the level pose, velocity and acceleration for a pose controller at a time since the start [s]."""
     before, after = _around(guide, t)
     reference = guide.at(np.array([t, before, after]))
     velocity = reference.velocity
@@ -208,12 +210,13 @@ def goal_at(guide: Guide, t: float) -> Goal:
 
 
 def acceleration_at(guide: Guide, t: float) -> Array:
-    """Acceleration of a guide, world frame [m/s²], (3,): the change of its velocity over 0.1 s; zero past its ends."""
+    """Return the acceleration of a guide, world frame [m/s²], (3,): the change of its velocity over 0.1 s;
+    zero beyond its ends."""
     return np.asarray(goal_at(guide, t).acceleration)
 
 
 def _around(guide: Guide, t: float) -> tuple[float, float]:
-    """Times between which the acceleration is taken [s]; equal past the guide's ends."""
+    """Return the times of the finite difference for the acceleration [s]; equal beyond the guide's ends."""
     if not 0.0 <= t <= guide.duration:
         return t, t
     return max(t - DIFFERENCE, 0.0), min(t + DIFFERENCE, guide.duration)

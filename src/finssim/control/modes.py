@@ -1,10 +1,10 @@
-"""Action modes: what a policy's numbers in [-1, 1] mean; limits and scale are part of the definition.
+"""Action modes: the meaning of a policy's outputs in [-1, 1]; limits and scale are part of the definition.
 
-A mode mixes the components of an action to parts of the vehicle's wrench limits, which are allocated to the thrusters,
-to parts of the thrusters' own limits, or to the axes of an autopilot, whose mixer drives the thrusters. The batch does
-so for all worlds and the robot for one, with the same function (`thrusts_of`) and the same numbers (`mode_data`).
-`surfaces` commands every channel, fins and other actuators too; `course` and `course_pitch` are orders to the autopilot
-of `finssim.control.course`, which needs to know how the vehicle moves.
+A mode maps the components of an action to fractions of the vehicle's wrench limits, which are allocated to the
+thrusters, to fractions of the thrusters' own limits, or to the axes of an autopilot, whose mixer drives the
+thrusters. The batch does this for all worlds and the robot for one vehicle, with the same function (`thrusts_of`) and
+the same numbers (`mode_data`). `surfaces` commands every channel, including fins and other actuators; `course` and
+`course_pitch` are references for the autopilot of `finssim.control.course`, which requires the vehicle's state.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 
@@ -31,33 +31,33 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
 QUIET = 0.01
-"""Axes of `pilot6` up to this turn no motor [-]."""
+"""Value up to which an axis of `pilot6` turns no motor [-]."""
 TOLERANCE = 1e-6
-"""Relative difference between computed limits and those of a policy's directory that counts as none."""
+"""Relative difference between computed limits and those of a policy's directory that is ignored."""
 
 
 class ModeKind(NamedTuple):
-    """One action mode, for any vehicle."""
+    """Definition of an action mode, for any vehicle."""
 
     wrench: bool
-    """True if the components are mixed to a wrench, which is allocated to the thrusters; False: directly to the
-    thrusters."""
+    """True if the components are combined to a wrench, which is allocated to the thrusters; False if they
+    command the thrusters directly."""
     labels: Callable[[Any], tuple[str, ...]]
     """Names of the components of an action for a vehicle, m of them."""
     mix: Callable[[Any], Array]
-    """Function that gives the effect of each component at 1: shares of the wrench limits (m, 6), of the limits of n
-    thrusters (m, n), or of the autopilot's demands (m, 6)."""
+    """Function that returns the effect of each component at 1: fractions of the wrench limits (m, 6), of the
+    limits of n thrusters (m, n), or of the autopilot's demands (m, 6)."""
     pilot: bool = False
     """True if the components are the axes of the vehicle's autopilot."""
     channels: bool = False
-    """True if the components drive all channels: thrusters, then the other actuators."""
+    """True if the components command all channels: thrusters, then the other actuators."""
     course: Literal["", "depth", "pitch"] = ""
-    """Third component, depth or pitch, of actions that are orders to the autopilot of `finssim.control.course`; empty
-    for other actions."""
+    """Third component, depth or pitch, of actions that are references for the autopilot of
+    `finssim.control.course`; empty for other actions."""
 
 
 def _axes(*axes: int) -> ModeKind:
-    """A mode whose components drive axes of the wrench; the others are asked to be zero."""
+    """Return a mode whose components command axes of the wrench; the others are requested to be zero."""
     labels = tuple(AXES[axis] for axis in axes)
     return ModeKind(True, lambda vehicle: labels, lambda vehicle: np.eye(6)[list(axes)])
 
@@ -89,16 +89,16 @@ MODES: dict[str, ModeKind] = {
     ),
     "pilot6": ModeKind(False, lambda vehicle: AXES, lambda vehicle: FROM_BODY.T * _gain(vehicle), pilot=True),
 }
-"""Action modes by name; another is one entry."""
+"""Action modes by name; a new mode is one entry."""
 
 
 @wp.struct
 class ModeData:
-    """Numbers of each vehicle that `thrusts_of` uses; built by `mode_data`, with the vehicle as first index."""
+    """Numbers of each vehicle for `thrusts_of`, built by `mode_data`, with the vehicle as first index."""
 
     columns: wp.array2d(dtype=vec8)
-    """Effect of each component at 1: a wrench [N, N m] or demands [-] and two zeros, or shares of the thrusters'
-    limits, (vehicles, m)."""
+    """Effect of each component at 1: a wrench [N, N m] or demands [-] and two zeros, or fractions of the
+    thrusters' limits, (vehicles, m)."""
     lower: wp.array(dtype=vec8)
     """Least thrust [N], (vehicles,)."""
     upper: wp.array(dtype=vec8)
@@ -110,18 +110,18 @@ class ModeData:
     pilot: wp.bool
     """True if the columns are demands."""
     dead_band: wp.array(dtype=vec8)
-    """Part of each axis up to which no motor turns [-], (vehicles,); of demands."""
+    """Fraction of each axis up to which no motor turns [-], (vehicles,); for demands."""
     mixer: MixerData
-    """Mixer from demands to the thrusters; empty if the columns are not demands."""
+    """Mixer of demands to the thrusters; empty if the columns are not demands."""
 
 
 @wp.func
 def past_dead_band(part: float, dead_band: float) -> float:
-    """An axis of an action, moved on by the part of it at which no motor turns, beyond +-`QUIET`.
+    """Return an axis of an action beyond ± `QUIET`, shifted by the fraction at which no motor turns.
 
     Args:
-        part: In [-1, 1].
-        dead_band: Up to this no motor turns [-], from `axis_dead_band`.
+        part: Value in [-1, 1].
+        dead_band: Value up to which no motor turns [-], from `axis_dead_band`.
     """
     size = wp.abs(part)
     if size <= wp.static(QUIET):
@@ -132,7 +132,7 @@ def past_dead_band(part: float, dead_band: float) -> float:
 
 @wp.func
 def thrusts_of_shares(shares: vec8, lower: vec8, upper: vec8) -> vec8:
-    """Thrusts [N] that are shares [-1, 1] of the least and greatest [N]; shares beyond saturate."""
+    """Return thrusts [N] from fractions [-1, 1] of the least and greatest thrusts [N]; larger fractions saturate."""
     f = vec8()
     for k in range(MAX_THRUSTERS):
         share = wp.clamp(shares[k], -1.0, 1.0)
@@ -142,12 +142,12 @@ def thrusts_of_shares(shares: vec8, lower: vec8, upper: vec8) -> vec8:
 
 @wp.func
 def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
-    """Thrusts that an action asks for, canonical order [N].
+    """Return the thrusts for an action, canonical order [N].
 
     Args:
-        action: Its components [-1, 1]; those beyond saturate.
+        action: Components [-1, 1]; larger values saturate.
         vehicle: First index into `data`.
-        data: From `mode_data`.
+        data: Numbers from `mode_data`.
     """
     x = vec8()
     for k in range(data.columns.shape[1]):
@@ -164,24 +164,24 @@ def thrusts_of(action: vec8, vehicle: int, data: ModeData) -> vec8:
 
 @wp.kernel(enable_backward=False)
 def thrusts_row(action: wp.array(dtype=vec8), data: ModeData, force: wp.array(dtype=vec8)):
-    """`thrusts_of` for the first vehicle.
+    """Run `thrusts_of` for the first vehicle.
 
     Args:
         action: Actions, (N,).
-        data: From `mode_data`.
-        force: Thrusts out, along the thrusters' axes, canonical order [N], (N,).
+        data: Numbers from `mode_data`.
+        force: Resulting thrusts, along the thrusters' axes, canonical order [N], (N,).
     """
     i = wp.tid()
     force[i] = thrusts_of(action[i], 0, data)
 
 
 def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device: Any = "cpu") -> ModeData:
-    """The numbers of a mode for `thrusts_of`.
+    """Return the numbers of a mode for `thrusts_of`.
 
     Args:
-        name: Of the mode.
-        vehicles: Alike in their number of thrusters where components drive thrusters.
-        scales: By vehicle: part of each limit that is asked for at 1, one number or one for each.
+        name: Name of the mode.
+        vehicles: Vehicles, with equal numbers of thrusters if components command thrusters.
+        scales: Fraction of each limit at an action of 1, by vehicle, one number or one for each.
         device: Warp device.
     """
     kind, data = MODES[name], ModeData()
@@ -207,11 +207,12 @@ def mode_data(name: str, vehicles: Sequence[Any], scales: Sequence[Any], device:
 
 
 def axis_dead_band(vehicle: Any, scale: Any = 1.0) -> Array:
-    """Part of each axis of `pilot6` up to which no motor turns, at the autopilot's gain and voltage [-], (6,).
+    """Return the fraction of each axis of `pilot6` up to which no motor turns, at the autopilot's gain and
+    voltage [-], (6,).
 
     Args:
-        vehicle: With an `autopilot` section.
-        scale: Part of each axis that action 1 stands for [-], one number or (6,); an axis at 0 turns no motor at all.
+        vehicle: Vehicle with an `autopilot` section.
+        scale: Fraction of each axis that action 1 represents [-], one number or (6,); an axis at 0 turns no motor.
 
     Raises:
         ControlError: No motor turns even at action 1 of an axis.
@@ -226,11 +227,11 @@ def axis_dead_band(vehicle: Any, scale: Any = 1.0) -> Array:
 
 
 def before_dead_band(part: npt.ArrayLike, dead_band: npt.ArrayLike) -> Array:
-    """Axes of an action which `past_dead_band` moves on to `part`.
+    """Return the axes of an action that `past_dead_band` maps to `part`.
 
     Args:
-        part: In [-1, 1], (..., 6).
-        dead_band: From `axis_dead_band`, a share of each axis' limit, (6,).
+        part: Values in [-1, 1], (..., 6).
+        dead_band: Values from `axis_dead_band`, as a fraction of each axis' limit, (6,).
     """
     band, size = np.broadcast_to(dead_band, np.shape(part)), np.abs(part)
     rest = np.divide(size - band, 1.0 - band, out=np.ones_like(size), where=band < 1.0)
@@ -244,8 +245,8 @@ def _limits(kind: ModeKind, vehicle: Any) -> tuple[Array, Array]:
 
 
 def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
-    """Return the effect of each component at 1: a wrench [N, N m] or demands [-], (m, 6), or shares of the thrusters'
-    limits, (m, n)."""
+    """Return the effect of each component at 1: a wrench [N, N m] or demands [-], (m, 6), or fractions of the
+    thrusters' limits, (m, n)."""
     if kind.pilot:
         return np.asarray(kind.mix(vehicle) * np.reshape(scale, (-1, 1)))
     full = np.asarray(scale, float) * (np.asarray(vehicle.wrench_limits, float) if kind.wrench else 1.0)
@@ -253,48 +254,48 @@ def _columns(kind: ModeKind, vehicle: Any, scale: Any) -> Array:
 
 
 def _padded(rows: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float32]:
-    """Rows with zeros for thrusters that are not there, (..., 8)."""
+    """Return rows padded with zeros for missing thrusters, (..., 8)."""
     arrays = [np.asarray(row, np.float32) for row in rows]
     return np.stack([np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, MAX_THRUSTERS - a.shape[-1])]) for a in arrays])
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActionMode:
-    """A mode for one vehicle.
+    """Action mode for one vehicle.
 
     Note:
-        Runs on the CPU and reuses its launch buffers, so one instance belongs to one thread.
+        It runs on the CPU and reuses its launch buffers, so each instance must be used by one thread only.
     """
 
     name: str
     labels: tuple[str, ...]
     """Names of the components."""
     definition: dict[str, tuple[float, ...]]
-    """Limits and scale, as `describe` has them: `scale`, with the `limits` of the wrench at action 1 and scale 1 about
-    `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], of all channels in their units, or of
-    speed [m/s], course [rad] and depth [m] or pitch [rad]; and of an autopilot its `factors`, row by row, `gain` and
-    `dead_band` by axis [-]."""
+    """Limits and scale, as in `describe`: `scale`, with the `limits` of the wrench at action 1 and scale 1
+    about `reference` [N, N m, m], or with `lower` and `upper` of the thrusters [N], of all channels in their
+    units, or of speed [m/s], course [rad] and depth [m] or pitch [rad]; and for an autopilot its `factors`,
+    row by row, `gain` and `dead_band` by axis [-]."""
     columns: Array = field(repr=False, compare=False)
-    """Effect of each component at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m, 6), or
-    shares of the thrusters' limits, (m, n)."""
+    """Effect of each component at 1: a wrench about `reference` [N, N m] or demands of the autopilot [-], (m,
+    6), or fractions of the thrusters' limits, (m, n)."""
     thrusters: int
-    """Number of the vehicle's thrusters n, or of its channels where the mode commands them."""
+    """Number of the vehicle's thrusters n, or of its channels if the mode commands them."""
     launch: RowLaunch | None = field(repr=False, compare=False)
-    """Actions to thrusts, by `thrusts_of`; None where they take the vehicle's state."""
+    """Launch of `thrusts_of` from actions to thrusts; None if it requires the vehicle's state."""
 
     @property
     def size(self) -> int:
-        """Components of an action, m."""
+        """Number of components of an action, m."""
         return len(self.labels)
 
     @property
     def scale(self) -> tuple[float, ...]:
-        """Share of the limits that action 1 means."""
+        """Fraction of the limits that action 1 represents."""
         return self.definition["scale"]
 
     @property
     def wrench(self) -> bool:
-        """True if the components are mixed to a wrench."""
+        """True if the components are combined to a wrench."""
         return MODES[self.name].wrench
 
     @property
@@ -313,12 +314,12 @@ class ActionMode:
         return self.columns @ self.definition["lower"], self.columns @ self.definition["upper"]
 
     def to_thrusters(self, action: npt.ArrayLike) -> Array:
-        """Thrusts in canonical order [N], (..., n), for actions (..., m); components beyond +-1 saturate.
+        """Return thrusts in canonical order [N], (..., n), for actions (..., m); components beyond ±1 saturate.
 
-        In mode `surfaces` they are all channels, in their units.
+        In mode `surfaces` the result contains all channels, in their units.
 
         Raises:
-            ControlError: The action has another length, or holds NaN; or the mode needs the vehicle's state.
+            ControlError: The action has another length, or contains NaN; or the mode requires the vehicle's state.
         """
         if self.launch is None:
             raise ControlError(
@@ -329,25 +330,25 @@ class ActionMode:
         if a.shape[-1:] != (self.size,):
             raise ControlError(f"{self.name} action has shape {a.shape}, expected (..., {self.size})")
         if np.isnan(a).any():
-            raise ControlError(f"{self.name} action holds NaN: the policy or its observation is broken")
+            raise ControlError(f"{self.name} action contains NaN: the policy or its observation is broken")
         return self.launch(a)[..., : self.thrusters]
 
     def describe(self) -> dict[str, Any]:
-        """Everything that defines the mode, as plain data."""
+        """Return everything that defines the mode, as plain data."""
         numbers = {name: list(values) for name, values in self.definition.items()}
         return {"mode": self.name, "size": self.size, "labels": list(self.labels), **numbers}
 
 
 def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -> ActionMode:
-    """The mode of that name for a vehicle.
+    """Return the mode of a name for a vehicle.
 
     Args:
         name: Key of `MODES`.
-        vehicle: Its limits, thrusters and control matrix are read.
-        scale: Part of each limit that action 1 stands for [-], one number or one for each axis or thruster.
+        vehicle: Vehicle with its limits, thrusters and control matrix.
+        scale: Fraction of each limit that action 1 represents [-], one number or one for each axis or thruster.
 
     Raises:
-        ControlError: No such mode, or a scale it cannot have.
+        ControlError: There is no such mode, or the scale is invalid.
     """
     if name not in MODES:
         raise ControlError(f"unknown action mode '{name}'; available: {', '.join(MODES)}")
@@ -391,11 +392,11 @@ def action_mode(name: str, vehicle: Any, scale: float | Sequence[float] = 1.0) -
 
 
 def mode_from_dict(description: Mapping[str, Any], vehicle: Any) -> ActionMode:
-    """The mode that `describe()` recorded, for the vehicle it is to drive now.
+    """Return the mode that `describe()` recorded, for the vehicle that it will command.
 
     Raises:
-        ControlError: The vehicle's limits, names or reference are not those of the description: its actions would mean
-            something else.
+        ControlError: The vehicle's limits, names or reference differ from those of the description, so that
+            actions would have another meaning.
     """
     mode = action_mode(str(description.get("mode")), vehicle, description.get("scale", 1.0))
     here = mode.describe()

@@ -15,27 +15,27 @@ from finssim.control import ControlError
 __all__ = ["AT_REST", "Motor", "MotorMap", "MotorMemory", "PulseMemory", "TurningDirection"]
 
 
-# One motor: the shaft speed to command for a thrust, small thrusts as pulses that are right on average.
+# One motor: the shaft speed to command for a thrust, with small thrusts as pulses that are correct on average.
 #
-# A motor does not turn below a slowest speed, so the thrust of that speed is the least one that can be held. Anything
-# smaller thrusts are delivered on average: the motor runs at its slowest speed in pulses, set by the owed impulse.
+# A motor does not turn below a minimum speed, so the thrust at that speed is the least that can be held. Smaller
+# thrusts are delivered on average: the motor runs at its minimum speed in pulses, controlled by the owed impulse.
 #
 #     owed_dot = f - T(ω),      a pulse begins at owed = +h and ends at owed = -h,      h = T_slow t_pulse / 2
 #
-# ω follows the pulses through the motor's first-order lag; without lag a constant f becomes pulses and gaps of at least
-# t_pulse each, with a period of t_pulse T_slow² / (f (T_slow - f)). The impulse is never much more than one pulse,
-# T_slow t_pulse, away from what was asked. What jitters around zero without a mean owes nothing and starts no pulse.
+# ω follows the pulses through the motor's first-order lag; without lag a constant f results in pulses and gaps of at
+# least t_pulse each, with a period of t_pulse T_slow² / (f (T_slow - f)). The impulse differs from the requested one by
+# hardly more than one pulse, T_slow t_pulse. A request that jitters around zero mean starts no pulse.
 
 
 class PulseMemory(NamedTuple):
-    """State of one motor's pulses from one call to the next."""
+    """State of one motor's pulses between calls."""
 
     owed: float
-    """Impulse that was asked for and not delivered [N s]."""
+    """Impulse that was requested and not yet delivered [N s]."""
     pulse: float
     """Direction of the running pulse [-]: -1, 0 or 1."""
     shaft: float
-    """Shaft speed that the pulses left, by the model [rad/s]."""
+    """Modelled shaft speed due to the pulses [rad/s]."""
 
 
 AT_REST = PulseMemory(0.0, 0.0, 0.0)
@@ -43,19 +43,19 @@ AT_REST = PulseMemory(0.0, 0.0, 0.0)
 
 
 class TurningDirection(NamedTuple):
-    """One direction of turning."""
+    """Parameters of one direction of rotation."""
 
     c: float
-    """T = c ω² [N s²/rad²]."""
+    """Coefficient of T = c ω² [N s²/rad²]."""
     slowest: float
-    """Least thrust that is held steadily [N]; 0 where every speed turns the shaft."""
+    """Least thrust that can be held steadily [N]; 0 if every speed turns the shaft."""
     half: float
-    """Half a pulse, h [N s]."""
+    """Half of a pulse, h [N s]."""
 
 
 @dataclass(frozen=True)
 class Motor:
-    """Numbers of one motor."""
+    """Parameters of one motor."""
 
     plus: TurningDirection
     minus: TurningDirection
@@ -63,24 +63,24 @@ class Motor:
     """Time constant of the shaft speed [s]."""
 
     def step(self, requested: float, memory: PulseMemory, dt: float) -> tuple[float, PulseMemory]:
-        """The shaft speed to command until the next call.
+        """Return the shaft speed to command until the next call.
 
         Args:
             requested: Thrust within the limits [N].
-            memory: From the call before, or `AT_REST`.
-            dt: How long the command will stand [s].
+            memory: Memory from the previous call, or `AT_REST`.
+            dt: Duration of the command [s].
 
         Returns:
-            Speed [rad/s]: exactly 0 for a thrust of 0, which also forgets what is owed; and the memory after.
+            Speed [rad/s]: exactly 0 for a thrust of 0, which also clears the owed impulse; and the new memory.
         """
         if requested == 0.0:
             return 0.0, AT_REST
         direction, side = (1.0, self.plus) if requested > 0.0 else (-1.0, self.minus)
         size = requested * direction
         if size >= side.slowest:
-            # How a held thrust builds up and dies away is the lag of any motor, and not owed to anybody.
+            # The build-up and decay of a held thrust is the lag of any motor, and is not counted as owed.
             return direction * math.sqrt(size / side.c), PulseMemory(memory.owed, 0.0, 0.0)
-        # A pulse never runs against the request: of another sign, what is owed is worked off by the gaps.
+        # A pulse never opposes the request: an owed impulse of the other sign is reduced by the gaps.
         running = memory.pulse == direction
         on = memory.owed * direction > (-side.half if running else side.half)
         pulse = direction if on else 0.0
@@ -89,11 +89,12 @@ class Motor:
         return target, PulseMemory(memory.owed + requested * dt - delivered, pulse, shaft)
 
     def _lagged(self, speed: float, target: float, dt: float) -> tuple[float, float]:
-        """Shaft speed after dt of a first-order lag [rad/s], and the impulse of its thrust meanwhile [N s].
+        """Return the shaft speed after dt of a first-order lag [rad/s], and the impulse of its thrust in that
+        time [N s].
 
         ∫(a + b e^{-t/τ})² dt = a² dt + 2 a b τ (1 - e) + b² τ (1 - e²) / 2,    a = target, b = speed - a, e = e^{-dt/τ}
 
-        A change of sign in between is charged to the direction that lasts longer.
+        A change of sign in between is attributed to the direction that lasts longer.
         """
         decay = math.exp(-dt / self.lag)
         gap = speed - target
@@ -106,21 +107,22 @@ class Motor:
 
 Array = npt.NDArray[np.float64]
 MotorMemory = tuple[PulseMemory, ...]
-"""State of the map from one call to the next, one entry per thruster in canonical order."""
+"""State of the map between calls, one entry per thruster in canonical order."""
 
 RPM = 2.0 * math.pi / 60.0
-"""One rpm in rad/s."""
+"""Angular velocity of one rpm [rad/s]."""
 SLOWEST_MARGIN = 1.1
-"""Ratio of the speed of a pulse to the slowest speed in the vehicle file, at which a motor might not turn."""
+"""Ratio of the speed of a pulse to the minimum speed in the vehicle file, at which a motor might not turn."""
 SHORTEST_PULSE = 0.05
-"""[s]; three periods of a loop at 60 Hz, for motors faster than that."""
+"""Duration of the shortest pulse [s]; three periods of a loop at 60 Hz, for motors with a shorter lag."""
 
 
 class MotorMap:
-    """Thrusts in canonical order to normalised shaft speeds in the motor controller's order, and back.
+    """Map from thrusts in canonical order to normalised shaft speeds in the motor controller's order, and back.
 
     Note:
-        The controller regulates shaft speed, so the lag is taken to act on it, whatever `domain` the simulator uses.
+        The controller regulates shaft speed, so the lag is assumed to apply to it, whatever `domain` the
+        simulator uses.
     """
 
     def __init__(
@@ -131,17 +133,17 @@ class MotorMap:
         full_scale: float,
         outputs: int,
     ) -> None:
-        """Tables of one vehicle.
+        """Create the map of one vehicle.
 
         Args:
             thrusters: `vehicles.Thruster`, canonical order, n of them.
-            index: Output of each, (n,).
-            sign: Between positive thrust and positive command, (n,).
-            full_scale: Shaft speed of a command of 1 [rpm].
-            outputs: Outputs of the controller.
+            index: Output of each thruster, (n,).
+            sign: Sign between positive thrust and positive command, (n,).
+            full_scale: Shaft speed at a command of 1 [rpm].
+            outputs: Number of outputs of the controller.
 
         Raises:
-            ControlError: Outputs that do not exist or are used twice.
+            ControlError: An output does not exist or is used twice.
         """
         if len(set(index)) != len(index) or any(not 0 <= k < outputs for k in index):
             raise ControlError(
@@ -153,14 +155,14 @@ class MotorMap:
         self.full_scale = float(full_scale)
         self._c = _sides([t.c_minus for t in thrusters], [t.c_plus for t in thrusters])
         rpm = _sides([t.rpm_min for t in thrusters], [t.rpm_max for t in thrusters])
-        # Short of full scale by rounding, so that no command comes out as 1.0000000000000002.
+        # Slightly below full scale, so that no command is rounded to 1.0000000000000002.
         reach = self._c * (np.minimum(np.abs(rpm), full_scale) * RPM) ** 2 * (1.0 - 1e-12)
         self.lower: Array = -np.minimum([-t.force_min for t in thrusters], reach[0])
         self.upper: Array = np.minimum([t.force_max for t in thrusters], reach[1])
         dead = _sides([t.dead_rpm_minus for t in thrusters], [t.dead_rpm_plus for t in thrusters])
         slowest = self._c * (SLOWEST_MARGIN * dead * RPM) ** 2
         self.slowest: Array = np.minimum(slowest, np.stack([-self.lower, self.upper]))
-        """Least thrust that is held steadily, reverse and forward, as magnitudes [N], (2, n)."""
+        """Least thrust that can be held steadily, reverse and forward, as magnitudes [N], (2, n)."""
         self._motors = [self._motor(k, t.time_constant) for k, t in enumerate(thrusters)]
         self._channels = list(
             zip(index, (self.sign / (full_scale * RPM)).tolist(), self._motors, strict=True)
@@ -168,7 +170,7 @@ class MotorMap:
 
     @classmethod
     def from_vehicle(cls, vehicle: Any) -> MotorMap:
-        """Map of a vehicle; canonical order where no thruster names a motor, sign +1 where it names none.
+        """Return the map of a vehicle; canonical order if no thruster names a motor, sign +1 if it is omitted.
 
         Raises:
             ControlError: Only some thrusters have `motor_index` and `motor_sign`.
@@ -192,11 +194,11 @@ class MotorMap:
         return len(self._motors)
 
     def reset(self) -> MotorMemory:
-        """Memory of motors at rest that owe nothing."""
+        """Return the memory of motors at rest without owed impulse."""
         return (AT_REST,) * self.thrusters
 
     def limited(self, force: npt.ArrayLike) -> Array:
-        """Thrusts within force, shaft speed and full-scale limits, canonical order [N], (..., n).
+        """Return thrusts limited by force, shaft speed and full scale, canonical order [N], (..., n).
 
         Args:
             force: Thrusts along the thrusters' axes, canonical order [N], (..., n).
@@ -205,12 +207,14 @@ class MotorMap:
         return limited
 
     def force(self, rpm: npt.ArrayLike) -> Array:
-        """Steady thrust of canonical shaft speeds [rpm] -> [N], (..., n)                      (paper, eq. 16)."""
+        """Return the steady thrust of canonical shaft speeds [rpm] -> [N], (..., n)
+        (paper, eq. 16)."""
         omega = np.asarray(rpm, float) * RPM
         return np.asarray(np.where(omega < 0.0, self._c[0], self._c[1]) * omega * np.abs(omega))
 
     def canonical_rpm(self, motor_rpm: npt.ArrayLike) -> Array:
-        """Shaft speeds in canonical order, positive for positive thrust, from those of the outputs, (..., n) [rpm]."""
+        """Return shaft speeds in canonical order, positive for positive thrust, from those of the outputs,
+        (..., n) [rpm]."""
         return np.asarray(np.asarray(motor_rpm, float)[..., self.index] * self.sign)
 
     def normalised(
@@ -219,13 +223,13 @@ class MotorMap:
         """Return the command to send to the controller until the next call.
 
         Args:
-            force: Thrusts asked for, along the thrusters' axes, canonical order [N], (n,); finite.
-            memory: From the call before, or `reset()`.
-            dt: How long the command will stand; the time since the call before will do [s].
+            force: Requested thrusts, along the thrusters' axes, canonical order [N], (n,); finite.
+            memory: Memory from the previous call, or `reset()`.
+            dt: Duration of the command, approximately the time since the previous call [s].
 
         Returns:
-            Part of full scale per output, (outputs,), in [-1, 1]; the thrusts delivered on average [N], (n,), which
-            are those asked for within the limits; and the memory after.
+            Fraction of full scale per output, (outputs,), in [-1, 1]; the thrusts delivered on average [N],
+            (n,), which are the requested ones within the limits; and the new memory.
         """
         requested = self.limited(force)
         outputs = [0.0] * self.outputs
@@ -248,5 +252,5 @@ class MotorMap:
 
 
 def _sides(minus: Any, plus: Any) -> Array:
-    """Reverse and forward numbers stacked, (2, n)."""
+    """Return reverse and forward numbers stacked, (2, n)."""
     return np.stack([np.array(minus, float), np.array(plus, float)])

@@ -1,4 +1,4 @@
-"""Following a path in space with vehicles that must move to steer: waypoints, line of sight, and the seabed."""
+"""Path following in space with vehicles that must move to steer: waypoints, line of sight, and terrain following."""
 
 from __future__ import annotations
 
@@ -18,31 +18,32 @@ Indices = npt.NDArray[np.int64]
 
 
 class PathErrors(NamedTuple):
-    """Places of n vehicles beside the leg that each follows."""
+    """Positions of n vehicles relative to the leg that each follows."""
 
     course: Array
     """Direction of the leg, counter-clockwise from the world's x axis [rad], (n,)."""
     slope: Array
-    """Its pitch, positive downwards [rad], (n,)."""
+    """Pitch of the leg, positive downwards [rad], (n,)."""
     along: Array
-    """Way along the leg from its start [m], (n,)."""
+    """Distance along the leg from its start [m], (n,)."""
     across: Array
-    """Distance to the left of the leg, level [m], (n,)."""
+    """Horizontal distance to the left of the leg [m], (n,)."""
     above: Array
     """Distance above the leg, perpendicular to it [m], (n,)."""
     remaining: Array
-    """Way along the leg to its end [m], (n,)."""
+    """Distance along the leg to its end [m], (n,)."""
 
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Straight legs from point to point, one after the other.
+    """Straight legs between successive points.
 
-    A leg is left within the radius of acceptance of its end, or beyond the plane across its end.
+    The next leg starts within the radius of acceptance of a leg's end, or beyond the plane perpendicular to
+    the leg at its end.
     """
 
     points: Array
-    """World frame [m], (k, 3)."""
+    """Points in the world frame [m], (k, 3)."""
     radius: float = 2.0
     """Radius of acceptance [m]."""
 
@@ -55,7 +56,7 @@ class Waypoints:
         equal = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) == 0.0)
         if len(equal):
             raise ControlError(
-                f"waypoints {equal[0] + 1} and {equal[0] + 2} are one point: leave one of them out"
+                f"waypoints {equal[0] + 1} and {equal[0] + 2} are the same point: omit one of them"
             )
         if not self.radius > 0.0:
             raise ControlError(
@@ -65,9 +66,9 @@ class Waypoints:
 
     @classmethod
     def along(cls, trajectory: Guide, spacing: float = 1.0) -> Waypoints:
-        """Return the path of a guide with an end, without its times, as legs of about a `spacing` [m].
+        """Return the path of a guide with finite duration, without its times, as legs of about a `spacing` [m].
 
-        The radius of acceptance is so small that legs are left at their ends.
+        The radius of acceptance is so small that legs are completed at their ends.
         """
         t = np.linspace(0.0, trajectory.duration, 4001)
         x = trajectory.at(t).position
@@ -82,17 +83,17 @@ class Waypoints:
         return len(self.points) - 1
 
     def reset(self, n: int = 1) -> Indices:
-        """Return the leg at the start, 0, of n vehicles, (n,)."""
+        """Return the initial leg, 0, of n vehicles, (n,)."""
         return np.zeros(n, dtype=np.int64)
 
     def errors(
         self, leg: Indices, position: npt.ArrayLike
     ) -> tuple[PathErrors, Indices, npt.NDArray[np.bool_]]:
-        """Return the errors beside the path, the leg of each vehicle, and whether it has finished the last.
+        """Return the path errors, the leg of each vehicle, and whether it has completed the last leg.
 
         Args:
-            leg: From `reset` or the call before, (n,).
-            position: World frame [m], (n, 3).
+            leg: Legs from `reset` or the previous call, (n,).
+            position: Positions in the world frame [m], (n, 3).
         """
         x = np.atleast_2d(np.asarray(position, float))
         for _ in range(self.legs):
@@ -117,20 +118,20 @@ class Waypoints:
 
 @dataclass(frozen=True)
 class PathGuide:
-    """Straight legs from point to point as a guide, each in a second: for those who follow the path without its
-    times."""
+    """Straight legs between successive points as a guide, each in one second, for controllers that follow the
+    path without its times."""
 
     points: Array
-    """World frame [m], (k, 3)."""
+    """Points in the world frame [m], (k, 3)."""
     name: str = "path"
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return float(len(self.points) - 1)
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """Return the place at times since the start [s], (...), with the world's x axis for a heading."""
+        """Return the position at times since the start [s], (...), with a heading along the world's x axis."""
         time = np.clip(np.asarray(t, float), 0.0, self.duration)
         k = np.minimum(time.astype(int), len(self.points) - 2)
         way = self.points[k + 1] - self.points[k]
@@ -144,28 +145,29 @@ class LineOfSight:
 
         course = course of the path - atan((y + s Y) / D),   Y' = D y / ((y + s Y)² + D²)
 
-    and the slope likewise (Børhaug, Pavlov and Pettersen 2008). Far away the integral hardly moves, so that it does not
-    wind up.
+    and the slope accordingly (Børhaug, Pavlov and Pettersen 2008). Far from the path the integral hardly
+    changes, which prevents windup.
     """
 
     look_ahead: float
-    """D [m]."""
+    """Look-ahead distance D [m]."""
     gain: float = 0.2
-    """s: the integral's share for an autopilot of the course over ground is small, for it crabs by itself [1/s]."""
+    """Integral gain s [1/s]: small for an autopilot of the course over ground, which already compensates the
+    drift."""
     steepest: float = math.radians(25.0)
     """Greatest slope [rad]."""
 
     def reset(self, n: int = 1) -> Array:
-        """Return the integrals at the start [m s], (n, 2)."""
+        """Return the initial integrals [m s], (n, 2)."""
         return np.zeros((n, 2))
 
     def aim(self, memory: Array, errors: PathErrors, period: float) -> tuple[tuple[Array, Array], Array]:
-        """Return course and slope to take [rad], (n,) each, and the integrals after.
+        """Return the commanded course and slope [rad], (n,) each, and the new integrals.
 
         Args:
-            memory: Y of both [m s], (n, 2).
-            errors: Of `Waypoints.errors`.
-            period: Time since the aim before [s].
+            memory: Integrals Y of both [m s], (n, 2).
+            errors: Errors from `Waypoints.errors`.
+            period: Time since the previous call [s].
         """
         off = np.column_stack([errors.across, errors.above])
         leading = off + self.gain * memory
@@ -178,34 +180,35 @@ class LineOfSight:
 
 @dataclass(frozen=True)
 class SeabedFollower:
-    """The depth that keeps an altitude over a seabed that an altimeter sees.
+    """Depth command that keeps an altitude over a seabed measured by an altimeter.
 
-    The depth of the seabed, own depth plus range, and its slope along the way are estimated by an alpha-beta filter.
+    The depth of the seabed, vehicle depth plus range, and its slope along the path are estimated by an
+    alpha-beta filter.
     """
 
     altitude: float
-    """To keep [m]."""
+    """Altitude to keep [m]."""
     time_constant: float = 1.5
     """Time constant of the filter [s]."""
     ahead: float = 1.0
     """Time for which the slope is extrapolated [s]."""
 
     def reset(self, n: int = 1) -> Array:
-        """Return depth of the seabed [m] and its rate [m/s] at the start: not known, (n, 2)."""
+        """Return the initial depth of the seabed [m] and its rate [m/s]: unknown, (n, 2)."""
         return np.full((n, 2), np.nan)
 
     def depth(
         self, memory: Array, depth: npt.ArrayLike, altitude: npt.ArrayLike, period: float
     ) -> tuple[Array, Array, Array]:
-        """Return the depth to take [m] and its rate [m/s], (n,) each, and the memory after.
+        """Return the commanded depth [m] and its rate [m/s], (n,) each, and the new memory.
 
-        It is the own depth until the seabed was seen.
+        It is the vehicle's depth until the first measurement of the seabed.
 
         Args:
-            memory: From `reset` or the call before [m, m/s], (n, 2).
-            depth: Of the vehicle below the surface [m], (n,).
-            altitude: What the altimeter measured above the seabed [m], (n,); not finite where it saw nothing.
-            period: Time since the call before [s].
+            memory: Memory from `reset` or the previous call [m, m/s], (n, 2).
+            depth: Depth of the vehicle below the surface [m], (n,).
+            altitude: Altitude measured above the seabed [m], (n,); not finite without a measurement.
+            period: Time since the previous call [s].
         """
         own = np.asarray(depth, float)
         seen = np.where(np.isfinite(altitude), own + np.asarray(altitude, float), np.nan)

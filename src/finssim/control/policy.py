@@ -1,8 +1,8 @@
 """Trained policies as directories: `policy.yaml` describes inputs and outputs, `policy.onnx` is the network.
 
-The same directory is run by the evaluation, by the robot and by the virtual pool, with onnxruntime and without torch.
-What a policy was trained with is part of it, and `Policy.load` refuses to run it with anything else: a network fed in
-another order, or multiplied by other limits, still answers, and answers wrongly.
+The same directory is run by the evaluation, by the robot and by the virtual pool, with onnxruntime and
+without torch. It includes the conditions of the training, and `Policy.load` refuses to run it under others: a
+network with a different order of inputs or other limits would still return actions, but wrong ones.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from finssim.core.files import atomic_directory
 from finssim.core.page import notebook_html
 from finssim.core.yaml_file import first_problem, read_mapping
 
-# `policy.yaml`: its schema, and how two descriptions are compared.
+# `policy.yaml`: its schema, and the comparison of two descriptions.
 
 
 FORMAT = 1
+"""Version of the directory's layout; increased if an older reader would misinterpret it."""
 LARGEST = 1 << 20
-"""Numbers in an observation, an action or a memory."""
-"""Version of the directory's layout; raised when an older reader would misread it."""
+"""Largest number of elements of an observation, an action or a memory."""
 
 NETWORK_FILE = "policy.onnx"
 DESCRIPTION_FILE = "policy.yaml"
 
 
 class PolicyError(ValueError):
-    """A policy directory cannot be read, or does not fit what it is asked to control."""
+    """Policy directory that cannot be read, or does not match the vehicle that it is to control."""
 
 
 class _Record(BaseModel):
@@ -45,18 +45,18 @@ class _Record(BaseModel):
 
 
 class ObservationEntry(_Record):
-    """A run of observation elements holding one quantity, as clip(quantity / scale)."""
+    """Contiguous observation elements of one quantity, as clip(quantity / scale)."""
 
     name: str
     """Name of the quantity with its frame, such as `position_error_body`."""
     indices: tuple[int, ...]
     """Indices of its components in the observation, in order."""
     unit: str
-    """Unit of the quantity before division; "1" when it has none."""
+    """Unit of the quantity before division; "1" if dimensionless."""
     scale: float = Field(default=1.0, gt=0.0)
     """Divisor, in `unit`."""
     clip: tuple[float, float] | None = None
-    """Bounds (low, high) put on the divided value [-], or None."""
+    """Bounds (low, high) of the divided value [-], or None."""
 
 
 class ObservationSchema(_Record):
@@ -69,16 +69,16 @@ class ObservationSchema(_Record):
     def _covers_every_index_once(self) -> ObservationSchema:
         indices = sorted(index for entry in self.entries for index in entry.indices)
         if indices != list(range(self.size)):
-            raise ValueError(f"entries hold indices {indices}, expected each of 0 to {self.size - 1} once")
+            raise ValueError(f"entries contain indices {indices}, expected each of 0 to {self.size - 1} once")
         return self
 
     def name_at(self, index: int) -> str:
-        """Name of the entry that holds observation element `index`."""
+        """Return the name of the entry with observation element `index`."""
         return next(entry.name for entry in self.entries if index in entry.indices)
 
 
 class VehicleIdentity(_Record):
-    """The vehicle a policy was trained for."""
+    """Vehicle that a policy was trained for."""
 
     name: str
     sha256: str
@@ -92,24 +92,24 @@ class PolicyDescription(_Record):
     task: str
     observation: ObservationSchema
     pictures: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Pictures besides the observation, by the name of the entry of the vehicle's `perception`: device, shape (height,
-    width, 3), rate [Hz] and latency [s]."""
+    """Pictures in addition to the observation, by the name of the entry of the vehicle's `perception`:
+    device, shape (height, width, 3), rate [Hz] and latency [s]."""
     action: dict[str, Any]
-    """The action mode, as its `describe()` gives it: at least `mode` (name), `size`, and its limits and scale."""
+    """Action mode, as returned by its `describe()`: at least `mode` (name), `size`, and its limits and scale."""
     control_period: float = Field(ge=1e-3, le=10.0)
-    """Time between two actions [s]."""
+    """Interval between two actions [s]."""
     memory: int = Field(default=0, ge=0, le=LARGEST)
-    """Numbers that the network hands on to its next action, zeros at an episode's start; 0: it remembers nothing."""
+    """Size of the network's recurrent state, which is zero at an episode's start; 0 for a network without memory."""
     vehicle: VehicleIdentity
     hydrodynamics: str
-    """Hydrodynamic set or model it was trained in."""
+    """Hydrodynamic set or model used in training."""
     seed: int
     training: dict[str, Any] = Field(default_factory=dict)
-    """Training configuration, complete enough to repeat the run."""
+    """Training configuration, complete enough to repeat the training."""
     provenance: dict[str, Any] = Field(default_factory=dict)
     """Git revision, package versions and platform."""
     created: str = ""
-    """When it was written, ISO 8601, UTC."""
+    """Time of creation, ISO 8601, UTC."""
     files: dict[str, str] = Field(default_factory=dict)
     """SHA-256 of the other files of the directory that must not change (the network)."""
 
@@ -143,7 +143,7 @@ class PolicyDescription(_Record):
 
 
 def read_file(path: Path) -> bytes:
-    """Content of one file of a policy directory; a `PolicyError` where it cannot be read."""
+    """Return the content of one file of a policy directory; raise a `PolicyError` if it cannot be read."""
     try:
         return read_bytes(path, PolicyError)
     except PolicyError as error:
@@ -151,7 +151,8 @@ def read_file(path: Path) -> bytes:
 
 
 def read_description(folder: Path) -> PolicyDescription:
-    """`policy.yaml` of a directory, checked; a `PolicyError` names the file, the key and what is expected there."""
+    """Return the validated `policy.yaml` of a directory; a `PolicyError` names the file, the key and the
+    expected value."""
     path = folder / DESCRIPTION_FILE
     if not folder.is_dir():
         raise PolicyError(f"{folder}: no such policy directory: give the folder that `finssim train` wrote")
@@ -165,7 +166,7 @@ def read_description(folder: Path) -> PolicyDescription:
 
 
 def plain_data(value: Any) -> Any:
-    """`value` as the YAML file would give it back: NumPy arrays and tuples become lists, NumPy scalars Python's."""
+    """Return `value` as read back from YAML: NumPy arrays and tuples become lists, NumPy scalars Python scalars."""
     if isinstance(value, Mapping):
         return {str(key): plain_data(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -176,13 +177,13 @@ def plain_data(value: Any) -> Any:
 
 
 def first_difference(trained: Any, actual: Any, path: str, tolerance: float = 1e-9) -> str | None:
-    """Return where two pieces of plain data first differ, as "PATH is A in the policy and B here", or None.
+    """Return the first difference of two pieces of plain data, as "PATH is A in the policy and B here", or None.
 
     Args:
-        trained: What the policy has.
-        actual: What there is.
-        path: Name of both.
-        tolerance: Relative difference of numbers that is none [-].
+        trained: Data of the policy.
+        actual: Data to compare.
+        path: Path of both in the message.
+        tolerance: Relative difference of numbers that is ignored [-].
     """
     if isinstance(trained, dict) and isinstance(actual, dict):
         for key in [*trained, *(key for key in actual if key not in trained)]:
@@ -203,7 +204,7 @@ def first_difference(trained: Any, actual: Any, path: str, tolerance: float = 1e
 
 
 OUTPUTS = ["action", "memory_after"]
-"""Outputs of the network; the second only of a network with memory."""
+"""Outputs of the network; the second only for a network with memory."""
 
 
 class Identified(Protocol):
@@ -217,12 +218,12 @@ class Identified(Protocol):
 
 
 class Policy:
-    """A trained policy: observation in, action in [-1, 1] out. Make one with `Policy.load`.
+    """Trained policy, from an observation to an action in [-1, 1]. Create one with `Policy.load`.
 
     Attributes:
-        description: What `policy.yaml` says.
-        folder: The policy directory that it was read from.
-        vehicle: The vehicle that it was loaded for; None where that was not checked.
+        description: Content of `policy.yaml`.
+        folder: Policy directory that it was read from.
+        vehicle: Vehicle that it was loaded for; None if that was not checked.
     """
 
     def __init__(
@@ -243,16 +244,16 @@ class Policy:
         task: Mapping[str, Any] | None = None,
         mode: Mapping[str, Any] | None = None,
     ) -> Policy:
-        """Reads a policy directory and checks that it fits what it will control; what is None goes unchecked.
+        """Read a policy directory and check that it matches its application; arguments that are None are not checked.
 
         Args:
             directory: Folder with `policy.yaml` and `policy.onnx`.
-            vehicle: The vehicle it will control; its SHA-256 must be the one trained with.
-            task: The task's description, with keys `name` and `observation` (the schema as plain data).
-            mode: The action mode's `describe()`: name, size, limits, scale.
+            vehicle: Vehicle to control; its SHA-256 must equal that in training.
+            task: Description of the task, with keys `name` and `observation` (the schema as plain data).
+            mode: Result of the action mode's `describe()`: name, size, limits, scale.
 
         Raises:
-            PolicyError: One sentence naming the file or the first value that does not fit.
+            PolicyError: The message is one sentence with the file or the first value that does not match.
         """
         folder = Path(directory)
         description = read_description(folder)
@@ -261,7 +262,9 @@ class Policy:
         if mode is not None:
             difference = first_difference(description.action, plain_data(mode), "action")
             if difference:
-                raise PolicyError(f"{folder}: action does not fit: {difference}: train again with this mode")
+                raise PolicyError(
+                    f"{folder}: action does not match: {difference}: train again with this mode"
+                )
         if vehicle is not None and vehicle.sha256 != description.vehicle.sha256:
             trained = description.vehicle
             raise PolicyError(
@@ -274,7 +277,7 @@ class Policy:
         """Copy the policy directory, and return the copy's path.
 
         Raises:
-            OutputError: The directory holds something other than a policy, or cannot be written.
+            OutputError: The directory contains something other than a policy, or cannot be written.
         """
         with atomic_directory(directory, replaces=DESCRIPTION_FILE) as folder:
             shutil.copytree(self.folder, folder, dirs_exist_ok=True)
@@ -298,24 +301,25 @@ class Policy:
         return notebook_html("Policy", ("", ""), rows)
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Action for each observation, of a policy without memory.
+        """Return the action for each observation, for a policy without memory.
 
         Args:
-            observation: Scaled and clipped [-] as the schema says, shape (..., n); taken as float32.
+            observation: Scaled and clipped observation [-] according to the schema, shape (..., n); converted
+                to float32.
 
         Returns:
-            Action in [-1, 1], shape (..., m); its meaning is `description.action`.
+            Action in [-1, 1], shape (..., m); `description.action` defines its meaning.
 
         Raises:
-            PolicyError: An observation has another length than n, or an element that is not finite; or the policy has a
-                memory.
+            PolicyError: An observation does not have length n, or an element is not finite; or the policy has
+                a memory.
         """
         return self.step(None, observation)[0]
 
     def reset(self, n: int) -> NDArray[np.float32] | None:
-        """Return the memory at the start of n episodes, (n, k); None for a policy without memory.
+        """Return the initial memory of n episodes, (n, k); None for a policy without memory.
 
-        The memory has no unit [-].
+        The memory is dimensionless [-].
         """
         k = self.description.memory
         return np.zeros((n, k), dtype=np.float32) if k else None
@@ -326,19 +330,19 @@ class Policy:
         observation: ArrayLike,
         pictures: Mapping[str, NDArray[np.uint8]] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Actions, and the memory to give with the next observations.
+        """Return actions, and the memory for the next step.
 
         Args:
-            memory: From `reset`, or from the step before, with a row for each observation.
-            observation: As `act` takes it.
-            pictures: What it sees by name, uint8 (rows, height, width, channels), a row for each observation; None
-                where it sees nothing.
+            memory: Memory from `reset` or the previous step, with a row for each observation.
+            observation: Observation as for `act`.
+            pictures: Pictures by name, uint8 (rows, height, width, channels), a row for each observation;
+                None for a policy without pictures.
 
         Returns:
-            Actions as of `act`, and the memory after.
+            Actions as from `act`, and the new memory.
 
         Raises:
-            PolicyError: As of `act`; or memory or pictures are not this policy's.
+            PolicyError: As for `act`; or memory or pictures do not match this policy.
         """
         x = self._checked(observation)
         rows, k = x.reshape(-1, self._size), self.description.memory
@@ -347,7 +351,7 @@ class Policy:
         if shape != expected:
             labels = [f"one of shape {s}" if s else "no memory" for s in (shape, expected)]
             raise PolicyError(
-                f"the policy is given {labels[0]}, expected {labels[1]}: begin with what reset gives"
+                f"the policy received {labels[0]}, expected {labels[1]}: start with the result of reset"
             )
         inputs: dict[str, Any] = {"memory": np.asarray(memory, dtype=np.float32)} if k else {}
         for name, about in self.description.pictures.items():
@@ -356,14 +360,14 @@ class Policy:
             if picture is None or picture.shape != expected_shape or picture.dtype != np.uint8:
                 got = "nothing" if picture is None else f"{picture.dtype} {picture.shape}"
                 raise PolicyError(
-                    f"the policy sees {name}: it is given {got}, expected uint8 {expected_shape}"
+                    f"the policy requires picture {name}: it received {got}, expected uint8 {expected_shape}"
                 )
             inputs[name] = picture
         action, *after = self._session.run(OUTPUTS[: 1 + bool(k)], {"observation": rows, **inputs})
         return action.reshape(*x.shape[:-1], action.shape[-1]), after[0] if after else None
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """The observation, if it is of the right length and finite."""
+        """Return the observation, after checking that it has the correct length and is finite."""
         x = np.asarray(observation, dtype=np.float32)
         if x.ndim == 0 or x.shape[-1] != self._size:
             length = x.shape[-1] if x.ndim else "no"
@@ -381,7 +385,7 @@ class Policy:
 
 
 def _open_network(folder: Path, description: PolicyDescription) -> Any:
-    """The network as an onnxruntime session on one thread: a batch of one gains nothing from more."""
+    """Return the network as an onnxruntime session with one thread: more threads do not accelerate a batch of one."""
     path = folder / NETWORK_FILE
     content = read_file(path)
     digest = hashlib.sha256(content).hexdigest()
@@ -406,7 +410,9 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
     try:
         with limited_memory():
             session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises a class per error code, with no common base but Exception
+    except (
+        Exception
+    ) as error:  # onnxruntime raises a class per error code, without a common base other than Exception
         raise refused(error) from error
     k = [description.memory] if description.memory else []
     shapes: list[Any] = [tuple(picture["shape"]) for picture in description.pictures.values()]
@@ -439,7 +445,7 @@ def _open_network(folder: Path, description: PolicyDescription) -> Any:
     timer = threading.Timer(SECONDS, setattr, (stop, "terminate", True))
     timer.daemon = True
     timer.start()
-    try:  # once, so that what it needs shows here and not on the way
+    try:  # run once, so that missing requirements appear here and not during operation
         with limited_memory():
             session.run(names[1], zeros, stop)
     except Exception as error:
@@ -458,5 +464,5 @@ def _check_task(folder: Path, description: PolicyDescription, task: Mapping[str,
     difference = first_difference(trained, current, "observation")
     if difference:
         raise PolicyError(
-            f"{folder}: observation schema does not fit: {difference}: train again with this task"
+            f"{folder}: observation schema does not match: {difference}: train again with this task"
         )

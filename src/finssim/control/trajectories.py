@@ -1,4 +1,4 @@
-"""Trajectories to follow: shapes, the published ones by name, and anyone's own from a file."""
+"""Trajectories: shapes, the published trajectories by name, and user-defined ones from a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from finssim.core.yaml_file import read_mapping
 from finssim.vehicles import Vehicle
 from finssim.vehicles.defaults import room
 
-# Shapes that a trajectory can follow: position and its exact derivative as functions of time.
+# Shapes of trajectories: position and its exact derivative as functions of time.
 #
 # A shape lies in the horizontal plane z = `depth` (negative under water) unless stated otherwise. In the paper's
 # controller frame that is the x-z plane: its x is ours, its z is our y, both at y = depth.
@@ -31,26 +31,26 @@ Array = npt.NDArray[np.float64]
 Motion = Callable[[Array], tuple[Array, Array]]
 """Times since the start [s], (...) -> position [m] and velocity [m/s], world frame, (..., 3) each."""
 Timed = tuple[float, Motion]
-"""A motion and its duration [s]."""
+"""Motion and its duration [s]."""
 
 DEPTH = -0.5
 """Height of the published trajectories [m]."""
 
 TABLE_SIZE = 2048
-"""Knots of the ellipse's table: its spline is then exact to 1e-10 rad."""
+"""Number of knots of the ellipse's table: its spline is then accurate to 1e-10 rad."""
 
 
 def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> Timed:
-    """Return straight segments from point to point, each from rest to rest: s = 3u² - 2u³.
+    """Return straight segments between successive points, each from rest to rest: s = 3u² - 2u³.
 
-    Points are [x, y, z, yaw] in [m] and [rad], durations in [s]; so is the result.
+    Points are [x, y, z, yaw] in [m] and [rad], durations in [s]; the result has the same units.
 
     Args:
         points: Corners, world frame [m], (n + 1, 3).
-        durations: Time for each segment [s], (n,).
+        durations: Duration of each segment [s], (n,).
 
     Raises:
-        ControlError: Lengths do not fit, or a time is not positive.
+        ControlError: Lengths do not match, or a duration is not positive.
     """
     corners, times = np.asarray(points, float), np.asarray(durations, float)
     if corners.ndim != 2 or corners.shape[1:] != (3,) or times.shape != (len(corners) - 1,):
@@ -70,14 +70,14 @@ def polyline(points: Sequence[Sequence[float]], durations: Sequence[float]) -> T
 
 
 def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -> Timed:
-    """Circles about the pool's middle at constant speed, counter-clockwise from (radius, 0).
+    """Return circles about the pool's centre at constant speed, counter-clockwise from (radius, 0).
 
     Lengths and the result are in [m], times in [s].
 
     Args:
-        radius: [m]
+        radius: Radius [m].
         turns: Number of circles.
-        duration: Time for all of them [s].
+        duration: Total duration [s].
         depth: Height of their plane, world frame [m]: negative under water.
     """
     _positive(radius=radius, turns=turns, duration=duration)
@@ -85,7 +85,7 @@ def circle(radius: float, turns: float, duration: float, depth: float = DEPTH) -
 
 
 def helix(radius: float, turns: float, duration: float, bottom: float, top: float) -> Timed:
-    """A circle that rises steadily from `bottom` to `top` (heights in the world frame [m])."""
+    """Return a helix that rises steadily from `bottom` to `top` (heights in the world frame [m])."""
     _positive(radius=radius, turns=turns, duration=duration)
     rate, climb = 2.0 * math.pi * turns / duration, (top - bottom) / duration
 
@@ -98,14 +98,14 @@ def helix(radius: float, turns: float, duration: float, bottom: float, top: floa
 
 
 def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
-    """A figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
+    """Return a figure of eight at constant phase rate: x = a sin θ, y = b sin θ cos θ (Gerono's lemniscate).
 
     Lengths and the result are in [m], times in [s].
 
     Args:
         a: Half its length along world x [m].
         b: Its width along world y [m].
-        duration: Time for one figure [s].
+        duration: Duration of one figure [s].
         depth: Height of its plane, world frame [m]: negative under water.
     """
     _positive(a=a, b=b, duration=duration)
@@ -121,30 +121,31 @@ def gerono(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
 
 
 def ellipse(a: float, b: float, duration: float, depth: float = DEPTH) -> Timed:
-    """Return one turn of an ellipse from rest to rest, slower at its four vertices.
+    """Return one revolution on an ellipse from rest to rest, slower at its four vertices.
 
-    The speed along the arc follows 0.5 + 0.5 sin² 2θ, and time itself runs by s = 3u² - 2u³. That reading of what is
-    published gives the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m in 92.70 s.
+    The speed along the arc is proportional to 0.5 + 0.5 sin² 2θ, and time is scaled by s = 3u² - 2u³. This
+    interpretation of the publication results in the published peak: 0.1031 m/s for half axes of 1.0 and 0.4 m
+    in 92.70 s.
 
     Lengths and the result are in [m], times in [s].
 
     Args:
         a: Half axis along world x [m].
         b: Half axis along world y [m].
-        duration: Time for the turn [s].
+        duration: Duration of the revolution [s].
         depth: Height of its plane, world frame [m]: negative under water.
     """
     _positive(a=a, b=b, duration=duration)
     theta = np.linspace(0.0, 2.0 * math.pi, TABLE_SIZE + 1)
 
     def slowness(angle: Array) -> Array:
-        """Time per angle, up to a factor: |dr/dθ| / (0.5 + 0.5 sin² 2θ)."""
+        """Return the time per angle, up to a factor: |dr/dθ| / (0.5 + 0.5 sin² 2θ)."""
         stretch = np.hypot(a * np.sin(angle), b * np.cos(angle))
         return np.asarray(stretch / (0.5 + 0.5 * np.sin(2.0 * angle) ** 2))
 
-    @cache  # where it is first followed: importing the splines takes half a second
+    @cache  # computed on first use: importing the splines takes half a second
     def turned() -> tuple[Any, Any]:
-        """Angle of the share of the way, and its derivative."""
+        """Return the angle as a function of the path fraction, and its derivative."""
         from scipy.interpolate import CubicHermiteSpline
 
         middle = slowness(0.5 * (theta[1:] + theta[:-1]))
@@ -176,7 +177,7 @@ SHAPES: dict[str, Callable[..., Timed]] = {
 
 
 def _smooth_step(u: Array) -> tuple[Array, Array]:
-    """3u² - 2u³ and its derivative."""
+    """Return 3u² - 2u³ and its derivative."""
     return u * u * (3.0 - 2.0 * u), 6.0 * u * (1.0 - u)
 
 
@@ -187,32 +188,33 @@ def _positive(**numbers: float) -> None:
 
 
 TANGENT_SPAN = 0.1
-"""The tangent is taken across this much time on either side [s], so that it is known at rests and corners too."""
+"""Half the interval over which the tangent is computed [s], so that it is defined at rests and corners as well."""
 
 CHECK_STEP = 0.02
 """Interval at which limits are checked [s]."""
 
 LONGEST = 86400.0
-"""A day, of any trajectory [s]."""
+"""Longest duration of a trajectory, one day [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """A wanted motion from 0 to `duration`, held still at its ends before and after."""
+    """Requested motion from 0 to `duration`, held constant before and after."""
 
     name: str
     duration: float
-    """[s]"""
+    """Duration [s]."""
     motion: Motion = field(repr=False)
-    """Position and velocity at times within the duration."""
+    """Function that returns position and velocity at times within the duration."""
     heading: Literal["fixed", "tangent"] = "fixed"
-    """Keep the heading `yaw`, or look along the way (plus `yaw`)."""
+    """Heading mode: keep the heading `yaw`, or follow the tangent of the path (plus `yaw`)."""
     yaw: float = 0.0
-    """[rad]"""
+    """Heading, or offset from the tangent [rad]."""
     turning: Callable[[Array], Array] | None = field(default=None, repr=False)
-    """Heading at times within the duration [rad], in place of a fixed one; `yaw` is added."""
+    """Function that returns the heading at times within the duration [rad], instead of a fixed one; `yaw` is
+    added."""
     knots: Array | None = field(default=None, repr=False, compare=False)
-    """Times of the points that it goes through [s], (n,); None without points."""
+    """Times of the points that it passes through [s], (n,); None without points."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.duration <= LONGEST:
@@ -225,7 +227,7 @@ class Trajectory:
             )
 
     def at(self, t: npt.ArrayLike) -> Reference:
-        """The reference at times since the start [s], (...).
+        """Return the reference at times since the start [s], (...).
 
         The velocity is the exact derivative of the position, and zero where the trajectory is held.
         """
@@ -237,7 +239,7 @@ class Trajectory:
         return Reference(position, velocity, self._yaw(inside), inside / self.duration)
 
     def scaled(self, factor: float) -> Trajectory:
-        """Return the same trajectory in the same time, with lengths, depth and speeds times a factor."""
+        """Return the same trajectory in the same time, with lengths, depth and speeds multiplied by a factor."""
 
         def motion(t: Array) -> tuple[Array, Array]:
             position, velocity = self.motion(t)
@@ -272,7 +274,7 @@ def _catalogue() -> dict[str, Trajectory]:
 
 
 TRAJECTORIES = _catalogue()
-"""The published trajectories, and a helix of ours, by name. Heading 0 throughout: the paper states none."""
+"""Published trajectories, and a helix of ours, by name. The heading is always 0: the paper states none."""
 
 PUBLISHED_NAMES = {"straight_pro": "broken"}
 """Name in the published configuration -> our name."""
@@ -285,17 +287,17 @@ def load_trajectory(
     yaw: float | None = None,
     vehicle: Vehicle | None = None,
 ) -> Trajectory:
-    """A trajectory by name or from a YAML or CSV file.
+    """Return a trajectory by name or from a YAML or CSV file.
 
     Args:
-        name_or_file: Key of `TRAJECTORIES`, or a file as `read_trajectory` reads it.
-        heading: Keep one heading, or look along the way; as the trajectory has it if None.
-        yaw: That heading, or the angle to the way [rad]; as the trajectory has it if None.
-        vehicle: Scales a published trajectory by the room that the vehicle needs (1 for FinsROV); one that it cannot
-            follow or that leaves its workspace is refused.
+        name_or_file: Key of `TRAJECTORIES`, or a file for `read_trajectory`.
+        heading: Fixed heading, or tangent to the path; that of the trajectory if None.
+        yaw: Fixed heading, or angle to the path [rad]; that of the trajectory if None.
+        vehicle: Vehicle whose required room (1 for FinsROV) scales a published trajectory; a trajectory that
+            it cannot follow or that leaves its workspace is refused.
 
     Raises:
-        ControlError: No such trajectory, a file that is wrong, or a vehicle that cannot.
+        ControlError: There is no such trajectory, the file is invalid, or the vehicle cannot follow it.
     """
     name = PUBLISHED_NAMES.get(str(name_or_file), str(name_or_file))
     if name in TRAJECTORIES:
@@ -315,10 +317,10 @@ def load_trajectory(
 
 
 def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
-    """Refuse a trajectory that leaves a vehicle's workspace or is faster than it can go, axis by axis.
+    """Refuse a trajectory that leaves a vehicle's workspace or exceeds its speed, axis by axis.
 
     Raises:
-        ControlError: Names what is exceeded and when.
+        ControlError: A limit is exceeded; the message states which, and when.
     """
     from finssim.vehicles.capability import terminal_speeds
 
@@ -344,10 +346,10 @@ def check_vehicle(trajectory: Trajectory, vehicle: Vehicle) -> None:
 
 
 def check_speed(trajectory: Trajectory, vehicle: Vehicle) -> None:
-    """Refuse a trajectory that is faster than a vehicle can go in any direction, wherever its points lie.
+    """Refuse a trajectory that is faster than a vehicle in any direction, whatever the position of its points.
 
     Raises:
-        ControlError: Names the speed and when.
+        ControlError: The speed is exceeded; the message states it, and when.
     """
     from finssim.vehicles.capability import terminal_speeds
 
@@ -372,7 +374,7 @@ def _too_fast(
     )
 
 
-# Trajectory files: points in time as CSV or YAML, or a shape with its measures as YAML.
+# Trajectory files: points in time as CSV or YAML, or a shape with its dimensions as YAML.
 
 
 COLUMNS = ("t", "x", "y", "z", "yaw")
@@ -382,14 +384,14 @@ KEYS = {"name", "heading", "yaw", "points", "shape"}
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """A trajectory from a file.
+    """Return a trajectory from a file.
 
-    CSV: a header `t,x,y,z` or `t,x,y,z,yaw`, one row per point. YAML: `points`, a list of such rows, or `shape`, a
-    mapping of `kind` (key of `SHAPES`) and its arguments such as radius and duration; with it `name`, `heading` (fixed
-    or tangent) and `yaw` [rad].
+    CSV: a header `t,x,y,z` or `t,x,y,z,yaw`, one row per point. YAML: `points`, a list of such rows, or
+        `shape`, a mapping of `kind` (key of `SHAPES`) and its arguments such as radius and duration;
+        optionally `name`, `heading` (fixed or tangent) and `yaw` [rad].
 
     Raises:
-        ControlError: The file cannot be read, or what it says is no trajectory; one sentence with the file's name.
+        ControlError: The file cannot be read, or its content is not a trajectory; one sentence with the file's name.
     """
     try:
         if path.suffix.lower() == ".csv":
@@ -407,18 +409,18 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def through_points(name: str, points: npt.ArrayLike, **options: Any) -> Trajectory:
-    """A trajectory through points in time: smooth, and never beyond two neighbours on any axis.
+    """Return a smooth trajectory through points in time that overshoots no two neighbours on any axis.
 
-    Piecewise cubic with the slopes of Fritsch and Carlson (1980), at rest at both ends: a rest between two equal points
-    stays a rest.
+    Piecewise cubic with the slopes of Fritsch and Carlson (1980), at rest at both ends: a rest between two
+    equal points remains a rest.
 
     Args:
-        name: Of the trajectory.
-        points: t [s] from 0 on, x, y, z [m] and if wanted yaw [rad], (n, 4) or (n, 5).
-        options: `heading` and `yaw` of `Trajectory`.
+        name: Name of the trajectory.
+        points: t [s] from 0 on, x, y, z [m] and optionally yaw [rad], (n, 4) or (n, 5).
+        options: Fields `heading` and `yaw` of `Trajectory`.
 
     Raises:
-        ControlError: Fewer than two points, numbers that are not finite, or times that do not increase from 0.
+        ControlError: There are fewer than two points, numbers are not finite, or times do not increase from 0.
     """
     from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
@@ -470,11 +472,11 @@ def _checked_points(points: Any) -> Array:
         table = np.array(points, dtype=float)
     except (TypeError, ValueError):
         raise ControlError(
-            "points: expected rows of 4 or 5 numbers, all of one length: t, x, y, z and yaw"
+            "points: expected rows of 4 or 5 numbers, all of equal length: t, x, y, z and yaw"
         ) from None
     if table.ndim != 2 or table.shape[1] not in (4, 5) or len(table) < 2:
         raise ControlError(
-            f"points are {table.shape}, expected two or more rows of t, x, y, z and if wanted yaw"
+            f"points are {table.shape}, expected two or more rows of t, x, y, z and optionally yaw"
         )
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0, 0])

@@ -70,7 +70,7 @@ def test_a_policy_directory_says_what_it_sees_and_runs_in_episodes(trained):
 
 def test_a_policy_refuses_to_act_blind(trained):
     policy, row = Policy.load(trained), np.zeros((2, 10))
-    with pytest.raises(PolicyError, match="sees front_camera: it is given nothing"):
+    with pytest.raises(PolicyError, match="requires picture front_camera: it received nothing"):
         policy.step(None, row)
     with pytest.raises(PolicyError, match="expected uint8"):
         policy.step(None, row, {"front_camera": np.zeros((2, 36, 64, 3), np.uint8)})
