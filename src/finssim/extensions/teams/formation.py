@@ -133,13 +133,13 @@ def target_slip(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def next_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the last received position of the next corner, world frame [m]."""
+    """Return the position of the next corner that is known to the agent, world frame [m]."""
     return mate_position(arrays, w, a, (a + 1) % AGENTS)
 
 
 @wp.func
 def last_place(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
-    """Return the last received position of the corner after the next, world frame [m]."""
+    """Return the position of the corner after the next that is known to the agent, world frame [m]."""
     return mate_position(arrays, w, a, (a + 2) % AGENTS)
 
 
@@ -152,7 +152,7 @@ def outward(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -
 
 @wp.func
 def seen_net(arrays: TaskArrays, w: int, a: int, left: wp.vec3, right: wp.vec3) -> wp.vec4:
-    """Return `spanned` of the target, with the other corners at the last positions that the agent received [m]."""
+    """Return `spanned` of the target, with the other corners at the positions known to the agent [m]."""
     return spanned(arrays.net.target[w], arrays.position[w, a], left, right)
 
 

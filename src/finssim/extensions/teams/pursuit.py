@@ -88,13 +88,13 @@ def prey_motion(arrays: TaskArrays, w: int, a: int) -> wp.vec3:
 
 @wp.func
 def gap_to(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Return the position of agent b relative to agent a, as last received by a, body frame of a [m]."""
+    """Return the position of agent b relative to agent a, as known to a, body frame of a [m]."""
     return wp.quat_rotate_inv(arrays.quaternion[w, a], mate_position(arrays, w, a, b) - arrays.position[w, a])
 
 
 @wp.func
 def motion_of(arrays: TaskArrays, w: int, a: int, b: int) -> wp.vec3:
-    """Return the velocity of agent b relative to agent a, as last received by a, body frame of a [m/s]."""
+    """Return the velocity of agent b relative to agent a, as known to a, body frame of a [m/s]."""
     relative = mate_velocity(arrays, w, a, b) - measured_velocity(arrays, w, a)
     return wp.quat_rotate_inv(arrays.quaternion[w, a], relative)
 
