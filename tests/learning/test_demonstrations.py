@@ -160,7 +160,7 @@ def test_who_is_no_expert_is_refused():
         match="'nobody' is neither a policy directory nor a baseline of task 't1'; baselines: pid",
     ):
         expert_for("nobody", load_vehicle("finsrov"), task_named("t1"), "wrench6")
-    with pytest.raises(AgentError, match="acts by wrench6, expected thruster8"):
+    with pytest.raises(AgentError, match="uses action mode wrench6, expected thruster8"):
         expert_for("pid", load_vehicle("finsrov"), task_named("t1"), "thruster8")
 
 

@@ -1,4 +1,4 @@
-"""Agents: what acts in a task, from classical controllers and scripted baselines to policies."""
+"""Agents that act in tasks: classical controllers, scripted baselines and policies."""
 
 from typing import TYPE_CHECKING
 

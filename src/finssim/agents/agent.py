@@ -22,20 +22,20 @@ from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
 
 TASKS_OF_PIDS = ("t1", "t2")
-"""Tasks that the robot's own PIDs do."""
+"""Tasks for which the robot has PIDs."""
 
 
 NOWHERE = Goal(np.zeros((0, 3)), np.zeros((0, 4)))
-"""A goal without content: of an agent whose observation holds all that it may know."""
+"""Empty goal, for an agent whose observation contains all that it may know."""
 
 
 class AgentError(ValueError):
-    """An agent that does not exist, or that acts otherwise than it is asked to."""
+    """Agent that does not exist, or that does not act as requested."""
 
 
 def known_in(environment: Environment) -> Known:
-    """Return the measurements of an environment: the observation of every agent of every world, the first vehicle's
-    state."""
+    """Return the measurements of an environment: the observations of all agents of all worlds, and the state
+    of the first vehicle."""
     arrays = environment.arrays
     observed: Rows = arrays.observation.numpy()
     state = (arrays.position, arrays.quaternion, arrays.velocity)
@@ -48,7 +48,7 @@ def known_in(environment: Environment) -> Known:
 
 
 def goals_in(environment: Environment) -> Goal:
-    """Return the goals that the task has set to the worlds, one each; none for a team."""
+    """Return the goals that the task has set, one per world; an empty goal for a team."""
     if environment.agents > 1:
         return NOWHERE
     arrays = environment.arrays
@@ -56,39 +56,40 @@ def goals_in(environment: Environment) -> Goal:
 
 
 class Agent(Protocol):
-    """An agent without internal state: it sees measurements and a goal; its memory is an argument and a result."""
+    """Agent without internal state, which acts on measurements and a goal; its memory is an argument and a result."""
 
     name: str
     period: float
     """Time between two actions [s]."""
     action: str
-    """Action mode."""
+    """Name of the action mode."""
     wrench_scale: Any
-    """Share of each wrench limit that action 1 means, one number or (6,)."""
+    """Fraction of each wrench limit that corresponds to an action of 1, one number or (6,)."""
 
     def reset(self, n: int) -> Any:
-        """Memory before the first of n episodes' actions: arrays with n rows, in tuples; or None."""
+        """Return the memory before the first action of n episodes: tuples of arrays with n rows, or None."""
 
     def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
-        """Actions (n, size) and the memory after."""
+        """Return the actions, (n, size), and the next memory."""
 
     def describe(self) -> dict[str, Any]:
         """Return the agent's description as plain data."""
 
 
 class PolicyAgent:
-    """A policy directory, run with onnxruntime."""
+    """Agent of a policy directory, run with onnxruntime."""
 
     def __init__(self, directory: str | Path, vehicle: Vehicle, task: Task) -> None:
         """Load a policy for the vehicle and task.
 
         Args:
-            directory: Of the policy.
-            vehicle: It must be the very one that the policy was trained for.
-            task: It must have been trained for.
+            directory: Directory of the policy.
+            vehicle: Vehicle, which must be identical to the one that the policy was trained for.
+            task: Task, which must be the one that the policy was trained for.
 
         Raises:
-            PolicyError, ControlError: It was trained for another vehicle, task, observation or other limits.
+            PolicyError, ControlError: The policy was trained for another vehicle, task or observation, or for
+                other limits.
         """
         schema = task.schema.model_dump(mode="json")
         task_data = {"name": task.name, "observation": schema}
@@ -101,15 +102,15 @@ class PolicyAgent:
         self.name = Path(directory).resolve().name
 
     def reset(self, n: int) -> Any:
-        """Memory of the policy, if it has one."""
+        """Return the initial memory of the policy, or None if it has none."""
         return self.policy.reset(n)
 
     def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
-        """Actions for the environment's observations, a row for each agent of each world."""
+        """Return the actions for the environment's observations, one row per agent and world."""
         return self.policy.step(memory, reading.observation, reading.pictures)
 
     def describe(self) -> dict[str, Any]:
-        """Name, network, and what it was trained in."""
+        """Return the name, the network and the training conditions."""
         d = self.policy.description
         randomization = d.training.get("randomization")
         return {
@@ -125,57 +126,61 @@ class PolicyAgent:
 
 
 class PidAgent:
-    """A PID by name: its wrench, as a part of each axis' limit, goes through the same allocation as a policy's."""
+    """Agent of a PID: its wrench, as a fraction of each axis' limit, is allocated as that of a policy."""
 
     kind, action, wrench_scale = "pid", "wrench6", 1.0
 
     def __init__(self, name: str, vehicle: Vehicle, task: str = "t1") -> None:
-        """Make the controller of that name for a vehicle and a task."""
+        """Create the controller with a name for a vehicle and a task."""
         self.name = name
         self.controller: Any = controller_for(task, name, vehicle)
         self.period = self.controller.period
         self._limits = np.asarray(vehicle.wrench_limits, dtype=float)
 
     def reset(self, n: int) -> Any:
-        """Memory before the first of n episodes' actions: empty integrals."""
+        """Return the memory before the first action of n episodes, with zero integrals."""
         return self.controller.reset(n)
 
     def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
-        """Wrench of each world, as a part of the limits; more than a limit is limited axis by axis."""
+        """Return the wrench of each world as a fraction of the limits; an excess is clipped on each axis
+        separately."""
         tau, memory = self.controller.command(memory, reading, goal)
         return part_of_limits(tau, self._limits), memory
 
     def describe(self) -> dict[str, Any]:
-        """Name and rate."""
+        """Return the name and the period."""
         return {"name": self.name, "kind": self.kind, "action": self.action, "period_s": self.period}
 
 
 class BaselineAgent(PidAgent):
-    """A baseline of a task, which sees the observation alone."""
+    """Agent of a task's baseline, which uses only the observation."""
 
     kind = "baseline"
 
     def __init__(self, name: str, vehicle: Vehicle, task: Task, scale: Any = 1.0) -> None:
-        """Make the task's baseline of that name for a vehicle; action 1 is `scale` of each limit in the worlds."""
+        """Create the task's baseline with a name for a vehicle; an action of 1 is `scale` of each limit in
+        the worlds."""
         self.name, self.action, self.scale = name, task.action, scale
         self.controller = baseline(task, name, vehicle)
         self.period = self.controller.period
 
     def act(self, memory: Any, reading: Known, goal: Goal) -> tuple[Rows, Any]:
-        """Actions, a row for each agent of each world."""
+        """Return the actions, one row per agent and world."""
         pictures = () if reading.pictures is None else (reading.pictures,)
         action, memory = self.controller.act(memory, reading.observation, *pictures)
         return np.clip(action / self.scale, -1.0, 1.0).astype(np.float32), memory
 
 
 def agent_for(name_or_directory: str | Path, vehicle: Vehicle, task: Task) -> Agent:
-    """A PID or another baseline by its name, the policy of a directory, or the agent of a file, FILE.py:CLASS.
+    """Return the agent for a PID's or a baseline's name, a policy directory, or FILE.py:CLASS.
 
-    The PIDs of T1 and T2 are the robot's, which know state and goal; other baselines see what a policy sees.
+    The PIDs of T1 and T2 are those of the robot, which use state and goal; other baselines use the policy's
+    observation.
 
     Raises:
-        AgentError: It is none of these.
-        PolicyError, ControlError, EnvironmentSetupError: It does not fit the vehicle or the task, or its file fails.
+        AgentError: The argument is none of these.
+        PolicyError, ControlError, EnvironmentSetupError: The agent does not match the vehicle or the task, or
+            its file fails.
     """
     name = str(name_or_directory)
     if ".py:" in name:
@@ -199,24 +204,24 @@ def agent_for(name_or_directory: str | Path, vehicle: Vehicle, task: Task) -> Ag
 def expert_for(
     name_or_directory: str | Path, vehicle: Vehicle, task: Task, action: str, scale: Any = 1.0
 ) -> PolicyAgent | BaselineAgent:
-    """Return the expert: a baseline of the task or the policy of a directory, which see the observation alone.
+    """Return the expert: a baseline of the task or the policy of a directory, which use only the observation.
 
     Args:
-        name_or_directory: Which.
-        vehicle: Theirs.
-        task: Theirs.
-        action: Mode of the learner's actions.
-        scale: Part of each wrench limit that action 1 of the learner stands for [1].
+        name_or_directory: Name of the baseline or directory of the policy.
+        vehicle: Vehicle of the expert.
+        task: Task of the expert.
+        action: Action mode of the learner.
+        scale: Fraction of each wrench limit that corresponds to an action of 1 of the learner [1].
 
     Raises:
-        AgentError: There is neither, or it acts in another mode than `action`.
+        AgentError: There is neither, or it uses an action mode other than `action`.
         PolicyError: The policy was trained for another vehicle or task.
     """
     baselines = baselines_of(task)
     if str(name_or_directory) in baselines:
         if action != task.action:
             raise AgentError(
-                f"baseline '{name_or_directory}' acts by {task.action}, expected {action}: leave --action out"
+                f"baseline '{name_or_directory}' uses action mode {task.action}, expected {action}: omit --action"
             )
         return BaselineAgent(str(name_or_directory), vehicle, task, scale)
     if not (Path(name_or_directory) / DESCRIPTION_FILE).is_file():
@@ -227,13 +232,13 @@ def expert_for(
     expert = PolicyAgent(name_or_directory, vehicle, task)
     if expert.action != action:
         raise AgentError(
-            f"{name_or_directory} acts by {expert.action}, expected {action}: collect and train with --action "
+            f"{name_or_directory} uses action mode {expert.action}, expected {action}: collect and train with --action "
             f"{expert.action}"
         )
     return expert
 
 
-# An agent in a batch of worlds, decision after decision.
+# Rollout of an agent in a batch of worlds.
 
 
 def rollout(
@@ -244,17 +249,17 @@ def rollout(
     *,
     record: Path | None = None,
 ) -> Iterator[tuple[int, Step | None]]:
-    """Let an agent act, and yield before each decision and after the last.
+    """Let an agent act, and yield before each decision and after the last one.
 
     Args:
-        agent: Who acts; several agents of a world share it.
-        environment: As it stands.
-        steps: How many decisions, unless the iteration is ended before.
-        goal: Where to go at a time since the start [s].
-        record: New folder for every state, command and thrust; none if None.
+        agent: Acting agent; several agents of a world share it.
+        environment: Environment in its current state.
+        steps: Number of decisions, unless the iteration is ended earlier.
+        goal: Function from the time since the start [s] to the goal.
+        record: New folder for all states, commands and thrusts; no recording if None.
 
     Yields:
-        How many decisions were made, and what the environment said to the last one; None before the first.
+        The number of decisions so far, and the environment's result for the last one; None before the first.
     """
     worlds, agents = environment.worlds, environment.agents
     shape = (worlds, -1) if agents == 1 else (worlds, agents, -1)

@@ -1,4 +1,4 @@
-"""Baselines: classical controllers of tasks. Each sees what a policy sees and acts as a policy does."""
+"""Baselines: classical controllers of tasks, with the same observations and actions as a policy."""
 
 from __future__ import annotations
 
@@ -44,28 +44,29 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class Baseline(Protocol):
-    """A controller without internal state: its memory is an argument and a result of every call."""
+    """Controller without internal state: its memory is an argument and a result of every call."""
 
     @property
     def period(self) -> float:
         """Time between two actions [s]."""
 
     def reset(self, n: int) -> Any:
-        """Memory at the start of n episodes: arrays with n rows, in tuples; or None."""
+        """Return the memory at the start of n episodes: tuples of arrays with n rows, or None."""
 
     def act(self, memory: Any, observation: NDArray[Any]) -> tuple[Rows, Any]:
-        """Actions (n, size) for observations (n, numbers), in the task's own action mode, and the memory after."""
+        """Return actions (n, size) for observations (n, numbers), in the task's action mode, and the next memory."""
 
 
 @dataclass(frozen=True)
 class WrenchPid:
-    """Base of the baselines with the full-wrench PID of `agents.pid`, whose state is read from the observation."""
+    """Base of the baselines with the full-wrench PID of `agents.pid`, whose state is derived from the observation."""
 
     pid: Pid
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle, period: float = PERIOD) -> Any:
-        """Gains by pole placement for a vehicle and the time between two actions [s]; a batch shows it the present."""
+        """Return the baseline with gains by pole placement, for a period between actions [s] and observations
+        without delay."""
         return cls(Pid.from_vehicle(vehicle, coefficients_of(vehicle), period, least_lag=0.0))
 
     @property
@@ -74,46 +75,48 @@ class WrenchPid:
         return self.pid.period
 
     def reset(self, n: int) -> Any:
-        """Empty integrals."""
+        """Return zero integrals."""
         return self.pid.reset(n)
 
     def command(self, memory: PidMemory, measured: Measured, goal: Goal) -> tuple[Rows, PidMemory]:
-        """Actions (n, 6), as parts of each axis' limit within ±1, and the memory after."""
+        """Return actions (n, 6), as fractions of each axis' limit within ±1, and the next memory."""
         tau, memory = self.pid.command(memory, measured, goal)
         return part_of_limits(tau, np.asarray(self.pid.wrench_limits)), memory
 
 
 def part_of_limits(tau: Array, limits: Array) -> Rows:
-    """A wrench as a part of each axis' limit, 0 where there is none, (..., 6).
+    """Return a wrench as a fraction of each axis' limit, (..., 6); 0 where the limit is 0.
 
     Args:
         tau: Wrench, body frame [N, N m], (..., 6).
-        limits: Largest of each axis [N, N m], (6,).
+        limits: Limit of each axis [N, N m], (6,).
     """
     return np.divide(tau, limits, out=np.zeros_like(tau), where=limits > 0.0).astype(np.float32)
 
 
 class StationPid(WrenchPid):
-    """PID of T1. The goal is level, so its own axes have z up: the vehicle's pose in them is all that matters."""
+    """PID of T1. The goal is level, so z of the goal frame is up, and the vehicle's pose in that frame is
+    sufficient."""
 
     def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
-        """Actions for observations of T1."""
+        """Return the actions for observations of T1."""
         measured = seen_from_goal(observation)
         here = Goal(np.zeros_like(measured.position), np.broadcast_to(LEVEL, measured.quaternion.shape))
         return self.command(memory, measured, here)
 
 
 def seen_from_goal(observation: Rows) -> Track:
-    """The vehicle in the axes of its goal, from the first 15 numbers of T1's observation."""
+    """Return the vehicle's state in the goal frame, from the first 15 numbers of T1's observation."""
     o = np.asarray(observation, float)
     q = turned_from(o)
     return Track(-quat_rotate(q, STATION_SCALE * o[..., :3]), q, o[..., 9:15])
 
 
 def turned_from(o: Array) -> Array:
-    """Body to goal axes, xyzw, (n, 4), from the two columns of the goal's rotation in observations (n, numbers)."""
+    """Return body to goal axes, xyzw, (n, 4), from two columns of the goal's rotation in observations (n,
+    numbers)."""
     x, y = o[..., 3:6], o[..., 6:9]
-    # The columns of R_b' R*: the goal's axes in the body. Together with their cross product they are the rotation.
+    # The columns of R_b' R* are the goal's axes in the body; with their cross product they form the rotation.
     return quat_conjugate(matrix_to_quat(np.stack([x, y, cross(x, y)], axis=-1)))
 
 
@@ -121,22 +124,23 @@ class TrackingMemory(NamedTuple):
     """Memory of `TrackingPid`."""
 
     heading: Array
-    """Heading since the start, counted from the yaw rate [rad], (n,)."""
+    """Heading relative to the start, integrated from the yaw rate [rad], (n,)."""
     pid: PidMemory
 
 
 class TrackingPid(WrenchPid):
-    """PID of T2. The observation has no heading, and none is asked for: the vehicle keeps the one it starts with.
+    """PID of T2, which keeps the initial heading: the observation has no heading, and the task requires none.
 
-    The axes are level, with the vehicle at the origin and x where it pointed at the start, as its yaw rate tells.
+    It uses a level frame with the vehicle at the origin and x along the initial heading, known from the integrated
+    yaw rate.
     """
 
     def reset(self, n: int) -> TrackingMemory:
-        """Heading zero, empty integrals."""
+        """Return zero headings and integrals."""
         return TrackingMemory(np.zeros(n), self.pid.reset(n))
 
     def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
-        """Actions for observations of T2."""
+        """Return the actions for observations of T2."""
         o = np.asarray(observation, float)
         up, nu = o[..., 21:24], o[..., 15:21]
         q = attitude_from(up, memory.heading)
@@ -152,13 +156,15 @@ class TrackingPid(WrenchPid):
 
 
 class TargetPid(TrackingPid):
-    """PID of T3 with the target's velocity fed forward. The observation has no attitude: it is taken to be level.
+    """PID of T3 with feed-forward of the target's velocity. The observation has no attitude, so a level one
+    is assumed.
 
-    The heading is the one at the start, as the yaw rate tells; roll and pitch are left to the water and their rates.
+    The heading is relative to the start, from the yaw rate; roll and pitch are left to the vehicle's own
+    stability and the feedback of their rates.
     """
 
     def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
-        """Actions for observations of T3."""
+        """Return the actions for observations of T3."""
         o = np.asarray(observation, float)
         q, nu = quat_from_yaw(memory.heading), o[..., 6:12]
         goal = Goal(
@@ -171,10 +177,11 @@ class TargetPid(TrackingPid):
 
 
 class VelocityPid(TrackingPid):
-    """PID of `velocity6`: no way to go, the commanded velocity is that of the goal. Axes as for `TrackingPid`."""
+    """PID of `velocity6`: zero position error, and the commanded velocity as the goal's. Frame as in
+    `TrackingPid`."""
 
     def act(self, memory: TrackingMemory, observation: Rows) -> tuple[Rows, TrackingMemory]:
-        """Actions for observations of `velocity6`."""
+        """Return the actions for observations of `velocity6`."""
         o = np.asarray(observation, float)
         up, nu = o[..., 15:18], o[..., 9:15]
         q = attitude_from(up, memory.heading)
@@ -185,37 +192,39 @@ class VelocityPid(TrackingPid):
 
 
 def attitude_from(up: Array, heading: Array) -> Array:
-    """Body to level axes, xyzw, (n, 4), from the world's up in the body, (n, 3), and a heading [rad], (n,)."""
+    """Return body to level axes, xyzw, (n, 4), from the world's up in the body frame, (n, 3), and the heading
+    [rad], (n,)."""
     roll = np.arctan2(up[..., 1], up[..., 2])
     pitch = np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))
     return quat_from_euler(roll, pitch, heading)
 
 
 def heading_rate(up: Array, nu: Array) -> Array:
-    """(q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ].
+    """Return (q sin φ + r cos φ) / cos θ, with up = [-sin θ, cos θ sin φ, cos θ cos φ].
 
     Args:
         up: World's up in the body frame [-], (n, 3).
         nu: Twist, body frame [m/s, rad/s], (n, 6).
 
     Returns:
-        [rad/s], (n,).
+        Rate of the heading [rad/s], (n,).
     """
     level = np.maximum(up[..., 1] ** 2 + up[..., 2] ** 2, 1e-6)
     return np.asarray((nu[..., 4] * up[..., 1] + nu[..., 5] * up[..., 2]) / level)
 
 
 def acceleration_ahead(offsets: list[Array], velocity: Array) -> Array:
-    """Acceleration of a reference from where it is now, one and two `LOOK_AHEAD` later, and its velocity.
+    """Return the acceleration of a reference from its current position, those one and two `LOOK_AHEAD` later,
+    and its velocity.
 
-    p(k) - p(0) = v k + a k²/2 + j k³/6; of k and 2k together the jerk j falls out.
+    p(k) - p(0) = v k + a k²/2 + j k³/6; the combination of k and 2k eliminates the jerk j.
 
     Args:
-        offsets: Way to the reference at the three times, in one frame [m], (n, 3) each.
-        velocity: Of the reference, same frame [m/s], (n, 3).
+        offsets: Vectors to the reference at the three times, in one frame [m], (n, 3) each.
+        velocity: Velocity of the reference, same frame [m/s], (n, 3).
 
     Returns:
-        Same frame [m/s²], (n, 3).
+        Acceleration, same frame [m/s²], (n, 3).
     """
     near, far = offsets[1] - offsets[0], offsets[2] - offsets[0]
     return np.asarray((8.0 * near - far - 6.0 * LOOK_AHEAD * velocity) / (2.0 * LOOK_AHEAD**2))

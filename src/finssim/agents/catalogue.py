@@ -1,4 +1,4 @@
-"""Baselines of tasks by name; each task's class names its own."""
+"""Baselines of tasks by name, as listed by each task's class."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class BaselineError(ValueError):
 
 
 def baselines_of(task: Task | str) -> Mapping[str, str | Callable[..., Any]]:
-    """Return the makers of a task's baselines by name; see `Task.baselines`.
+    """Return the constructors of a task's baselines by name; see `Task.baselines`.
 
-    A subclass under another name may observe something else, so it has the baselines alone that it defines.
+    A subclass under another name may have another observation, so it has only the baselines that it defines.
 
     Raises:
-        EnvironmentSetupError: There is no task of that name.
+        EnvironmentSetupError: There is no task with that name.
     """
     task = task_named(task)
     owner = next(kind for kind in type(task).__mro__ if "baselines" in vars(kind))
@@ -32,12 +32,12 @@ def baselines_of(task: Task | str) -> Mapping[str, str | Callable[..., Any]]:
 
 
 def baseline(task: Task | str, name: str, vehicle: Vehicle | str = "finsrov") -> Baseline:
-    """Return a task's baseline by name, made for a vehicle; its `period` is the task's control step.
+    """Return a task's baseline by name, for a vehicle; its `period` is the task's control step.
 
     Raises:
-        BaselineError: The task has none of that name.
-        EnvironmentSetupError: There is no task of that name.
-        ControlError: The vehicle's file does not give what the baseline needs.
+        BaselineError: The task has no baseline with that name.
+        EnvironmentSetupError: There is no task with that name.
+        ControlError: The vehicle's file lacks a quantity that the baseline requires.
     """
     task = task_named(task)
     have = baselines_of(task)

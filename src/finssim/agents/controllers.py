@@ -1,4 +1,4 @@
-"""The pose controllers by name."""
+"""Pose controllers by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from finssim.vehicles import Vehicle
 
 
 def _nmpc(vehicle: Vehicle, **options: Any) -> Controller:
-    from finssim.agents.nmpc import Nmpc  # takes CasADi, an extra
+    from finssim.agents.nmpc import Nmpc  # requires the extra with CasADi
 
     return Nmpc.from_vehicle(vehicle, **options)
 
@@ -24,16 +24,17 @@ CONTROLLERS: dict[str, Callable[..., Controller]] = {
     "lqr": Lqr.from_vehicle,
     "nmpc": _nmpc,
 }
-"""Makers `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
+"""Constructors `(vehicle, hydrodynamics="calibrated", period=...) -> Controller` by name."""
 COSTLY = ("nmpc",)
-"""Controllers that need an extra and a second to start, which are made only when they are requested by name."""
+"""Controllers that need an extra and a second to start, so that they are created only if requested by name."""
 
 
 def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
-    """The controller of that name for a vehicle; options are its maker's (`hydrodynamics`, `period`).
+    """Return the controller with a name for a vehicle; options are those of its constructor (`hydrodynamics`,
+    `period`).
 
     Raises:
-        ControlError: No such controller, or an option it refuses.
+        ControlError: The controller does not exist, or rejects an option.
     """
     if name not in CONTROLLERS:
         raise ControlError(f"unknown controller '{name}'; available: {', '.join(CONTROLLERS)}")
@@ -41,10 +42,10 @@ def controller(name: str, vehicle: Vehicle, **options: Any) -> Controller:
 
 
 def controller_for(task: str, name: str, vehicle: Vehicle, **options: Any) -> Controller:
-    """Return the controller of a name as a baseline of a task; `pid-paper` has a separate published profile for t2.
+    """Return the controller with a name as a baseline of a task; `pid-paper` has a separate published profile for t2.
 
     Raises:
-        ControlError: As `controller`.
+        ControlError: See `controller`.
     """
     if (task, name) == ("t2", "pid-paper"):
         options = {"profile": TRAJECTORY_PROFILE, **options}

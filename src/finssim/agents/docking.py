@@ -1,4 +1,4 @@
-"""The classical way into a dock: come before its mouth, turn to it, and go in as far as the nose is on the axis."""
+"""Classical docking: wait in front of the mouth, align, and advance according to the alignment of the nose."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from finssim.vehicles import Vehicle
 
 @dataclass(frozen=True)
 class DockingPid(WrenchPid):
-    """A PID whose goal runs ahead of the nose, along the dock's axis, while nose and heading are right.
+    """PID with a goal that leads the nose along the dock's axis as long as nose and heading are aligned.
 
-    In dock axes. Beside the axis, or turned away, the goal is the waiting place before the mouth; there is no switch
-    between the two: the goal moves with how right it is.
+    All is in dock axes. Off the axis, or turned away from it, the goal is the waiting position in front of the mouth.
+    There is no switch between the two: the goal varies continuously with the alignment.
     """
 
     nose: float
     """Distance of the vehicle's nose from its origin [m]."""
     berth: float
-    """Final place of the nose, along the axis [m]."""
+    """Final position of the nose along the axis [m]."""
     wait: float
-    """Place where the nose waits until it is aligned, along the axis [m]."""
+    """Position along the axis where the nose waits until it is aligned [m]."""
     gap: float
-    """Greatest distance of the nose from the axis in the tube [m]; towards the mouth it grows by `slope`."""
+    """Greatest distance of the nose from the axis in the tube [m]; it grows by `slope` towards the mouth."""
     slope: float
     """Growth of that distance towards the mouth, per distance from the tube [m/m]."""
     lead: float
-    """Distance of the goal ahead of the nose [m], which sets the speed."""
+    """Distance by which the goal leads the nose [m], which determines the speed."""
     turn: float = np.radians(15.0)
-    """Greatest angle away from the axis [rad]."""
+    """Greatest angle to the axis [rad]."""
 
     @classmethod
     def for_vehicle(
@@ -48,13 +48,13 @@ class DockingPid(WrenchPid):
         lead: float = 0.25,
         **more: Any,
     ) -> Any:
-        """For a vehicle and its dock.
+        """Return the baseline for a vehicle and its dock.
 
         Args:
-            vehicle: Its file.
+            vehicle: Vehicle.
             period: Time between two actions [s].
-            task: Whose dock it is; None: that of `Docking`.
-            lead: Distance by which the goal runs ahead of the nose, as a share of the vehicle's length.
+            task: Task with the dock; `Docking` with its defaults if None.
+            lead: Distance by which the goal leads the nose, as a fraction of the vehicle's length.
             more: Further fields.
         """
         task = (task or Docking()).fitted([vehicle])
@@ -71,16 +71,16 @@ class DockingPid(WrenchPid):
         )
 
     def act(self, memory: PidMemory, observation: Rows) -> tuple[Rows, PidMemory]:
-        """Actions for observations of docking."""
+        """Return the actions for observations of docking."""
         o = np.asarray(observation, float)
         return self.steer(memory, DOCK_SCALE * o[..., 15:18], turned_from(o), o[..., 9:15])
 
     def steer(self, memory: PidMemory, nose: Array, q: Array, nu: Array) -> tuple[Rows, PidMemory]:
-        """Actions for where the nose is.
+        """Return the actions for a position of the nose.
 
         Args:
-            memory: Of the PID.
-            nose: From the throat, dock axes [m], (n, 3).
+            memory: Memory of the PID.
+            nose: Position of the nose relative to the throat, dock axes [m], (n, 3).
             q: Quaternion from body to dock axes, xyzw, (n, 4).
             nu: Twist, body frame [m/s, rad/s], (n, 6).
         """
@@ -92,7 +92,8 @@ class DockingPid(WrenchPid):
         return self.command(memory, track, Goal(aim - arm, level))
 
     def _ahead(self, nose: Array, forward: Array) -> Array:
-        """Return the nose's next place on the axis [m], (n,), from its position and direction, dock axes, (n, 3)."""
+        """Return the next position of the nose on the axis [m], (n,), from its position and direction, dock
+        axes, (n, 3)."""
         aside = np.hypot(nose[..., 1], nose[..., 2])
         allowed = self.gap + self.slope * np.maximum(-nose[..., 0], 0.0)
         turned = np.arccos(np.clip(forward[..., 0], -1.0, 1.0))

@@ -1,4 +1,5 @@
-"""Following a wanted velocity with a vehicle's own thrust: for vehicles that a script commands, and for baselines."""
+"""Following a commanded velocity with a vehicle's own thrust, for vehicles controlled by a script and for
+baselines."""
 
 from __future__ import annotations
 
@@ -19,31 +20,32 @@ from finssim.vehicles.capability import level_speed, terminal_speeds
 Array = NDArray[Any]
 
 RATE = 1.2
-"""Rate at which an error of the velocity decays [1/s]: as fast as motors and a control step of 0.1 s allow."""
+"""Decay rate of a velocity error [1/s]: as fast as motors and a control step of 0.1 s allow."""
 YAW_RATE = 3.0
-"""Rate at which an error of the yaw rate decays [1/s]: three times that of the heading, or the heading oscillates."""
+"""Decay rate of a yaw-rate error [1/s]: three times that of the heading, since the heading would oscillate
+otherwise."""
 TURN = 1.0
-"""Yaw rate asked for at a heading error of 1 rad [1/s]."""
+"""Requested yaw rate per heading error [1/s]."""
 MOST_TURN = 0.8
-"""Largest yaw rate asked for [rad/s]."""
+"""Largest requested yaw rate [rad/s]."""
 ROWS = [0, 1, 2, 5]
-"""Places in a wrench of the axes that these tasks need: surge, sway, heave, yaw."""
+"""Indices, in a wrench, of the axes that these tasks use: surge, sway, heave, yaw."""
 
 
 @wp.func
 def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
-    """Return the action that brings the velocity to a wanted one.
+    """Return the action that drives the velocity to a commanded one.
 
     tau = d1 v* + d2 |v*| v* + RATE m (v* - v) + (weight - buoyancy) up,  action = shared(tau / limit)
 
     Args:
-        d: The vehicle's `DriveNumbers`.
-        q: Body to world.
+        d: `DriveNumbers` of the vehicle.
+        q: Quaternion from body to world.
         nu: Velocity, body frame [m/s, rad/s].
-        target: v*: surge, sway, heave and yaw rate, body frame [m/s, rad/s].
+        target: v*: commanded surge, sway, heave and yaw rate, body frame [m/s, rad/s].
 
     Returns:
-        Parts of the limits on surge, sway, heave and yaw, each in [-1, 1].
+        Fractions of the limits on surge, sway, heave and yaw, each in [-1, 1].
     """
     v = wp.vec4(nu[0], nu[1], nu[2], nu[5])
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
@@ -58,9 +60,9 @@ def drive(d: Any, q: wp.quat, nu: vec6, target: wp.vec4) -> wp.vec4:
 
 @wp.func
 def shared(a: wp.vec4) -> wp.vec4:
-    """Return actions of surge, sway and yaw limited together, for the same thrusters give them.
+    """Return actions with surge, sway and yaw limited jointly, since they use the same thrusters.
 
-    Yaw gets up to half, the others the rest.
+    Yaw gets at most half, the others the rest.
     """
     yaw = wp.clamp(a[3], -0.5, 0.5)
     part = wp.min(1.0, (1.0 - wp.abs(yaw)) / wp.max(wp.abs(a[0]) + wp.abs(a[1]), 1.0e-6))
@@ -69,7 +71,7 @@ def shared(a: wp.vec4) -> wp.vec4:
 
 @wp.func
 def towards(q: wp.quat, velocity: wp.vec3) -> wp.vec4:
-    """A velocity of the world as one of the body, with a yaw rate that turns the body's x axis along it.
+    """Return a world velocity in the body frame, with a yaw rate that turns the body's x axis towards it.
 
     Returns:
         Surge, sway, heave and yaw rate [m/s, rad/s].
@@ -83,7 +85,7 @@ def towards(q: wp.quat, velocity: wp.vec3) -> wp.vec4:
 
 @dataclass(frozen=True)
 class DriveNumbers:
-    """Numbers for following a velocity; rows are surge, sway, heave, yaw."""
+    """Parameters for following a velocity; rows are surge, sway, heave, yaw."""
 
     d1: tuple[float, float, float, float]
     """Linear damping [N s/m, N m s]."""
@@ -94,29 +96,29 @@ class DriveNumbers:
     limit: tuple[float, float, float, float]
     """Wrench of an action of 1 [N, N m]."""
     terminal: tuple[float, float, float, float]
-    """Steady speed at the limit [m/s, rad/s]."""
+    """Terminal speed at the limit [m/s, rad/s]."""
     sink: float
-    """Weight less buoyancy [N]."""
+    """Weight minus buoyancy [N]."""
     level: float
-    """Speed ahead up to which the vehicle's stiffness in pitch outweighs the Munk moment [m/s]; see `level_speed`."""
+    """Forward speed up to which the vehicle's pitch stiffness exceeds the Munk moment [m/s]; see `level_speed`."""
 
     @property
     def top(self) -> float:
-        """Speed ahead that the vehicle can hold, by thrust and without pitching over [m/s]."""
+        """Largest forward speed that thrust and pitch stability allow [m/s]."""
         return min(self.terminal[0], self.level)
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> DriveNumbers:
-        """The numbers of a vehicle, from its first hydrodynamic set with coefficients.
+        """Return the parameters of a vehicle, from its first hydrodynamic set with coefficients.
 
         Raises:
-            EnvironmentSetupError: It has no coefficients.
+            EnvironmentSetupError: The vehicle has no coefficients.
         """
         sets = [name for name, model in vehicle.hydrodynamics.items() if isinstance(model, HydrodynamicSet)]
         if not sets:
             raise EnvironmentSetupError(
-                f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation need: take another "
-                "vehicle"
+                f"vehicle '{vehicle.name}' has no damping coefficients, which pursuit and formation require: use "
+                "another vehicle"
             )
         hydro: Any = vehicle.hydrodynamics[sets[0]]
         columns = (
@@ -130,11 +132,11 @@ class DriveNumbers:
         """Return the result of `drive` for a level vehicle.
 
         Args:
-            velocity: Surge, sway, heave, yaw rate [m/s, rad/s], (n, 4).
-            target: The wanted velocity, body frame [m/s, rad/s], of the same shape.
+            velocity: Surge, sway, heave and yaw rate [m/s, rad/s], (n, 4).
+            target: Commanded velocity, body frame [m/s, rad/s], (n, 4).
 
         Returns:
-            Parts of the limits on the four axes, (n, 4), each in [-1, 1].
+            Fractions of the limits on the four axes, (n, 4), each in [-1, 1].
         """
         d1, d2, mass, limit = (np.array(row) for row in (self.d1, self.d2, self.mass, self.limit))
         rate = np.array([RATE, RATE, RATE, YAW_RATE])
@@ -147,31 +149,32 @@ class DriveNumbers:
         return a.astype(np.float32)
 
     def turned(self, error: Array) -> Array:
-        """Yaw rate that takes a heading error away [rad/s], from the error [rad]."""
+        """Return the yaw rate [rad/s] that reduces a heading error [rad]."""
         return np.clip(TURN * error, -MOST_TURN, MOST_TURN)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveBaseline:
-    """Base of the baselines that steer by a vehicle's thrust and drag; it remembers nothing, and acts by wrench4."""
+    """Base of the baselines that steer with a vehicle's thrust and drag, in action mode wrench4 and without
+    memory."""
 
     drive: DriveNumbers
     period: float = PERIOD
     """Time between two commands [s]."""
     turn_first: float = math.inf
-    """A heading error above this is turned away before anything else [rad]."""
+    """Heading error above which the vehicle only turns [rad]."""
 
     @classmethod
     def for_vehicle(cls, vehicle: Vehicle) -> Any:
-        """Return the baseline with the numbers of a vehicle."""
+        """Return the baseline with the parameters of a vehicle."""
         return cls(drive=DriveNumbers.of(vehicle))
 
     def reset(self, n: int) -> None:
-        """It remembers nothing."""
+        """Return None, the memory of these baselines."""
         return None
 
     def act(self, memory: None, observation: Rows) -> tuple[Rows, None]:
-        """Actions for observations, (n, numbers)."""
+        """Return the actions for observations, (n, numbers)."""
         o = np.asarray(observation, dtype=float)
         target, turn = self.wanted(o)
         velocity = np.column_stack([o[:, 0:3], o[:, 5]])
@@ -180,5 +183,5 @@ class DriveBaseline:
         return action, None
 
     def wanted(self, o: Array) -> tuple[Array, Array]:
-        """Velocity of the body, body frame [m/s], (n, 3), and the heading error to turn away [rad], (n,)."""
+        """Return the requested velocity, body frame [m/s], (n, 3), and the heading error to reduce [rad], (n,)."""
         raise NotImplementedError

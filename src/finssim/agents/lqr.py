@@ -1,4 +1,4 @@
-"""A linear-quadratic regulator with a disturbance observer on the feedback-linearised axes: controller `lqr`."""
+"""Linear-quadratic regulator with a disturbance observer on the feedback-linearised axes: controller `lqr`."""
 
 from __future__ import annotations
 
@@ -18,64 +18,66 @@ from finssim.vehicles import Vehicle
 Array = npt.NDArray[np.float64]
 
 POSITION_SCALE, ANGLE_SCALE = 0.25, math.radians(25.0)
-"""Errors whose cost equals that of the full wrench limit of their axis [m, rad]."""
+"""Errors with the same cost as the full wrench limit of their axis [m, rad]."""
 OBSERVER_TIME = 1.0
-"""Time constant with which the observer takes over an unknown wrench [s]."""
+"""Time constant of the observer for an unknown wrench [s]."""
 SLOWEST_LAG = 0.02
-"""Time constant of thrusters that have none in the file [s]."""
+"""Time constant of thrusters without one in the file [s]."""
 
 
 class LqrMemory(NamedTuple):
-    """Memory of the controller between two commands; n vehicles if they are a batch."""
+    """Memory of the controller between two commands, for one vehicle or a batch."""
 
     force: Array
-    """Observed force, WORLD frame [N], (..., 3): a current pushes the same way whatever the heading."""
+    """Observed force, WORLD frame [N], (..., 3): the force of a current does not depend on the heading."""
     moment: Array
     """Observed moment, body frame [N m], (..., 3)."""
     nu: Array
-    """Velocity of the reference at the last command, body frame [m/s, rad/s], (..., 6); NaN before the first."""
+    """Velocity at the reference point at the last command, body frame [m/s, rad/s], (..., 6); NaN before the
+    first."""
     modelled: Array
-    """Wrench since then by the model, thrusters included, body frame [N, N m], (..., 6)."""
+    """Mean wrench since then according to the model, thrusters included, body frame [N, N m], (..., 6)."""
     delivered: Array
-    """Wrench that the thrusters' lag lets through, body frame [N, N m], (..., 6)."""
+    """Wrench after the thrusters' lag, body frame [N, N m], (..., 6)."""
     queue: Array
-    """Wrenches commanded and not yet at the thrusters, oldest first, body frame [N, N m], (..., delays, 6)."""
+    """Commanded wrenches that have not reached the thrusters, oldest first, body frame [N, N m], (..., delays, 6)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lqr:
-    """Optimal state feedback behind the actuators' lag and delay, with the unknown wrench observed and taken out.
+    """Optimal state feedback with the actuators' lag and delay in the model, and compensation of the unknown wrench.
 
-    On every axis the vehicle is m x'' + d x' + k x = f + w, lag f' + f = u(t - delay), in discrete time the state
-    (e, e', f, u's under way); the gains minimise the sum of (e / scale)² + (u / limit)² (Anderson and Moore, Optimal
+    The model of each axis is m x'' + d x' + k x = f + w, lag f' + f = u(t - delay). In discrete time the state is (e,
+    e', f, pending commands u); the gains minimise the sum of (e / scale)² + (u / limit)² (Anderson and Moore, Optimal
     Control: Linear Quadratic Methods, 1990, section 2.4). Coriolis, weight and buoyancy are fed forward as in `Pid`.
-    The observer compares the change of momentum with the model's,
+    The observer compares the change of momentum with that of the model,
 
         w' = (m (nu - nu_before) / period - wrench of the model - w) / OBSERVER_TIME,
 
-    so that what the model cannot explain (current, ballast, weak thrusters) is compensated.
+    so that effects outside the model (current, ballast, weak thrusters) are compensated.
     """
 
     body: Pid = field(repr=False)
     """Model, limits, allocation and feed-forward."""
     gains: Array
-    """Gains of e [m, rad], e' [m/s, rad/s], f [N, N m] and the delayed commands [N, N m], per axis, (6, 3 + delays)."""
+    """Gains of e [m, rad], e' [m/s, rad/s], f [N, N m] and the delayed commands [N, N m], per axis, (6, 3 +
+    delays)."""
     error_limit: Array
-    """Largest error that is acted on, (6,) [m, rad]."""
+    """Bound on the error, (6,) [m, rad]."""
     lag: float
     """Time constant of the thrusters [s]."""
     delays: int
-    """Commands under way."""
+    """Number of pending commands."""
     period: float
     """Time between two commands [s]."""
 
     @classmethod
     def from_vehicle(cls, vehicle: Vehicle, hydrodynamics: str = "calibrated", period: float = 0.05) -> Lqr:
-        """Controller of a vehicle.
+        """Return the controller of a vehicle.
 
         Args:
-            vehicle: Its inertia, damping, limits and its thrusters' lag and delay are used.
-            hydrodynamics: Set whose coefficients are the model.
+            vehicle: Vehicle; its inertia, damping, limits and its thrusters' lag and delay are used.
+            hydrodynamics: Hydrodynamic set whose coefficients are the model.
             period: Time between two commands [s].
 
         Raises:
@@ -85,7 +87,7 @@ class Lqr:
         thrusters = vehicle.thrusters.values()
         lag = max(float(np.mean([t.time_constant for t in thrusters])), SLOWEST_LAG)
         delay = float(np.mean([t.delay for t in thrusters]))
-        delays = max(1, round(delay / period) + 1)  # the state is as old as a period when its command arrives
+        delays = max(1, round(delay / period) + 1)  # the state is one period old when its command arrives
         scale = np.repeat([POSITION_SCALE, ANGLE_SCALE], 3)
         gains = np.stack([_gains(body, i, float(scale[i]), lag, delays, period) for i in range(6)])
         model = body.model
@@ -96,11 +98,11 @@ class Lqr:
 
     @property
     def allocator(self) -> Allocator:
-        """Determines what the thrusters can deliver."""
+        """Allocator for the wrench that the thrusters can deliver."""
         return self.body.allocator
 
     def reset(self, n: int | None = None) -> LqrMemory:
-        """Memory of a vehicle at rest that nothing pushes, for one vehicle or for a batch of n."""
+        """Return the memory of a vehicle at rest without unknown wrench, for one vehicle or for a batch of n."""
         shape = () if n is None else (n,)
         three, six = np.zeros((*shape, 3)), np.zeros((*shape, 6))
         return LqrMemory(
@@ -108,7 +110,7 @@ class Lqr:
         )
 
     def command(self, memory: LqrMemory, measured: Measured, goal: Goal) -> tuple[Array, LqrMemory]:
-        """Wanted wrench about `body.reference`, body frame [N, N m], (..., 6), and the memory for the next command."""
+        """Return the wrench about `body.reference`, body frame [N, N m], (..., 6), and the next memory."""
         body, model = self.body, self.body.model
         q = np.asarray(measured.quaternion, float)
         error = tracking_error(measured, goal, body.reference)
@@ -136,7 +138,7 @@ class Lqr:
         arriving = memory.queue[..., 0, :]
         through = 1.0 - math.exp(-self.period / self.lag)
         mean = arriving + (memory.delivered - arriving) * self.lag / self.period * through
-        # Wrench until the next command by the model; the thrusters' part is its mean over the period.
+        # Mean wrench until the next command, according to the model; the thrusters' part is its mean over the period.
         modelled = mean - model_wrench - body.holding_wrench(q, q)
         delivered = memory.delivered + through * (arriving - memory.delivered)
         return tau, LqrMemory(
@@ -144,7 +146,8 @@ class Lqr:
         )
 
     def _observed(self, memory: LqrMemory, q: Array, nu: Array) -> Array:
-        """The unknown wrench as the last period's change of momentum shows it, body frame [N, N m], (..., 6)."""
+        """Return the unknown wrench, updated by the change of momentum in the last period, body frame [N, N
+        m], (..., 6)."""
         before = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment], axis=-1)
         change = self.body.model.inertia * (nu - memory.nu) / self.period
         unmodelled = np.where(np.isnan(change), before, change - memory.modelled)
@@ -154,7 +157,8 @@ class Lqr:
 
 
 def _gains(body: Pid, axis: int, scale: float, lag: float, delays: int, period: float) -> Array:
-    """Feedback of one axis of e, e', f and the commands under way, (3 + delays,); zero without authority."""
+    """Return one axis' feedback gains of e, e', f and the pending commands, (3 + delays,); zero without a
+    wrench limit."""
     from scipy.linalg import expm, solve_discrete_are
 
     model, limit = body.model, float(body.wrench_limits[axis])
@@ -162,7 +166,7 @@ def _gains(body: Pid, axis: int, scale: float, lag: float, delays: int, period: 
     if not limit > 0.0:
         return np.zeros(n)
     m, d, k = (float(x[axis]) for x in (model.inertia, model.linear_damping, model.stiffness))
-    continuous = np.zeros((4, 4))  # x, x', f, and the input that is held over a period
+    continuous = np.zeros((4, 4))  # x, x', f, and the input, which is constant over a period
     continuous[0, 1] = 1.0
     continuous[1] = [-k / m, -d / m, 1.0 / m, 0.0]
     continuous[2, 2:] = [-1.0 / lag, 1.0 / lag]

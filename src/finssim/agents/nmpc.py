@@ -23,68 +23,69 @@ from finssim.vehicles.vehicle import moved_to_origin, skew
 Array = npt.NDArray[np.float64]
 
 HORIZON = 20
-"""Control periods that are looked ahead."""
+"""Number of control periods in the horizon."""
 SPEED_SCALE = 4.0
-"""Error in velocity that costs as much as an error of place, in scales a second [1/s]."""
+"""Ratio of the scales of velocity and position errors in the cost [1/s]."""
 FINAL = 5.0
-"""Cost of the state at the end of the horizon, in those of a step."""
+"""Weight of the state at the end of the horizon, relative to that of one step."""
 ITERATIONS = 30
-"""Greatest number of iterations; a solution is good enough to act on long before."""
+"""Largest number of iterations; a solution is usable long before."""
 
 
 class NmpcMemory(NamedTuple):
-    """Memory of the controller between two commands; n vehicles if they are a batch."""
+    """Memory of the controller between two commands, for one vehicle or a batch."""
 
     force: Array
     """Observed force, WORLD frame [N], (..., 3)."""
     moment: Array
     """Observed moment about the body origin, body frame [N m], (..., 3)."""
     predicted: Array
-    """Velocity of the body origin that the model expected by now, body frame [m/s, rad/s], (..., 6); NaN at first."""
+    """Velocity of the body origin that the model predicted for the present, body frame [m/s, rad/s], (...,
+    6); NaN at first."""
     thrust: Array
-    """Thrust by the thrusters' lag [N], (..., n)."""
+    """Thrust after the thrusters' lag [N], (..., n)."""
     queue: Array
-    """Thrusts commanded and not yet at the thrusters, oldest first [N], (..., delays, n)."""
+    """Commanded thrusts that have not reached the thrusters, oldest first [N], (..., delays, n)."""
     plan: Array
-    """Solution of the last problem in the units of its variables, from which the next one starts; NaN at first, (...,
-    variables)."""
+    """Solution of the previous problem in the units of its variables, (..., variables), the start of the
+    next; NaN at first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Nmpc:
-    """Nonlinear model-predictive control: the cheapest thrusts of the next two seconds, of which the first is
+    """Nonlinear model-predictive control: the optimal thrusts of the next two seconds, of which the first is
     commanded.
 
         M nu_dot + C(nu) nu + D(nu) nu + g(q) = B f + w,    lag f_dot + f = u(t - delay),    lower <= u <= upper
 
-    in all six degrees of freedom about the body origin (Fossen 2021, eq. 8.1), the unknown wrench w observed as by
-    `Lqr` and taken to last. The cost of a step is that of `Lqr`, position and attitude by their scales and thrust by
-    its limits. The problem is solved by multiple shooting with Fatrop through CasADi, from the last solution moved on
-    by a period.
+    in all six degrees of freedom about the body origin (Fossen 2021, eq. 8.1). The unknown wrench w is observed as in
+    `Lqr` and assumed constant. The cost of a step is that of `Lqr`, with position and attitude relative to their
+    scales and thrust relative to its limits. The problem is solved by multiple shooting with Fatrop through CasADi,
+    starting from the previous solution shifted by one period.
     """
 
     solve: Callable[..., Any] = field(repr=False)
-    """CasADi's solver."""
+    """Solver from CasADi."""
     advance: Callable[..., Any] = field(repr=False)
-    """(state, thrust that arrives, w) -> state a period later."""
+    """Function (state, arriving thrust, w) -> state one period later."""
     body: Pid = field(repr=False)
-    """Limits, allocation and what holds the vehicle at rest."""
+    """Limits, allocation and the wrench that holds the vehicle at rest."""
     mass: Array
     """M about the body origin [kg, kg m, kg m²], (6, 6)."""
     bounds: tuple[Array, Array]
-    """Bounds of the constraints, in the units of these, (constraints,) each."""
+    """Bounds of the constraints, in their units, (constraints,) each."""
     delays: int
-    """Commands under way."""
+    """Number of pending commands."""
     period: float
     """Time between two commands [s]."""
 
     @classmethod
     def from_vehicle(cls, vehicle: Vehicle, hydrodynamics: str = "calibrated", period: float = 0.1) -> Nmpc:
-        """Controller of a vehicle.
+        """Return the controller of a vehicle.
 
         Args:
-            vehicle: Its inertia, damping, centres, limits and its thrusters' lag and delay are the model.
-            hydrodynamics: Set whose coefficients are used.
+            vehicle: Vehicle; its inertia, damping, centres, limits and its thrusters' lag and delay are the model.
+            hydrodynamics: Hydrodynamic set whose coefficients are used.
             period: Time between two commands [s].
 
         Raises:
@@ -103,11 +104,11 @@ class Nmpc:
 
     @property
     def allocator(self) -> Allocator:
-        """Determines what the thrusters can deliver."""
+        """Allocator for the wrench that the thrusters can deliver."""
         return self.body.allocator
 
     def reset(self, n: int | None = None) -> NmpcMemory:
-        """Memory of a vehicle at rest that nothing pushes, for one vehicle or for a batch of n."""
+        """Return the memory of a vehicle at rest without unknown wrench, for one vehicle or for a batch of n."""
         shape, thrusters = () if n is None else (n,), self.allocator.B.shape[1]
         three, still = np.zeros((*shape, 3)), np.zeros((*shape, thrusters))
         size = HORIZON * (13 + 2 * thrusters) + 13 + thrusters
@@ -117,10 +118,10 @@ class Nmpc:
         )  # fmt: skip
 
     def command(self, memory: NmpcMemory, measured: Measured, goal: Goal) -> tuple[Array, NmpcMemory]:
-        """Wanted wrench about `body.reference`, body frame [N, N m], (..., 6), and the memory for the next command.
+        """Return the wrench about `body.reference`, body frame [N, N m], (..., 6), and the next memory.
 
         Raises:
-            ControlError: A number that is given is not finite.
+            ControlError: An input is not finite.
         """
         position = np.asarray(measured.position, float)
         shape = position.shape[:-1]
@@ -131,7 +132,7 @@ class Nmpc:
             for x, size in zip([*inputs, goal.acceleration], sizes, strict=True)
         ]
         if not all(np.isfinite(x).all() for x in rows):
-            raise ControlError("a state or a goal that is not finite cannot be planned with")
+            raise ControlError("the state or the goal contains a non-finite number: check both inputs")
         memories = [x.reshape(len(rows[0]), *x.shape[len(shape) :]) for x in memory]
         results = [
             self._single(NmpcMemory(*(x[i] for x in memories)), *(x[i] for x in rows))
@@ -146,7 +147,7 @@ class Nmpc:
         a_goal: Array,
     ) -> tuple[Array, NmpcMemory]:  # fmt: skip
         """Return thrusts and memory for one vehicle; the goal moves with its velocity and acceleration."""
-        # q and -q are one attitude, but of the other sign no step of the last plan would fit.
+        # q and -q are the same attitude, but the previous plan only matches one of the signs.
         if memory.plan[3:7] @ q < 0.0:
             q = -q
         observed = np.concatenate([quat_inverse_rotate(q, memory.force), memory.moment])
@@ -160,7 +161,7 @@ class Nmpc:
 
         state = np.concatenate([p, q / np.linalg.norm(q), nu, memory.thrust])
         first = state
-        # What is under way acts before anything that is decided now.
+        # The pending commands act before the new one.
         for k, under_way in enumerate(memory.queue):
             state = np.asarray(self.advance(state, under_way, w)).ravel()
             first = state if k == 0 else first
@@ -169,7 +170,9 @@ class Nmpc:
         ahead = self.delays * self.period
         target = p_goal + ahead * v_goal + 0.5 * ahead**2 * a_goal
         plan = np.tile(np.concatenate([state, steady]), HORIZON + 1)[: memory.plan.size]
-        if not np.isnan(memory.plan).any():  # the last solution moved on, its last step once more
+        if not np.isnan(
+            memory.plan
+        ).any():  # previous solution shifted by one step, with the last step repeated
             stage = state.size + steady.size
             plan = np.concatenate([memory.plan[stage:], memory.plan[-stage:]])
         parameters = np.concatenate([state, w, target, q_goal, v_goal + ahead * a_goal, a_goal, steady])
@@ -177,7 +180,7 @@ class Nmpc:
         plan = np.asarray(answer["x"]).ravel()
         lower, upper = self.allocator.lower, self.allocator.upper
         thrust = np.clip(plan[state.size : state.size + steady.size], lower, upper)
-        # A solver that fails does not stop the vehicle: keep the last thrust and start the plan again.
+        # If the solver fails, hold the goal with the steady thrust and discard the plan.
         if not np.isfinite(plan).all():
             thrust, plan = steady, np.full_like(plan, np.nan)
         queue = np.concatenate([memory.queue, thrust[None]])
@@ -190,21 +193,22 @@ class Nmpc:
 
 
 def _model(vehicle: Vehicle, hydrodynamics: str, lag: float, period: float) -> Any:
-    """CasADi function (state, thrust that arrives, unknown wrench) -> state a period later.
+    """Return the CasADi function (state, arriving thrust, unknown wrench) -> state one period later.
 
-    The state is position and quaternion (xyzw) in the world, velocity of the body origin in the body, and thrusts. The
-    lag is solved exactly, its mean thrust acts over the period; the rest goes by a midpoint step.
+    The state is position and quaternion (xyzw) in the world, velocity of the body origin in the body frame, and
+    thrusts. The lag is solved exactly, and its mean thrust acts over the period; the rest is integrated by the
+    midpoint method.
     """
     chosen = vehicle.hydrodynamic_set(hydrodynamics)
     if not isinstance(chosen, HydrodynamicSet):
         raise ControlError(
-            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients to predict with: name "
-            "one that does"
+            f"hydrodynamic set '{hydrodynamics}' of {vehicle.name} has no damping coefficients for the prediction: "
+            "name one with coefficients"
         )
     n, point = len(vehicle.thrusters), np.asarray(chosen.reference_point, float)
     M, B = vehicle.mass_matrix(hydrodynamics), vehicle.thruster_matrix()
     D1 = moved_to_origin(np.asarray(chosen.linear_damping, float), point)
-    # Twist of the body origin -> twist of the point that the quadratic damping is given for.
+    # From the twist of the body origin to that of the reference point of the quadratic damping.
     to_point = np.eye(6)
     to_point[:3, 3:] = -skew(point)
     D2 = np.asarray(chosen.quadratic_damping, float)
@@ -241,16 +245,16 @@ def _model(vehicle: Vehicle, hydrodynamics: str, lag: float, period: float) -> A
 
 
 def _rotate(q: Any, v: Any) -> Any:
-    """A vector rotated by a unit quaternion (xyzw)."""
+    """Return a vector rotated by a unit quaternion (xyzw)."""
     t = 2.0 * ca.cross(q[:3], v)
     return v + q[3] * t + ca.cross(q[:3], t)
 
 
 def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tuple[Any, tuple[Array, Array]]:
-    """Solver of the problem and the bounds of its constraints.
+    """Return the solver of the problem and the bounds of its constraints.
 
-    Variables: state and thrust of every step in turn, then the last state. Constraints, by step: the next state is that
-    of the model; of the first the state is the given one; thrusts are within their limits.
+    Variables: state and thrust of each step in turn, then the last state. Constraints of each step: the next state
+    equals the model's prediction; in the first step the state equals the given one; thrusts are within their limits.
     """
     n = len(vehicle.thrusters)
     lower, upper = vehicle.force_limits
@@ -258,7 +262,7 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
              (("x", 13 + n), ("w", 6), ("p", 3), ("q", 4), ("v", 3), ("a", 3), ("steady", n))]  # fmt: skip
     start, w, position, attitude, velocity, acceleration, steady = symbols
     reach = np.maximum(upper, -lower)
-    # An axis that the thrusters do not command is not controlled.
+    # Axes without thrusters are not controlled.
     driven = (limits > 0.0).astype(float)
     turning = np.array([driven[3], driven[4], driven[5]]) / ANGLE_SCALE**2
 
@@ -271,7 +275,7 @@ def _problem(vehicle: Vehicle, advance: Any, limits: Array, period: float) -> tu
             q[3] * attitude[3] + ca.dot(q[:3], attitude[:3]),
         )
         slip = _rotate(q, x[7:10]) - speed
-        # The vector part is twice the half angle's sine: its sign is that of the short way round.
+        # The vector part is the sine of half the angle; its sign is chosen for the shorter rotation.
         turn = 2.0 * ca.if_else(rotation_error[3] < 0.0, -1.0, 1.0) * rotation_error[:3]
         return (
             ca.sumsqr(x[:3] - moved) / POSITION_SCALE**2

@@ -1,4 +1,4 @@
-"""The baseline controllers: a full-wrench PID with gains from the vehicle's identified model, and the published one."""
+"""Baseline controllers: a full-wrench PID with gains from the vehicle's identified model, and the published one."""
 
 from __future__ import annotations
 
@@ -17,53 +17,53 @@ from finssim.core.frames import FROM_CONTROLLER, TO_CONTROLLER
 from finssim.core.rotations import cross, quat_inverse_rotate, quat_rotate, quat_yaw, wrap_angle
 from finssim.vehicles import Vehicle
 
-# PID gains that put the poles of an identified axis where they are wanted, the actuators' lag included.
+# PID gains by pole placement on an identified axis, with the actuators' lag.
 
 
 Array = npt.NDArray[np.float64]
 
 POLE_SHARE = 0.25
-"""The two working poles, as a part of the sum of all four: a quarter each leaves the rest to the fourth."""
+"""Each of the two working poles as a fraction of the sum of all four; a quarter each leaves enough for the fourth."""
 
 INTEGRAL_RATIO = 0.2
-"""The integral's pole, as a part of the working poles: slow enough that it hardly overshoots."""
+"""Pole of the integral as a fraction of the working poles, slow enough for little overshoot."""
 
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of tau = kp e + integral - kd x', with integral' = rate (the force that the model leaves unexplained), per
-    axis."""
+    """Gains of tau = kp e + integral - kd x' per axis, with integral' = rate (force that the model does not
+    explain)."""
 
     kp: Array
     """[N/m, N m/rad], (6,)."""
     kd: Array
     """[N s/m, N m s/rad], (6,)."""
     rate: Array
-    """Rate at which the integral takes over an unknown force [1/s], (6,)."""
+    """Rate at which the integral compensates an unknown force [1/s], (6,)."""
 
 
 def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0) -> Gains:
-    """Gains for poles at -w, -w, -w/5 and -b of every axis behind a first-order lag.
+    """Return the gains for poles at -w, -w, -w/5 and -b of each axis behind a first-order lag.
 
         lag m s^4 + (m + d lag) s^3 + (d + k lag + kd) s^2 + (k + Kp) s + Ki = lag m (s + w)^2 (s + w/5) (s + b)
 
-    The lag fixes the sum of the poles, 1/lag + d/m; w is a quarter of it. Kp and Ki are those of the textbook PID.
-    Here the integral follows
+    The lag determines the sum of the poles, 1/lag + d/m; w is a quarter of it. Kp and Ki are those of the textbook
+    PID. Here the integral follows
 
         integral' = rate ((kp + k) e - (kd - m rate + d) x'),
 
-    the sum of forces a disturbance would show up in, so that a manoeuvre the model explains leaves nothing in it.
-    Both laws are the same feedback when kp + k = Ki / rate and
+    the sum of forces that would contain a disturbance, so that it stays zero in a manoeuvre that the model
+    explains. Both laws are the same feedback if kp + k = Ki / rate and
 
         m rate^3 - (kd + d) rate^2 + (Kp + k) rate - Ki = 0.
 
-    Where the water's own stiffness is more than that, kp < 0 would soften it through the lag: such an axis gets a slow
-    integral and nothing else.
+    On an axis whose own stiffness k exceeds kp + k, a negative kp would reduce the stiffness, delayed by the lag, so
+    such an axis gets only a slow integral.
 
     Args:
-        model: The axes.
-        lag: Of the actuators: time constant, delay and half a control period [s], one or (6,).
-        speed: Operating speed about which d = d1 + 2 d2 |speed| is taken, body frame [m/s, rad/s], (6,).
+        model: Model of the axes.
+        lag: Lag of the actuators: time constant, delay and half a control period [s], one or (6,).
+        speed: Operating speed of the linearisation d = d1 + 2 d2 |speed|, body frame [m/s, rad/s], (6,).
     """
     m, k = model.inertia, model.stiffness
     d = model.linear_damping + 2.0 * model.quadratic_damping * np.abs(np.asarray(speed, float))
@@ -78,7 +78,7 @@ def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0
 
     kp = Ki / rate - k
     passive = kp <= 0.0
-    # A tenth of the axis' own decay rate, so that the integral cannot ring with the pendulum.
+    # A tenth of the decay rate of the axis, so that the integral does not oscillate with the pendulum.
     return Gains(
         kp=np.where(passive, 0.0, kp),
         kd=np.where(passive, 0.0, kd),
@@ -87,62 +87,64 @@ def place_poles(model: AxisModel, lag: float | Array, speed: npt.ArrayLike = 0.0
 
 
 def _slowest(m: float, damping: float, stiffness: float, integral: float) -> float:
-    """Smallest root of m r^3 - damping r^2 + stiffness r - integral = 0 [1/s]: the slow pole without the lag."""
+    """Return the least root of m r^3 - damping r^2 + stiffness r - integral = 0 [1/s]: the slow pole without
+    the lag."""
     roots = np.roots([m, -damping, stiffness, -integral])
     return float(np.min(roots.real[np.abs(roots.imag) < 1e-9 * np.abs(roots)]))
 
 
 CRUISE = 0.7
-"""Speed at which a far goal is approached, as a part of the terminal speed at the wrench limit."""
+"""Speed of the approach to a far goal, as a fraction of the terminal speed at the wrench limit."""
 
 LEAST_LAG = 0.15
-"""Shortest lag of a position or heading loop [s]: exposure, wire and filter delay the measurement."""
+"""Least lag of a position or heading loop [s], since exposure, transmission and filter delay the measurement."""
 
 INTEGRAL_SHARE = 0.5
-"""Largest integral, as a part of the wrench limit."""
+"""Largest integral, as a fraction of the wrench limit."""
 
 
 class PidMemory(NamedTuple):
     """Memory of the controller between two commands."""
 
     force: Array
-    """Integral part of the force, WORLD frame [N], (..., 3): a current pushes the same way whatever the heading."""
+    """Integral part of the force, WORLD frame [N], (..., 3): the force of a current does not depend on the
+    heading."""
     moment: Array
     """Integral part of the moment, body frame [N m], (..., 3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pid:
-    """Position and attitude PID with weight and buoyancy fed forward.
+    """Position and attitude PID with feed-forward of weight and buoyancy.
 
         tau = tau_goal + M a_goal + C(nu) nu + D nu_goal + kp clip(e) - kd (nu - nu_goal) + integral
 
     about the vehicle's wrench reference. tau_goal holds the goal at rest against weight and buoyancy; e is clipped
-    where it would ask for more than the cruise speed; the derivative acts on the measured velocity. The integral
-    collects the force that the identified model cannot explain, with what the thrusters could not deliver taken out
-    of it (back-calculation), and is bounded (clamping): neither a long way nor saturation winds it up.
+    where it would request more than the cruise speed; the derivative uses the measured velocity. The integral
+    contains the force that the identified model does not explain, without the undelivered part of the wrench
+    (back-calculation), and is bounded (clamping), so that neither a long distance nor saturation causes windup.
     """
 
     model: AxisModel
     """Inertia, damping and stiffness at `reference`."""
     gains: Gains
-    """Per axis, zero on axes without authority."""
+    """Gains per axis, zero on axes without a wrench limit."""
     error_limit: Array
-    """Largest error that is acted on, (6,) [m, rad]."""
+    """Bound on the error, (6,) [m, rad]."""
     wrench_limits: Array
-    """Largest wrench asked for, per axis, body frame [N, N m], (6,)."""
+    """Largest requested wrench, per axis, body frame [N, N m], (6,)."""
     reference: Array
     """Body point about which the wrench acts [m], (3,)."""
     weight: float
-    """[N]"""
+    """Weight [N]."""
     buoyancy: float
-    """Fully submerged [N]."""
+    """Buoyancy when fully submerged [N]."""
     center_of_gravity: Array
     """Body frame [m], (3,)."""
     center_of_buoyancy: Array
     """Body frame [m], (3,)."""
     allocator: Allocator = field(repr=False)
-    """Allocator that gives what the thrusters can deliver."""
+    """Allocator for the wrench that the thrusters can deliver."""
     period: float
     """Time between two commands [s]."""
 
@@ -155,14 +157,14 @@ class Pid:
         speed: npt.ArrayLike = 0.0,
         least_lag: float = LEAST_LAG,
     ) -> Pid:
-        """Controller of a vehicle, gains by pole placement.
+        """Return the controller of a vehicle, with gains by pole placement.
 
         Args:
-            vehicle: Its thrusters' lag, limits, weight and buoyancy are used too.
-            hydrodynamics: Set whose coefficients are the model.
+            vehicle: Vehicle; its thrusters' lag, limits, weight and buoyancy are used too.
+            hydrodynamics: Hydrodynamic set whose coefficients are the model.
             period: Time between two commands [s].
-            speed: Operating speed about which damping is linearised, body frame [m/s, rad/s], (6,).
-            least_lag: Of the loops of place and heading [s]; 0 where nothing delays what is seen.
+            speed: Operating speed at which damping is linearised, body frame [m/s, rad/s], (6,).
+            least_lag: Least lag of the position and heading loops [s]; 0 if the measurements are not delayed.
 
         Raises:
             ControlError: The set has no coefficients, or the period is not positive.
@@ -173,7 +175,7 @@ class Pid:
         thrusters = vehicle.thrusters.values()
         thruster_lag = float(np.mean([t.time_constant + t.delay for t in thrusters]))
         lag = np.full(6, max(thruster_lag, least_lag))
-        lag[3:5] = thruster_lag  # roll and pitch come straight from the IMU
+        lag[3:5] = thruster_lag  # roll and pitch are measured directly by the IMU
         lag += 0.5 * period
         placed = place_poles(model, lag, speed)
         limits = np.asarray(vehicle.wrench_limits, float)
@@ -202,12 +204,12 @@ class Pid:
         )
 
     def reset(self, n: int | None = None) -> PidMemory:
-        """Memory without any integral, for one vehicle or for a batch of n."""
+        """Return the memory with zero integrals, for one vehicle or for a batch of n."""
         shape = (3,) if n is None else (n, 3)
         return PidMemory(np.zeros(shape), np.zeros(shape))
 
     def command(self, memory: PidMemory, measured: Measured, goal: Goal) -> tuple[Array, PidMemory]:
-        """Wanted wrench about `reference`, body frame [N, N m], (..., 6), and the memory for the next command."""
+        """Return the wrench about `reference`, body frame [N, N m], (..., 6), and the next memory."""
         q = np.asarray(measured.quaternion, float)
         error = tracking_error(measured, goal, self.reference)
         clipped = np.clip(error.pose, -self.error_limit, self.error_limit)
@@ -234,22 +236,24 @@ class Pid:
         return tau, PidMemory(quat_rotate(q, integral[..., :3]), integral[..., 3:])
 
     def accelerating_wrench(self, quaternion: Array, goal: Goal) -> Array:
-        """Force that accelerates the vehicle as the goal is, body frame [N, N m], (..., 6); the moment is zero.
+        """Return the wrench for the goal's acceleration, body frame [N, N m], (..., 6); the moment is zero.
 
-        The inertia, water included, differs from axis to axis: what is left over on turning is for the feedback.
+        The inertia, with added mass, differs between axes: the remaining terms during a turn are left to the
+        feedback.
         """
         force = self.model.inertia[:3] * quat_inverse_rotate(quaternion, np.asarray(goal.acceleration, float))
         return np.concatenate([force, np.zeros_like(force)], axis=-1)
 
     def holding_wrench(self, quaternion: npt.ArrayLike, goal: npt.ArrayLike) -> Array:
-        """Wrench that holds the goal attitude at rest against weight and buoyancy, body frame [N, N m], (..., 6).
+        """Return the wrench that holds the goal attitude at rest against weight and buoyancy, body frame [N,
+        N m], (..., 6).
 
-        The moment is that of the goal attitude, not of the measured one: the pendulum's own righting moment stays in
-        the loop, where it acts without delay.
+        The moment is that of the goal attitude, not of the measured one: the pendulum's righting moment
+        remains in the loop, where it acts without delay.
 
         Args:
-            quaternion: Measured attitude, xyzw, (..., 4): the force is vertical in it.
-            goal: Wanted attitude, xyzw, (..., 4).
+            quaternion: Measured attitude, xyzw, (..., 4), in which the force is vertical.
+            goal: Goal attitude, xyzw, (..., 4).
 
         Note:
             Assumes that the vehicle is submerged.
@@ -261,11 +265,11 @@ class Pid:
         return np.concatenate([force, moment], axis=-1)
 
 
-# The published controller of the paper's vehicle, as its configuration files state it: profile `pid-paper`.
+# The published controller of the paper's vehicle, as in its configuration files: profile `pid-paper`.
 
 
 class PaperProfile(NamedTuple):
-    """Numbers as published: order depth, surge, sway, then yaw in degrees; a mixed system of units."""
+    """Published parameters, in the order depth, surge, sway (all in m) and yaw (in degrees); mixed units."""
 
     kp: tuple[float, float, float, float]
     ki: tuple[float, float, float, float]
@@ -273,7 +277,7 @@ class PaperProfile(NamedTuple):
     output_limit: tuple[float, float, float, float]
     """Bound of each PID's output, in the unit of `axis_range`."""
     axis_range: tuple[float, float, float, float]
-    """Divisor that turns each output into an effort in [-1, 1]: smaller is stronger."""
+    """Divisor that scales each output to an effort in [-1, 1]; a smaller one makes the control stronger."""
     integral_decay: float = 0.95
     """Factor on the integral per period."""
     integral_limit: float = 100.0
@@ -293,7 +297,7 @@ PAPER_PROFILE = PaperProfile(
     output_limit=(250.0, 30.0, 30.0, 0.10),
     axis_range=(10.0, 20.0, 20.0, 5.0),
 )
-"""'Position + yaw (hardware)' of the published configuration; what it leaves out is the published core's default."""
+"""'Position + yaw (hardware)' of the published configuration, with the published defaults for omitted values."""
 
 TRAJECTORY_PROFILE = PaperProfile(
     kp=(12.0, 20.0, 20.0, 0.0),
@@ -304,10 +308,11 @@ TRAJECTORY_PROFILE = PaperProfile(
     integral_decay=0.985,
     unit=19.8,
 )
-"""'Trajectory (hardware)' of the published configuration: what T2's baseline ran with; it leaves the heading alone.
+"""'Trajectory (hardware)' of the published configuration, used by the baseline of T2; it does not control the
+heading.
 
-An effort of one is read as all four slanted thrusters at their limit, 4 * 7 N * cos 45°: the errors in the simulator
-are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would be twice as large.
+An effort of one is interpreted as all four slanted thrusters at their limit, 4 * 7 N * cos 45°: the errors in the
+simulator are then 0.12 to 0.19 m, near the published 0.17 to 0.21 m; with 7 N they would be twice as large.
 """
 
 
@@ -324,17 +329,17 @@ class PaperMemory(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PaperPid:
-    """Three position loops in the body's axes and one heading loop, run in the paper's controller frame.
+    """Three position loops in the body's axes and one heading loop, in the paper's controller frame.
 
     effort = clip((kp e + ki int(e) + kd de/dt) / axis range, +-1),   wrench = effort * unit
 
-    The published mixer is the pseudo-inverse of an idealised thruster matrix and acts on efforts; an effort of one on
-    a thruster is its full thrust. So we read one unit of effort as one thruster limit of force (7 N), or of moment at
-    one metre: nothing published states it outright.
+    The published mixer is the pseudo-inverse of an idealised thruster matrix and acts on efforts; an effort
+    of one on a thruster is its full thrust. One unit of effort is therefore interpreted as the limit of one
+    thruster as a force (7 N), or as a moment at one metre; the publications do not state it explicitly.
 
     Note:
-        The heading gain is per degree and the heading output is bounded by 0.10, a fiftieth of full effort: the
-        published controller turns the vehicle very slowly.
+        The heading gain is per degree and the heading output is bounded by 0.10, a fiftieth of full effort,
+        so the published controller turns the vehicle very slowly.
     """
 
     reference: Array
@@ -353,13 +358,13 @@ class PaperPid:
         period: float = 1.0 / 60.0,
         profile: PaperProfile = PAPER_PROFILE,
     ) -> PaperPid:
-        """Controller of a vehicle; the published gains do not depend on its hydrodynamics.
+        """Return the controller of a vehicle; the published gains do not depend on its hydrodynamics.
 
         Args:
-            vehicle: The vehicle.
+            vehicle: Vehicle.
             hydrodynamics: Not used.
             period: Time between two commands [s].
-            profile: Published numbers.
+            profile: Published parameters.
 
         Raises:
             ControlError: The period is not positive.
@@ -370,12 +375,12 @@ class PaperPid:
         return cls(reference=reference, period=period, profile=profile, unit=profile.unit)
 
     def reset(self, n: int | None = None) -> PaperMemory:
-        """Memory before the first command, for one vehicle or for a batch of n."""
+        """Return the memory before the first command, for one vehicle or for a batch of n."""
         shape = (4,) if n is None else (n, 4)
         return PaperMemory(np.zeros(shape), np.full(shape, np.nan), np.zeros(shape))
 
     def command(self, memory: PaperMemory, measured: Measured, goal: Goal) -> tuple[Array, PaperMemory]:
-        """Wanted wrench about `reference`, body frame [N, N m], (..., 6), and the memory for the next command."""
+        """Return the wrench about `reference`, body frame [N, N m], (..., 6), and the next memory."""
         profile = self.profile
         error = self._error(measured, goal)
         integral = profile.integral_decay * memory.integral + self.period * error
@@ -389,12 +394,12 @@ class PaperPid:
             np.clip(output / np.array(profile.axis_range), -1.0, 1.0), -1, 0
         )
         zero = np.zeros_like(depth)
-        # Controller axes: surge x, depth y (up), sway z (left); heading about y, right positive.
+        # Controller axes: surge x, depth y (up), sway z (left); heading about y, positive to the right.
         effort = np.stack([surge, depth, sway, zero, yaw, zero], axis=-1)
         return FROM_CONTROLLER.twist(self.unit * effort), PaperMemory(integral, error, slope)
 
     def _error(self, measured: Measured, goal: Goal) -> Array:
-        """Depth, surge, sway errors [m] and heading error [deg] in the controller frame, (..., 4)."""
+        """Return depth, surge and sway errors [m] and the heading error [deg] in the controller frame, (..., 4)."""
         q = np.asarray(measured.quaternion, float)
         away = np.asarray(goal.position, float) - np.asarray(measured.position, float)
         x, y, z = np.moveaxis(TO_CONTROLLER.vector(quat_inverse_rotate(q, away)), -1, 0)

@@ -1,4 +1,4 @@
-"""Baselines of tasks for vehicles that must move to steer: classical guidance, by orders to the autopilot."""
+"""Baselines of tasks for vehicles that need speed to steer: classical guidance by references to the autopilot."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from finssim.vehicles import Vehicle
 Array = NDArray[np.float64]
 
 LOOK_AHEAD_TIME = 1.5
-"""Time at cruising speed to the point ahead on the path [s]."""
+"""Look-ahead distance on the path, as a time at cruising speed [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PathPilot:
-    """Line of sight with integral action along a path, seen from the observation."""
+    """Line of sight with integral action along a path, from the observation."""
 
     cruise: Cruise
     guide: LineOfSight
@@ -43,7 +43,7 @@ class PathPilot:
         return self.guide.reset(n)
 
     def act(self, memory: Array, observation: Rows) -> tuple[Rows, Array]:
-        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        """Return the actions for observations, (n, numbers): cruising speed, course and pitch."""
         o = np.asarray(observation, float)
         up, velocity, ahead = o[:, 17:20], o[:, 11:14], o[:, 5:8]
         across, above = (ERROR_SCALE * self.cruise.size * o[:, i] for i in (0, 1))
@@ -59,8 +59,8 @@ def level_angle(start: Array, end: Array, up: Array) -> Array:
     """Return the angle about the vertical from one direction to another, counter-clockwise from above [rad], (n,).
 
     Args:
-        start: Body frame [-], (n, 3).
-        end: Body frame [-], (n, 3).
+        start: First direction, body frame [-], (n, 3).
+        end: Second direction, body frame [-], (n, 3).
         up: World's up, body frame [-], (n, 3).
     """
     across = (cross(start, end) * up).sum(axis=1)
@@ -70,7 +70,7 @@ def level_angle(start: Array, end: Array, up: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainPilot:
-    """The depth that keeps the altitude, from the beams' estimate of the seabed, and line of sight along the line."""
+    """Constant altitude, from the beams' estimate of the seabed, and line of sight along the survey line."""
 
     cruise: Cruise
     guide: LineOfSight
@@ -94,12 +94,12 @@ class TerrainPilot:
         return self.guide.reset(n), self.follower.reset(n)
 
     def act(self, memory: tuple[Array, Array], observation: Rows) -> tuple[Rows, tuple[Array, Array]]:
-        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        """Return the actions for observations, (n, numbers): cruising speed, course and pitch."""
         o = np.asarray(observation, float)
         size = self.cruise.size
         line, velocity, up = o[:, 4:7], o[:, 7:10], o[:, 13:16]
         depth = 10.0 * size * o[:, 2]
-        # Height over a level seabed; the echo of a wide beam is taken closer to the vertical than its axis.
+        # Height over a level seabed; the echo angle of a wide beam is nearer to the vertical than its axis.
         beta = np.arccos(np.clip(-(up * self.beam.direction).sum(axis=1), -1.0, 1.0))
         below = 5.0 * size * o[:, 0] * np.cos(self.beam.echo_angle(beta))
         altitude = below - (up * self.beam.position).sum(axis=1)
@@ -115,10 +115,11 @@ class TerrainPilot:
 
 @dataclass(frozen=True, kw_only=True)
 class HomingPilot:
-    """The bearing of a dock, led past it in proportion to its angle from the axis, so that the way bends into that."""
+    """Course towards the dock plus an angle proportional to the bearing's angle to the axis, so that the path
+    joins the axis."""
 
     lead: float = 1.0
-    """Part of the angle from the axis to the bearing that is added to the bearing [-]."""
+    """Fraction of the angle from the axis to the bearing that is added to the bearing [-]."""
     period: float = PERIOD
     """Time between two actions [s]."""
 
@@ -128,11 +129,11 @@ class HomingPilot:
         return cls()
 
     def reset(self, n: int) -> Array:
-        """Return no memory [-], (n, 0)."""
+        """Return an empty memory [-], (n, 0)."""
         return np.zeros((n, 0))
 
     def act(self, memory: Array, observation: Rows) -> tuple[Rows, Array]:
-        """Actions for observations, (n, numbers): cruising speed, course and pitch."""
+        """Return the actions for observations, (n, numbers): cruising speed, course and pitch."""
         o = np.asarray(observation, float)
         dock, axis, velocity, up = o[:, 0:3], o[:, 3:6], o[:, 6:9], o[:, 12:15]
         turn = level_angle(velocity, dock, up) + self.lead * level_angle(axis, dock, up)

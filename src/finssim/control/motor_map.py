@@ -207,8 +207,7 @@ class MotorMap:
         return limited
 
     def force(self, rpm: npt.ArrayLike) -> Array:
-        """Return the steady thrust of canonical shaft speeds [rpm] -> [N], (..., n)
-        (paper, eq. 16)."""
+        """Return the steady thrust of canonical shaft speeds [rpm] -> [N], (..., n) (paper, eq. 16)."""
         omega = np.asarray(rpm, float) * RPM
         return np.asarray(np.where(omega < 0.0, self._c[0], self._c[1]) * omega * np.abs(omega))
 

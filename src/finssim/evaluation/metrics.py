@@ -422,4 +422,4 @@ def effort_measures(t: Array, thrust: Array, limits: tuple[ArrayLike, ArrayLike]
 
 
 summarize_tracking = partial(summarize, counts="complete", valid="p95_m", means=MEASURES)
-"""One row of the table of T2: `trials`, `valid`, `complete` (count) and the means of `MEASURES`."""
+"""Function for one row of the table of T2: `trials`, `valid`, `complete` (count) and the means of `MEASURES`."""

@@ -1,7 +1,7 @@
 """Motion of a trial on a uniform grid: velocities, attitude and applied wrench about the body origin.
 
-Measured quantities are smoothed (`smooth`) and transferred to the body origin; others are
-derived if the remaining columns determine them, and NaN otherwise. Nothing is interpolated across a gap.
+Measured quantities are smoothed (`smooth`) and transferred to the body origin; others are derived if the remaining
+columns determine them, and NaN otherwise. Nothing is interpolated across a gap.
 """
 
 from __future__ import annotations

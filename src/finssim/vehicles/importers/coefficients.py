@@ -164,7 +164,7 @@ def read_coefficients(path: Path) -> Draft:
     """Read the vehicle from a .py or .m file with coefficients.
 
     Args:
-        path: The file; it is read as text and never executed.
+        path: File, which is read as text and never executed.
 
     Raises:
         VehicleError: The file cannot be read, or lacks required numbers.
