@@ -148,11 +148,9 @@ def test_a_command_without_setpoints_is_a_bad_frame():
 
 def test_an_autopilot_that_moves_thrusters_alone_is_refused():
     """In the pool and at the robot's end: one sentence."""
-    with pytest.raises(
-        PlantSpecError, match="firmware ardusub moves thrusters alone, but torpedo has rudder"
-    ):
+    with pytest.raises(PlantSpecError, match="firmware ardusub moves only thrusters, but torpedo has rudder"):
         VirtualPool(TORPEDO, NOMINAL, firmware="ardusub")
-    with pytest.raises(LinkError, match="mavlink moves thrusters alone, but torpedo has rudder"):
+    with pytest.raises(LinkError, match="mavlink moves only thrusters, but torpedo has rudder"):
         link_of("mavlink", TORPEDO)
 
 

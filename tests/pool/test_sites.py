@@ -47,9 +47,9 @@ def test_sites_and_systems_that_do_not_exist_are_refused():
         site_of("pond", spec)
     with pytest.raises(PlantSpecError, match="none, motion-capture, usbl"):
         positioning_of("gps", 1)
-    with pytest.raises(PlantSpecError, match="no camera hangs over open water"):
+    with pytest.raises(PlantSpecError, match="open water has no overhead camera"):
         make_plan("bluerov2_heavy", "1", "nominal", camera="corners", site="open-water")
-    with pytest.raises(PlantSpecError, match="take open-water"):
+    with pytest.raises(PlantSpecError, match="choose open-water"):
         site_of("tank", draw_plant(load_vehicle("rexrov"), 1, "nominal"))
     assert make_plan("rexrov", "1", "nominal", camera="none", site="open-water").spec.basin == OPEN
 

@@ -78,5 +78,5 @@ def test_what_is_no_truth_file_is_refused(tmp_path):
     with pytest.raises(TruthError, match="cannot be read"):
         read_truth(tmp_path / "none")
     (tmp_path / "other").write_text("time,x\n0,1\n")
-    with pytest.raises(TruthError, match="is no truth file"):
+    with pytest.raises(TruthError, match="is not a truth file"):
         read_truth(tmp_path / "other")

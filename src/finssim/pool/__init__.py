@@ -1,4 +1,4 @@
-"""The virtual pool: the vehicle, its motor controller and its room, behind the wires that a real one has."""
+"""Virtual pool: the vehicle, its motor controller and its pool, behind the same interfaces as a real one."""
 
 from typing import TYPE_CHECKING
 

@@ -1,9 +1,9 @@
-"""An autopilot to try against: what ArduSub 4.5 does on a BlueROV2, with MAVLink 2 in and out.
+"""Emulated autopilot for tests: behaviour of ArduSub 4.5 on a BlueROV2, with MAVLink 2 in and out.
 
 The messages, their units and rates, the rules of pilot input, arming and failsafes, and the answers to commands are
-those recorded from ArduSub 4.5.0 (`tests/data/ardusub_4_5_0`); docs/reference/ardusub_sitl.md names the exceptions. It
-has one link, which a router shares among ground stations, as on the
-vehicle itself. Its axes are forward, right, down in north, east, down; north is our world x.
+those recorded from ArduSub 4.5.0 (`tests/data/ardusub_4_5_0`); docs/reference/ardusub_sitl.md lists the exceptions. It
+has one link, which a router shares among ground stations, as on the vehicle itself. Its axes are forward, right, down
+in north, east, down; north is world x.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ Array = NDArray[np.float64]
 STABILIZE, ACRO, ALT_HOLD, SURFACE, POSHOLD, MANUAL, MOTOR_DETECT, SURFTRAK = 0, 1, 2, 9, 16, 19, 20, 21
 """Modes, by their numbers in HEARTBEAT.custom_mode."""
 BY_HAND = (MANUAL, STABILIZE, ACRO, MOTOR_DETECT)
-"""Modes whose throttle is the pilot's."""
+"""Modes in which the pilot controls the throttle."""
 DEPTH_MODES = (ALT_HOLD, SURFACE, SURFTRAK)
 VERSIONS = {"4.1": (4, 1, 2), "4.5": (4, 5, 0), "4.7": (4, 7, 0)}
-"""Firmware that is emulated. 4.5 is as recorded; 4.1 knows neither the axes of pitch and roll nor SURFTRAK; 4.7 has
-SURFACE_MAX_THR and other names of its own number and the ground station's."""
+"""Emulated firmware versions. 4.5 is as recorded; 4.1 has neither pitch and roll axes nor SURFTRAK; 4.7 has
+SURFACE_MAX_THR and other names for its own system id and that of the ground station."""
 PARAMETERS = Path(__file__).with_name("ardusub_4_5_0.csv")
 """Name, value and type of every parameter of ArduSub 4.5.0 after its start."""
 RENAMED = {"SYSID_THISMAV": "MAV_SYSID", "SYSID_MYGCS": "MAV_GCS_SYSID"}
-"""Parameters of 4.5 and their names in 4.7."""
+"""Parameters of 4.5 -> their names in 4.7."""
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
 """Results of commands."""
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6
-"""Severities of texts."""
+"""Severities of status texts."""
 CAPABILITIES = 2 | 8192
-"""Parameters as floats, MAVLink 2."""
+"""Capability bits: parameters as floats, MAVLink 2."""
 SENSORS = sum(
     getattr(mavlink, f"MAV_SYS_STATUS_{name}")
     for name in ("SENSOR_3D_GYRO", "SENSOR_3D_ACCEL", "SENSOR_ABSOLUTE_PRESSURE", "SENSOR_BATTERY",
                  "SENSOR_MOTOR_OUTPUTS", "AHRS", "PREARM_CHECK")
 )  # fmt: skip
-"""Bits of SYS_STATUS of what every vehicle has."""
+"""Bits of SYS_STATUS that every vehicle has."""
 WITHOUT_SAMPLE = {
     "heartbeat",
     "autopilot_version",
@@ -72,16 +72,17 @@ WITHOUT_SAMPLE = {
     "system_time",
     "meminfo",
 }
-"""Messages that need no instrument."""
+"""Messages that do not need any instrument."""
 CONSTANT = {
     "power_status": (5000, 0, 0),
     "meminfo": (0, 65535, 100000),
     "mission_current": (0,),
     "gps_raw_int": (0, 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0),  # none under water
 }
-"""Messages that never change, with their fields."""
+"""Constant messages, with their fields."""
 FRD = TO_FOSSEN.A
-"""Forward, left, up to forward, right, down, (3, 3): half a turn, so that rates and quaternions turn by it too."""
+"""Rotation from forward, left, up to forward, right, down, (3, 3), by 180°; it also applies to rates and
+quaternions."""
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]"""
 STANDARD_ATMOSPHERE = 101325.0
@@ -89,7 +90,7 @@ STANDARD_ATMOSPHERE = 101325.0
 
 SYSTEM = 1
 NEUTRAL, HALF_RANGE = 1500, 400
-"""Pulse width of no demand and how far a full one is from it [µs]."""
+"""Pulse width at no demand, and its difference at full demand [µs]."""
 PITCH, ROLL, THROTTLE, YAW, FORWARD, LATERAL = range(6)
 """Input channels, from 0."""
 BOOT_INPUTS = (NEUTRAL,) * 8 + (1100,) * 10
@@ -98,32 +99,36 @@ SPECIFIC_WEIGHT = 9800.0
 """Pressure gradient of fresh water, as in ArduPilot [Pa/m]."""
 METRES_PER_DEGREE = 111319.5
 CALIBRATION, STILL = 1.0, 0.03
-"""For so long after the start the gyroscope is averaged [s], unless it turns faster than this [rad/s]."""
+"""Time after the start in which the gyroscope is averaged [s], and rate above which the average is not used
+[rad/s]."""
 SPOOL_TIME = 0.5
 """Time after arming in which the limit of the throttle rises from 0 to 1 [s]."""
 GROUND_LOST, WARN_AGAIN = 2.5, 30.0
-"""Silence of the ground station's heartbeat that is a failsafe, and least time between two warnings of it [s]."""
+"""Time without a heartbeat of the ground station that triggers the failsafe, and shortest time between two warnings
+[s]."""
 CALIBRATING = 3.0
-"""Time that the calibration of the gyroscope takes [s]."""
+"""Duration of the gyroscope calibration [s]."""
 TEST_LASTS, COOL_DOWN, RETRY = 0.5, 10.0, 2.0
-"""Longest time between two motor tests, and least time after a test, and after a refused one, until the next [s]."""
+"""Longest time between two motor test commands, and shortest time from a test, and from a refused one, to the next
+[s]."""
 FIRST_RELAY = 9
-"""First servo output that DO_SET_SERVO may drive: those before are motors."""
+"""First servo output that DO_SET_SERVO may drive: lower outputs are motors."""
 DEPTH_LAG = 0.4
 """Time constant of the depth estimate [s]."""
 COMPASS_SHARE = 0.05
-"""Part of the difference to a heading that one reading of the compass takes away [-]."""
+"""Fraction of the heading difference that one reading of the compass corrects [-]."""
 BIAS_SHARE, SETTLED = (0.02, 0.0005), 10.0
-"""Part of that difference that the gyroscope's bias takes [1/s], before and after the time since the start [s]."""
+"""Integral gain from this difference to the gyroscope bias [1/s], before and after a time since the start [s]."""
 LATE = 30
-"""Samples for which attitudes are remembered, which is longer than a Doppler log is late [-]."""
+"""Number of samples for which attitudes are stored, which exceeds the latency of a Doppler log [-]."""
 TURNING = 20.0
-"""Time in which the heading turns from magnetic to true north, once there is an origin [s]."""
+"""Time in which the heading changes from magnetic to true north, once there is an origin [s]."""
 POSITION_LASTS, INERTIAL = 6.0, 0.5
-"""A position is given so long after the last velocity [s]; the accelerometer gives velocity after the second."""
+"""Time after the last velocity for which a position is reported, and after which the accelerometer is integrated
+[s]."""
 
 FTP_NAK, FTP_UNKNOWN = 129, 7
-"""Answer to an operation of file transfer, and its reason."""
+"""Negative answer to a file transfer operation, and its reason."""
 
 GROUPS = {
     "RAW_SENS": (1, "raw_imu scaled_imu2 scaled_imu3 scaled_pressure scaled_pressure2"),
@@ -137,13 +142,13 @@ GROUPS = {
     "EXTRA2": (11, "vfr_hud"),
     "EXTRA3": (12, "ahrs system_time battery_status ekf_status_report vibration"),
 }
-"""Stream groups: name in the parameter SR0_NAME, number in REQUEST_DATA_STREAM, messages."""
+"""Stream groups: name in the parameter SR0_NAME -> number in REQUEST_DATA_STREAM, messages."""
 
 REAL32 = 9
 BUTTON_MODES = {5: MANUAL, 6: STABILIZE, 7: ALT_HOLD, 8: POSHOLD, 12: ACRO, 13: SURFTRAK}
 """BTNn_FUNCTION -> mode."""
 LIMITS = {2: 2**7 - 1, 4: 2**15 - 1, 6: 2**31 - 1}
-"""Type of an integer parameter -> its greatest value."""
+"""Type of an integer parameter -> its largest value."""
 ANSWERS = {
     mavlink.MAV_CMD_DO_SET_RELAY: ACCEPTED,
     mavlink.MAV_CMD_DO_FENCE_ENABLE: ACCEPTED,
@@ -154,19 +159,19 @@ ANSWERS = {
     mavlink.MAV_CMD_MISSION_START: FAILED,
     mavlink.MAV_CMD_DO_FLIGHTTERMINATION: FAILED,
 }
-"""Commands without an effect here, and how they are answered."""
+"""Commands without an effect here -> result of the answer."""
 
 
 class ArduSub:
-    """One autopilot, from power-on; like `Firmware` it is given the time, and its motors turn in the plant.
+    """One emulated autopilot, from power-on; like `Firmware`, it receives the time, and its motors run in the plant.
 
     Attributes:
-        parameters: By name; they outlive a reboot.
-        target: Shaft speeds that its pulses stand for on a full battery, canonical order [rad/s], (n,).
-        pulses: Of motors 1, 2, ... [µs], (n,).
+        parameters: Values by name, which a reboot does not change.
+        target: Shaft speeds that correspond to its pulses with a full battery, canonical order [rad/s], (n,).
+        pulses: Pulse widths of motors 1, 2, ... [µs], (n,).
         mode: Its number in HEARTBEAT.custom_mode.
-        armed: Whether its motors turn.
-        ordered: Whether its frames cannot overtake each other on the wire.
+        armed: True if its motors are enabled.
+        ordered: True if frames cannot overtake each other on the link.
     """
 
     ordered = True
@@ -206,10 +211,10 @@ class ArduSub:
             self._origin, self._origin_at = (round(1e7 * latitude), round(1e7 * longitude)), -math.inf
 
     def _default_parameters(self, vehicle: Vehicle) -> dict[str, tuple[int, float]]:
-        """Types and values, by name, sorted: the recorded ones, and what a user sets for this vehicle.
+        """Return types and values by name, sorted: the recorded ones, and those that a user sets for this vehicle.
 
-        The vehicle decides the frame, the directions of its motors, the specific gravity of its water and, with a
-        Doppler log, where the autopilot's position comes from.
+        The vehicle determines the frame, the directions of its motors, the specific gravity of its water and, with a
+        Doppler log, the source of the autopilot's position.
         """
         with PARAMETERS.open(newline="") as file:
             table = {r["name"]: (int(r["mavlink_type"]), float(r["value"])) for r in csv.DictReader(file)}
@@ -233,7 +238,7 @@ class ArduSub:
         return dict(sorted(table.items()))
 
     def _start(self, now: float) -> None:
-        """State after power-on: parameters are remembered and nothing else."""
+        """Set the state after power-on: only parameters are kept."""
         self._boot = self._now = now
         self._out: list[bytes] = []
         self._mav = mavlink.MAVLink(SimpleNamespace(write=self._out.append), self._id, 1)
@@ -282,28 +287,28 @@ class ArduSub:
             self._stream(name, self.parameters[f"SR0_{name}"])
         self._greet()
 
-    # What the pool calls.
+    # Functions that the pool calls.
 
     def reboot(self, now: float) -> None:
-        """Stop the motors, be silent for the plant's `reboot_time`, then restart everything but the parameters.
+        """Stop the motors, send nothing for the plant's `reboot_time`, then reset everything except the parameters.
 
-        The barometer is calibrated where the vehicle is then: its depth counts from there. `now` is the time [s].
+        The barometer is then calibrated at the present depth, which becomes the origin of depth. `now` is the time [s].
         """
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
         self._calibrate_at_start = True
 
     def running(self, now: float) -> bool:
-        """Return whether it has finished starting. `now` is the time [s]."""
+        """Return whether the autopilot has finished starting. `now` is the time [s]."""
         return now >= self._boot
 
     @property
     def driving(self) -> bool:
-        """Return whether it is armed."""
+        """Return whether the autopilot is armed."""
         return self.armed
 
     def receive(self, now: float, data: bytes) -> list[bytes]:
-        """Read a datagram of complete MAVLink frames and return the answers; it raises nothing.
+        """Process a datagram of complete MAVLink frames, and return the answers; it never raises an exception.
 
         `now` is the time [s].
         """
@@ -316,7 +321,7 @@ class ArduSub:
             for_us = getattr(message, "target_system", self._id) in (0, self._id)
             if handler is not None and for_us and getattr(message, "target_component", 1) in (0, 1):
                 handler(message)
-        # The rest is no complete frame: it must not consume the next one.
+        # Incomplete data are dropped, so that they do not consume the next frame.
         self._mav.buf, self._mav.buf_index = bytearray(), 0
         self._mav.expected_length = mavlink.HEADER_LEN_V1 + 2
         out = self._drain()
@@ -325,7 +330,7 @@ class ArduSub:
         return out
 
     def watch(self, now: float) -> None:
-        """Let overrides lapse, look at the pilot and the ground station, and set the motors.
+        """Release expired overrides, check pilot and ground station, and set the motors.
 
         `now` is the time [s].
         """
@@ -347,14 +352,14 @@ class ArduSub:
     def frames(
         self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
-        """Return what is sent at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
+        """Return the frames at a sample of the IMU: telemetry that is due, and the lines of the Doppler log.
 
         Args:
-            now: When it leaves [s].
-            sample: Of the instruments.
-            aids: Of compass and Doppler log, new at this sample.
-            plant: Battery, and distance to the floor.
-            faults: What is wrong.
+            now: Time of sending [s].
+            sample: Readings of the instruments.
+            aids: New readings of compass and Doppler log at this sample.
+            plant: Plant with the battery and the distance to the floor.
+            faults: Active faults.
         """
         aids = [aid for aid in aids if aid.kind != VELOCITY or not faults.autopilot.dvl_silent]
         silent = faults.autopilot.dvl_silent or self._dvl is None or not self._spec.log_shared
@@ -386,7 +391,7 @@ class ArduSub:
         self._out.clear()
         return out
 
-    # Instruments, and what it makes of them.
+    # Instruments and state estimation.
 
     def _sense(self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid]) -> None:
         dt, self._sampled, self._sample = now - self._sampled, now, sample
@@ -397,16 +402,16 @@ class ArduSub:
             self._rates_sum, self._rates_count = self._rates_sum + gyro, self._rates_count + 1
             self._fastest = max(self._fastest, float(np.abs(gyro).max()))
             x, y, z = (self._rates_sum / self._rates_count).tolist()
-            # One that was moved meanwhile would take its motion for the gyroscope's offset.
+            # Motion during the average would be mistaken for a gyroscope offset.
             self._filter.bias = (x, y, z) if self._fastest < STILL else (0.0, 0.0, 0.0)
         self._filter.update(tuple(gyro.tolist()), tuple(accel.tolist()), dt)
         velocities = []
         for aid in aids:
             if aid.kind == HEADING and self.parameters["COMPASS_USE"]:
-                # Our angles count to the left; the magnetic heading is short of the true one by the declination.
+                # The filter's angles are left positive; the magnetic heading is the true one minus the declination.
                 disturbed = self._faults.autopilot.north if self._faults else 0.0
                 missing = self._spec.declination * (1.0 - self._true_north(now)) + disturbed
-                # A turn of the north is no offset of the gyroscope.
+                # A change of the north direction is not a gyroscope offset.
                 turning = disturbed or (self._spec.declination and 0.0 < self._true_north(now) < 1.0)
                 settled = bool(turning) or now - self._boot > SETTLED
                 share = COMPASS_SHARE if self._headed else 1.0
@@ -440,17 +445,17 @@ class ArduSub:
                 self._places.popleft()
 
     def _attitude_at(self, time: float) -> tuple[Array, Array]:
-        """Return the attitude of a time [s], x y z w, body to north, east, down, and the rates of the body [rad/s]: the
-        real filter is as late as its slowest instrument."""
+        """Return the attitude at a time [s], x y z w, body to north, east, down, and the body rates [rad/s]: the real
+        filter is as late as its slowest instrument."""
         then = ((q, rates) for at, q, rates in self._attitudes if at >= time)
         return next(then, (self._quaternion, self._rates))
 
     def _true_north(self, now: float) -> float:
-        """Return how far the heading has turned from magnetic to true north [0, 1]."""
+        """Return the progress of the heading's change from magnetic to true north [0, 1]."""
         return min(max((now - self._origin_at) / TURNING, 0.0), 1.0)
 
     def _calibrate_barometer(self) -> None:
-        """Let depth count from where the vehicle is."""
+        """Set the present depth as the origin of depth."""
         assert self._sample is not None
         self._calibrate_at_start = False
         for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):
@@ -458,7 +463,7 @@ class ArduSub:
                 self._store(name, self._sample.pressure)
 
     def _climb_by(self, acceleration: float, dt: float) -> None:
-        """Height, climb rate and the accelerometer's offset from pressure and vertical acceleration [m/s^2]: an
+        """Update height, climb rate and accelerometer offset from pressure and vertical acceleration [m/s^2], with an
         observer of three equal poles."""
         assert self._sample is not None
         weight = SPECIFIC_WEIGHT * self._within("BARO_SPEC_GRAV", 0.5, 2.0)
@@ -470,13 +475,13 @@ class ArduSub:
         self._altitude += dt * (self._climb + 3.0 / DEPTH_LAG * error)
         self._climb += dt * (self._lift + 3.0 / DEPTH_LAG**2 * error)
         self._lift_offset += dt * error / DEPTH_LAG**3
-        # Above SURFACE_DEPTH; below it again by 5 cm.
+        # True above SURFACE_DEPTH, and false again 5 cm below it.
         self._surfaced = (
             self.armed and measured > 0.01 * self.parameters["SURFACE_DEPTH"] - 0.05 * self._surfaced
         )
 
     def _dvl_lines(self, now: float, aids: Sequence[NavigationAid], plant: Plant) -> list[bytes]:
-        """Reports of the Doppler log: its velocities, and that it has none where it misses more than one."""
+        """Return the reports of the Doppler log: its velocities, or an invalid report if more than one is missing."""
         assert self._dvl is not None
         interval = now - self._dvl_time
         velocities = [aid for aid in aids if aid.kind == VELOCITY]
@@ -504,7 +509,8 @@ class ArduSub:
     # Motors.
 
     def _hold(self, dt: float) -> None:
-        """Set the demands of roll, pitch, yaw and throttle that hold attitude and depth, in the modes that do.
+        """Set the demands of roll, pitch, yaw and throttle that hold attitude and depth, in modes with these
+        controllers.
 
         `dt` is the time since the last call [s].
         """
@@ -533,7 +539,7 @@ class ArduSub:
         )
 
     def _climbing(self, dt: float) -> float:
-        """Return the throttle that climbs by the stick, or to the surface, or holds the depth."""
+        """Return the throttle that climbs by the stick, rises to the surface, or holds the depth."""
         p = self.parameters
         climb = climb_rate(self._inputs[THROTTLE], self._gain, p)
         if self.mode == SURFACE:
@@ -545,7 +551,7 @@ class ArduSub:
         return min(least + (1.0 - least) * max(0.0, min(1.0, surface - self._altitude)), up)
 
     def _drive(self) -> None:
-        """Pulses of the mixer while armed, else 1500."""
+        """Set the pulses of the mixer while armed, else 1500."""
         if self._testing:
             return
         demands = self._demands() if self.armed and self.mode != MOTOR_DETECT else None
@@ -554,13 +560,13 @@ class ArduSub:
         self._driven = demands
         pulses = np.full(len(self._motor), float(NEUTRAL))
         if demands is not None:
-            # Truncated to microseconds; 1e-3 makes up for single precision.
+            # Truncated to microseconds; 1e-3 compensates for single precision.
             offsets = self._signs() * (self._mixer.pulses(np.array(demands)) - NEUTRAL)
             pulses = np.floor(NEUTRAL + offsets + 1e-3)
         self._output(pulses)
 
     def _output(self, pulses: Array) -> None:
-        """Let the motors follow pulses [µs], motors 1, 2, ..., (n,)."""
+        """Set pulse widths [µs] of motors 1, 2, ..., (n,), and the target speeds that follow from them."""
         self.pulses = pulses
         column = (pulses[self._motor] - (NEUTRAL - HALF_RANGE)).astype(int)
         self.target = self._speeds[np.arange(len(column)), column]
@@ -574,7 +580,7 @@ class ArduSub:
         return roll, pitch, yaw, max(-spool, min(spool, throttle)), forward, lateral
 
     def _signs(self) -> Array:
-        """Return the signs of the motors that parameters turn against the vehicle file, (n,)."""
+        """Return the signs of motors whose direction in the parameters differs from the vehicle file, (n,)."""
         n = len(self.pulses)
         now = np.array([self.parameters[f"MOT_{i + 1}_DIRECTION"] for i in range(n)])
         return np.asarray(np.where(now < 0.0, -1.0, 1.0) * self._mixer.directions)
@@ -582,7 +588,7 @@ class ArduSub:
     # Pilot.
 
     def _sticks(self) -> list[float]:
-        """The first six inputs in [-1, 1]: pitch, roll, throttle, yaw, forward, lateral."""
+        """Return the first six inputs in [-1, 1]: pitch, roll, throttle, yaw, forward, lateral."""
         return [max(-1.0, min(1.0, (width - NEUTRAL) / HALF_RANGE)) for width in self._inputs[:6]]
 
     def _override(self, channel: int, width: float) -> None:
@@ -596,11 +602,11 @@ class ArduSub:
             self._release(channel)
 
     def _from_ground(self) -> bool:
-        """Return whether the newest message came from the ground station that may steer."""
+        """Return whether the newest message came from the ground station that has control."""
         return bool(self._sender[0] == self.parameters[self._named("SYSID_MYGCS")])
 
     def _named(self, name: str) -> str:
-        """Return the name that a parameter of 4.5 has in this version."""
+        """Return the name of a parameter of 4.5 in this version."""
         return RENAMED.get(name, name) if self._version >= (4, 7) else name
 
     def _on_heartbeat(self, message: Any) -> None:
@@ -620,7 +626,7 @@ class ArduSub:
         scale = 0.4 * self._gain
         lift = 2.0 * scale * self.parameters["JS_THR_GAIN"]
         pitch, roll = (message.s, message.t) if self._version >= (4, 5) else (0, 0)
-        # The autopilot computes in integers of 16 bits: pitch and roll can wrap.
+        # The autopilot computes with 16-bit integers: pitch and roll can wrap.
         for channel, width in (
             (PITCH, _wrapped(NEUTRAL + pitch)),
             (ROLL, _wrapped(NEUTRAL + roll)),
@@ -632,9 +638,9 @@ class ArduSub:
             self._override(channel, max(NEUTRAL - HALF_RANGE, min(NEUTRAL + HALF_RANGE, width)))
 
     def _press(self, function: int, held: bool) -> None:
-        """Perform the function of a button: of arming and modes in each message, of the gain when it is pressed.
+        """Perform the function of a button: arming and modes on every message, gain only when it is pressed.
 
-        Those of lights, camera, trim and relays do nothing.
+        Functions of lights, camera, trim and relays have no effect.
         """
         if function in (2, 3, 4):
             arm = function == 3 or (function == 2 and not self.armed)
@@ -663,7 +669,7 @@ class ArduSub:
     # Arming, modes, failsafes.
 
     def _unfit(self) -> list[str]:
-        """Return why it must not be armed; ARMING_CHECK names what is checked beside the button."""
+        """Return the reasons against arming; ARMING_CHECK selects the checks in addition to the button."""
         p, checks = self.parameters, int(self.parameters["ARMING_CHECK"])
         reasons = []
         if not any(p[f"BTN{i}_FUNCTION"] in (2, 4) for i in range(16)) and not (
@@ -680,7 +686,7 @@ class ArduSub:
         return reasons
 
     def _arm(self) -> bool:
-        """Arm, if nothing is against it; forcing does not help."""
+        """Arm if there is no reason against it, also with forced arming; return whether the command succeeds."""
         if self.armed:
             return True
         reasons = self._unfit()
@@ -694,7 +700,7 @@ class ArduSub:
         if self._origin is None:
             self._statustext(WARNING, "No origin: the heading is magnetic")
             self._statustext(WARNING, "No origin: no world position")
-            # As recorded of later versions and read of this one: it is armed all the same.
+            # As recorded from later versions and read in this one's source: it arms although the command fails.
             return not int(self.parameters["ARMING_CHECK"]) & (1 | 32)
         return True
 
@@ -712,7 +718,7 @@ class ArduSub:
         if depth:
             modes.add(ALT_HOLD)
             modes |= {SURFTRAK} if self._version >= (4, 5) else set()
-            # Rising needs a position: so do the modes that are not emulated, which are refused even with one.
+            # SURFACE needs a position; so do the modes that are not emulated, which are always refused.
             modes |= {SURFACE} if self._has_position or self.mode == SURFACE else set()
         if mode not in modes:
             self._statustext(WARNING, "Mode change failed: no position, no depth, or not emulated")
@@ -732,7 +738,7 @@ class ArduSub:
             self._due["heartbeat"] = self._now
 
     def _failsafe(self, name: str, active: bool, severity: int, text: str) -> bool:
-        """Keep the state of a failsafe; True, and a text, where it sets in."""
+        """Store the state of a failsafe; when it sets in, send a text and return True."""
         sets_in = active and name not in self._failsafes
         self._failsafes = self._failsafes | {name} if active else self._failsafes - {name}
         if sets_in:
@@ -740,8 +746,8 @@ class ArduSub:
         return sets_in
 
     def _check_pilot(self, now: float) -> None:
-        """Without input for FS_PILOT_TIMEOUT, set the sticks to neutral, and disarm if FS_PILOT_INPUT demands it; once
-        a loss."""
+        """After FS_PILOT_TIMEOUT without input, set the sticks to neutral, and disarm if FS_PILOT_INPUT requires it;
+        once per loss."""
         action = self.parameters["FS_PILOT_INPUT"]
         known = self._pilot_seen > -math.inf
         lost = known and action > 0 and now - self._pilot_seen > self.parameters["FS_PILOT_TIMEOUT"]
@@ -750,8 +756,7 @@ class ArduSub:
             self._act({2: None}.get(int(action), self.mode))
 
     def _check_ground(self, now: float) -> None:
-        """Without a heartbeat of the ground station, once there was one: warn, and do what FS_GCS_ENABLE demands, while
-        armed."""
+        """If the ground station's heartbeat is lost, send a warning, and act by FS_GCS_ENABLE while armed."""
         action, since = self.parameters["FS_GCS_ENABLE"], self._ground_seen
         timeout = self.parameters.get("FS_GCS_TIMEOUT", GROUND_LOST)
         lost = action > 0 and since > -math.inf and now - since > timeout
@@ -767,7 +772,7 @@ class ArduSub:
             self._act({2: None, 3: ALT_HOLD, 4: SURFACE}.get(int(action), self.mode))
 
     def _check_battery(self, now: float) -> None:
-        """BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once a start."""
+        """Perform BATT_FS_LOW_ACT (2 disarm, 3 surface) after BATT_LOW_TIMER below BATT_LOW_VOLT; once per start."""
         p, voltage = self.parameters, self._battery[0]
         self._low_since = min(self._low_since, now) if voltage < p["BATT_LOW_VOLT"] else math.inf
         low = "battery" in self._failsafes or now - self._low_since >= p["BATT_LOW_TIMER"]
@@ -777,20 +782,20 @@ class ArduSub:
             self._act({2: None, 3: SURFACE}.get(int(p["BATT_FS_LOW_ACT"]), self.mode), keep=True)
 
     def _check_leak(self, leaking: bool) -> None:
-        """FS_LEAK_ENABLE: 1 warns, 2 surfaces too; the heartbeat stays as it is."""
+        """Act by FS_LEAK_ENABLE: 1 warns, 2 also surfaces; the heartbeat does not change."""
         action = self.parameters["FS_LEAK_ENABLE"]
         if self._failsafe("leak", leaking and action > 0, CRITICAL, "Leak Detected"):
             self._act({2: SURFACE}.get(int(action), self.mode), keep=True)
 
     def _check_test(self, now: float) -> None:
-        """End a motor test that is not repeated, and disarm."""
+        """End a motor test whose command is not repeated, and disarm."""
         if self._testing and now - self._tested > TEST_LASTS:
             self._testing, self._test_ended, self._driven = False, now, ()
             self._statustext(INFO, "Motor test timed out")
             self._disarm()
 
     def _act(self, mode: int | None, *, keep: bool = False) -> None:
-        """Go into a mode; None disarms, and so does a mode that is refused, unless `keep`."""
+        """Set a mode; disarm if it is None, or if it is refused and `keep` is False."""
         if self.armed and (mode is None or not (self._set_mode(mode) or keep)):
             self._disarm()
 
@@ -807,11 +812,13 @@ class ArduSub:
         self._send("command_ack", mavlink.MAVLINK_MSG_ID_SET_MODE, result)
 
     def _command(self, command: int, values: list[float]) -> None:
-        """Perform it or refuse it; one that is not known is unsupported, never met with silence."""
-        values = [value if abs(value) < 1e9 else -1.0 for value in values]  # NaN too: no command accepts it
+        """Perform or refuse a command; an unknown command is answered as unsupported."""
+        values = [
+            value if abs(value) < 1e9 else -1.0 for value in values
+        ]  # also NaN, which no command accepts
         do = COMMANDS.get(command)
         result = ANSWERS.get(command, UNSUPPORTED) if do is None else do(self, values)
-        if result is None:  # it takes its time
+        if result is None:  # answered after the calibration
             self._answer_later.append((self._now + CALIBRATING, command, self._sender))
         else:
             self._send("command_ack", command, result, 0, 0, *self._sender)
@@ -851,7 +858,8 @@ class ArduSub:
         return UNSUPPORTED
 
     def _do_calibrate(self, values: list[float]) -> int | None:
-        """Gyroscope (first), ground pressure (third) or accelerometer (fifth, never here); nothing while armed."""
+        """Calibrate gyroscope (first value), ground pressure (third) or accelerometer (fifth, never here); refused
+        while armed."""
         if self.armed or self._sample is None:
             if values[2] == 1.0:
                 self._statustext(NOTICE, "Disarm before calibrating")
@@ -867,7 +875,8 @@ class ArduSub:
         return REJECTED if values[4] else UNSUPPORTED
 
     def _do_motor_test(self, values: list[float]) -> int:
-        """Drive one motor (first, from 0) by a pulse or a percentage until it is not repeated, past the mixer."""
+        """Drive one motor (first value, from 0) by a pulse or a percentage, without the mixer, while the command is
+        repeated."""
         motor, kind, width, order = int(values[0]), values[1], values[2], values[5]
         self._tested, refused = self._now, self._now - self._test_refused < RETRY
         if not self._testing:
@@ -895,7 +904,7 @@ class ArduSub:
         return ACCEPTED
 
     def _do_set_servo(self, values: list[float]) -> int:
-        """Outputs that are no motors keep the pulse, which nothing here follows."""
+        """Store the pulse of an output that is not a motor; it has no effect here."""
         if not FIRST_RELAY <= values[0] <= 16:
             self._statustext(INFO, f"Servo {values[0]:.0f} is a motor's")
             return FAILED
@@ -906,14 +915,14 @@ class ArduSub:
         self._rebooting = not self.armed and values[0] in (1.0, 3.0)
         return _result(self._rebooting)
 
-    # Parameters, streams and what else a ground station asks.
+    # Parameters, streams and other requests of a ground station.
 
     @property
     def _id(self) -> int:
         return int(self._within(self._named("SYSID_THISMAV"), 1, 255))
 
     def _within(self, name: str, low: float, high: float) -> float:
-        """A parameter, which anybody may have set, within what makes sense."""
+        """Return a parameter, which any station may have set, limited to a valid range."""
         return max(low, min(high, self.parameters[name]))
 
     def _on_param_request_list(self, message: Any) -> None:
@@ -954,7 +963,7 @@ class ArduSub:
             self._every(name, 1.0 / rate if rate > 0.0 else 0.0)
 
     def _every(self, name: str, interval: float) -> None:
-        """Send a message at an interval [s]; 0 or a negative one ends it."""
+        """Send a message at an interval [s]; 0 or a negative value stops it."""
         if interval > 0.0:
             self._interval[name] = max(interval, 0.0025)
             self._due.setdefault(name, self._now)
@@ -969,7 +978,7 @@ class ArduSub:
         self._send("mission_ack", *self._sender, mavlink.MAV_MISSION_ACCEPTED, message.mission_type)
 
     def _on_file_transfer_protocol(self, message: Any) -> None:
-        """Refuse, so that the client does not wait: parameters go by PARAM_REQUEST_LIST."""
+        """Refuse, so that the client does not wait: parameters are sent on PARAM_REQUEST_LIST."""
         sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
         fields = (sequence + 1) & 0xFFFF, session, FTP_NAK, 1, opcode, 0, 0, FTP_UNKNOWN
         payload = struct.pack("<HBBBBHIB", *fields).ljust(251, b"\0")
@@ -984,7 +993,7 @@ class ArduSub:
             self.sign(bytes(message.secret_key) if any(message.secret_key) else b"")
 
     def sign(self, key: bytes) -> None:
-        """Sign with a key of 32 bytes from now on, and take nothing that is not; empty: neither."""
+        """Sign all messages with a key of 32 bytes from now on, and refuse unsigned ones; an empty key ends both."""
         signing, self._key = self._mav.signing, key
         signing.secret_key, signing.sign_outgoing, signing.link_id = key or None, bool(key), 1
 
@@ -996,7 +1005,7 @@ class ArduSub:
     # Telemetry.
 
     def _send(self, name: str, *fields: Any) -> None:
-        """Put a message on the link, by its name in lower case and its fields in MAVLink's order."""
+        """Queue a message for sending, by its name in lower case and its fields in MAVLink's order."""
         self._mav.send(getattr(mavlink, f"MAVLink_{name}_message")(*fields))
 
     def _statustext(self, severity: int, text: str) -> None:
@@ -1007,12 +1016,12 @@ class ArduSub:
         self._statustext(INFO, f"Frame: {self._mixer.autopilot.name}")
 
     def _reporter(self, name: str) -> Callable[[], tuple[Any, ...]] | None:
-        """Return the function that gives the fields of a message, or of several, by its name."""
+        """Return the function that computes the fields of one or several messages, by the name of the message."""
         constant = (lambda: CONSTANT[name]) if name in CONSTANT else None
         return getattr(self, f"_report_{name}", constant)
 
     def _report(self, name: str) -> bool:
-        """Send a message with current values, if there are any; return False if there is none of this name."""
+        """Send a message with current values, if there are any; return False if the message does not exist."""
         reporter = self._reporter(name)
         if reporter is None:
             return False
@@ -1024,12 +1033,12 @@ class ArduSub:
 
     @property
     def _milliseconds(self) -> int:
-        """Its own clock, modulo 2^32."""
+        """Return the time of its own clock, modulo 2^32 [ms]."""
         rate = 1000.0 * (1.0 + 1e-6 * self._spec.crystal_ppm)
         return (self._clock_start + int(rate * (self._now - self._boot))) & 0xFFFFFFFF
 
     def _spoiled(self, values: Any, *fields: str) -> list[float]:
-        """Numbers, or NaN where a fault names one of these fields."""
+        """Return the numbers, or NaN if a fault concerns one of these fields."""
         field = self._faults.nan_field.partition(".")[0] if self._faults else ""
         return [math.nan if field in fields else float(value) for value in values]
 
@@ -1060,7 +1069,7 @@ class ArduSub:
         return (self._milliseconds, w, x, y, z, *self._spoiled(self._rates, "gyro"))
 
     def _imu(self) -> list[int]:
-        """Specific force [mg], rates with their bias [mrad/s], and no magnetic field."""
+        """Return specific force [mg], rates with their bias [mrad/s], and no magnetic field."""
         values = [*(1000.0 / STANDARD_GRAVITY * self._force), *(1000.0 * self._gyro), 0.0, 0.0, 0.0]
         return [_int16(value) for value in values]
 
@@ -1073,7 +1082,7 @@ class ArduSub:
     _report_scaled_imu3 = _report_scaled_imu2
 
     def _report_scaled_pressure(self) -> tuple[Any, ...]:
-        """The barometer of the dry hull."""
+        """Return the fields of the barometer inside the hull."""
         return self._milliseconds, 0.01 * STANDARD_ATMOSPHERE, 0.0, 3500
 
     def _report_scaled_pressure2(self) -> tuple[Any, ...]:
@@ -1115,7 +1124,7 @@ class ArduSub:
         return self._origin is not None and aided and self._now - self._velocity_time < POSITION_LASTS
 
     def leap(self, north: float, east: float) -> None:
-        """Move the autopilot's own position, as a reset of its filter does; both are lengths [m]."""
+        """Shift the autopilot's own position, as a reset of its filter does; both are lengths [m]."""
         self._position = self._position + (north, east)
 
     def _report_local_position_ned(self) -> tuple[Any, ...]:
@@ -1152,7 +1161,7 @@ class ArduSub:
         )
 
     def _power(self) -> tuple[int, int, int]:
-        """Voltage [mV], current [cA] and what is left of the charge [%]."""
+        """Return voltage [mV], current [cA] and remaining charge [%]."""
         voltage, current = self._battery
         remaining = max(0.0, 1.0 - self._used / max(self.parameters["BATT_CAPACITY"], 1.0))
         return round(1000.0 * voltage), _int16(100.0 * current), round(100.0 * remaining)
@@ -1207,7 +1216,7 @@ COMMANDS: dict[int, Callable[[ArduSub, list[float]], int | None]] = {
     mavlink.MAV_CMD_DO_MOTOR_TEST: ArduSub._do_motor_test,
     mavlink.MAV_CMD_DO_SET_SERVO: ArduSub._do_set_servo,
 }
-"""Commands and what performs them; every other is answered by `ANSWERS`, or as unsupported."""
+"""Commands -> functions that perform them; others are answered by `ANSWERS`, or as unsupported."""
 
 
 def _result(done: bool) -> int:
@@ -1221,7 +1230,7 @@ def _name(number: float) -> str:
 
 
 def _wrapped(value: int) -> int:
-    """Return an integer as it is in 16 bits."""
+    """Return an integer wrapped to 16 bits."""
     return (value + 2**15) % 2**16 - 2**15
 
 

@@ -1,8 +1,8 @@
-"""The loops by which ArduSub 4.5 holds attitude and depth: sticks to demands of the mixer.
+"""Control loops with which ArduSub 4.5 holds attitude and depth: stick inputs to demands of the mixer.
 
 Gains, dead zones and limits are the autopilot's own parameters, by their names there. Its axes are forward, right, down
-in north, east, down; heights count upwards. Reference: ArduSub 4.5.0 (modes STABILIZE, ACRO and ALT_HOLD; attitude and
-position controllers), whose recorded steady states the tests compare.
+in north, east, down; heights are positive upwards. Reference: ArduSub 4.5.0 (modes STABILIZE, ACRO and ALT_HOLD;
+attitude and position controllers), with whose recorded steady states the tests compare.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ Array = NDArray[np.float64]
 
 AXES = ("RLL", "PIT", "YAW")
 FULL_STICK = math.radians(45.0)
-"""Angle of a full stick of roll, pitch or yaw, before gains [rad]."""
+"""Angle of a full roll, pitch or yaw stick, before gains [rad]."""
 SETTLING = 0.25
-"""Time after a turn in which the vehicle slows down before its heading is held [s]."""
+"""Time after a turn during which the vehicle slows down before its heading is held [s]."""
 LEAD = math.radians(45.0)
-"""Greatest lead of the target heading over the vehicle's [rad]."""
+"""Greatest lead of the target heading over the vehicle's heading [rad]."""
 DEPTH_LEAD = 2.0
-"""Greatest distance of the target height from the vehicle's [m]."""
+"""Greatest distance of the target height from the vehicle's height [m]."""
 BUFFER = 0.05
-"""Distance below SURFACE_DEPTH at which a vehicle that reached the surface is held [m]."""
+"""Distance below SURFACE_DEPTH at which a vehicle is held after reaching the surface [m]."""
 
 
 def _beyond(width: float, dead: float, half: float = 400.0) -> float:
-    """Return the part of a stick in [-1, 1] that lies beyond its dead zone; all in µs from the middle."""
+    """Return the deflection of a stick beyond its dead zone, in [-1, 1]; arguments in µs from the middle."""
     return math.copysign(min(max(abs(width) - dead, 0.0) / (half - dead), 1.0), width)
 
 
 def lean_angles(roll: float, pitch: float, parameters: Mapping[str, float]) -> tuple[float, float]:
-    """Return the roll and pitch [rad] that sticks [µs from the middle] ask for: ANGLE_MAX at most, together.
+    """Return the roll and pitch [rad] commanded by sticks [µs from the middle], together at most ANGLE_MAX.
 
-    `parameters` are the autopilot's [its own units].
+    `parameters` are those of the autopilot [its own units].
     """
     limit = math.radians(0.01 * min(max(parameters["ANGLE_MAX"], 1000.0), 8000.0))
     r, p = limit * _beyond(roll, parameters["RC2_DZ"]), limit * _beyond(pitch, parameters["RC1_DZ"])
@@ -59,21 +59,21 @@ def lean_angles(roll: float, pitch: float, parameters: Mapping[str, float]) -> t
 
 
 def yaw_rate(yaw: float, gain: float, parameters: Mapping[str, float]) -> float:
-    """Return the rate [rad/s] that the stick of yaw [µs from the middle] asks for; its dead zone shrinks with the
-    pilot's gain."""
+    """Return the rate [rad/s] commanded by the yaw stick [µs from the middle]; the pilot's gain scales its dead
+    zone."""
     return parameters["ACRO_YAW_P"] * FULL_STICK * _beyond(yaw, gain * parameters["RC4_DZ"])
 
 
 def climb_rate(throttle: float, gain: float, parameters: Mapping[str, float]) -> float:
-    """Return the climb rate [m/s] that the stick of throttle asks for.
+    """Return the climb rate [m/s] commanded by the throttle stick.
 
-    The stick counts from 0 to 1000 between the dead zone of its lower end and its upper end; around its middle lies
-    THR_DZ times the pilot's gain.
+    The stick has the range 0 to 1000, from the lower end plus its dead zone to the upper end; the dead zone around its
+    middle is THR_DZ times the pilot's gain.
 
     Args:
         throttle: Input of the throttle [µs].
-        gain: Of the pilot [-].
-        parameters: Of the autopilot, by name [its own units].
+        gain: Pilot's gain [-].
+        parameters: Parameters of the autopilot, by name [its own units].
     """
     low = parameters["RC3_MIN"] + parameters["RC3_DZ"]
     high = parameters["RC3_MAX"]
@@ -97,13 +97,13 @@ class AttitudeLoop:
     """
 
     heading: float | None = None
-    """Held [rad]; None before the first step."""
+    """Heading to hold [rad]; None before the first step."""
     since_turn: float = math.inf
-    """Time since the stick of yaw was last used [s]."""
+    """Time since the yaw stick was last used [s]."""
     integral: Array = field(default_factory=lambda: np.zeros(3))
     """Integrals of roll, pitch, yaw [-]."""
     lead: Array = field(default_factory=lambda: np.zeros(3))
-    """Lead of the turn that was asked for over the vehicle's, in ACRO [rad]."""
+    """Lead of the commanded rotation over the vehicle's, in ACRO [rad]."""
 
     def step(
         self,
@@ -118,13 +118,13 @@ class AttitudeLoop:
         """Return demands of roll, pitch and yaw in [-1, 1].
 
         Args:
-            dt: Since the last step [s].
+            dt: Time since the last step [s].
             lean: Roll and pitch to hold [rad].
             turn: Rate of turn, clockwise from above [rad/s]; 0 holds the heading.
             attitude: Roll, pitch, yaw [rad], (3,).
-            quaternion: The same, x y z w, body to north, east, down, (4,).
+            quaternion: The same attitude, x y z w, body to north, east, down, (4,).
             rates: Body rates [rad/s], (3,).
-            parameters: Of the autopilot, by name [its own units].
+            parameters: Parameters of the autopilot, by name [its own units].
         """
         yaw = float(attitude[2])
         self.since_turn = 0.0 if turn else self.since_turn + dt
@@ -138,25 +138,25 @@ class AttitudeLoop:
         return self.track(dt, rate, rates, parameters)
 
     def turn_by(self, dt: float, rate: Array, rates: Array, parameters: Mapping[str, float]) -> list[float]:
-        """Return demands of roll, pitch and yaw in [-1, 1] that turn the vehicle as far as body rates would.
+        """Return demands of roll, pitch and yaw in [-1, 1] with which the vehicle follows the integral of body rates.
 
         Args:
-            dt: Since the last step [s].
-            rate: Wanted [rad/s], (3,).
-            rates: Of the vehicle [rad/s], (3,).
-            parameters: Of the autopilot, by name [its own units].
+            dt: Time since the last step [s].
+            rate: Commanded body rates [rad/s], (3,).
+            rates: Body rates of the vehicle [rad/s], (3,).
+            parameters: Parameters of the autopilot, by name [its own units].
         """
         self.lead = np.clip(self.lead + (rate - rates) * dt, -LEAD, LEAD)
         return self.track(dt, rate + _gains("ANG", "P", parameters) * self.lead, rates, parameters)
 
     def track(self, dt: float, rate: Array, rates: Array, parameters: Mapping[str, float]) -> list[float]:
-        """Return demands of roll, pitch and yaw in [-1, 1] that give the vehicle body rates [rad/s], (3,).
+        """Return demands of roll, pitch and yaw in [-1, 1] with which the vehicle follows body rates [rad/s], (3,).
 
         Args:
-            dt: Since the last step [s].
-            rate: Wanted [rad/s], (3,).
-            rates: Of the vehicle [rad/s], (3,).
-            parameters: Of the autopilot, by name [its own units].
+            dt: Time since the last step [s].
+            rate: Commanded body rates [rad/s], (3,).
+            rates: Body rates of the vehicle [rad/s], (3,).
+            parameters: Parameters of the autopilot, by name [its own units].
         """
         error, most = rate - rates, _gains("RAT", "IMAX", parameters)
         self.integral = np.clip(self.integral + _gains("RAT", "I", parameters) * error * dt, -most, most)
@@ -165,7 +165,7 @@ class AttitudeLoop:
 
 
 def _gains(kind: str, name: str, parameters: Mapping[str, float]) -> Array:
-    """Return a gain of ATC_<kind>_<axis> for the three axes, (3,)."""
+    """Return one gain of ATC_<kind>_<axis> for the three axes, (3,)."""
     return np.array([parameters[f"ATC_{kind}_{axis}_{name}"] for axis in AXES])
 
 
@@ -179,11 +179,11 @@ class DepthLoop:
     """
 
     height: float | None = None
-    """Held [m]; None before the first step."""
+    """Height to hold [m]; None before the first step."""
     rate: float = 0.0
     """Climb rate of the target [m/s]."""
     integral: float = 0.0
-    """Integral of the acceleration's error, times its gain [m/s^2]."""
+    """Integral of the acceleration error, times its gain [m/s^2]."""
 
     def step(
         self,
@@ -198,13 +198,13 @@ class DepthLoop:
         """Return the demand of throttle in [-1, 1].
 
         Args:
-            dt: Since the last step [s].
-            climb: Rate to climb at [m/s]; 0 holds the height.
-            height: Of the vehicle, 0 at the surface [m].
-            speed: Upwards [m/s].
-            acceleration: Upwards, without gravity [m/s^2].
+            dt: Time since the last step [s].
+            climb: Climb rate [m/s]; 0 holds the height.
+            height: Height of the vehicle, 0 at the surface [m].
+            speed: Upward speed [m/s].
+            acceleration: Upward acceleration, without gravity [m/s^2].
             surfaced: Whether the vehicle is above SURFACE_DEPTH.
-            parameters: Of the autopilot, by name [its own units].
+            parameters: Parameters of the autopilot, by name [its own units].
         """
         p, most = parameters, 0.01 * parameters["PILOT_ACCEL_Z"] * dt
         if self.height is None:

@@ -1,7 +1,7 @@
-"""`finssim ardusub-sitl`: the physics behind ArduPilot's own ArduSub in SITL, over its JSON interface (UDP).
+"""`finssim ardusub-sitl`: physics for ArduPilot's own ArduSub in SITL, over its JSON interface (UDP).
 
-SITL sends pulse widths and waits; each new frame moves the world on by 1 / frame_rate, and the answer tells where the
-vehicle is, in ArduPilot's frames (body forward-right-down, world north-east-down; north is world x).
+SITL sends pulse widths and waits. Each new frame advances the simulation by 1 / frame_rate, and the answer contains the
+state of the vehicle in ArduPilot's frames (body forward-right-down, world north-east-down; north is world x).
 """
 
 from __future__ import annotations
@@ -52,24 +52,24 @@ _LOG = logging.getLogger("finssim.ardusub_sitl")
 
 
 class Pulses(NamedTuple):
-    """Packet that SITL sends."""
+    """Packet from SITL."""
 
     frame_rate: int
-    """Frames in a second of its clock [Hz]."""
+    """Frames per second of its clock [Hz]."""
     frame_count: int
-    """Counts answers that SITL has taken."""
+    """Number of answers that SITL has received."""
     pulses: tuple[int, ...]
     """Pulse widths by output channel from 1, 16 or 32 [µs]; 0 without a signal."""
 
 
 _LAYOUTS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
-"""Magic number -> packet."""
+"""Magic number -> layout of the packet."""
 SLOWEST, FASTEST = 20, 2000
-"""Frame rates that can be served [Hz]."""
+"""Lowest and highest supported frame rate [Hz]."""
 
 
 def decode_pulses(data: bytes) -> Pulses | str:
-    """The content of a packet of SITL, or in a word why it is none.
+    """Return the content of a packet of SITL, or a short reason why it is invalid.
 
     Args:
         data: A datagram.
@@ -84,27 +84,27 @@ def decode_pulses(data: bytes) -> Pulses | str:
 
 
 GRAVITY = 9.80665
-"""Gravity that ArduPilot subtracts from a specific force [m/s²]: with it, accelerations and velocities of an answer
-agree."""
+"""Gravity that ArduPilot subtracts from a specific force [m/s²]; its use makes accelerations and velocities of an
+answer consistent."""
 _FLIP = TO_FOSSEN.A
 _LONGEST_STEP = 0.005
 """Longest physics step [s]."""
 _LONGEST_PULSE = 2500
 _RANGE = 100.0
-"""Reach of the rangefinder, and of its tilt the cosine [m, -]."""
+"""Range of the rangefinder, and smallest cosine of its tilt [m, -]."""
 _LEAST_COSINE = 0.5
 TRUTH_PERIOD = 0.02
-"""Least time between two true states in their record [s]."""
+"""Shortest time between two recorded true states [s]."""
 
 
 class SitlWorld:
-    """One vehicle in its water: pulse widths and a time step in, the state as SITL reads it out.
+    """One vehicle in water: input are pulse widths and a time step, output is the state in SITL's format.
 
     Attributes:
-        time: Since the start [s].
-        simulator: The one world.
-        voltage: Of the battery under load [V].
-        current: Out of the battery [A].
+        time: Time since the start [s].
+        simulator: Simulator of the single world.
+        voltage: Battery voltage under load [V].
+        current: Battery current [A].
     """
 
     def __init__(
@@ -122,14 +122,15 @@ class SitlWorld:
         """Put the vehicle into the water, at rest and level.
 
         Args:
-            vehicle: Its thrusters have an `esc`; those without a `motor_index` are on the outputs in their order.
+            vehicle: Vehicle whose thrusters have an `esc`; those without a `motor_index` use the outputs in their
+                order.
             start: Pose of the body, world frame; yaw from world x, which is north, left positive [m, rad].
-            pool: Walls and floor; open water without a floor if None.
-            water: Current and waves; still water if None.
-            battery: Of its motors; 16 V whatever the load if None.
-            dvl: Server of its Doppler log; none if None.
+            pool: Walls and floor; None for open water without a floor.
+            water: Current and waves; None for still water.
+            battery: Battery of its motors; None for a constant 16 V.
+            dvl: Server of its Doppler log; None for no log.
             noise: Whether rates and specific force have the noise of the vehicle file's IMU.
-            seed: Of everything random.
+            seed: Seed of all random numbers.
 
         Raises:
             VehicleError, SimulatorError: The vehicle cannot be driven by pulse widths, or not simulated.
@@ -152,7 +153,7 @@ class SitlWorld:
         self._forces = lru_cache(maxsize=512)(self._forces_at)
         self._fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in self._thrusters]) * (math.tau / 60.0)
         self.truth: Recorder | None = None
-        """Takes the true motion down, by this machine's clock, which a robot's record has too."""
+        """Recorder of the true motion, on this machine's clock, as in a robot's record."""
         self._noted = -math.inf
         self.log = None if dvl is None else _DopplerLog(with_navigation(vehicle), dvl, self._floor, seed)
         imu, self._seed = vehicle.sensors.imu, seed
@@ -163,11 +164,11 @@ class SitlWorld:
         )
         self._rate = FASTEST
         self.restart()
-        self.step((0,) * 32, self._rate)  # kernels are compiled before anybody waits
+        self.step((0,) * 32, self._rate)  # compiles the kernels before SITL waits for an answer
         self.restart()
 
     def restart(self) -> None:
-        """Back to the start, at time 0."""
+        """Restore the initial state, at time 0."""
         self.time, self.voltage, self.current = 0.0, self.battery.full_voltage, self.battery.idle_current
         self._thrust[:] = 0.0
         self.simulator.restart_episodes()
@@ -178,11 +179,11 @@ class SitlWorld:
             self.log.restart()
 
     def step(self, pulses: tuple[int, ...], rate: int) -> None:
-        """Move on by 1 / rate.
+        """Advance by 1 / rate.
 
         Args:
-            pulses: By output channel [µs].
-            rate: Frames in a second [Hz].
+            pulses: Pulse widths by output channel [µs].
+            rate: Frames per second [Hz].
         """
         if rate != self._rate:
             self._rate = rate
@@ -205,7 +206,8 @@ class SitlWorld:
             self.truth.reading(now, Reading(now, p, q, nu, ready=True))
 
     def _forces_at(self, twentieths: int) -> tuple[Array, Array]:
-        """Steady thrust [N] and electric power [W] at every pulse width, (n, 2501), at a voltage of so many 0.05 V."""
+        """Return steady thrust [N] and electric power [W] at every pulse width, (n, 2501), at a voltage in units of
+        0.05 V."""
         width = np.arange(_LONGEST_PULSE + 1)
         omega = np.array([t.shaft_speed(width, 0.05 * twentieths) for t in self._thrusters])
         force = np.array([t.thrust(speed) for t, speed in zip(self._thrusters, omega, strict=True)])
@@ -213,11 +215,12 @@ class SitlWorld:
 
     @property
     def frozen(self) -> bool:
-        """Return whether the vehicle is frozen since its motion stopped being finite."""
+        """Return whether the vehicle is frozen because its motion was no longer finite."""
         return bool(self._frozen[0])
 
     def answer(self) -> bytes:
-        """Return the state in the form of SITL's parser, which searches for names and reads what follows them."""
+        """Return the state in the format of SITL's parser, which searches for names and reads the values after
+        them."""
         R = quat_to_matrix(self._quaternion)
         nu, nu_dot = self._nu.astype(float), self._nu_dot.astype(float)
         v, omega = nu[:3], nu[3:]
@@ -242,13 +245,13 @@ class SitlWorld:
 
 
 class Forwarder:
-    """The companion computer beside ArduSub: over MAVLink it sets the origin and passes on velocities of the log.
+    """Companion computer of ArduSub: it sets the origin and forwards velocities of the Doppler log over MAVLink.
 
-    Velocities go as VISION_POSITION_DELTA, which ArduSub 4.5.0 took in this form, the origin as SET_GPS_GLOBAL_ORIGIN
-    until ArduSub reports it.
+    Velocities are sent as VISION_POSITION_DELTA, which ArduSub 4.5.0 accepted in this form, the origin as
+    SET_GPS_GLOBAL_ORIGIN until ArduSub reports it.
 
     Attributes:
-        counts: `velocities` that were sent, and `origins` that ArduSub reported.
+        counts: Number of `velocities` that were sent, and of `origins` that ArduSub reported.
     """
 
     def __init__(self, address: Address) -> None:
@@ -258,7 +261,7 @@ class Forwarder:
             address: TCP server of one of its serial ports.
 
         Raises:
-            LinkError: There is no such host, or pymavlink is not installed.
+            LinkError: The host does not exist, or pymavlink is not installed.
         """
         try:
             from pymavlink.dialects.v20 import ardupilotmega
@@ -274,11 +277,11 @@ class Forwarder:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with an ArduSub that has started again, without an origin."""
+        """Reset the state for an ArduSub that has restarted, without an origin."""
         self._has_origin, self._asked, self._last = False, -math.inf, math.nan
 
     def poll(self) -> None:
-        """Read what ArduSub says, and give it an origin while it reports none."""
+        """Read ArduSub's messages, and send it an origin until it reports one."""
         for data in self._wire.receive():
             for message in self._mav.parse_buffer(data) or ():
                 if message.get_type() == "GPS_GLOBAL_ORIGIN" and not self._has_origin:
@@ -293,10 +296,10 @@ class Forwarder:
             self._send(self._dialect.MAVLink_command_long_message(*command))
 
     def velocity(self, measured: float, velocity: Array, std: float) -> None:
-        """Pass on a velocity over the floor.
+        """Forward a velocity over ground.
 
         Args:
-            measured: When, by the world's clock [s].
+            measured: Time of the measurement, on the world's clock [s].
             velocity: Vehicle's axes, forward, left, up [m/s], (3,).
             std: Its standard deviation [m/s].
         """
@@ -304,7 +307,7 @@ class Forwarder:
         if dt < SHORTEST:
             return
         self._last = measured
-        if not dt <= LONGEST:  # after a gap the distance is unknown
+        if not dt <= LONGEST:  # after a gap the displacement is unknown
             return
         delta = (dt * TO_FOSSEN.vector(velocity)).tolist()
         confidence = 100.0 * (1.0 - min(std, WORST) / WORST)
@@ -324,31 +327,31 @@ class Forwarder:
 
 
 class _DopplerLog:
-    """The vehicle's Doppler log, sampled once per frame; its reports are sent when their latency is over."""
+    """Doppler log of the vehicle, sampled once per frame; its reports are sent after their latency."""
 
     def __init__(self, vehicle: Vehicle, server: DvlServer, floor: float, seed: int) -> None:
         self.forwarder: Forwarder | None = None
         log = vehicle.sensors.dvl
-        assert log is not None  # with_navigation gives one
+        assert log is not None  # with_navigation adds one
         self.entry, self.server, self._floor = log, server, floor
         self._R_bs, self._random = quat_to_matrix(log.orientation), np.random.default_rng([seed, 73])
         self.restart()
 
     def restart(self) -> None:
-        """Back to time 0, which is now."""
+        """Restart at time 0, which corresponds to the present time."""
         self._next, self._sent = 0.0, 0.0
         self._waiting: deque[tuple[float, Array | None, float]] = deque()
         self._reckoning = DeadReckoning()
         self._epoch = time.time()
 
     def look(self, now: float, position: Array, R: Array, nu: Array) -> None:
-        """Measure if it is time, and send what has waited long enough.
+        """Measure if a sample is due, and send the reports whose latency is over.
 
         Args:
-            now: Since the start [s].
-            position: Of the body origin, world frame [m], (3,).
-            R: Attitude, body to world, (3, 3).
-            nu: Body frame [m/s, rad/s], (6,).
+            now: Time since the start [s].
+            position: Position of the body origin, world frame [m], (3,).
+            R: Rotation, body to world, (3, 3).
+            nu: Twist, body frame [m/s, rad/s], (6,).
         """
         log = self.entry
         if now >= self._next - 1e-9:
@@ -384,29 +387,29 @@ class _DopplerLog:
 Address = tuple[str, int]
 
 _POLL = 0.1
-"""Longest wait for a packet between looks at everything else [s]."""
+"""Longest wait for a packet before other connections are polled [s]."""
 _PACKETS_AT_ONCE = 1024
 _AWAY = 1.5
-"""A SITL that is silent for so long may be followed by another one [s]."""
+"""Time without packets after which another SITL is accepted [s]."""
 
 
 COMPANION = 1
-"""System of the companion computer, which is that of the vehicle."""
+"""System id of the companion computer, which is that of the vehicle."""
 SHORTEST, LONGEST = 0.05, 1.0
-"""Time between two velocities that are passed on [s]: ArduSub's filter drops them below the first; beyond the second
-the floor was lost."""
+"""Shortest and longest interval of forwarded velocities [s]: ArduSub's filter drops shorter ones; after a longer one,
+the bottom lock was lost."""
 WORST = 0.4
-"""Standard deviation that means no confidence [m/s]."""
+"""Standard deviation that corresponds to a confidence of 0 [m/s]."""
 SETTLING = 0.5
-"""Time of the world after a restart of SITL in which its counts may jump without a lost answer [s]."""
+"""Simulated time after a restart of SITL in which its counts may jump without a lost answer [s]."""
 
 
 class SitlServer:
-    """Answers SITL packet by packet, by its lock-step rules; what is no packet of SITL is counted and not answered.
+    """Server that answers SITL's packets by its lock-step rules; invalid packets are counted and not answered.
 
     Attributes:
-        counts: Of `frames`, `repeats`, `restarts`, `gaps`, and of what was refused: `wrong magic`, `wrong length`,
-            `wrong rate`, `stranger`.
+        counts: Number of `frames`, `repeats`, `restarts` and `gaps`, and of refused packets: `wrong magic`,
+            `wrong length`, `wrong rate`, `stranger`.
     """
 
     def __init__(
@@ -416,12 +419,12 @@ class SitlServer:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Listen.
+        """Listen for packets.
 
         Args:
             world: The physics.
-            address: Host and port of this end; port 0 takes a free one (see `address`).
-            clock: Tells for how long SITL is silent [s].
+            address: Host and port of this end; port 0 selects a free one (see `address`).
+            clock: Clock for the time without packets from SITL [s].
 
         Raises:
             LinkError: It cannot be bound.
@@ -445,12 +448,13 @@ class SitlServer:
         self.address: Address = self._socket.getsockname()
 
     def serve(self, duration: float = math.inf) -> None:
-        """Answer until the world's clock has come so far [s]."""
+        """Answer until the world's clock reaches a time [s]."""
         while self.world.time < duration - 1e-9:
             self.serve_once()
 
     def serve_once(self) -> None:
-        """Wait a moment for packets, and answer the newest one: SITL takes one answer per frame, more would lag."""
+        """Wait briefly for packets, and answer only the newest: SITL reads one answer per frame, so others would
+        add lag."""
         newest = None
         select.select([self._socket], [], [], _POLL)
         with suppress(BlockingIOError, ConnectionError):
@@ -460,7 +464,7 @@ class SitlServer:
                     self.counts["repeats"] += 1
                 newest = packet or newest
         if newest is not None and self._peer is not None:
-            with suppress(OSError):  # SITL has gone, as its system reports
+            with suppress(OSError):  # SITL has ended, as the system reports
                 self._socket.sendto(self.answer(newest), self._peer)
         elif self.world.log is not None:
             self.world.log.server.poll()
@@ -483,7 +487,7 @@ class SitlServer:
         return packet
 
     def answer(self, packet: Pulses) -> bytes:
-        """Return the answer to a packet; the world advances if its frame is new, and restarts if it counts back."""
+        """Return the answer to a packet; a new frame advances the simulation, a smaller count restarts it."""
         count = packet.frame_count
         if count == self._last:
             self.counts["repeats"] += 1
@@ -507,18 +511,18 @@ class SitlServer:
         return self._answer
 
     def _note(self, kind: str, sentence: str, *values: Any) -> None:
-        """Count, and log the first of its kind; the end reports their number."""
+        """Count an event, and log the first of its kind; the total is reported at the end."""
         self.counts[kind] += 1
         if self.counts[kind] == 1 or kind == "restarts":
             _LOG.warning(sentence, *values)
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the socket."""
         self._socket.close()
 
 
 MOTOR_POWER = 385.0
-"""Power of a T200 at full speed on 16 V, from its table [W]."""
+"""Power of a T200 at full speed with 16 V, from its table [W]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -528,8 +532,8 @@ class SitlScene:
     site: str = "tank"
     """(NAME) Walls and floor: pool, tank or open-water (no walls near, floor at 20 m)."""
     start: str | None = None
-    """(X,Y,Z,YAW) Where the vehicle starts, world frame: x (north), y, z [m], yaw left positive [deg]; at the
-    surface if not given, since SITL calibrates its barometers where the vehicle starts."""
+    """(X,Y,Z,YAW) Start of the vehicle, world frame: x (north), y, z [m], yaw left positive [deg]; at the surface if
+    not given, since SITL calibrates its barometers at the start."""
     current: str = "0,0,0"
     """(X,Y,Z) Current, world frame [m/s]."""
     wave: str | None = None
@@ -539,7 +543,7 @@ class SitlScene:
         """Return the walls and the floor.
 
         Raises:
-            PlantSpecError: There is no such site.
+            PlantSpecError: The site does not exist.
         """
         if self.site not in SITES:
             raise PlantSpecError(f"unknown site '{self.site}'; available: {', '.join(SITES)}")
@@ -547,10 +551,10 @@ class SitlScene:
         return RectangularPool(length=length, width=width, depth=depth)
 
     def water(self, depth: float) -> Water:
-        """Return the current and the wave in water of a depth [m].
+        """Return current and wave, in water of a depth [m].
 
         Raises:
-            PlantSpecError: They are not three numbers each.
+            PlantSpecError: One of them is not given as three numbers.
         """
         waves = []
         if self.wave is not None:
@@ -581,12 +585,12 @@ class Addresses:
     dvl_page: str | None = None
     """(HOST:PORT) Address of the DVL's web page, by which BlueOS' driver finds it; none if not given."""
     mavlink: str = "127.0.0.1:5762"
-    """(HOST:PORT) TCP address of one of SITL's serial ports, by which it is given its origin and, with --dvl,
-    the DVL's velocities; SITL's second port if not given; none: nothing is sent."""
+    """(HOST:PORT) TCP address of one of SITL's serial ports, through which it receives its origin and, with --dvl, the
+    DVL's velocities; SITL's second port if not given; none: nothing is sent."""
 
     @contextmanager
     def dvl_server(self) -> Iterator[DvlServer | None]:
-        """Serve the DVL and its web page, where they have an address."""
+        """Serve the DVL and its web page, if they have an address."""
         with ExitStack() as stack:
             log = None
             if self.dvl is not None:
@@ -601,13 +605,13 @@ class Addresses:
 
 @dataclass(frozen=True, kw_only=True)
 class SitlProgram:
-    """Program of ArduSub's SITL, and its parameters."""
+    """ArduSub's SITL program, and its parameters."""
 
     version: Literal["4.1", "4.5", "4.6", "4.7"] = "4.5"
-    """(VERSION) ArduSub's, which decides the names of parameters."""
+    """(VERSION) ArduSub version, which determines the names of parameters."""
     parm: str = "finssim.parm"
-    """(FILE) Parameters for SITL, written at the start: frame, rate, barometers, satellites and, with --dvl,
-    the DVL. A file that was not written by this command is not replaced."""
+    """(FILE) Parameters for SITL, written at the start: frame, rate, barometers, satellites and, with --dvl, the DVL. A
+    file that was not written by this command is not replaced."""
     exec: str | None = None
     """(FILE) ArduSub's SITL program, started with these parameters in the folder of --parm and ended with this
     command; if not given, start it yourself."""
@@ -681,15 +685,15 @@ WRITTEN = "# written by finssim ardusub-sitl"
 
 
 def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, float]:
-    """Return the parameters with which SITL flies a vehicle on this physics, by name [ArduPilot's units].
+    """Return the parameters with which SITL controls a vehicle in this physics, by name [ArduPilot's units].
 
     Args:
-        vehicle: Its autopilot's frame and directions are taken.
-        version: Of ArduSub: 4.1, 4.5, 4.6 or 4.7.
-        dvl: Whether a Doppler log gives velocities.
+        vehicle: Vehicle whose autopilot's frame and motor directions are used.
+        version: ArduSub version: 4.1, 4.5, 4.6 or 4.7.
+        dvl: Whether a Doppler log provides velocities.
 
     Note:
-        Its origin is no parameter: ORIGIN_LAT would set it at the moment of arming, and turn the heading then.
+        The origin is not a parameter: ORIGIN_LAT would set it when arming, and change the heading at that moment.
 
     Raises:
         ControlError: The vehicle has no autopilot.
@@ -703,7 +707,7 @@ def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, f
         "SIM_BAR2_RND": 0.01,
         "BATT_MONITOR": 4,
     }
-    # The offsets of its simulated compasses.
+    # Offsets of its simulated compasses.
     values |= {
         f"COMPASS_OFS{n}_{axis}": x for n in ("", 2, 3) for axis, x in zip("XYZ", (5, 13, -18), strict=True)
     }
@@ -726,10 +730,10 @@ def sitl_parameters(vehicle: Vehicle, version: str, *, dvl: bool) -> dict[str, f
 
 
 def write_parameters(path: Path, values: dict[str, float]) -> Path:
-    """Write a file of parameters for SITL, by name [ArduPilot's units]; return its path.
+    """Write a parameter file for SITL, by name [ArduPilot's units]; return its path.
 
     Raises:
-        PlantSpecError: Another file is there, or it cannot be written.
+        PlantSpecError: Another file has this path, or it cannot be written.
     """
     try:
         if path.exists() and not path.read_text(errors="replace").startswith(WRITTEN):
@@ -742,7 +746,7 @@ def write_parameters(path: Path, values: dict[str, float]) -> Path:
 
 
 def sitl_command(program: str, parameters: Path, address: Address) -> list[str]:
-    """Return the command that starts SITL on this physics, which listens at `address`."""
+    """Return the command that starts SITL with this physics, which listens at `address`."""
     home = f"{HOME[0]},{HOME[1]},0,185"
     words = [
         "--model",
@@ -758,7 +762,7 @@ def sitl_command(program: str, parameters: Path, address: Address) -> list[str]:
 
 
 def _started(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """Start SITL, quietly.
+    """Start SITL without output.
 
     Raises:
         PlantSpecError: It cannot be started.
@@ -773,7 +777,7 @@ def _started(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End SITL, and wait for it."""
+    """Terminate SITL, and wait for its end."""
     process.terminate()
     try:
         process.wait(5.0)
@@ -783,7 +787,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _three(text: str, option: str) -> tuple[float, float, float]:
-    """Three numbers with commas between."""
+    """Return three numbers from a text with commas."""
     try:
         a, b, c = map(float, text.split(","))
     except ValueError:

@@ -1,4 +1,5 @@
-"""The overhead camera of the virtual pool: pictures through rippling water, or the tag corners found in them."""
+"""Overhead camera of the virtual pool: pictures through rippled water, or the tag corners that a detector finds in
+them."""
 
 from __future__ import annotations
 
@@ -33,47 +34,47 @@ __all__ = [
 Array = npt.NDArray[np.float64]
 
 
-# Result of a detector that fits the known tag to the picture when ripples bend the tag's image.
+# Result of a detector that fits the known tag to the picture, for a tag whose image is distorted by ripples.
 #
-# The fit of `localization.detection` moves a homography until the edges of all cells agree with the picture, so its
-# corners are those of the tag as ripples shift it on average, not of the bent image. For small bends that is linear:
-# the corners follow from a few points of the tag by a matrix that the tag's cells alone decide.
+# The fit of `localization.detection` adjusts a homography until the edges of all cells agree with the picture, so its
+# corners are those of the mean shift of the tag, not of the distorted image. For small distortions this is linear: the
+# corners follow from a few points of the tag by a matrix that depends only on the tag's cells.
 
 
 NODES = 6
-"""Along each side of the tag: a polynomial of degree 5 follows ripples as long as the tag's edge."""
+"""Number of nodes along each side of the tag: a polynomial of degree 5 represents ripples as long as the tag's
+edge."""
 HOMOGENEOUS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 """Corners of the unit square."""
 _UNITY = np.eye(3)
 
 
 class CornerFit:
-    """The tags of a vehicle: where to look at each, and which corners the fit reports."""
+    """Tags of a vehicle: the sampled points of each, and the corners that the fit reports."""
 
     def __init__(self, family: str, tags: Sequence[int]) -> None:
+        """Args:
+        family: Name of the tags' family.
+        tags: Their ids.
         """
-        Args:
-            family: Name of the tags' family.
-            tags: Their ids.
-        """
-        along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev's, the ends included
+        along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev nodes, with the ends
         self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
         self._at_corner = [0, NODES - 1, NODES * NODES - 1, NODES * (NODES - 1)]
         self.nodes = np.zeros((NODES * NODES, 3))
-        """Points of a tag whose pixels `corners` wants, tag frame, in edges of its black border, (N, 3)."""
+        """Points of a tag whose pixels `corners` needs, tag frame, in edges of its black border, (N, 3)."""
         self.nodes[:, 0] = self._square[:, 0] - 0.5
         self.nodes[:, 1] = 0.5 - self._square[:, 1]
         self._matrix = np.stack([_fit_matrix(family, tag, along, self._square) for tag in tags])
 
     def corners(self, pixels: Array) -> tuple[Array, Array]:
-        """Corners that the fit reports, and how far ripples bend each tag.
+        """Return the corners that the fit reports, and the distortion of each tag by ripples.
 
         Args:
-            pixels: Of `nodes` of every tag, (T, N, 2).
+            pixels: Pixels of the `nodes` of every tag, (T, N, 2).
 
         Returns:
-            Corners (T, 4, 2) [px], and the rms distance of the nodes from where the fit has them, in edges of the tag,
-            (T,). Those of a tag of which not all nodes have pixels mean nothing.
+            Corners (T, 4, 2) [px], and the rms distance of the nodes from the fit, in edges of the tag, (T,). Values of
+            a tag are meaningless unless all its nodes have pixels.
         """
         with np.errstate(all="ignore"):
             square = [from_square(tag) for tag in pixels[:, self._at_corner].tolist()]
@@ -94,7 +95,7 @@ class CornerFit:
 
 
 def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
-    """Return the matrix from motions of the nodes, all x before all y, to the fit's homography (8 rows) and its
+    """Return the matrix from shifts of the nodes, all x before all y, to the fit's homography (8 rows) and its
     residual."""
     points, across = _cell_edges(family, tag)
     columns, there = _warp_columns(points), _interpolation(along, points)
@@ -107,8 +108,8 @@ def _fit_matrix(family: str, tag: int, along: Array, square: Array) -> Array:
 
 
 def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Middles of all edges between a black and a white cell, unit square of the border with y down, (E, 2), and
-    whether each is upright, so that the fit feels motion along x there, (E,)."""
+    """Return the midpoints of all edges between a black and a white cell, unit square of the border with y down, (E,
+    2), and whether each edge is vertical, so that the fit is sensitive to motion along x, (E,)."""
     kind = family_named(family)
     cells = np.pad(bitmap(family, tag).astype(bool), 1, constant_values=True)
     upright = np.argwhere(cells[:, 1:] != cells[:, :-1])[:, ::-1] + np.array([0.0, -0.5])
@@ -118,7 +119,7 @@ def _cell_edges(family: str, tag: int) -> tuple[Array, npt.NDArray[np.bool_]]:
 
 
 def _warp_columns(points: Array) -> Array:
-    """d(x, y)/d(h) of the homography I + [[h0, h1, h2], [h3, h4, h5], [h6, h7, 0]] at points, (E, 2, 8)."""
+    """Return d(x, y)/d(h) of the homography I + [[h0, h1, h2], [h3, h4, h5], [h6, h7, 0]] at points, (E, 2, 8)."""
     x, y = points.T
     ones, zero = np.ones_like(x), np.zeros_like(x)
     return np.stack(
@@ -131,30 +132,30 @@ def _warp_columns(points: Array) -> Array:
 
 
 def _interpolation(along: Array, points: Array) -> Array:
-    """Weights of the nodes of a square grid in the polynomial through them, at points, (E, N)."""
+    """Return the weights of the nodes of a square grid in the interpolating polynomial, at points, (E, N)."""
     vandermonde = np.vander(along, len(along))
     by_x, by_y = (np.vander(x, len(along)) @ np.linalg.inv(vandermonde) for x in points.T)
     return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(points), -1))
 
 
-# Where points in the water appear to a camera above a rippling surface, without drawing a picture.
+# Pixels of points in the water for a camera above a rippled surface, without rendering a picture.
 
 
 FLAT_STEPS = 2
-"""Steps of Newton's method for still water: within 1e-5 px. One is enough as a start for ripples."""
+"""Newton steps for still water: within 1e-5 px. One is enough as a start for ripples."""
 RIPPLE_STEPS = 2
-"""For ripples, with the surface's curvature from the first: within 0.001 px rms at a slope of 0.01, 0.03 px at 0.03."""
+"""Newton steps for ripples, with the surface curvature of the first: within 0.001 px rms at a slope of 0.01, 0.03 px at
+0.03."""
 
 
 class RippledView:
-    """The renderer's surface and law of refraction, solved from the point to the pixel."""
+    """Projection from a point to its pixel, with the surface and the refraction of the renderer."""
 
     def __init__(self, camera: Camera, interface: Interface, ripples: Ripples | None = None) -> None:
-        """
-        Args:
-            camera: Above the water.
-            interface: Still surface, without a window.
-            ripples: As in `sim.overhead_camera.Scene`; None for a flat surface.
+        """Args:
+        camera: Camera above the water.
+        interface: Still surface, without a window.
+        ripples: Same as in `sim.overhead_camera.Scene`; None for a flat surface.
         """
         self.camera = camera
         self._frame = surface_frame(camera, interface)
@@ -165,15 +166,15 @@ class RippledView:
         )
 
     def pixels(self, points_p: Array, time: float) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Pixels at which points appear.
+        """Return the pixels at which points appear.
 
         Args:
             points_p: Pool frame [m], (N, 3).
             time: Middle of the exposure [s].
 
         Returns:
-            Pixels (N, 2), inside the picture or not, and which of them mean something: the point is under water and
-            the lens has a place for it, (N,).
+            Pixels (N, 2), inside or outside the picture, and whether each is valid: the point is under water and within
+            the domain of the lens, (N,).
         """
         points = self._frame.point(points_p)
         direction = np.empty_like(points)
@@ -186,11 +187,11 @@ class RippledView:
     def _crossing(
         self, px: Array, py: Array, depth: Array, time: float
     ) -> tuple[Array, Array, Array | float]:
-        """Return where the ray from the camera to each point crosses the surface: x, y, height, surface frame [m],
-        (N,).
+        """Return the point where the ray from the camera to each target crosses the surface: x, y, height, surface
+        frame [m], (N,).
 
-        Found as the root of the miss: the ray through a place of the surface, bent by the slope there, lands beside
-        the point.
+        It is the root of the miss distance: the ray through a surface point, refracted by the slope there, misses the
+        target.
         """
         H, r = self._frame.camera_height, self._ratio
         reach = np.hypot(px, py)
@@ -216,8 +217,8 @@ class RippledView:
         flat: tuple[Array, Array, Array],
         time: float,
     ) -> tuple[Array, Array, Array]:
-        """Return the place on ripples for a place on still water. `flat`: d landing / d place along the radius and
-        across it on still water, and how much curvature adds to them."""
+        """Return the crossing points on rippled water from those on still water. `flat`: derivatives of the landing
+        point by the crossing point, along and across the radius on still water, and their change with curvature."""
         assert self._surface is not None
         x, y = still
         along, across, by_curvature = flat
@@ -240,7 +241,7 @@ class RippledView:
     def _step(
         self, x: Array, y: Array, height: Array, sx: Array, sy: Array, depth: Array
     ) -> tuple[Array, Array]:
-        """Return the sideways distance of a ray under water until it is at a depth [m], (N,) each."""
+        """Return the horizontal displacement of an underwater ray down to a depth [m], (N,) each."""
         r = self._ratio
         drop = self._frame.camera_height - height
         length = np.sqrt(x * x + y * y + drop * drop)
@@ -267,7 +268,7 @@ class _Surface:
         self._of_cosine = np.stack([a * kx, a * ky])
 
     def at(self, x: Array, y: Array, time: float) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """h [m], h_x, h_y, h_xx, h_xy, h_yy [1/m] at places, (N,) each."""
+        """Return h [m], h_x, h_y, h_xx, h_xy, h_yy [1/m] at points, (N,) each."""
         angle = np.array((x, y)).T @ self._k
         angle += self._phase - self._omega * time
         h, h_xx, h_xy, h_yy = self._of_sine @ np.sin(angle).T
@@ -275,37 +276,36 @@ class _Surface:
         return h, h_x, h_y, h_xx, h_xy, h_yy
 
 
-# Tag corners as a detector reports them, computed from the optics without drawing a picture.
+# Tag corners as a detector reports them, computed from the optics without rendering a picture.
 
 
 LEAST_EDGE = 12.0
-"""A tag with a shorter edge is not found [px]."""
+"""Shortest edge of a tag that is detected [px]."""
 RIM = 0.15
-"""White around the tag that must be in the picture too, part of its edge."""
+"""White margin of the tag that must be in the picture too, as a fraction of its edge."""
 NARROWEST = 0.25
-"""A tag whose image covers less of the square over its longest side is not found: it is seen from 75° off its normal,
-or from behind."""
+"""Smallest ratio of a detected tag's image area to the square of its longest side: less means a view from more than 75°
+off its normal, or from behind."""
 OPPOSITE = [2, 3, 0, 1]
 MOST_BENT = 0.031
-"""A tag that ripples bend further from a plane one is not found, rms in edges of the tag: half of those that are bent
-so are found in rendered pictures."""
+"""Largest distortion by ripples at which a tag is detected, rms in edges of the tag: at this value half of the tags are
+found in rendered pictures."""
 UNEXPLAINED = 0.33
-"""Error of a corner, part of the bend [px]: the fit gives less weight to the cells that are bent most."""
+"""Ratio of a corner's error to the distortion [-]: the fit reduces the weight of strongly distorted cells."""
 
 
 class CornerCamera:
-    """Looks at the tags of a vehicle."""
+    """Camera whose output is the tag corners of a vehicle."""
 
     def __init__(
         self, tags: Tags, site: Pool, ripples: Ripples | None, *, pixel_noise: float, seed: int
     ) -> None:
-        """
-        Args:
-            tags: Where they truly sit.
-            site: Camera and water as they are.
-            ripples: Of the water; None for flat.
-            pixel_noise: Standard deviation of a corner, per axis [px].
-            seed: Of the noise.
+        """Args:
+        tags: Tags with their true mounts.
+        site: True camera and water.
+        ripples: Ripples of the water; None for a flat surface.
+        pixel_noise: Standard deviation of a corner, per axis [px].
+        seed: Seed of the noise.
         """
         self._noise, self._seed = pixel_noise, seed
         self._inside = site.camera.lens.inside
@@ -322,13 +322,13 @@ class CornerCamera:
     def picture(
         self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
     ) -> Picture:
-        """Corners at the middle of an exposure.
+        """Return the corners at the middle of an exposure.
 
         Args:
-            start: Position [m] and orientation (xyzw) of the body when it began, pool frame.
-            end: Position [m], (3,), and attitude when it ended.
-            middle: [s]
-            sequence: Of the picture.
+            start: Position [m] and orientation (xyzw) of the body at its start, pool frame.
+            end: Position [m], (3,), and quaternion at its end.
+            middle: Time [s].
+            sequence: Number of the picture.
         """
         q = start[1] + math.copysign(1.0, float(start[1] @ end[1])) * end[1]
         position, R = 0.5 * (start[0] + end[0]), quat_to_matrix(q / np.linalg.norm(q))
@@ -349,7 +349,7 @@ class CornerCamera:
 
 
 def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> Array | None:
-    """Corners of one tag in the picture, None where a detector would not find it."""
+    """Return the corners of one tag in the picture; None if a detector would not find it."""
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners.tolist()
     sides = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by), math.hypot(dx - cx, dy - cy)
     area = 0.5 * ((cx - ax) * (dy - by) - (cy - ay) * (dx - bx))
@@ -359,19 +359,19 @@ def _reported(corners: Array, bend: float, pixel_noise: float, noise: Array) -> 
     return np.asarray(corners + error * noise)
 
 
-# The overhead camera of a virtual pool as it truly hangs, as its calibration has it, and how good its pictures are.
+# Overhead camera of a virtual pool: its true parameters, its calibration, and the quality of its pictures.
 
 
 HEIGHT = 1.4
-"""Height of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's was at 1.21 m, from where its lens
-does not see the ends of the pool. From here it sees everything that is 0.4 m under the surface, and between the walls'
-last 0.23 m everything from 0.1 m down."""
+"""Height of the camera above the water, for a pool of 4 m x 2 m [m]. The paper's was at 1.21 m, where its lens does not
+cover the ends of the pool. At this height it covers everything from 0.4 m below the surface, and everything from 0.1 m
+down except the last 0.23 m at the walls."""
 SWIM = 0.4
-"""Usual depth of the tags, as a share of the pool's depth."""
+"""Usual depth of the tags, as a fraction of the pool's depth."""
 PAPER_POOL = 4.0, 2.0
-"""[m]"""
+"""Length and width of the paper's pool [m]."""
 LATENCY = 0.045
-"""Average time from the middle of the exposure to the robot's computer [s]: readout, compression, USB."""
+"""Mean time from the middle of the exposure to the robot's computer [s]: readout, compression, USB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,25 +379,24 @@ class CameraSettings:
     """Settings of the camera, and true mounts of the tags."""
 
     rate: float = 30.0
-    """Pictures a second [Hz]."""
+    """Picture rate [Hz]."""
     exposure: float = 0.006
     """[s]"""
     latency: float = LATENCY
     """True mean time from the middle of the exposure to arrival [s]."""
     jitter: float = 0.0
-    """Standard deviation of the latency from picture to picture [s]."""
+    """Standard deviation of the latency between pictures [s]."""
     dropout: float = 0.0
-    """Chance that a picture is lost."""
+    """Probability that a picture is lost."""
     ripples: float = 0.0
     """Root mean square of the water's slope [-]."""
     pixel_noise: float = 0.03
-    """Noise of corners that are made without a picture, per axis [px]; rendered pictures have the noise of their
-    pixels."""
+    """Noise of corners without a rendered picture, per axis [px]; rendered pictures have pixel noise instead."""
     mounts: Mapping[int, TagMount] = field(default_factory=dict)
-    """True mounts of tags, by id; the others are as in the vehicle file."""
+    """True mounts of tags, by id; missing ones are as in the vehicle file."""
 
     def shutter(self, seed: int) -> Shutter:
-        """Its shutter, from the seed of jitter and losses."""
+        """Return the shutter, from the seed of jitter and losses."""
         return Shutter(
             rate=self.rate, exposure=self.exposure, latency=self.latency, jitter=self.jitter, dropout=self.dropout,
             seed=seed,
@@ -406,7 +405,7 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Standard deviations of what a calibration does not know, and the pictures' faults."""
+    """Standard deviations of the calibration errors, and faults of the pictures."""
 
     position: float  # of the camera, per axis [m]
     tilt: float  # about each axis [rad]
@@ -437,22 +436,23 @@ ERRORS = by_severity(
 
 
 def paper_lens(finer: float = 1.0) -> Lens:
-    """The lens of the published pool, 100° across, before 1280 x 720 pixels or `finer` times as many each way."""
+    """Return the lens of the published pool, 100° wide, with 1280 x 720 pixels or `finer` times as many in each
+    direction."""
     distortion = (0.02944176, -0.05975546, 0.00088098, 0.00179148, 0.01256862)
     f, cx, cy = finer * 540.9305, finer * (682.2341 + 0.5) - 0.5, finer * (348.6136 + 0.5) - 0.5
     return Lens(round(1280 * finer), round(720 * finer), f, f, cx, cy, "plumb_bob", distortion)
 
 
 def true_site(basin: Basin | None = None, *, finer: float = 1.0) -> Pool:
-    """The camera above the middle of a pool. Pool frame: x and y as the world's, z = 0 on the floor.
+    """Return the camera above the middle of a pool. Pool frame: x and y of the world frame, z = 0 on the floor.
 
     Args:
-        basin: 4 m x 2 m, 1 m deep if not given; the camera hangs higher over a larger one.
-        finer: How many times as many pixels as the paper's it has each way.
+        basin: Basin of the pool; 4 m x 2 m, 1 m deep if not given; above a larger one the camera is higher.
+        finer: Factor on the paper's number of pixels in each direction.
     """
     basin = basin or Basin()
     lens, height = paper_lens(finer), _height(basin)
-    # So far beside the middle that both ends of the pool are as far from the edges of the picture.
+    # Offset from the middle such that both ends of the pool are equally far from the edges of the picture.
     middle = 0.5 * (lens.width - 1), 0.5 * (lens.height - 1)
     edges = [[0.0, middle[1]], [2.0 * middle[0], middle[1]], [middle[0], 0.0], [middle[0], 2.0 * middle[1]]]
     left, right, top, bottom = lens.rays(edges)[0]
@@ -464,7 +464,7 @@ def true_site(basin: Basin | None = None, *, finer: float = 1.0) -> Pool:
 
 
 def _height(basin: Basin) -> float:
-    """Return the height of the camera above the water from which it sees all of a pool [m]."""
+    """Return the height of the camera above the water at which it covers all of a pool [m]."""
     return HEIGHT * max(basin.length / PAPER_POOL[0], basin.width / PAPER_POOL[1])
 
 
@@ -474,17 +474,17 @@ def camera_of(
     """Draw the camera of a plant.
 
     Args:
-        vehicle: Has tags.
-        seed: Of all errors; equal seeds give equal cameras.
-        severity: How large they are: nominal has none.
-        basin: Of the plant; that of plants drawn around the vehicle if None. Over a larger one the camera has as many
-            more pixels as it hangs higher, so that it finds the vehicle's tags there too.
+        vehicle: Vehicle with tags.
+        seed: Seed of all errors; equal seeds give equal cameras.
+        severity: Size of the errors: nominal has none.
+        basin: Basin of the plant; None for that of plants drawn for the vehicle. Above a larger basin, the number of
+            pixels grows with the height of the camera, so that it still finds the vehicle's tags.
 
     Returns:
-        The pool as it is, the pool as its calibration has it, and the settings for `PoolCamera`.
+        The true pool, the calibrated pool, and the settings for `PoolCamera`.
 
     Raises:
-        PlantSpecError: The vehicle has no tags, or there is no such severity.
+        PlantSpecError: The vehicle has no tags, or the severity does not exist.
     """
     if severity not in ERRORS:
         raise PlantSpecError(f"unknown severity '{severity}'; available: {', '.join(ERRORS)}")
@@ -510,7 +510,7 @@ def _tags_of(vehicle: Vehicle) -> Tags:
 
 
 def _calibrated(true: Pool, errors: _Errors, random: np.random.Generator, severity: str) -> Pool:
-    """Return the result of a survey of a camera with these errors."""
+    """Return the result of a calibration with these errors."""
     lens, focal = true.camera.lens, 1.0 + errors.focal * random.normal(0.0, 1.0)
     lens = replace(lens, fx=lens.fx * focal, fy=lens.fy * focal)
     turn = quat_from_rotvec(random.normal(0.0, errors.tilt, 3))
@@ -532,23 +532,23 @@ def _moved(mount: TagMount, errors: _Errors, random: np.random.Generator) -> Tag
     return mount.model_copy(update={"position": position, "orientation": orientation})
 
 
-# Pictures of a vehicle's tags under water, drawn by the overhead camera's renderer; its hull is left out.
+# Pictures of a vehicle's tags under water, from the overhead camera's renderer, without the hull.
 
 
 MARGIN = 0.15
-"""White around a tag, part of its edge."""
+"""White margin around a tag, as a fraction of its edge."""
 STILL = 0.05
-"""Motion during the exposure that is left out [px]."""
+"""Motion during the exposure that is neglected [px]."""
 SLOW = 0.4
-"""Motion up to which one ray a pixel will do, where corners are placed to 0.03 px; beyond it, two by two [px]."""
+"""Motion up to which one ray per pixel locates corners to 0.03 px; beyond it, pixels have two by two rays [px]."""
 REACH = 0.2
-"""Distance of a tag's corner from the body's origin, for the motion by a turn [m]."""
+"""Distance of a tag's corner from the body's origin, for its motion by rotation [m]."""
 FREEBOARD = 0.1
 """Height of the pool's edge above the water [m]."""
 
 
 class PictureCamera:
-    """Renders what moves in every picture, and the pool around it once."""
+    """Camera that renders moving tags in every picture, and the pool around them once."""
 
     def __init__(
         self,
@@ -560,14 +560,13 @@ class PictureCamera:
         exposure: float,
         seed: int,
     ) -> None:
-        """
-        Args:
-            tags: Where they truly sit.
-            site: Camera and water as they are; the pool's floor is at z = 0 under its middle.
-            ripples: Of the water; None for flat.
-            basin: Of the pool.
-            exposure: [s]
-            seed: Of the noise.
+        """Args:
+        tags: Tags with their true mounts.
+        site: True camera and water; the pool's floor is at z = 0 below its middle.
+        ripples: Ripples of the water; None for a flat surface.
+        basin: Basin of the pool.
+        exposure: [s]
+        seed: Seed of the noise.
         """
         self._tags, self._seed = tags, seed
         self._bitmaps = {tag: bitmap(tags.family, tag).astype(bool) for tag in tags.mounts}
@@ -592,7 +591,7 @@ class PictureCamera:
     def picture(
         self, start: tuple[Array, Array], end: tuple[Array, Array], middle: float, sequence: int
     ) -> Picture:
-        """Expose; arguments as of `CornerCamera.picture`."""
+        """Return the rendered picture; arguments as for `CornerCamera.picture`."""
         motion = self._motion(start, end)
         moves = motion > STILL
         image = (self._slow if motion < SLOW else self._fast).render(
@@ -604,7 +603,7 @@ class PictureCamera:
         return Picture(middle, sequence, image=image)
 
     def _motion(self, start: tuple[Array, Array], end: tuple[Array, Array]) -> float:
-        """About how far a tag moves in the picture [px]."""
+        """Estimate the motion of a tag in the picture [px]."""
         turn = 2.0 * math.sqrt(max(1.0 - float(start[1] @ end[1]) ** 2, 0.0))
         return self._per_metre * (float(np.linalg.norm(end[0] - start[0])) + REACH * turn)
 
@@ -623,7 +622,7 @@ class PictureCamera:
 
 
 def _placed(body: tuple[Array, Array], mount: TagMount) -> oc.ObjectPose:
-    """Pose of a tag on the body, pool frame."""
+    """Return the pose of a tag on the body, pool frame."""
     x, y, z = (body[0] + quat_rotate(body[1], np.asarray(mount.position))).tolist()
     q = np.asarray(quat_multiply(body[1], mount.orientation))
     a, b, c, d = (q / np.linalg.norm(q)).tolist()
@@ -631,7 +630,7 @@ def _placed(body: tuple[Array, Array], mount: TagMount) -> oc.ObjectPose:
 
 
 class PoolCamera:
-    """Takes pictures of a vehicle at a fixed rate and delivers them late, as a camera does."""
+    """Overhead camera of a vehicle, with a fixed picture rate and a delivery latency."""
 
     def __init__(
         self,
@@ -644,19 +643,19 @@ class PoolCamera:
         seed: int = 0,
         noise_seed: int | None = None,
     ) -> None:
-        """
-        Args:
-            vehicle: Carries tags.
-            site: The camera and the water as they are, from `camera_of`.
-            mode: pictures are rendered; corners are computed by the same optics without a picture, with what the
-                detector would make of ripples, pixel noise and tags that it would not find.
-            settings: How it takes pictures, from `camera_of`.
-            basin: What the pictures show around the vehicle; that of plants drawn around it if None.
-            seed: Of ripples, noise, jitter and losses.
-            noise_seed: Of the noise alone, for another vehicle in the same corners; `seed` if None.
+        """Args:
+            vehicle: Vehicle with tags.
+            site: True camera and water, from `camera_of`.
+            mode: pictures are rendered; corners are computed by the same optics without a picture, with the detector's
+            errors
+                by ripples and pixel noise, and without tags that it would not find.
+            settings: Settings of the camera, from `camera_of`.
+            basin: Surroundings of the vehicle in the pictures; None for the basin of plants drawn for the vehicle.
+            seed: Seed of ripples, noise, jitter and losses.
+            noise_seed: Separate seed of the noise, for another vehicle in the same pictures; None for `seed`.
 
         Raises:
-            PlantSpecError: The vehicle has no tags, or there is no such mode.
+            PlantSpecError: The vehicle has no tags, or the mode does not exist.
         """
         s = settings or CameraSettings(latency=site.latency)
         tags = _tags_of(vehicle)
@@ -682,17 +681,17 @@ class PoolCamera:
         self._q_pw = np.asarray(site.world_orientation)
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
-        """Pictures that arrive in (t0, t1], oldest first.
+        """Return the pictures that arrive in (t0, t1], oldest first.
 
         Args:
-            t0: Where the last call ended [s].
-            t1: Now [s].
+            t0: End of the last call [s].
+            t1: Present time [s].
             pose_at: Time in [t0, t1] -> position [m] and orientation (xyzw) of the body, world frame.
         """
         return [self.develop(exposure) for exposure in self.exposures(t0, t1, pose_at)]
 
     def exposures(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Return the exposures of `advance` before they are developed: for a process that renders them in parallel.
+        """Return the exposures of `advance` before rendering, for a process that renders them in parallel.
 
         Times are in [s].
         """

@@ -1,4 +1,4 @@
-"""Drawing a plant around a vehicle file: by seed, at one of three severities."""
+"""Random plants around a vehicle file: by seed, at one of three severities."""
 
 from __future__ import annotations
 
@@ -34,63 +34,64 @@ __all__ = [
 ]  # fmt: skip
 
 
-# How far the plants of each severity lie from the vehicle file.
+# Spreads of the plants of each severity around the vehicle file.
 
 
 @dataclass(frozen=True)
 class HydrodynamicSpread:
-    """Distance of added mass, damping and the hull's drag from the vehicle file: ±, uniform."""
+    """Spreads of added mass, damping and hull drag around the vehicle file: ±, uniform."""
 
     entries: float
     """Spread of every diagonal entry of added mass and damping, and of the forces of each term [-]."""
     center: float
-    """Spread of the points where they are diagonal, per axis [m]."""
+    """Spread of the points about which they are diagonal, per axis [m]."""
     tilt_deg: float
     """Spread of the axes in which they are diagonal [deg]."""
     hull_share: float
-    """Part of the drag, on the axis where it is largest, that the hull's panels make [-]."""
+    """Fraction of the drag that the hull's panels cause, on the axis where it is largest [-]."""
 
 
 @dataclass(frozen=True)
 class PropulsionSpread:
-    """Distance of thrusters, other actuators and battery from the vehicle file: ±, uniform, unless stated otherwise."""
+    """Spreads of thrusters, other actuators and battery around the vehicle file: ±, uniform, unless stated
+    otherwise."""
 
     own_share: float
-    """Share of the vehicle's speed that enters its propellers [-]."""
+    """Fraction of the vehicle's speed in the inflow of its propellers [-]."""
     induced_share: float
-    """Share of a neighbour's jet [-]."""
+    """Fraction of a neighbour's induced speed in the inflow [-]."""
     deduction: tuple[float, float]
-    """Least and most of the thrust [-]."""
+    """Smallest and largest thrust deduction [-]."""
     thrust: float
     """Spread of each propeller's thrust, in each direction, and of the gain of other actuators [-]."""
     motor: float
     """Spread of each motor's lag, delay and slowest speed, and of the lag of other actuators [-]."""
     offset: float
-    """Misalignment of other actuators, of half their travel [-]."""
+    """Spread of the offset of other actuators, as a fraction of half their travel [-]."""
     fade: float
-    """Discharge of the battery in a quarter of an hour [-]."""
+    """Largest relative voltage loss of the battery in a quarter of an hour [-]."""
     resistance: float
     """Resistance of the battery [ohm]."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Distance of a plant of one severity from the vehicle file: ±, uniform, unless a name says otherwise."""
+    """Spread of a plant of one severity around the vehicle file: ±, uniform, unless a description says otherwise."""
 
     hydrodynamics: HydrodynamicSpread
     propulsion: PropulsionSpread
     mass: float
     """[kg]"""
     gravity_offset: tuple[float, float]
-    """Least and most distance of the centre of gravity from where the file has it [m]."""
+    """Smallest and largest distance of the centre of gravity from that of the file [m]."""
     buoyancy: float
-    """Amplitude of its drift [g]."""
+    """Amplitude of the buoyancy drift [g]."""
     current: tuple[float, float]
-    """Least and most of the pool's circulation [m/s]; none at 0."""
+    """Smallest and largest speed of the pool's circulation [m/s]; 0 for no circulation."""
     tether_weight: float
-    """[N/m]"""
+    """Spread of the tether's weight in water [N/m]."""
     tether: tuple[float, float]
-    """Shortest and longest [m]; none at 0."""
+    """Smallest and largest length of the tether [m]; 0 for no tether."""
     noise: float
     """Factor on the file's instrument noise [-]."""
     pressure_drift: float
@@ -99,9 +100,10 @@ class Spread:
     """[ppm]"""
 
     def slender(self, share: float) -> Spread:
-        """Return the spread for a hull that is shaped and trimmed to go ahead; the share is its beam over length [-].
+        """Return the spread for a slender hull, trimmed for forward motion; the share is its ratio of beam to length
+        [-].
 
-        Added mass about axes that are tilted by 3° would turn a torpedo harder than its rudder (Munk).
+        Added mass about axes tilted by 3° would turn a torpedo-shaped vehicle more than its rudder does (Munk).
         """
         least, most = self.gravity_offset
         hydro = self.hydrodynamics
@@ -141,41 +143,42 @@ SPREADS: dict[Severity, Spread] = by_severity(
     pressure_drift=(0.0, 2.0e-4, 4.0e-4),
     crystal=(0.0, 30.0, 60.0),
 )
-"""Spreads of a careful laboratory, and about twice those."""
+"""Severity -> spreads: those of a careful laboratory in `realistic`, and about twice as large in `hard`."""
 
 
-# How much of a vehicle's steady drag its panels and its propellers make, by axis: so that damping keeps the rest.
+# Part of a vehicle's steady drag that panels and propellers cause, by axis; it is subtracted from the damping.
 
 
 Array = NDArray[np.float64]
 
 CRUISE = 0.4
-"""Part of the largest wrench at which the shares are taken: between hovering and full speed [-]."""
+"""Fraction of the largest wrench at which these parts are computed: between hovering and full speed [-]."""
 
 LARGEST = 2.0 / 3.0
-"""Largest part of a damping coefficient that is taken out [-]."""
+"""Largest fraction of a damping coefficient that is subtracted [-]."""
 
 SKIN = 0.02
-"""Skin drag over form drag, as in the published mesh set [-]."""
+"""Ratio of the skin to the form drag coefficient, as in the published mesh set [-]."""
 
 
 def cruise(vehicle: Vehicle) -> tuple[Array, Array]:
-    """Steady wrench and velocity of each axis alone at `CRUISE`, by the file's damping.
+    """Return steady wrench and velocity at `CRUISE`, one axis at a time, with the file's damping.
 
     Returns:
-        Wrench [N, N m] and velocity [m/s, rad/s], (6,) each; zeros where an axis is not controlled or not damped.
+        Wrench [N, N m] and velocity [m/s, rad/s], (6,) each; zeros on axes that are not controlled or not damped.
     """
     hydro: Any = vehicle.hydrodynamics["calibrated"]
     d1, d2 = np.diag(hydro.linear_damping), hydro.axis_drag
     F = CRUISE * np.asarray(vehicle.wrench_limits)
-    # d2 v² + d1 v = F, by the root that stays exact without d2.
+    # d2 v² + d1 v = F, by the root that is also exact without d2.
     root = d1 + np.sqrt(d1 * d1 + 4.0 * d2 * F)
     v = np.divide(2.0 * F, root, out=np.zeros(6), where=root > 0.0)
     return F, v
 
 
 def panel_drag(vehicle: Vehicle) -> Array:
-    """Drag of the hull's panels when cruising along each axis, with C_form = 1 [N, N m], (6,); zeros without a hull."""
+    """Return the drag of the hull's panels at cruise along each axis, with C_form = 1 [N, N m], (6,); zeros without
+    a hull."""
     if vehicle.hull is None:
         return np.zeros(6)
     _, v = cruise(vehicle)
@@ -200,12 +203,12 @@ def panel_drag(vehicle: Vehicle) -> Array:
 
 
 def hull_share(vehicle: Vehicle, share: float, drag: Array) -> dict[str, float]:
-    """Coefficients with which the panels make a share of the file's drag, on the driven axis where that is largest.
+    """Return coefficients with which the panels cause a fraction of the drag, on the driven axis where this is largest.
 
     Args:
         vehicle: Its file.
-        share: Of the drag when cruising [-].
-        drag: As from `panel_drag`.
+        share: Fraction of the drag at cruise [-].
+        drag: Result of `panel_drag` [N, N m].
     """
     F, _ = cruise(vehicle)
     largest = np.max(np.divide(drag, F, out=np.zeros(6), where=F > 0.0), initial=0.0)
@@ -214,16 +217,16 @@ def hull_share(vehicle: Vehicle, share: float, drag: Array) -> dict[str, float]:
 
 
 def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float], deduction: float) -> Array:
-    """Return the share of drag by panels and propellers when cruising, by axis [N, N m], (6,).
+    """Return the drag of panels and propellers at cruise, by axis [N, N m], (6,).
 
-    The propellers' part is the thrust lost to their own motion through the water, T V / (J0 n D), see `losses`, and to
-    the thrust deduction: a file's damping was fitted to thrusts measured on a bench, so it holds both.
+    The part of the propellers is the thrust lost to the vehicle's motion, T V / (J0 n D), as in `delivered_thrust`, and
+    to the thrust deduction: a file's damping was fitted with thrusts measured on a bench, so it contains both.
 
     Args:
         vehicle: Its file.
         panels: Drag of the panels, by axis [N, N m], (6,).
         propellers: Keys of `Propellers`, in the units of `Propellers`.
-        deduction: Mean of the thrust deduction [-].
+        deduction: Mean thrust deduction [-].
     """
     F, v = cruise(vehicle)
     p = Propellers.model_validate(propellers)
@@ -243,13 +246,13 @@ def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float
 
 
 def less_share(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Array, Array]:
-    """Damping that is left when a part of the drag is made by something else; a third always stays.
+    """Return the damping without the drag that other parts cause; a third of each coefficient always remains.
 
     Args:
         vehicle: Its file.
-        D1: Linear [N s/m, N m s], (6, 6).
-        D2: Quadratic [N s²/m², N m s²], (6, 6).
-        drag: Drag when cruising, by axis [N, N m], (6,): out of the linear part first.
+        D1: Linear damping [N s/m, N m s], (6, 6).
+        D2: Quadratic damping [N s²/m², N m s²], (6, 6).
+        drag: Drag at cruise, by axis [N, N m], (6,); subtracted from the linear part first.
 
     Returns:
         D1 [N s/m, N m s] and D2 [N s²/m², N m s²] with smaller diagonals.
@@ -266,15 +269,15 @@ DRAWN = 20261122
 
 
 def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") -> PlantSpec:
-    """Return a plant around the vehicle in the pool; equal seeds give equal plants.
+    """Return a random plant for the vehicle in the pool; equal seeds give equal plants.
 
     Args:
         vehicle: Its file, with a `calibrated` set, an IMU and a depth sensor.
-        seed: 0 or more. A seed keeps its character over severities: what is strong in `realistic` is so in `hard`.
+        seed: 0 or more. With one seed, deviations of all severities have the same signs and proportions.
         severity: nominal, realistic or hard.
 
     Raises:
-        PlantSpecError: There is no such severity, or the vehicle has not what the pool needs.
+        PlantSpecError: The severity does not exist, or the vehicle lacks something that the pool needs.
     """
     if severity not in SPREADS:
         raise PlantSpecError(f"unknown severity '{severity}'; available: {', '.join(SPREADS)}")
@@ -321,7 +324,7 @@ def draw_plant(vehicle: Vehicle, seed: int, severity: Severity = "realistic") ->
 
 
 class _Draw:
-    """Draws rounded to six digits, so that a plant's file reads well and is the plant."""
+    """Random numbers rounded to six digits, so that the plant's file is readable and exact."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self._random = random
@@ -330,7 +333,7 @@ class _Draw:
         return float(f"{self._random.uniform(low, high):.6g}")
 
     def around(self, half: float, size: int | None = None) -> Any:
-        """Between -half and half: a number, or an array of `size`."""
+        """Return a number between -half and half, or an array of `size`."""
         part = self._random.uniform(-1.0, 1.0, size)
         return float(f"{half * part:.6g}") if size is None else half * np.round(part, 6)
 
@@ -345,12 +348,12 @@ class _Draw:
 def _water(
     vehicle: Vehicle, hydro: HydrodynamicSet, spread: Spread, draw: _Draw, sections: dict[str, Any]
 ) -> dict[str, Any]:
-    """Added mass, damping and hull drag, so that the sum of all losses of speed is about the file's damping."""
+    """Return added mass, damping and hull drag such that the total resistance is about the file's damping."""
     half, about = spread.hydrodynamics.entries, spread.hydrodynamics
     M_A = _congruent(hydro.added_mass, draw.around(half, 6))
     factor = draw.around(half, 6)
     D1, D2 = _congruent(hydro.linear_damping, factor), _congruent(hydro.quadratic_damping, factor)
-    # Terms describe the flow around the hull already.
+    # Terms already describe the flow around the hull.
     drag = np.zeros(6) if hydro.terms else panel_drag(vehicle)
     hull = hull_share(vehicle, about.hull_share, drag)
     panels = hull["form_drag"] * drag
@@ -371,7 +374,7 @@ def _water(
 
 
 def _dissipative(D1: Array, D2: Array) -> tuple[Array, Array]:
-    """Return D1 and D2 with couplings as small as `Damping` asks for; those that are small enough stay as they are."""
+    """Return D1 and D2 with couplings reduced to what `Damping` allows; unchanged if they are small enough."""
     scale = np.sqrt(np.maximum(np.outer(np.diag(D1), np.diag(D1)), 1e-24))
     least = min(float(np.linalg.eigvalsh((D1 + D1.T) / 2.0 / scale)[0]), 0.0)
     off = np.abs(D2 - np.diag(np.diag(D2)))
@@ -384,7 +387,7 @@ def _dissipative(D1: Array, D2: Array) -> tuple[Array, Array]:
 
 
 def _congruent(matrix: Any, change: Array) -> Array:
-    """S A S with S = diag sqrt(1 + change): scaled on every axis, and no less definite than A."""
+    """Return S A S with S = diag sqrt(1 + change): scaled on every axis, with the definiteness of A."""
     S = np.sqrt(1.0 + change)
     return np.asarray(np.asarray(matrix) * np.outer(S, S))
 
@@ -468,7 +471,7 @@ def _tether(vehicle: Vehicle, spread: Spread, draw: _Draw) -> dict[str, Any] | N
     }
 
 
-# Where a vehicle swims: pool, tank or open water, and how it learns where it is there.
+# Sites: pool, tank or open water, and positioning systems.
 
 
 TANK, OPEN = (
@@ -477,19 +480,19 @@ TANK, OPEN = (
 STREAM = {"nominal": 0.0, "realistic": 0.1, "hard": 0.25}
 """Current of open water by severity [m/s]."""
 SWELL = {"nominal": 0.0, "realistic": 0.05, "hard": 0.15}
-"""Amplitude of the longest of its three waves [m]."""
+"""Amplitude of the longest of the three waves in open water, by severity [m]."""
 
 
 def site_of(name: str, spec: PlantSpec) -> PlantSpec:
-    """The plant at a site: the vehicle as it is built, in other water.
+    """Return the plant at a site: the same vehicle in other water.
 
     Args:
-        name: pool, tank (10 m x 6 m, 5 m deep, still but for the pool's own eddies) or open-water (20 m deep, without
-            walls that it could meet or a tether, with a stream and three waves by severity).
-        spec: Drawn for the pool.
+        name: pool, tank (10 m x 6 m, 5 m deep, only with the pool's own eddies) or open-water (20 m deep, without walls
+            within reach or a tether, with a uniform current and three waves by severity).
+        spec: Plant drawn for the pool.
 
     Raises:
-        PlantSpecError: There is no such site, or the vehicle has no room in it.
+        PlantSpecError: The site does not exist, or the vehicle does not fit into it.
     """
     if name not in SITES:
         raise PlantSpecError(f"unknown site '{name}'; available: {', '.join(SITES)}")
@@ -498,7 +501,7 @@ def site_of(name: str, spec: PlantSpec) -> PlantSpec:
     if name == "tank":
         if spec.basin.length > TANK.length:
             raise PlantSpecError(
-                f"{spec.vehicle} needs {spec.basin.length:.1f} m, the tank has {TANK.length:g} m: take open-water"
+                f"{spec.vehicle} needs {spec.basin.length:.1f} m, the tank has {TANK.length:g} m: choose open-water"
             )
         return spec.model_copy(update={"basin": TANK, "tether": None})
     random = np.random.default_rng([spec.seed, 0x5EA])
@@ -520,10 +523,10 @@ def site_of(name: str, spec: PlantSpec) -> PlantSpec:
 
 
 def positioning_of(name: str, seed: int) -> Positioning | None:
-    """The positioning system of that name; None for `none`.
+    """Return the positioning system of that name; None for `none`.
 
     Raises:
-        PlantSpecError: There is no such system.
+        PlantSpecError: The system does not exist.
     """
     if name == "none":
         return None
@@ -533,11 +536,11 @@ def positioning_of(name: str, seed: int) -> Positioning | None:
 
 
 def site_of_world(world: Any, spec: PlantSpec) -> PlantSpec:
-    """The plant in the water of a world: its basin, or open water above its seabed.
+    """Return the plant in the water of a world: its basin, or open water above its seabed.
 
     Args:
         world: Described world.
-        spec: Drawn for the pool.
+        spec: Plant drawn for the pool.
     """
     if world.basin is not None:
         length, width, depth = world.basin.size.tolist()

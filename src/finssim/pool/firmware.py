@@ -1,4 +1,4 @@
-"""The motor controller's program: commands in, target speeds out, telemetry and echoes on the wire."""
+"""Program of the motor controller: commands in, target speeds out, telemetry and echoes on the link."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["AttitudeFilter", "Firmware", "PoolSensors", "FirmwareSample"]
 
 
-# The instruments aboard: the simulator's IMU and pressure gauge, sampled on the motor controller's clock.
+# Instruments of the vehicle: the simulator's IMU and pressure gauge, sampled on the motor controller's clock.
 
 
 IMU_ERRORS = (
@@ -52,27 +52,27 @@ class FirmwareSample(NamedTuple):
     """Readings of the motor controller at one time."""
 
     gyro: tuple[float, float, float]
-    """IMU frame [rad/s]."""
+    """Angular velocity, IMU frame [rad/s]."""
     accel: tuple[float, float, float]
     """Specific force, IMU frame [m/s²]."""
     depth: float
     """Depth of the pressure port, positive down [m]."""
     pressure: float
-    """Absolute [Pa]."""
+    """Absolute pressure [Pa]."""
 
 
 class PoolSensors:
     """IMU and pressure gauge of one plant; `sample` reads both once per period of the IMU."""
 
     def __init__(self, plant: Plant, seed: int) -> None:
-        """Switch them on: turn-on biases are drawn.
+        """Power the sensors on: this draws their turn-on biases.
 
         Args:
-            plant: What they measure.
-            seed: Of their errors.
+            plant: Plant that they measure.
+            seed: Seed of their errors.
         """
         self.period = 1.0 / plant.vehicle.sensors.imu.rate  # type: ignore[union-attr]
-        """Between samples [s]."""
+        """Sampling period [s]."""
         vehicle = with_instruments(plant.vehicle, plant.spec.instruments)
         key = int(np.random.SeedSequence([seed, 72]).generate_state(1)[0] >> 1)
         floor = plant.spec.basin.depth
@@ -108,7 +108,7 @@ class PoolSensors:
         self._sent = 0
 
     def sample(self) -> FirmwareSample:
-        """Read both; the gauge gives its newest sample that has arrived."""
+        """Return the readings of both; that of the gauge is its newest sample that has arrived."""
         self._count[0] += 1
         self._update()
         return FirmwareSample(
@@ -119,7 +119,8 @@ class PoolSensors:
         )
 
     def aids(self, delay: float) -> list[NavigationAid]:
-        """Return what Doppler log and compass have delivered at the newest `sample`, sent a delay [s] later."""
+        """Return the readings of Doppler log and compass that arrived with the newest `sample`, sent a delay [s]
+        later."""
         readings = []
         for kind, fresh, stamp, reading in self._aids:
             if not fresh[0]:
@@ -134,9 +135,9 @@ class PoolSensors:
 
 
 def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
-    """The vehicle with the errors that its instruments have in this plant.
+    """Return the vehicle with the errors of its instruments in this plant.
 
-    The IMU's latency is left out: it is the time between a sample and its frame, which the firmware takes.
+    The IMU's latency is set to 0: it is the time between a sample and its frame, which the firmware adds.
     """
     factor = instruments.noise
     imu, gauge = vehicle.sensors.imu, vehicle.sensors.depth
@@ -157,7 +158,7 @@ def with_instruments(vehicle: Vehicle, instruments: Instruments) -> Vehicle:
     return vehicle.model_copy(update={"sensors": sensors})
 
 
-# The attitude filter: gyroscope integrated, tilt from the accelerometer, yaw from a compass or left to drift.
+# Attitude filter: integrated gyroscope, tilt from the accelerometer; yaw from a compass, or drifting.
 
 
 Three = tuple[float, float, float]
@@ -166,23 +167,23 @@ Three = tuple[float, float, float]
 class AttitudeFilter:
     """Complementary filter on the rotation group (Mahony, Hamel and Pflimlin 2008, explicit form).
 
-    Without a compass its yaw drifts; `turn` takes a compass's headings.
+    Without a compass its yaw drifts; `turn` corrects it by compass headings.
 
-    With up the accelerometer's direction and R the estimate: e = up × Rᵀ z, b_dot = -ki e, q_dot = ½ q (ω - b + kp e).
-    Plain floats: at this size NumPy would cost ten times as much.
+    With the direction up of the specific force and the estimate R: e = up × Rᵀ z, b_dot = -ki e, q_dot = ½ q (ω - b +
+    kp e). It uses plain floats: at this size NumPy would cost ten times as much.
     """
 
     def __init__(self, gain: float, integral: float, gravity: float) -> None:
-        """Start without a sample.
+        """Initialise the filter without a sample.
 
         Args:
             gain: kp [1/s].
             integral: ki [1/s²].
-            gravity: [m/s²]; specific forces far from it are not used.
+            gravity: [m/s²]; specific forces of very different magnitude are not used.
         """
         self.gain, self.integral, self.gravity = gain, integral, gravity
         self.bias: Three = (0.0, 0.0, 0.0)
-        """Of the gyroscope, as estimated [rad/s]; without headings its vertical part stays about 0."""
+        """Estimated bias of the gyroscope [rad/s]; without headings its vertical component stays about 0."""
         self._q: tuple[float, float, float, float] | None = None
 
     @property
@@ -192,12 +193,12 @@ class AttitudeFilter:
         return x, y, z, w
 
     def update(self, gyro: Three, accel: Three, dt: float) -> None:
-        """Take one sample.
+        """Update the estimate with one sample.
 
         Args:
-            gyro: IMU frame [rad/s].
+            gyro: Angular velocity, IMU frame [rad/s].
             accel: Specific force, IMU frame [m/s²].
-            dt: Since the last [s].
+            dt: Time since the last sample [s].
         """
         if self._q is None:
             self._q = _level(accel)
@@ -226,9 +227,9 @@ class AttitudeFilter:
         """Turn the estimate about the vertical towards a heading.
 
         Args:
-            heading: Of the filter's x axis, left positive from world x [rad].
-            share: Part of the difference that is taken away [-].
-            learned: Part of the difference that the bias about the vertical takes [1/s].
+            heading: Heading of the filter's x axis, left positive from world x [rad].
+            share: Fraction of the difference that is corrected [-].
+            learned: Integral gain from the difference to the vertical bias [1/s].
         """
         if self._q is None:
             return
@@ -244,7 +245,7 @@ class AttitudeFilter:
 
 
 def _level(accel: Three) -> tuple[float, float, float, float]:
-    """Attitude at yaw 0 in which a specific force points upwards, wxyz."""
+    """Return the attitude at yaw 0 in which a specific force points upwards, wxyz."""
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
     cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
@@ -254,9 +255,9 @@ def _level(accel: Three) -> tuple[float, float, float, float]:
 Array = NDArray[np.float64]
 
 TURNING = 0.85
-"""Part of the file's slowest speed below which a target is taken as standing still [-]."""
+"""Fraction of the file's slowest speed below which a target counts as 0 [-]."""
 
-# As plain integers: the arithmetic of IntFlag is slow, and there are a hundred snapshots a second.
+# Plain integers, because the arithmetic of IntFlag is too slow for a hundred snapshots per second.
 ALWAYS = int(StatusFlag.DIAGNOSTICS | StatusFlag.RPM_CONTROL | StatusFlag.MOTOR_HANDLER)
 RECEIVED = int(StatusFlag.COMMAND_RECEIVED)
 ECHO_ON = int(StatusFlag.ECHO_ON)
@@ -266,13 +267,13 @@ THROTTLED = int(StatusFlag.THROTTLE)
 
 
 class Firmware:
-    """One run of the program, from power-on; its speed loops run inside the plant, where the motors are.
+    """One run of the program from power-on; its speed loops run inside the plant, together with the motors.
 
     Attributes:
-        target: Shaft speeds that it asks of the loops, canonical order [rad/s], (n,).
-        setpoints: Values that it asks of the other actuators [rad, m³ or m], (m,).
-        commands: How many it has received.
-        ordered: Whether its frames cannot overtake each other on the wire.
+        target: Target shaft speeds of the loops, canonical order [rad/s], (n,).
+        setpoints: Target values of the other actuators [rad, m³ or m], (m,).
+        commands: Number of received commands.
+        ordered: True if frames cannot overtake each other on the link.
     """
 
     ordered = False
@@ -281,7 +282,7 @@ class Firmware:
         """Power on.
 
         Args:
-            vehicle: Its file, which is what the program was configured with.
+            vehicle: Vehicle file with which the program was configured.
             spec: Clock and filter.
             now: Time of power-on [s].
         """
@@ -304,7 +305,7 @@ class Firmware:
         self._start(now)
 
     def _start(self, now: float) -> None:
-        """State after power-on: nothing is remembered, motors are off."""
+        """Set the state after power-on: all memory is cleared, motors are off."""
         self._boot = now
         self._decoder = Decoder(MCU, self._outputs, len(self._values))
         self._filter = AttitudeFilter(self._spec.attitude_gain, self._spec.attitude_integral, self._gravity)
@@ -319,21 +320,21 @@ class Firmware:
         self.commands = 0
 
     def reboot(self, now: float) -> None:
-        """Stop the motors, be silent for the plant's `reboot_time`, then restart clock, counters and attitude."""
+        """Stop the motors, send nothing for the plant's `reboot_time`, then restart clock, counters and attitude."""
         self._clock_start = 0
         self._start(now + self._spec.reboot_time)
 
     def running(self, now: float) -> bool:
-        """Return whether it has finished starting. `now` is the time [s]."""
+        """Return whether the program has finished starting. `now` is the time [s]."""
         return now >= self._boot
 
     def clock(self, now: float) -> int:
-        """Its own clock, modulo 2³² [ms]."""
+        """Return the time of its own clock, modulo 2³² [ms]."""
         rate = 1000.0 * (1.0 + 1e-6 * self._spec.crystal_ppm)
         return (self._clock_start + int(rate * (now - self._boot))) & 0xFFFFFFFF
 
     def receive(self, now: float, data: bytes) -> list[bytes]:
-        """Take bytes from the wire; returns the echoes that they cause. `now` is the time [s]."""
+        """Process bytes from the link, and return the resulting echoes. `now` is the time [s]."""
         if not self.running(now):
             return []
         replies = []
@@ -346,7 +347,7 @@ class Firmware:
         return replies
 
     def _command(self, now: float, command: ThrusterCommand) -> list[bytes]:
-        """Follow or refuse one command; the echo, if one is due."""
+        """Execute or refuse one command; return the echo, if one is due."""
         refused = RejectFlag(0)
         counts = self._decoder.refused
         bad = counts["bad_crc"] + counts["not_finite"]
@@ -375,19 +376,19 @@ class Firmware:
         return [self._echo(now, command, in_range and command.enable, int(refused))]
 
     def _aim(self, normalised: Array) -> None:
-        """Target speeds of a command, by motor output and with the motors' signs."""
+        """Set the target speeds of a command, by motor output and with the motors' signs."""
         speeds = self._sign * normalised[self._output] * self._full
         self.target = np.where((speeds < self._slow_plus) & (speeds > -self._slow_minus), 0.0, speeds)
         self._aiming = bool(self.target.any())
 
     def _stop_others(self) -> None:
-        """Send the other actuators to their `off`; those that have none stay where they are."""
+        """Set the other actuators to their `off`; those without one keep their values."""
         self.setpoints: Array = np.where(np.isnan(self._rest), self._values, self._rest)
 
     def _echo(self, now: float, command: ThrusterCommand, accepted: bool, refused: int) -> bytes:
         applied = np.zeros(self._outputs)
         applied[self._output] = self._sign * self.target / self._full
-        # The CRC as it came: of the same values in the same layout.
+        # The CRC as received, from the same values in the same layout.
         within = slice(2, -2) if command.setpoints else slice(1, -3)
         crc = crc16_modbus(encode_command(command)[within]) if _within(command) else 0
         echo = CommandEcho(
@@ -407,7 +408,7 @@ class Firmware:
         return encode_echo(echo)
 
     def watch(self, now: float) -> None:
-        """Stop the motors if commands have stopped. `now` is the time [s]."""
+        """Stop the motors if no more commands arrive. `now` is the time [s]."""
         if self._last_command is not None and now - self._last_command > self._timeout:
             self._last_command, self._timed_out, self._enabled = None, True, False
             self._aim(np.zeros(self._outputs))
@@ -416,14 +417,14 @@ class Firmware:
     def frames(
         self, now: float, sample: FirmwareSample, aids: Sequence[NavigationAid], plant: Plant, faults: Faults
     ) -> list[bytes]:
-        """Return what is sent at a sample of the IMU: a snapshot and the navigation aids; nothing while it starts.
+        """Return the frames at a sample of the IMU: a snapshot and the navigation aids; none during start-up.
 
         Args:
-            now: When it leaves [s].
-            sample: Of the instruments.
-            aids: New at this sample, with their ages now.
-            plant: Its motors.
-            faults: What is wrong.
+            now: Time of sending [s].
+            sample: Readings of the instruments.
+            aids: New readings at this sample, with their present ages.
+            plant: Plant with the motors.
+            faults: Active faults.
         """
         self._values = plant.measured_values
         telemetry = self.telemetry(now, sample, plant.measured_speed, plant.throttle)
@@ -434,13 +435,13 @@ class Firmware:
     def telemetry(
         self, now: float, sample: FirmwareSample, speed: Array, throttle: Array
     ) -> Telemetry | None:
-        """A snapshot for the wire; None while it starts.
+        """Return a snapshot for the link; None during start-up.
 
         Args:
-            now: When it is sent [s].
-            sample: Of the instruments.
+            now: Time of sending [s].
+            sample: Readings of the instruments.
             speed: Measured shaft speeds, canonical [rad/s], (n,).
-            throttle: Newest [-1, 1], canonical, (n,).
+            throttle: Newest throttles [-1, 1], canonical, (n,).
         """
         if not self.running(now):
             return None
@@ -463,7 +464,7 @@ class Firmware:
 
     @property
     def driving(self) -> bool:
-        """Return whether the newest command lets thrusters turn."""
+        """Return whether the newest command enables the thrusters."""
         return self._enabled
 
     def _flags(self, throttled: bool) -> int:

@@ -1,4 +1,4 @@
-"""Several vehicles in one water: a plant and a motor controller each, and one camera that sees the tags of all."""
+"""Several vehicles at one site: a plant and a motor controller each, and one camera that sees the tags of all."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from finssim.tasks.communication import Communication
 __all__ = ["Fleet", "Medium", "one_picture"]
 
 
-# Messages between vehicles on their way through the water: late by the way, and sometimes lost, as in training.
+# Transmission of messages between vehicles through the water: delayed by distance, and sometimes lost, as in training.
 
 
 Array = NDArray[np.float64]
 
 
 class Medium:
-    """Carries a datagram to all others; which are lost follows from the seed and the order of sending."""
+    """Medium that carries a datagram to all other vehicles; losses follow from the seed and the order of sending."""
 
     def __init__(
         self,
@@ -34,11 +34,10 @@ class Medium:
         communication: Communication | None = None,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            positions: Where everybody is, by name, world frame [m], (3,).
-            communication: Speed of sound, processing time and loss; None: everything arrives at once.
-            seed: Of what is lost.
+        """Args:
+        positions: Function that returns the positions of all vehicles, by name, world frame [m], (3,).
+        communication: Speed of sound, processing time and loss; None delivers everything immediately.
+        seed: Seed of the losses.
         """
         self._positions, self._communication = positions, communication
         self._random = random.Random(f"medium {seed}")
@@ -46,7 +45,7 @@ class Medium:
         self._under_way: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in positions()}
 
     def send(self, now: float, sender: str, datagram: bytes, *, lossless: bool = False) -> None:
-        """Put a datagram into the water at a time [s]; one that is `lossless` is on a cable."""
+        """Send a datagram at a time [s]; if `lossless`, it travels on a cable, without delay or loss."""
         places, c = self._positions(), self._communication
         for name, under_way in self._under_way.items():
             if name == sender:
@@ -60,7 +59,7 @@ class Medium:
             heapq.heappush(under_way, (arrival, next(self._order), datagram))
 
     def receive(self, now: float, name: str) -> list[bytes]:
-        """Return what has reached a receiver by a time [s], in the order of arrival."""
+        """Return the datagrams that have reached a receiver by a time [s], in the order of arrival."""
         under_way, out = self._under_way[name], []
         while under_way and under_way[0][0] <= now + 1e-9:
             out.append(heapq.heappop(under_way)[2])
@@ -72,26 +71,26 @@ class Fleet:
 
     Attributes:
         worlds: Plants and motor controllers.
-        medium: What carries messages between the vehicles; None: nothing does.
-        runtimes: Software of the vehicles that the site itself steers.
+        medium: Medium for messages between the vehicles; None means no messages.
+        runtimes: Software of the vehicles that the site itself controls.
     """
 
     def __init__(self, worlds: Mapping[str, VirtualPool], medium: Medium | None = None) -> None:
-        """Make a fleet of vehicles at the same time."""
+        """Create a fleet of vehicles with a common time."""
         self.worlds, self.medium = dict(worlds), medium
         self.runtimes: dict[str, Runtime] = {}
 
     @property
     def over(self) -> bool:
-        """Return whether the task is over; the vehicles continue to swim."""
+        """Return whether the task is over; the vehicles continue."""
         return False
 
     def turn(self, now: float, due: bool) -> None:
-        """Look at what is true; nothing but a task does.
+        """Evaluate the true state; only a task site does this.
 
         Args:
             now: Site's clock [s].
-            due: Whether the software of vehicles has just taken a step.
+            due: Whether the software of the vehicles has just run a step.
         """
 
     def close(self) -> None:
@@ -101,7 +100,7 @@ class Fleet:
 
 
 def one_picture(pictures: Iterable[Picture]) -> list[Picture]:
-    """Corners of each vehicle, of the same exposures, as the one camera has them: a picture with all tags."""
+    """Return pictures with the tags of all vehicles, from the pictures of each vehicle with equal exposures."""
     by_exposure: dict[tuple[str, int], Picture] = {}
     for picture in pictures:
         key = picture.source, picture.sequence

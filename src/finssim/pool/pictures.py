@@ -1,4 +1,4 @@
-"""The camera's end of the picture wire: over UDP to one robot."""
+"""Camera end of the picture link: over UDP to one robot."""
 
 from __future__ import annotations
 
@@ -40,16 +40,15 @@ __all__ = [
 
 
 class UdpSender:
-    """Datagrams to one robot: JPEG of quality 90, or the tags alone in one of them."""
+    """Sender of pictures to one robot by UDP: JPEG of quality 90, or only the tags, in one datagram."""
 
     def __init__(
         self, bind: tuple[str, int], peer: tuple[str, int], *, fragment: int = LONGEST_FRAGMENT
     ) -> None:
-        """
-        Args:
-            bind: Address and port of this end; port 0 takes a free one (see `address`).
-            peer: Of the robot.
-            fragment: Bytes of a picture in a datagram; 1400 for a network, more only on this machine.
+        """Args:
+            bind: Address and port of this end; port 0 selects a free one (see `address`).
+            peer: Address and port of the robot.
+            fragment: Bytes of a picture in a datagram; 1400 for a network, larger only on this machine.
 
         Raises:
             LinkError: The address cannot be bound.
@@ -61,13 +60,13 @@ class UdpSender:
         self.address: tuple[str, int] = self._socket.getsockname()
 
     def send(self, picture: Picture, now: float) -> None:
-        """Send a picture; one that cannot leave is counted and forgotten.
+        """Send a picture; if it cannot be sent, it is counted as lost and dropped.
 
         Args:
-            picture: With its time on the clock of `finssim.core.realtime` [s].
-            now: the clock of `finssim.core.realtime` [s].
+            picture: Picture with its time on the clock of `finssim.core.realtime` [s].
+            now: Time on the clock of `finssim.core.realtime` [s].
         """
-        # Small pictures of the vehicle's own sensors, which policies see, go as they are.
+        # Small pictures of the vehicle's own sensors, which policies use, are not compressed.
         compress = not picture.source or (
             picture.image is not None and picture.image.nbytes > LONGEST_FRAGMENT
         )
@@ -84,20 +83,21 @@ class UdpSender:
         self._socket.close()
 
 
-# Rendering of pictures in a separate process, so that telemetry never waits for one.
+# Rendering of pictures in a separate process, so that it never delays telemetry.
 
 
 UNDRAWN = 8
-"""Exposures that wait to be drawn; more are dropped, as a camera does whose computer is too slow."""
+"""Capacity of the queue of exposures before rendering; further ones are dropped, as in a camera with a slow
+computer."""
 STARTING = 120.0
-"""Time for the process to start and to compile the renderer, the first time on a machine [s]."""
+"""Time limit for starting the process and, the first time on a machine, compiling the renderer [s]."""
 ORPHANED = 1.0
-"""Between looks whether the parent is still there [s]."""
+"""Period at which the process checks that its parent still runs [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPlan:
-    """Arguments of `PoolCamera`, so that another process can make it."""
+    """Arguments of `PoolCamera`, so that another process can create it."""
 
     vehicle: Vehicle
     site: Pool
@@ -107,13 +107,13 @@ class CameraPlan:
     seed: int
 
     def camera(self) -> PoolCamera:
-        """Make it."""
+        """Return the camera."""
         return PoolCamera(
             self.vehicle, self.site, mode=self.mode, settings=self.settings, basin=self.basin, seed=self.seed
         )
 
     def shutter(self) -> Shutter:
-        """When it exposes."""
+        """Return the camera's shutter."""
         return self.settings.shutter(self.seed)
 
 
@@ -121,29 +121,29 @@ class PictureSourcePlan(Protocol):
     """Arguments of a camera, or of the vehicle's own sensors."""
 
     def camera(self) -> Any:
-        """Make it: `develop` gives the picture of an exposure."""
+        """Return the camera, whose `develop` returns the picture of an exposure."""
 
     def shutter(self) -> Any:
-        """When it exposes: `advance` gives exposures."""
+        """Return its shutter, whose `advance` returns exposures."""
 
 
 class PictureProcess:
-    """The cameras of a `VirtualPool` in real time: expose here, draw and send elsewhere; `advance` gives nothing."""
+    """Cameras of a `VirtualPool` in real time: exposure here, rendering and sending in another process."""
 
     def __init__(self, plans: Sequence[PictureSourcePlan], bind: Address, peer: Address) -> None:
-        """Start the process and wait until it can draw.
+        """Start the process and wait until it is ready to render.
 
         Args:
-            plans: What draws.
+            plans: Cameras to render.
             bind: Address and port of the sending end.
-            peer: Of the robot.
+            peer: Address and port of the robot.
 
         Raises:
-            LinkError: The wire cannot be opened, or the process did not start.
+            LinkError: The link cannot be opened, or the process did not start.
         """
         self.dropped = 0
         self.start = 0.0
-        """When the pool's clock was 0, on the clock of `finssim.core.realtime` [s]."""
+        """Time at which the pool's clock was 0, on the clock of `finssim.core.realtime` [s]."""
         self._shutters = [plan.shutter() for plan in plans]
         context = multiprocessing.get_context("spawn")
         self._undrawn: Any = context.Queue(UNDRAWN)
@@ -160,7 +160,7 @@ class PictureProcess:
         self._await(ready)
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
-        """Expose; pictures go their own way."""
+        """Queue exposures for rendering; return no pictures, as the other process sends them."""
         for i, shutter in enumerate(self._shutters):
             for exposure in shutter.advance(t0, t1, pose_at):
                 try:
@@ -171,13 +171,13 @@ class PictureProcess:
 
     @property
     def complaint(self) -> str:
-        """Return why pictures are missing, and what helps."""
+        """Return why pictures are missing, and a remedy."""
         if self._process.exitcode is not None:
             return f"the process that draws ended (status {self._process.exitcode}): start the pool again"
         return f"{self.dropped} pictures could not be drawn in time: --camera corners needs no drawing"
 
     def close(self) -> None:
-        """End the process and let go of the wire."""
+        """End the process and close the link."""
         if self._process.is_alive():
             try:
                 self._undrawn.put(None, timeout=1.0)
@@ -200,7 +200,7 @@ class PictureProcess:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """A process started meanwhile ignores Ctrl-C, which goes to all of a terminal, from its first moment on."""
+    """Make processes that are started in the context ignore Ctrl-C, which a terminal sends to all its processes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -214,7 +214,7 @@ def _deaf() -> Iterator[None]:
 def _draw(
     plans: Sequence[PictureSourcePlan], bind: Address, peer: Address, undrawn: Any, ready: Any, parent: int
 ) -> None:
-    """The process: draw each exposure as it comes, and send it when it is to arrive."""
+    """Run the process: render each exposure when it comes, and send the picture at its arrival time."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl-C reaches all processes; the parent decides when to end
@@ -223,9 +223,7 @@ def _draw(
         sink, cameras = UdpSender(bind, peer), [plan.camera() for plan in plans]
         for plan, camera in zip(plans, cameras, strict=True):
             if isinstance(plan, CameraPlan):
-                camera.develop(
-                    _first(plan)
-                )  # draws the background, and compiles the renderer where it is not
+                camera.develop(_first(plan))  # renders the background, and compiles the renderer if necessary
     except ValueError as problem:
         ready.send(str(problem))
         return
@@ -252,17 +250,17 @@ def _draw(
 
 
 def _first(plan: CameraPlan) -> Exposure:
-    """A vehicle in the middle of the pool."""
+    """Return an exposure of a vehicle in the middle of the pool."""
     pose = np.array([0.0, 0.0, -0.5 * plan.basin.depth]), np.array([0.0, 0.0, 0.0, 1.0])
     return Exposure(0, 0.0, 0.0, pose, pose)
 
 
 class Cameras:
-    """Several cameras as one."""
+    """Several cameras with the interface of one."""
 
     def __init__(self, *cameras: Any) -> None:
         self._cameras = cameras
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Picture]:
-        """Pictures of all; in the order of the cameras."""
+        """Return the pictures of all cameras, in the order of the cameras."""
         return [picture for camera in self._cameras for picture in camera.advance(t0, t1, pose_at)]

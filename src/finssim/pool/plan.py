@@ -1,4 +1,4 @@
-"""A virtual pool before it lives: plant, cameras and firmware."""
+"""Plan of a virtual pool before its simulation: plant, cameras and firmware."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from finssim.vehicles.defaults import vehicle_at
 
 @dataclass(frozen=True, kw_only=True)
 class PoolPlan:
-    """A virtual pool before it lives."""
+    """Plan of a virtual pool, from which its simulation is created."""
 
     vehicle: Vehicle
     spec: PlantSpec
     camera: CameraPlan | None
     calibrated: Pool | None
-    """Calibration of the camera that a robot may know."""
+    """Calibration of the camera as it is available to a robot."""
     positioning: str = "none"
     """Name of the positioning system."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
     """Firmware of the vehicle."""
     onboard: Any = None
-    """The vehicle's own cameras, sonars and altimeters, in the world that they see; None: there is none."""
+    """The vehicle's own cameras, sonars and altimeters in their world; None if there are none."""
 
     def eye(self) -> Any:
-        """All cameras as one, made here; None where there are none."""
+        """Return all cameras as one, created in this process; None if there are none."""
         cameras = [plan.camera() for plan in (self.camera, self.onboard) if plan is not None]
         return Cameras(*cameras) if len(cameras) > 1 else cameras[0] if cameras else None
 
     def world(self, camera: Any, *, start: Station, seed: int, truth: Path | None) -> VirtualPool:
-        """The living pool.
+        """Return the simulated pool.
 
         Args:
-            camera: Of the pool; None for none.
-            start: Where the vehicle begins, at rest and level.
-            seed: Of instruments and wire.
-            truth: File that is written.
+            camera: Camera of the pool; None for none.
+            start: Initial position and yaw of the vehicle, at rest and level.
+            seed: Seed of instruments and link.
+            truth: Truth file to write.
         """
         pose = np.asarray(start.position), quat_from_yaw(start.yaw)
         return VirtualPool(
@@ -65,7 +65,7 @@ class PoolPlan:
         )
 
     def standing(self, start: Station, *, seed: int, truth: Path | None = None) -> VirtualPool:
-        """The living pool with its own camera, for lock-step; arguments as of `world`."""
+        """Return the simulated pool with its camera in this process, for lock-step; arguments as for `world`."""
         return self.world(self.eye(), start=start, seed=seed, truth=truth)
 
 
@@ -84,17 +84,17 @@ def make_plan(
 
     Args:
         vehicle: A vehicle, its name or file.
-        plant: Seed, or a plant file, whose own severity and seed then also make the camera.
-        severity: Of a drawn plant.
-        camera: What it sends.
-        seed: Of ripples, noise, jitter and losses.
-        site: pool, tank or open-water; a camera hangs over the pool and the tank alone. If None the pool, or the
+        plant: Seed, or a plant file, whose severity and seed then also determine the camera.
+        severity: Severity of a drawn plant.
+        camera: Output of the camera.
+        seed: Seed of ripples, noise, jitter and losses.
+        site: pool, tank or open-water; only the pool and the tank have an overhead camera. None is the pool, or the
             water of the world.
-        firmware: mcu, or ardusub, with which the vehicle has a compass and a Doppler log.
-        world: What the vehicle's own sensors see: a site of the catalogue of worlds, or a path; None: nothing.
+        firmware: mcu, or ardusub, which gives the vehicle a compass and a Doppler log.
+        world: World for the vehicle's own sensors: a site of the catalogue of worlds, or a path; None: no world.
 
     Raises:
-        PlantSpecError: The plant cannot be made, or there is no such severity or camera.
+        PlantSpecError: The plant cannot be created, or the severity or camera does not exist.
     """
     ours = load_vehicle(vehicle)
     spec = draw_plant(ours, int(plant), severity) if plant.isdecimal() else load_plant_spec(plant)
@@ -105,7 +105,7 @@ def make_plan(
     ours = vehicle_at(site, ours, navigation=firmware == "ardusub")
     if site == "open-water" and camera != "none":
         raise PlantSpecError(
-            "no camera hangs over open water: give --camera none, and a positioning if there is one"
+            "open water has no overhead camera: give --camera none, and a positioning if there is one"
         )
     if firmware not in ("mcu", "ardusub"):
         raise PlantSpecError(f"unknown firmware '{firmware}'; available: mcu, ardusub")

@@ -1,4 +1,4 @@
-"""The plant: a vehicle in its water that no training model describes, behind its motors and their speed loop."""
+"""Plant: a vehicle in water with effects outside every training model, with its motors and their speed loops."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator,attr-defined"
 
 import math
@@ -32,33 +32,33 @@ from finssim.sim.state import State
 from finssim.vehicles import Vehicle
 from finssim.vehicles.hydrodynamics import MeshSet
 
-# The pool's own circulation: eddies in a box, still at the walls, that come and go slowly.
+# Circulation of the pool: slowly varying eddies in a box, which vanish at the walls.
 
 
 @wp.struct
 class Gyre:
-    """The circulation, by mode."""
+    """Circulation, by mode."""
 
     count: int
     length: float  # [m]
     width: float  # [m]
     depth: float  # [m]
-    floor_share: float  # share of the speed that is left at the floor
-    stream: wp.vec3  # the same everywhere [m/s]
+    floor_share: float  # ratio of the speed at the floor to that at the surface
+    stream: wp.vec3  # uniform current [m/s]
     cells: wp.array(dtype=float)  # number of cells along the pool [-]
     speed: wp.array(dtype=float)  # signed by the sense of rotation [m/s]
-    unsteadiness: wp.array(dtype=float)  # share of the speed that comes and goes
+    unsteadiness: wp.array(dtype=float)  # relative amplitude of the speed's variation [-]
     rate: wp.array(dtype=float)  # [rad/s]
     phase: wp.array(dtype=float)  # [rad]
 
 
 @wp.func
 def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
-    """Velocity of the water, world frame [m/s].
+    """Return the velocity of the water, world frame [m/s].
 
     From the stream function psi = A sin(πX) sin(cπX) sin²(πY), with X and Y from wall to wall and c cells:
-    (u, v) = (∂psi/∂y, -∂psi/∂x) is free of divergence, and both components vanish at all four walls. The speed along y
-    is largest for c = 1 at A π / length, that along x at A π / width.
+    (u, v) = (∂psi/∂y, -∂psi/∂x) has zero divergence, and both components vanish at all four walls. The largest speed
+    along y is A π / length for c = 1, that along x A π / width.
 
     Args:
         gyre: The circulation.
@@ -66,7 +66,7 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
         t: Time [s].
 
     Returns:
-        The stream, and horizontally what the eddies add to it within the walls [m/s].
+        The uniform current and, within the walls, the horizontal velocity of the eddies [m/s].
     """
     X = position[0] / gyre.length + 0.5
     Y = position[1] / gyre.width + 0.5
@@ -93,7 +93,7 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
 
 
 def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
-    """The struct that kernels take."""
+    """Return the circulation as a struct for kernels."""
     out = Gyre()
     modes = circulation.eddies
     out.count = len(modes)
@@ -111,14 +111,14 @@ def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
     )
 
 
-# What a hull, its motion and the neighbouring jets take from a propeller's thrust.
+# Losses of a propeller's thrust by the hull, by its motion and by neighbouring jets.
 
 
 Array = NDArray[np.float64]
 
 
 def with_arrays(struct: Any, device: Any = "cpu", **columns: Any) -> Any:
-    """Give a struct its arrays of numbers, by name; one 0 where there are none."""
+    """Set the arrays of a struct, by name; an empty one becomes a single 0."""
     for name, values in columns.items():
         numbers = np.asarray(values if len(values) else [0.0], dtype=np.float32)
         setattr(struct, name, wp.array(numbers, dtype=float, device=device))
@@ -126,7 +126,7 @@ def with_arrays(struct: Any, device: Any = "cpu", **columns: Any) -> Any:
 
 
 SLOWEST = 3.0
-"""Below this propeller speed the loss of thrust is taken as at it [1/s]: there is hardly any thrust to lose."""
+"""Propeller speed below which the loss of thrust is computed as at this speed [1/s]: the thrust is small there."""
 
 
 @wp.struct
@@ -135,25 +135,25 @@ class PropellerBank:
 
     count: int
     axis: wp.array(dtype=wp.vec3)  # unit vector of the thrust, body frame
-    place: wp.array(dtype=wp.vec3)  # body frame [m]
-    c_plus: wp.array(dtype=float)  # as built, less the thrust deduction [N s²/rad²]
+    place: wp.array(dtype=wp.vec3)  # position, body frame [m]
+    c_plus: wp.array(dtype=float)  # true coefficient, reduced by the thrust deduction [N s²/rad²]
     c_minus: wp.array(dtype=float)  # the same for reverse [N s²/rad²]
-    own_share: wp.array(dtype=float)  # share of the vehicle's own speed along the thrust in the inflow
-    share: wp.array2d(dtype=float)  # part of neighbour j's induced speed that enters propeller k
-    stall: float  # J0 D / 2π: inflow at which a shaft speed gives no thrust, per shaft speed [m]
-    disc: float  # 2 ρ times the disc's area [kg/m]
-    others: wp.array(dtype=float)  # commands of the channels behind the propellers [rad, m³ or m]
+    own_share: wp.array(dtype=float)  # fraction of the vehicle's speed along the thrust in the inflow
+    share: wp.array2d(dtype=float)  # fraction of neighbour j's induced speed that enters propeller k
+    stall: float  # J0 D / 2π: inflow at zero thrust, per shaft speed [m]
+    disc: float  # 2 ρ times the disc area [kg/m]
+    others: wp.array(dtype=float)  # commands of the channels after the propellers [rad, m³ or m]
 
 
 @wp.func
 def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu_r: vec6) -> vec8:
-    """Thrust that reaches the vehicle, T = T_bollard (1 - V / (J0 n D)), by propeller [N], and the other commands.
+    """Return the delivered thrust, T = T_bollard (1 - V / (J0 n D)), by propeller [N], followed by the other commands.
 
-    The inflow V is a share of the vehicle's own speed along the thrust, v·a sign T, and what the neighbours' jets add:
-    their induced speed sqrt(|T| / 2 ρ A), by momentum theory, falling with distance.
+    The inflow V is a fraction of the vehicle's speed along the thrust, v·a sign T, plus that of the neighbours' jets:
+    their induced speed sqrt(|T| / 2 ρ A), from momentum theory, which decreases with distance.
 
     Args:
-        propellers: All of them.
+        propellers: All propellers.
         speed: Shaft speeds [rad/s], (n,).
         nu_r: Velocity relative to the water, body frame [m/s, rad/s].
     """
@@ -176,7 +176,7 @@ def delivered_thrust(propellers: PropellerBank, speed: wp.array(dtype=float), nu
 
 
 def induced_shares(vehicle: Vehicle, spec: PlantSpec) -> Array:
-    """Part of neighbour j's induced speed that enters propeller k, (n, n)."""
+    """Return the fraction of neighbour j's induced speed that enters propeller k, (n, n)."""
     p = spec.propellers
     position = np.array([t.position for t in vehicle.thrusters.values()])
     distance = np.linalg.norm(position[:, None] - position, axis=-1)
@@ -186,7 +186,7 @@ def induced_shares(vehicle: Vehicle, spec: PlantSpec) -> Array:
 
 
 def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> PropellerBank:
-    """The propellers of a vehicle as one plant has them."""
+    """Return the propellers of a vehicle with the parameters of a plant."""
     nominal = list(vehicle.thrusters.values())
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
     bank = PropellerBank()
@@ -208,29 +208,29 @@ def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> Pr
     return bank
 
 
-# The pull of a slack tether: none until it is nearly straight. Its drag and weight are the engine's `TetherLine`.
+# Pull of a slack tether, zero until it is nearly straight. Its drag and weight are those of the engine's `TetherLine`.
 
 
 @wp.struct
 class Slack:
-    """A line that pulls only near its full length; a stiffness of 0 means none."""
+    """Tether that pulls only near its full length; a stiffness of 0 means no tether."""
 
     anchor: wp.vec3  # world frame [m]
     attachment: wp.vec3  # body frame [m]
-    start: float  # distance at which the pull sets in [m]
-    stretch: float  # from there to straight [m]
+    start: float  # distance at which the pull begins [m]
+    stretch: float  # additional distance at which it is straight [m]
     stiffness: float  # when straight [N/m]
 
 
 @wp.func
 def slack_pull(line: Slack, position: wp.vec3, q: wp.quat) -> vec6:
-    """Wrench of the line on the vehicle about its origin, body frame [N, N m].
+    """Return the wrench of the tether on the vehicle about its origin, body frame [N, N m].
 
-    With e the distance beyond the start and s the stretch to straight: F = k e²/(2 s) for e < s, then k (e - s/2). The
-    pull derives from a potential, so over a closed path it does no work.
+    With the distance e beyond the start and the distance s from there to straight: F = k e²/(2 s) for e < s, then
+    k (e - s/2). The pull is conservative.
 
     Args:
-        line: The line.
+        line: The tether.
         position: Body origin, world frame [m].
         q: Attitude, body to world.
     """
@@ -247,7 +247,7 @@ def slack_pull(line: Slack, position: wp.vec3, q: wp.quat) -> vec6:
 
 
 def slack_line(tether: SlackTether | None) -> Slack:
-    """The struct that kernels take."""
+    """Return the tether as a struct for kernels."""
     line = Slack()
     if tether is not None:
         line.anchor, line.attachment = wp.vec3(*tether.anchor), wp.vec3(*tether.attachment)
@@ -258,7 +258,7 @@ def slack_line(tether: SlackTether | None) -> Slack:
 
 
 def dragged_line(tether: SlackTether | None) -> TetherLine | None:
-    """Drag and weight of the line, for the engine."""
+    """Return drag and weight of the tether, for the engine."""
     if tether is None:
         return None
     return TetherLine(
@@ -270,22 +270,22 @@ def dragged_line(tether: SlackTether | None) -> TetherLine | None:
     )
 
 
-# Motors, their battery, and the firmware's speed loop for each: Warp functions over all motors.
+# Motors, battery and the firmware's speed loops: Warp functions over all motors.
 
 
 RPM = 2.0 * math.pi / 60.0
-"""One turn a minute [rad/s]."""
+"""One revolution per minute [rad/s]."""
 
 FILTER = 0.02
-"""Time constant of the measured speed in the derivative term [s]."""
+"""Filter time constant of the measured speed in the derivative term [s]."""
 
 
 @wp.struct
 class PowerSupply:
-    """Battery and wiring that feed all motors."""
+    """Battery and wiring that supply all motors."""
 
     full_voltage: float  # [V]
-    fade: float  # share of the voltage that is lost after fade_time
+    fade: float  # fraction of the voltage that is lost after fade_time
     fade_time: float  # [s]
     resistance: float  # [ohm]
     motor_power: float  # of one motor at full speed [W]
@@ -295,53 +295,54 @@ class PowerSupply:
 
 @wp.struct
 class SpeedLoop:
-    """The firmware's speed loop: its parameters, and its memory of every motor."""
+    """Speed loop of the firmware: its parameters, and its memory for every motor."""
 
-    on: int  # 0: no speed loop, the target is a throttle
+    on: int  # 0: no speed loop, the target determines the throttle
     steps: int  # motor steps between two runs
     period: float  # [s]
-    rated: wp.array(dtype=float)  # speed of a motor as described at full throttle on a full battery [rad/s]
-    scale: wp.array(dtype=float)  # speed that the firmware believes full throttle gives [rad/s]
-    model_alpha: wp.array(dtype=float)  # share of the way in one run, in the response of the firmware
-    kp: float  # gain of the relative deviation [-]
+    rated: wp.array(dtype=float)  # speed of a nominal motor at full throttle and full battery [rad/s]
+    scale: wp.array(dtype=float)  # speed at full throttle that the firmware assumes [rad/s]
+    model_alpha: wp.array(dtype=float)  # step response of the firmware's motor model after one run [-]
+    kp: float  # gain of the relative speed error [-]
     ki: float  # [1/s]
     kd: float  # [s]
     noise: float  # of one speed measurement [rad/s]
     quantum: float  # of one speed measurement [rad/s]
     measured: wp.array(dtype=float)  # newest measurement [rad/s]
     smooth: wp.array(dtype=float)  # smoothed measurement for the derivative [rad/s]
-    expected: wp.array(dtype=float)  # response that the firmware expects [rad/s]
+    expected: wp.array(dtype=float)  # speed in the firmware's motor model [rad/s]
     integral: wp.array(dtype=float)  # integral part of the throttle [-]
 
 
 @wp.struct
 class MotorBank:
-    """Parameters and memory of all motors, in canonical order; speeds are canonical too (positive pushes forward)."""
+    """Parameters and memory of all motors, in canonical order; speeds are canonical too (positive for forward
+    thrust)."""
 
     count: int
-    alpha: wp.array(dtype=float)  # share 1 - exp(-motor step / time constant) of the way in one step
-    delay: wp.array(dtype=int)  # motor steps from throttle to shaft
-    full: wp.array(dtype=float)  # steady speed at full throttle on a full battery [rad/s]
-    dead_plus: wp.array(dtype=float)  # slowest speed that turns the shaft [rad/s]
+    alpha: wp.array(dtype=float)  # fraction 1 - exp(-motor step / time constant) of the response in one step
+    delay: wp.array(dtype=int)  # delay from throttle to shaft in motor steps
+    full: wp.array(dtype=float)  # steady speed at full throttle and full battery [rad/s]
+    dead_plus: wp.array(dtype=float)  # slowest speed of the shaft [rad/s]
     dead_minus: wp.array(dtype=float)  # the same in reverse, as a magnitude [rad/s]
     target: wp.array(dtype=float)  # [rad/s]
     speed: wp.array(dtype=float)  # true shaft speed [rad/s]
     throttle: wp.array(dtype=float)  # newest [-1, 1]
-    line: wp.array2d(dtype=float)  # throttles on their way [-1, 1]
+    line: wp.array2d(dtype=float)  # delayed throttles [-1, 1]
     supply: PowerSupply
     loop: SpeedLoop
 
 
 @wp.func
 def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
-    """One run of the speed loop of motor k: feed-forward plus PID on the deviation from the expected response.
+    """Run the speed loop of motor k once: feed-forward plus PID on the deviation from the motor model.
 
-    Without a loop the throttle is the target over the speed of a motor as described at full throttle, so the true motor
-    and the battery's voltage decide how fast it turns.
+    Without a speed loop, the throttle is the target divided by the full-throttle speed of a nominal motor, so the
+    actual speed depends on the true motor and the battery voltage.
 
     Args:
         motors: All motors; memory of motor k is written.
-        k: Which motor.
+        k: Index of the motor.
         noise: A standard normal number.
 
     Returns:
@@ -349,7 +350,7 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     """
     measured = motors.speed[k] + motors.loop.noise * noise
     if motors.speed[k] == 0.0:
-        measured = 0.0  # a shaft at rest gives no pulses to count
+        measured = 0.0  # a stopped shaft produces no pulses to count
     if motors.loop.quantum > 0.0:
         measured = motors.loop.quantum * wp.round(measured / motors.loop.quantum)
     motors.loop.measured[k] = measured
@@ -368,16 +369,16 @@ def throttle_of(motors: MotorBank, k: int, noise: float) -> float:
     error = (expected - measured) / scale
     rate = (motors.loop.smooth[k] - before) / (motors.loop.period * scale)
     u = target / scale + motors.loop.kp * error + motors.loop.integral[k] - motors.loop.kd * rate
-    # Integrate only while the throttle is free to follow.
+    # Integrate only while the throttle is not saturated.
     if wp.abs(u) < 1.0 or u * error < 0.0:
         motors.loop.integral[k] = motors.loop.integral[k] + motors.loop.ki * motors.loop.period * error
-    # A motor with a target in one direction is never driven the other way: only the target can reverse it.
+    # The throttle never has the opposite sign of the target: only the target can reverse the motor.
     return wp.clamp(u, wp.where(target > 0.0, 0.0, -1.0), wp.where(target > 0.0, 1.0, 0.0))
 
 
 @wp.func
 def steady_speed(motors: MotorBank, k: int, throttle: float, voltage: float) -> float:
-    """Speed at which motor k settles [rad/s]: throttle times voltage, and none below the slowest that turns."""
+    """Return the steady speed of motor k [rad/s]: throttle times voltage, and 0 below its slowest speed."""
     speed = throttle * motors.full[k] * voltage / motors.supply.full_voltage
     if speed < motors.dead_plus[k] and speed > -motors.dead_minus[k]:
         return 0.0
@@ -386,7 +387,7 @@ def steady_speed(motors: MotorBank, k: int, throttle: float, voltage: float) -> 
 
 @wp.func
 def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
-    """One motor step of every motor: speed loop when due, delay line, first-order lag.
+    """Advance every motor by one motor step: speed loop when due, delay line, first-order lag.
 
     Args:
         motors: All motors; their memory is written.
@@ -407,7 +408,7 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
         goal = steady_speed(motors, k, late, voltage)
         speed = motors.speed[k] + motors.alpha[k] * (goal - motors.speed[k])
         if goal == 0.0 and wp.abs(speed) < 1.0:
-            speed = 0.0  # friction stops a shaft permanently
+            speed = 0.0  # friction stops a slow shaft completely
         motors.speed[k] = speed
         part = wp.abs(speed) / motors.full[k]
         power += motors.supply.motor_power * part * part * part
@@ -418,14 +419,14 @@ def turn_motors(motors: MotorBank, tick: int, dt: float, noise: wp.uint32):
 def motor_bank(
     vehicle: Vehicle, spec: PlantSpec, dt: float, device: Any = "cpu", *, speed_loop: bool = True
 ) -> MotorBank:
-    """Motors at rest.
+    """Return motors at rest.
 
     Args:
-        vehicle: As its file has it: what the firmware believes.
-        spec: As it is.
+        vehicle: Nominal vehicle of the file, which the firmware assumes.
+        spec: True parameters.
         dt: Motor step [s].
         device: Warp device.
-        speed_loop: Whether the firmware holds speeds; if not, a target is what it expects at full voltage.
+        speed_loop: Whether the firmware controls speeds; if not, targets determine throttles, as at full voltage.
     """
     true = [spec.thrusters[name] for name in vehicle.thruster_names]
     bank = MotorBank()
@@ -445,13 +446,13 @@ def motor_bank(
     for name in ("full_voltage", "fade", "fade_time", "resistance", "motor_power", "idle_current"):
         setattr(supply, name, getattr(spec.battery, name))
     with_arrays(supply, device, electric=[spec.battery.full_voltage, spec.battery.idle_current])
-    bank.supply = supply  # a copy, which has the same arrays
+    bank.supply = supply  # a copy, which shares its arrays
     bank.loop = _speed_loop(vehicle, spec.firmware, dt, device, speed_loop)
     return bank
 
 
 def _speed_loop(vehicle: Vehicle, firmware: FirmwareSpec, dt: float, device: Any, on: bool) -> SpeedLoop:
-    """The speed loop of a firmware that believes the vehicle file; arguments as of `motor_bank`."""
+    """Return the speed loop of a firmware that assumes the vehicle file; arguments as for `motor_bank`."""
     nominal, loop = list(vehicle.thrusters.values()), SpeedLoop()
     fastest = np.array([max(t.rpm_max, -t.rpm_min) for t in nominal])
     lag = np.array([t.time_constant + t.delay for t in nominal])
@@ -477,13 +478,13 @@ MOTOR_STEP = 0.001
 
 @wp.struct
 class Hidden:
-    """Forces on the body besides the engine's own."""
+    """Forces on the body in addition to the engine's own."""
 
-    T: mat66  # body twist to the damping's axes [-, m]
+    T: mat66  # body twist to the axes of the damping [-, m]
     D1: mat66  # linear damping [N s/m, N m s]
     D2: mat66  # quadratic damping [N s²/m², N m s²]
     r_b: wp.vec3  # centre of buoyancy, body frame [m]
-    half_height: float  # of the surface transition [m]
+    half_height: float  # half height of the surface transition [m]
     drifts: int
     drift: wp.array(dtype=float)  # amplitude of each slow change of buoyancy [N]
     drift_rate: wp.array(dtype=float)  # [rad/s]
@@ -492,14 +493,14 @@ class Hidden:
 
 @wp.func
 def coupled_damping(hidden: Hidden, nu_r: vec6) -> vec6:
-    """tau_D = -Tᵀ [D1 x + D2 (|x| x)], x = T nu_r, about the body origin [N, N m]."""
+    """Return tau_D = -Tᵀ [D1 x + D2 (|x| x)], x = T nu_r, about the body origin [N, N m]."""
     x = hidden.T * nu_r
     return -wp.transpose(hidden.T) * (hidden.D1 * x + hidden.D2 * wp.cw_mul(wp.abs(x), x))
 
 
 @wp.func
 def buoyancy_change(hidden: Hidden, t: float) -> float:
-    """Slow change of the buoyancy at a time [N]."""
+    """Return the slow change of buoyancy at a time [N]."""
     total = float(0.0)
     for i in range(hidden.drifts):
         total += hidden.drift[i] * wp.sin(hidden.drift_rate[i] * t + hidden.drift_phase[i])
@@ -508,7 +509,7 @@ def buoyancy_change(hidden: Hidden, t: float) -> float:
 
 @wp.struct
 class Machinery:
-    """Everything of a plant that the engine does not have."""
+    """Parts of a plant in addition to the engine."""
 
     motors: MotorBank
     propellers: PropellerBank
@@ -528,17 +529,17 @@ def drive(
     seed: int,
     world_offset: int,
 ):
-    """Before a physics step: turn the motors through it, and write thrusts, wrench and current for the engine.
+    """Advance the motors before a physics step, and write thrusts, wrench and current for the engine.
 
     Args:
-        state: Of one world with one vehicle.
-        command: Written: thrusts along the thrusters' axes [N], commands of other actuators, and the wrench about the
+        state: State of one world with one vehicle.
+        command: Output: thrusts along the thrusters' axes [N], commands of other actuators, and the wrench about the
             body origin, body frame [N, N m], (worlds, vehicles).
         surroundings: Water of the engine; its current is written, to which the engine adds the profile.
-        machinery: Motors, propellers and what else acts on the body.
+        machinery: Motors, propellers and additional forces on the body.
         step: Physics step [s].
-        motor_steps: Steps of the motors in it.
-        seed: Of the speed measurements' noise.
+        motor_steps: Number of motor steps in it.
+        seed: Seed of the noise of speed measurements.
         world_offset: First world of this launch; not used.
     """
     hidden = machinery.hidden
@@ -566,7 +567,7 @@ def drive(
 
 
 class Plant:
-    """One vehicle in one pool. It moves by shaft speeds that only the firmware commands."""
+    """One vehicle in one pool, driven by shaft speeds that only the firmware commands."""
 
     def __init__(
         self,
@@ -584,16 +585,17 @@ class Plant:
 
         Args:
             vehicle: Its file.
-            spec: What is hidden.
-            seed: Of the speed measurements' noise.
-            period: Time that the physics step must divide [s], such as the sensors' period.
+            spec: Hidden true parameters.
+            seed: Seed of the noise of speed measurements.
+            period: Time that must be a multiple of the physics step [s], such as the sensors' period.
             start: Position of the body origin, world frame [m], (3,), and attitude, body to world, xyzw, (4,).
-            speed_loop: Whether the firmware holds shaft speeds; if not, `target` is what it expects at full voltage.
-            world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
-            dock: A funnel in the water, at `simulator.funnel`.
+            speed_loop: Whether the firmware controls shaft speeds; if not, `target` determines throttles, as at full
+                voltage.
+            world: Single instance of a world whose objects the hull can touch; its basin replaces that of `spec`.
+            dock: Funnel in the water, at `simulator.funnel`.
 
         Raises:
-            PlantSpecError: The plant is not of this vehicle.
+            PlantSpecError: The plant is for another vehicle.
         """
         terms = getattr(vehicle.hydrodynamics["calibrated"], "terms", {})
         for kind, have, wanted in (
@@ -623,14 +625,14 @@ class Plant:
         propellers = propeller_bank(vehicle, spec)
         machinery = self._machinery = (
             Machinery()
-        )  # kept: a recorded launch does not keep arrays inside structs alive
+        )  # kept: a captured launch does not keep arrays inside structs alive
         machinery.motors, machinery.propellers, machinery.hidden = (
             self.motors,
             propellers,
             _hidden(vehicle, spec),
         )
         machinery.circulation, machinery.line = gyre(spec.circulation, spec.basin), slack_line(spec.tether)
-        # One slice of the generator's 32 bits per plant: seeds that differ by one must not share numbers.
+        # Different random numbers for every plant: consecutive seeds must not share any.
         key = int(np.random.SeedSequence([seed, 71]).generate_state(1)[0] >> 1)
         inputs = [s.state, s.command.array, s.water, machinery, self.step, motor_steps, key]
         pipeline.add(drive, inputs)
@@ -695,53 +697,53 @@ class Plant:
         self.quaternion = s.numpy("quaternion")[0, 0]
         """Body to world, xyzw; a view, (4,)."""
         self.nu = s.numpy("velocity")[0, 0]
-        """Body frame [m/s, rad/s]; a view, (6,)."""
+        """Twist, body frame [m/s, rad/s]; a view, (6,)."""
         self.thrust = s.numpy("thrust")[0, 0, :n]
-        """Delivered, canonical order [N]; a view, (n,)."""
+        """Delivered thrust, canonical order [N]; a view, (n,)."""
         self.values = s.numpy("thrust")[0, 0, n : len(self.vehicle.channel_names)]
         """Values of the other actuators [rad, m³ or m]; a view, (m,)."""
         self.water_velocity = s.water.current.numpy()[0]
-        """At the body, world frame [m/s]; a view, (3,)."""
+        """Velocity of the water at the body, world frame [m/s]; a view, (3,)."""
         self.target = self.motors.target.numpy()
-        """Shaft speeds that the firmware asks for, canonical [rad/s]; written by it, a view, (n,)."""
+        """Target shaft speeds of the firmware, which it writes, canonical [rad/s]; a view, (n,)."""
         self.shaft_speed = self.motors.speed.numpy()
-        """True, canonical [rad/s]; a view, (n,)."""
+        """True shaft speeds, canonical [rad/s]; a view, (n,)."""
         self.measured_speed = self.motors.loop.measured.numpy()
-        """As the firmware measures it, canonical [rad/s]; a view, (n,)."""
+        """Shaft speeds as measured by the firmware, canonical [rad/s]; a view, (n,)."""
         self.throttle = self.motors.throttle.numpy()
-        """-1 to 1; a view, (n,)."""
+        """Throttles, -1 to 1; a view, (n,)."""
         self.electric = self.motors.supply.electric.numpy()
         """Battery voltage [V] and current [A]; a view, (2,)."""
 
     def set_points(self, values: ArrayLike) -> None:
-        """Set what the firmware asks of the other actuators [rad, m³ or m], (m,)."""
+        """Set the firmware's target values of the other actuators [rad, m³ or m], (m,)."""
         self._others[:] = np.asarray(values, float) + self._offset
 
     @property
     def measured_values(self) -> Array:
-        """Values of the other actuators as their sensors have them [rad, m³ or m], (m,)."""
+        """Return the values of the other actuators as measured by their sensors [rad, m³ or m], (m,)."""
         return np.asarray(self.values / self._gain - self._offset)
 
     @property
     def time(self) -> float:
-        """Since the start [s]."""
+        """Return the time since the start [s]."""
         return self.steps * self.step
 
     def advance(self, steps: int = 1) -> None:
-        """Move on by some physics steps, with the shaft speeds of `target`."""
+        """Advance by some physics steps, with the shaft speeds of `target`."""
         for _ in range(steps):
             self._step()
         self.steps += steps
 
 
 def captured(run: Callable[[], None]) -> Callable[[], None]:
-    """Launches on the CPU as one call into native code: for a single vehicle, one by one they cost six times that.
+    """Return launches on the CPU as one native call, six times as fast for a single vehicle as single launches.
 
     Args:
-        run: Launches kernels, the same ones every time.
+        run: Function that launches kernels, the same ones every time.
 
     Returns:
-        What does the same; `run` itself where this version of Warp captures nothing on a CPU.
+        An equivalent function; `run` itself if this version of Warp cannot capture launches on a CPU.
     """
     try:
         with wp.ScopedCapture(device="cpu") as capture:
@@ -773,7 +775,7 @@ def _engine_fields(vehicle: Vehicle, spec: PlantSpec) -> dict[str, Any]:
 
 
 def _motors_fields() -> dict[str, float]:
-    """Return the parameters of the thrusters' channels in the engine, where motors and thrust are the plant's."""
+    """Return the engine's parameters of the thrusters' channels, since the plant computes motors and thrust itself."""
     return {"force_min": -1.0e6, "force_max": 1.0e6, "time_constant": 0.0, "slew": NO_LIMIT}
 
 

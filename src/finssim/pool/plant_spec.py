@@ -1,4 +1,4 @@
-"""A plant of the virtual pool: every number in which it differs from the vehicle file, as one YAML file."""
+"""Plant of the virtual pool: all parameters in which it differs from the vehicle file, as one YAML file."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ __all__ = [
 ]
 
 HEADROOM = 1.05
-"""A motor as the vehicle file describes it reaches so much more at full throttle than its bench drove it to [-]."""
+"""Ratio of a nominal motor's speed at full throttle to its speed range in the vehicle file [-]."""
 
 
-# Coefficients that hold about some point in tilted axes: how a matrix that couples all axes stays physical.
+# Coefficients about some point in tilted axes, so that a matrix that couples all axes remains physical.
 
 
 Array = NDArray[np.float64]
@@ -55,44 +55,45 @@ Three = tuple[float, float, float]
 
 
 class Section(BaseModel):
-    """A frozen part of a plant file: unknown keys and numbers that are not finite are refused."""
+    """Frozen section of a plant file, which refuses unknown keys and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class PrincipalAxes(Section):
-    """A point of the body and axes there."""
+    """Point of the body, and axes at this point."""
 
     center: Three
-    """Body frame [m]."""
+    """Position of the point, body frame [m]."""
     tilt_deg: Three
-    """Roll, pitch, yaw of the axes in the body [deg]."""
+    """Roll, pitch and yaw of the axes relative to the body [deg]."""
 
     def to_axes(self) -> Array:
-        """T with x = T nu: the twist at the point, in the tilted axes, from that of the body origin; (6, 6).
+        """Return T with x = T nu: the twist at the point, in the tilted axes, from that of the body origin; (6, 6).
 
-        The angles have no unit, the arms are in [m].
+        Its entries are cosines [-] and lever arms [m].
         """
         tilt = quat_to_matrix(quat_from_euler(*np.radians(self.tilt_deg)))
         return np.asarray(np.kron(np.eye(2), tilt.T) @ twist_shift(self.center))
 
 
 class CoupledMatrix(PrincipalAxes):
-    """A 6x6 matrix that is diagonal about some point in some axes."""
+    """6x6 matrix that is diagonal about some point in some axes."""
 
     diagonal: Six
-    """[kg, kg m²] or [N s/m, N m s]; above 0."""
+    """Diagonal [kg, kg m²] or [N s/m, N m s]; above 0."""
 
     def matrix(self) -> Array:
-        """About the body origin, body axes: Tᵀ diag T; positive definite for a positive diagonal, (6, 6).
+        """Return the matrix about the body origin, body axes: Tᵀ diag T; positive definite for a positive diagonal, (6,
+        6).
 
-        The unit is that of the diagonal.
+        Its unit is that of the diagonal.
         """
         T = self.to_axes()
         return np.asarray(T.T @ np.diag(self.diagonal) @ T)
 
 
-# Water and forces on the hull in a plant's file.
+# Water and hull forces in a plant file.
 
 
 Rows = tuple[Six, Six, Six, Six, Six, Six]
@@ -114,7 +115,7 @@ class AddedMass(PrincipalAxes):
         return self
 
     def about_origin(self) -> Array:
-        """M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
+        """Return M_A about the body origin, (6, 6) [kg, kg m, kg m²]."""
         T = self.to_axes()
         return np.asarray(T.T @ np.array(self.matrix) @ T)
 
@@ -140,7 +141,7 @@ class Damping(PrincipalAxes):
 
 
 class HullDrag(Section):
-    """Drag of the hull mesh's panels (paper, eq. 4), besides the damping."""
+    """Drag of the hull mesh's panels (paper, eq. 4), in addition to the damping."""
 
     form_drag: float = Field(default=0.0, ge=0.0)
     """Form drag coefficient [-]."""
@@ -149,14 +150,14 @@ class HullDrag(Section):
 
 
 class BuoyancyDrift(Section):
-    """Bubbles, warming air and soaking foam: slow changes of buoyancy, a sum of sines."""
+    """Slow changes of buoyancy by bubbles, warming air and soaking foam, as a sum of sines."""
 
     grams: tuple[float, ...] = ()
-    """Amplitude of each [g]."""
+    """Amplitude of each sine [g]."""
     periods: tuple[float, ...] = ()
-    """[s]"""
+    """Period of each sine [s]."""
     phases: tuple[float, ...] = ()
-    """[rad]"""
+    """Phase of each sine [rad]."""
 
     @model_validator(mode="after")
     def _same_length(self) -> BuoyancyDrift:
@@ -168,7 +169,7 @@ class BuoyancyDrift(Section):
 
 
 class SlackTether(Section):
-    """A line that hangs slack and pulls only when it is nearly straight."""
+    """Tether that hangs slack and pulls only when it is nearly straight."""
 
     anchor: Three
     """Point where it leaves the pool's edge, world frame [m]."""
@@ -177,15 +178,15 @@ class SlackTether(Section):
     length: float = Field(gt=0.0)
     """[m]"""
     stiffness: float = Field(default=15.0, ge=0.0)
-    """Stiffness of its last stretch before it is straight [N/m]."""
+    """Stiffness when the tether is straight [N/m]."""
     slack_share: float = Field(default=0.08, gt=0.0, lt=1.0)
-    """The pull sets in at (1 - slack_share) length [-]."""
+    """Fraction of the length: the pull begins at a distance of (1 - slack_share) length [-]."""
     diameter: float = Field(default=0.004, gt=0.0)
     """[m]"""
     drag_coefficient: float = Field(default=0.5, ge=0.0)
-    """Drag coefficient of a cylinder [-]; less than 1.2, since a slack line follows only in part."""
+    """Drag coefficient of a cylinder [-]; less than 1.2, since only part of a slack line moves with the vehicle."""
     wet_weight: float = 0.0
-    """[N/m]; negative floats."""
+    """Weight in water per length [N/m]; negative for a buoyant tether."""
 
 
 class Eddy(Section):
@@ -193,15 +194,15 @@ class Eddy(Section):
 
     cells: int = Field(ge=1, le=4)
     speed: float = Field(ge=0.0, le=0.5)
-    """Largest, at the surface [m/s]."""
+    """Largest speed, at the surface [m/s]."""
     unsteadiness: float = Field(ge=0.0, le=1.0)
-    """Part of the speed that comes and goes [-]."""
+    """Relative amplitude of the speed's variation [-]."""
     period: float = Field(gt=0.0)
-    """[s]"""
+    """Period of the variation [s]."""
     phase: float
-    """[rad]"""
+    """Phase of the variation [rad]."""
     sense: Literal[-1, 1] = 1
-    """1: anticlockwise from above."""
+    """Sense of rotation; 1: counterclockwise as seen from above."""
 
 
 class Swell(Section):
@@ -218,16 +219,16 @@ class Swell(Section):
 
 
 class Circulation(Section):
-    """The current: eddies that vanish at the walls, and in open water a stream and waves."""
+    """Current: eddies that vanish at the walls; in open water a uniform current and waves."""
 
     stream: Three = (0.0, 0.0, 0.0)
     """Uniform current, world frame [m/s]."""
     waves: tuple[Swell, ...] = ()
     water: Water | None = None
-    """Further current, profile, shear, drift and waves, as of a water file; its depth is that of the basin."""
+    """Additional current, profile, shear, drift and waves, as in a water file; its depth is that of the basin."""
     eddies: tuple[Eddy, ...] = ()
     floor_share: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Speed at the floor over that at the surface [-]."""
+    """Ratio of the speed at the floor to that at the surface [-]."""
 
 
 Severity = Literal["nominal", "realistic", "hard"]
@@ -235,19 +236,19 @@ T = TypeVar("T")
 
 
 HOME = (33.810313, -118.393867)
-"""Latitude and longitude of ArduSub's own test place [deg], the default origin."""
+"""Latitude and longitude of ArduSub's default test site [deg], the default origin."""
 
 
 class PlantSpecError(ValueError):
-    """A plant file that cannot be used, or a vehicle that the plant does not fit."""
+    """A plant file that cannot be used, or a vehicle that does not match the plant."""
 
 
 def by_severity(kind: Callable[..., T], **columns: tuple[Any, Any, Any]) -> dict[Severity, T]:
-    """A kind of settings for each severity.
+    """Return settings for each severity.
 
     Args:
-        kind: Makes one.
-        columns: A setting by name: nominal, realistic, hard.
+        kind: Function that creates the settings.
+        columns: Values of a setting by name: nominal, realistic, hard.
     """
     severities: tuple[Severity, ...] = get_args(Severity)
     return {
@@ -257,151 +258,151 @@ def by_severity(kind: Callable[..., T], **columns: tuple[Any, Any, Any]) -> dict
 
 
 class Basin(Section):
-    """The pool: a box centred on the world's z axis, the water surface at z = 0."""
+    """Basin of the pool: a box centred on the world's z axis, with the water surface at z = 0."""
 
     length: float = Field(default=4.0, gt=0.0)
-    """Along world x [m]."""
+    """Length along world x [m]."""
     width: float = Field(default=2.0, gt=0.0)
-    """Along world y [m]."""
+    """Width along world y [m]."""
     depth: float = Field(default=1.0, gt=0.0)
     """[m]"""
 
 
 def basin_of(vehicle: Vehicle) -> Basin:
-    """The published pool; a larger one, of the same shape, for a vehicle that it has no room for."""
+    """Return the published pool, or a larger one of the same shape for a vehicle that needs more room."""
     length, width, depth = (room(vehicle.body.size) * side for side in POOL)
     return Basin(length=length, width=width, depth=depth)
 
 
 class TrueBody(Section):
-    """The rigid body as it is, not as it was weighed."""
+    """True rigid body, in contrast to the measured one of the vehicle file."""
 
     mass: float = Field(gt=0.0)
     """[kg]"""
     inertia: tuple[Three, Three, Three]
-    """About the centre of gravity, body axes [kg m²]."""
+    """Inertia about the centre of gravity, body axes [kg m²]."""
     center_of_gravity: Three
-    """Body frame [m]."""
+    """Position, body frame [m]."""
     displaced_volume: float = Field(gt=0.0)
     """[m³]"""
     center_of_buoyancy: Three
-    """Body frame [m]."""
+    """Position, body frame [m]."""
 
 
 class TrueThruster(Section):
-    """One thruster as built."""
+    """True parameters of one thruster."""
 
     gain_plus: float = Field(gt=0.0)
-    """Thrust over the file's, forward [-]."""
+    """Ratio of true to nominal thrust, forward [-]."""
     gain_minus: float = Field(gt=0.0)
-    """Gain in reverse, the ratio of true to nominal thrust."""
+    """Ratio of true to nominal thrust, reverse [-]."""
     deduction: float = Field(ge=0.0, lt=1.0)
-    """Part of the thrust that its own jet takes back from the hull [-]."""
+    """Thrust deduction: fraction of the thrust that the force of its jet on the hull cancels [-]."""
     time_constant: float = Field(gt=0.0)
-    """Time constant of the shaft's speed [s]."""
+    """Time constant of the shaft speed [s]."""
     delay: float = Field(ge=0.0, le=1.0)
     """Delay from throttle to shaft [s]."""
     dead_rpm_plus: float = Field(ge=0.0)
-    """Slowest forward speed that turns the shaft [rpm]."""
+    """Slowest forward speed of the shaft [rpm]."""
     dead_rpm_minus: float = Field(ge=0.0)
     """Slowest reverse speed, as a magnitude [rpm]."""
     full_rpm: float = Field(gt=0.0)
-    """Speed at full throttle on a full battery [rpm]."""
+    """Speed at full throttle with a full battery [rpm]."""
 
 
 class TrueActuator(Section):
-    """One actuator besides the thrusters, as built; its force law is that of the vehicle file."""
+    """True parameters of one actuator other than a thruster; its force law is that of the vehicle file."""
 
     gain: float = Field(gt=0.0)
-    """Change of its value over that of its sensor [-]."""
+    """Ratio of the change of its value to that of its sensor reading [-]."""
     offset: float
-    """Value at which its sensor shows 0, over the gain [rad, m³ or m]."""
+    """Value at a sensor reading of 0, divided by the gain [rad, m³ or m]."""
     time_constant: float = Field(ge=0.0)
     """[s]"""
 
 
 class Propellers(Section):
-    """Loss of thrust by moving water: T (1 - V / (J0 n D)), V the inflow, n turns a second."""
+    """Loss of thrust by inflow: T (1 - V / (J0 n D)), with the inflow V and n revolutions per second."""
 
     diameter: float = Field(default=0.07, gt=0.0)
     """D [m]."""
     own_share: float = Field(default=0.0, ge=0.0)
-    """Part of the vehicle's own speed along the axis that enters V [-]; 0 where the vehicle file has an `inflow`."""
+    """Fraction of the vehicle's speed along the axis that enters V [-]; 0 if the vehicle file has an `inflow`."""
     advance_at_zero_thrust: float = Field(default=0.8, gt=0.0)
-    """J0 [-]"""
+    """J0, advance ratio at zero thrust [-]."""
     induced_share: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Part of a neighbour's induced speed that enters V, at no distance [-]."""
+    """Fraction of a neighbour's induced speed that enters V, at zero distance [-]."""
     induced_reach: float = Field(default=0.3, gt=0.0)
-    """Falls by e over this distance [m]."""
+    """Distance over which this fraction decreases by a factor of e [m]."""
 
 
 class Battery(Section):
-    """Voltage falls with time and with load."""
+    """Battery whose voltage decreases with time and load."""
 
     full_voltage: float = Field(default=16.4, gt=0.0)
     """[V]"""
     fade: float = Field(default=0.0, ge=0.0, lt=0.5)
-    """Part of the voltage lost after `fade_time` [-]."""
+    """Fraction of the voltage that is lost after `fade_time` [-]."""
     fade_time: float = Field(default=900.0, gt=0.0)
-    """[s]; the voltage stays there afterwards."""
+    """Time over which the voltage decreases [s]; it is constant afterwards."""
     resistance: float = Field(default=0.0, ge=0.0)
     """Resistance of cells and wiring [ohm]."""
     motor_power: float = Field(default=45.0, ge=0.0)
-    """Power of one motor at `full_rpm`; falls with the cube of speed [W]."""
+    """Power of one motor at `full_rpm` [W]; proportional to the cube of the speed."""
     idle_current: float = Field(default=0.6, ge=0.0)
-    """Current of everything else [A]."""
+    """Current of all other consumers [A]."""
 
 
 class Instruments(Section):
     """Differences of the instruments from the vehicle file."""
 
     noise: float = Field(default=1.0, ge=0.0)
-    """Factor on the file's noise, bias and drift [-]."""
+    """Factor on the noise, bias and drift of the vehicle file [-]."""
     pressure_drift: float = Field(default=0.0, ge=0.0)
-    """Random walk of the depth's bias, besides the file's [m/√s]."""
+    """Additional random walk of the depth bias [m/√s]."""
 
 
 class FirmwareSpec(Section):
-    """The motor controller: its speed loop, clock and attitude filter, and the wire behind it."""
+    """Motor controller: its speed loop, clock, attitude filter and link."""
 
     loop_period: float = Field(default=0.002, ge=0.001, le=0.005)
     """Period of the rpm loop [s]."""
     feed_forward: float = Field(default=1.0, gt=0.0)
-    """Throttle over what the file's speed range would need [-]."""
+    """Ratio of the feed-forward throttle to that from the file's speed range [-]."""
     gain: float = Field(default=0.4, ge=0.0)
-    """Proportional: throttle per normalised speed error [-]."""
+    """Proportional gain: throttle per normalised speed error [-]."""
     integral_gain: float = Field(default=1.5, ge=0.0)
     """[1/s]"""
     derivative_gain: float = Field(default=0.004, ge=0.0)
     """[s]"""
     rpm_noise: float = Field(default=12.0, ge=0.0)
-    """Standard deviation of one measurement [rpm]."""
+    """Standard deviation of one speed measurement [rpm]."""
     rpm_quantum: float = Field(default=8.0, ge=0.0)
-    """[rpm]"""
+    """Resolution of one speed measurement [rpm]."""
     crystal_ppm: float = Field(default=0.0, ge=-500.0, le=500.0)
-    """Error of its clock's rate [ppm]."""
+    """Error of the clock rate [ppm]."""
     clock_start: int = Field(default=0, ge=0, lt=2**32)
-    """Reading of its clock when the pool starts [ms]; 0 after a reboot."""
+    """Clock reading when the pool starts [ms]; 0 after a reboot."""
     reboot_time: float = Field(default=1.5, ge=0.0)
-    """Silence after a reboot [s]."""
+    """Time without frames after a reboot [s]."""
     version: Literal["4.1", "4.5", "4.7"] = "4.5"
-    """Version of ArduSub, where the vehicle has an autopilot."""
+    """Version of ArduSub, if the vehicle has an autopilot."""
     aiding_delay: float = Field(default=30.0, ge=0.0)
-    """Time of velocities by a Doppler log after which an autopilot has a position [s]; recorded: 28 to 36 s."""
+    """Duration of Doppler log velocities until an autopilot has a position [s]; recorded: 28 to 36 s."""
     origin: tuple[float, float] | None = None
-    """Latitude and longitude that an autopilot has been given as its origin before the start [deg]; None: none."""
+    """Latitude and longitude of the origin that an autopilot has at the start [deg]; None for no origin."""
     log_shared: bool = True
-    """True if the robot receives the reports of an autopilot's Doppler log too, as over the vehicle's network."""
+    """True if the robot also receives the reports of an autopilot's Doppler log, as over the vehicle's network."""
     declination: float = Field(default=0.0, ge=-math.pi, le=math.pi)
-    """Magnetic declination, east positive [rad]: without an origin an autopilot gives the magnetic heading."""
+    """Magnetic declination, east positive [rad]; without an origin an autopilot reports the magnetic heading."""
     attitude_gain: float = Field(default=0.5, ge=0.0)
     """Gain of the accelerometer in the attitude filter [1/s]."""
     attitude_integral: float = Field(default=0.01, ge=0.0)
-    """[1/s²]"""
+    """Integral gain of the attitude filter [1/s²]."""
     uplink: tuple[float, float] = (0.001, 0.003)
-    """Shortest and longest way of a telemetry frame to the robot [s]."""
+    """Shortest and longest delay of a telemetry frame to the robot [s]."""
     downlink: tuple[float, float] = (0.0008, 0.0014)
-    """Delay of a command [s]."""
+    """Shortest and longest delay of a command [s]."""
 
     @field_validator("uplink", "downlink")
     @classmethod
@@ -412,13 +413,13 @@ class FirmwareSpec(Section):
 
 
 class PlantSpec(Section):
-    """Everything hidden about one plant; the vehicle file gives thruster places, envelope and instruments."""
+    """All hidden parameters of one plant; the vehicle file provides thruster positions, envelope and instruments."""
 
     title: str
     severity: Severity
     seed: int = Field(ge=0)
     vehicle: str
-    """Name of the vehicle it was drawn around."""
+    """Name of the vehicle for which the plant was drawn."""
     basin: Basin = Basin()
     body: TrueBody
     added_mass: AddedMass
@@ -451,10 +452,10 @@ class PlantSpec(Section):
 
 
 def load_plant_spec(path: str | Path) -> PlantSpec:
-    """The plant in a file.
+    """Return the plant in a file.
 
     Raises:
-        PlantSpecError: The file cannot be used; names file, key and expectation.
+        PlantSpecError: The file cannot be used; the message names file, key and expectation.
     """
     data = read_mapping(Path(path), PlantSpecError, such_as="severity: realistic")
     if isinstance(data.get("circulation"), dict) and "water" in data["circulation"]:

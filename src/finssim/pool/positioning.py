@@ -1,4 +1,4 @@
-"""Position fixes on a wire: motion capture, or acoustic positioning, with their rate, latency, losses and outliers."""
+"""Position fixes on a link, from motion capture or acoustic positioning, with rate, latency, losses and outliers."""
 
 from __future__ import annotations
 
@@ -17,48 +17,47 @@ from finssim.robot.messages import POSE, POSITION, NavigationAid
 __all__ = ["Exposure", "POSITIONING", "PoseAt", "Positioning", "PositioningSettings", "Shutter"]
 
 
-# Exposure of the overhead camera and arrival of its pictures: a shutter that gets the time in ticks.
+# Exposure of the overhead camera and arrival of its pictures: a shutter that advances with the simulation time.
 
 
 Array = npt.NDArray[np.float64]
 
 PoseAt = Callable[[float], tuple[Array, Array]]
-"""Time [s] -> position of the body origin [m], (3,), and body to world, xyzw, (4,), world frame."""
+"""Time [s] -> position of the body origin [m], (3,), and quaternion body to world, xyzw, (4,), world frame."""
 WIDEST = 3.0
-"""Standard deviations of jitter beyond which there is none."""
+"""Limit of the jitter, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One picture before it is developed: how the vehicle moved while the shutter was open."""
+    """One picture before it is rendered: the motion of the vehicle while the shutter was open."""
 
     sequence: int
     middle: float
-    """[s]"""
+    """Middle of the exposure [s]."""
     arrival: float
     """Time of arrival at the robot's computer [s]."""
     start: tuple[Array, Array]
-    """Pose when the shutter opened, as of `PoseAt`."""
+    """Pose when the shutter opened, see `PoseAt`."""
     end: tuple[Array, Array]
-    """Position [m], (3,), and attitude when it closed."""
+    """Position [m], (3,), and quaternion, (4,), when it closed."""
     source: str = ""
     """Name of the vehicle's sensor; the overhead camera if empty."""
 
 
 class Shutter:
-    """Opens at a fixed rate; some pictures are lost on the way, the others arrive late by latency and jitter."""
+    """Shutter with a fixed rate; some pictures are lost, the others arrive with latency and jitter."""
 
     def __init__(
         self, *, rate: float, exposure: float, latency: float, jitter: float, dropout: float, seed: int
     ) -> None:
-        """
-        Args:
-            rate: Pictures a second [Hz].
-            exposure: [s].
-            latency: From the middle of the exposure to arrival, on average [s].
-            jitter: Standard deviation of the latency [s]; no picture overtakes another.
-            dropout: Chance that a picture is lost.
-            seed: Of jitter and losses.
+        """Args:
+        rate: Picture rate [Hz].
+        exposure: [s].
+        latency: Mean time from the middle of the exposure to arrival [s].
+        jitter: Standard deviation of the latency [s]; pictures arrive in order.
+        dropout: Probability that a picture is lost.
+        seed: Seed of jitter and losses.
         """
         self._rate, self._exposure, self._dropout = rate, exposure, dropout
         self._latency, self._jitter = latency, jitter
@@ -68,7 +67,8 @@ class Shutter:
         self._last_arrival = -math.inf
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[Exposure]:
-        """Exposures that ended in (t0, t1], without those that are lost; `pose_at` is asked for times in it alone.
+        """Return the exposures that ended in (t0, t1], without lost ones; `pose_at` is only called for times in this
+        interval.
 
         Times are in [s].
         """
@@ -90,17 +90,17 @@ class Shutter:
 
 
 class Mail:
-    """Pictures on their way, in the order of their arrival."""
+    """Queue of pictures before their arrival, in the order of arrival."""
 
     def __init__(self) -> None:
         self._waiting: deque[Exposure] = deque()
 
     def post(self, exposures: list[Exposure]) -> None:
-        """Send some on their way."""
+        """Add pictures to the queue."""
         self._waiting.extend(exposures)
 
     def arrived(self, t: float) -> list[Exposure]:
-        """Return those that have arrived at a time [s], each once."""
+        """Return the pictures that have arrived at a time [s], each once."""
         there = []
         while self._waiting and self._waiting[0].arrival <= t:
             there.append(self._waiting.popleft())
@@ -109,22 +109,22 @@ class Mail:
 
 @dataclass(frozen=True, kw_only=True)
 class PositioningSettings:
-    """One positioning system."""
+    """Settings of one positioning system."""
 
     rate: float
-    """Fixes a second [Hz]."""
+    """Rate of the fixes [Hz]."""
     std: float
-    """Per axis [m]."""
+    """Standard deviation of the position per axis [m]."""
     yaw_std: float = 0.0
-    """Standard deviation of the heading [rad]; 0: it gives none."""
+    """Standard deviation of the heading [rad]; 0 means that fixes have no heading."""
     latency: float = 0.0
-    """Average time from the measurement to arrival [s]."""
+    """Mean time from the measurement to arrival [s]."""
     jitter: float = 0.0
     """Standard deviation of the latency [s]."""
     dropout: float = 0.0
-    """Chance that a fix is lost."""
+    """Probability that a fix is lost."""
     outliers: float = 0.0
-    """Chance that a fix is wrong by up to `outlier_size`."""
+    """Probability that a fix is wrong by up to `outlier_size`."""
     outlier_size: float = 10.0
     """Largest offset of a wrong fix, per axis [m]."""
 
@@ -137,17 +137,16 @@ POSITIONING: Mapping[str, PositioningSettings] = {
         rate=0.5, std=0.5, latency=0.4, jitter=0.1, dropout=0.1, outliers=0.05, outlier_size=15.0
     ),
 }
-"""Positioning systems by name. Motion capture under or above water; an ultra-short baseline at some ten metres."""
+"""Positioning systems by name: motion capture, and an ultra-short baseline at a range of some ten metres."""
 
 
 class Positioning:
-    """Measures the position of the vehicle, and reports it late."""
+    """Positioning system that measures the position of the vehicle and reports it with latency."""
 
     def __init__(self, settings: PositioningSettings, seed: int) -> None:
-        """
-        Args:
-            settings: Of the system.
-            seed: Of noise, outliers, jitter and losses.
+        """Args:
+        settings: Settings of the system.
+        seed: Seed of noise, outliers, jitter and losses.
         """
         s = settings
         self.settings = s
@@ -157,7 +156,8 @@ class Positioning:
         self._mail, self._random = Mail(), np.random.default_rng([seed, 0xF1])
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[tuple[float, bytes]]:
-        """Frames that arrive in (t0, t1], each with its arrival [s], oldest first; `pose_at` as for a camera."""
+        """Return the frames that arrive in (t0, t1], each with its arrival [s], oldest first; `pose_at` as for a
+        camera."""
         self._mail.post(self._shutter.advance(t0, t1, pose_at))
         frames = []
         for fix in self._mail.arrived(t1):

@@ -1,4 +1,4 @@
-"""A virtual pool in real time, on open wires to robots in other processes."""
+"""Virtual pool in real time, with open links to robots in other processes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from finssim.robot.links.transports import Transport
 from finssim.robot.messages import Picture
 
 TICK = 0.003
-"""Between looks at the wire [s]."""
+"""Period at which the links are polled [s]."""
 MOST_BEHIND = 0.2
-"""Delay beyond which a pool gives up that time [s]: its clock stops instead, as on a stopped computer."""
+"""Delay beyond which a pool skips the lost time [s]: its clock stops instead, as on a stopped computer."""
 
 
 class Clocked(Protocol):
-    """A camera that must know when the pool's clock began."""
+    """Camera that needs the start time of the pool's clock."""
 
     start: float
-    """Time at which the pool's clock began, on the clock of the process [s]."""
+    """Time at which the pool's clock started, on the clock of the process [s]."""
 
 
 @dataclass
@@ -33,15 +33,15 @@ class Pace:
     duration: float = 0.0
     """Duration by the pool's clock [s]."""
     late: float = 0.0
-    """The most that the pool was behind at a tick [s]."""
+    """Largest delay of a tick [s]."""
     given_up: float = 0.0
-    """Time that the pool stood still because it was too far behind [s]."""
+    """Total time for which the pool's clock stopped because it was too late [s]."""
     received: int = 0
-    """Frames from the robot."""
+    """Number of frames from the robot."""
     sent: int = 0
-    """Frames to it."""
+    """Number of frames to the robot."""
     pictures: int = 0
-    """Number of pictures that were sent from this process."""
+    """Number of pictures sent from this process."""
 
     @property
     def sentence(self) -> str:
@@ -54,21 +54,22 @@ class Pace:
 
 
 RATE = 60.0
-"""Steps a second of the software of vehicles that the task commands [Hz]."""
+"""Step rate of the software of the vehicles that the site controls [Hz]."""
 
 
 class MessageEnd(Protocol):
-    """The medium's end for robots in other processes."""
+    """End of the medium for robots in other processes."""
 
     def poll(self, now: float) -> None:
-        """Take what was sent and deliver what has arrived, at the site's clock [s]."""
+        """Receive new messages and deliver arrived ones, at a time of the site's clock [s]."""
 
 
 class PoolTiming:
-    """Clock of a pool, and the medium of a team: those of this machine. A program that has its own derives a class."""
+    """Clock of a pool and medium of a team, here those of this machine; a program with its own clock derives a
+    class."""
 
     paced = False
-    """True if time waits for the pool, so that its cameras draw within a step."""
+    """True if the clock waits for the pool; the cameras then render in the pool's process."""
 
     def now(self) -> float:
         """Return the time [s]."""
@@ -79,20 +80,20 @@ class PoolTiming:
         realtime.wait(duration)
 
     def messages(self, fleet: Fleet) -> MessageEnd | None:
-        """Return the medium's end for the robots of a team; None: they exchange nothing."""
+        """Return the medium's end for the robots of a team; None means no messages."""
         return None
 
 
 @dataclass(frozen=True)
 class SiteWires:
-    """Open wires of a site, to robots in other processes."""
+    """Open links of a site to robots in other processes."""
 
     transports: Mapping[str, Transport]
-    """Vehicle -> wire to its robot, from the motor controller's end."""
+    """Vehicle -> link to its robot, at the motor controller's end."""
     messages: MessageEnd | None = None
-    """Messages between the robots; None: they tell each other nothing."""
+    """Messages between the robots; None means no messages."""
     sinks: Sequence[UdpSender] = ()
-    """Take the one camera's pictures, one for each robot."""
+    """Senders of the overhead camera's pictures, one for each robot."""
     camera: Clocked | None = None
     """Camera that sends its pictures itself."""
 
@@ -107,16 +108,16 @@ def serve_realtime(
     clock: Callable[[], float] = realtime.now,
     wait: Callable[[float], None] = realtime.wait,
 ) -> Pace:
-    """Run a site in real time until the time is over or `until` returns true.
+    """Run a site in real time for a duration, or until `until` returns true.
 
     Args:
-        site: With robots in other processes, at time 0.
-        wires: Its open wires.
-        duration: How long [s].
-        until: Ends it where it says so; asked at every tick.
-        over: Called once, when the site says that it is over; it lives on.
+        site: Site with robots in other processes, at time 0.
+        wires: Its open links.
+        duration: Duration [s].
+        until: Function that ends the run by returning true; called at every tick.
+        over: Function that is called once, when the site's task is over; the run continues.
         clock: This machine's clock [s].
-        wait: Waits so long [s].
+        wait: Function that waits for a time [s].
     """
     pace, start, now = Pace(), clock(), 0.0
     sent: dict[str, list[bytes]] = {name: [] for name in site.runtimes}

@@ -1,4 +1,4 @@
-"""`finssim pool`: make a plant, a camera and a motor controller, and serve a robot until a signal stops it."""
+"""`finssim pool`: create a plant, a camera and a motor controller, and serve a robot until a signal stops the pool."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ __all__ = ["MCU_PORT", "Ends", "PoolFiles", "SiteChoice", "run", "swimming"]
 MCU_PORT = 58766
 """Port of the motor controller; pictures come from the next port, lock-step uses the one after."""
 MESSAGES = 5
-"""The messages of a team are this far from the first port."""
+"""Offset of the port for messages of a team from the first port."""
 ROOM = 2.0
-"""Distance between the starts of a team's vehicles, in lengths of the longest."""
+"""Distance between the starts of a team's vehicles, in lengths of the longest vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SiteChoice:
-    """A site, and the plant of its vehicle."""
+    """Site, and plant of its vehicle."""
 
     vehicle: str = "finsrov"
     """(NAME|FILE) Vehicle in the catalogue, or path of a vehicle file."""
@@ -65,24 +65,24 @@ class SiteChoice:
     """(FILE) Water file (.yaml): currents, a profile over depth and time, waves or a sea state, which add to the site's
     own."""
     start: str | None = None
-    """(X,Y,Z,YAW) Where the vehicle starts, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint of a world,
-    if not given."""
+    """(X,Y,Z,YAW) Start of the vehicle, world frame: x,y,z [m], yaw [deg]; the centre, or the viewpoint of a world, if
+    not given."""
     camera: Literal["pictures", "corners", "none"] | None = None
     """(KIND) Output of the camera: pictures, corners (of the tags) or none. Default: pictures; corners for a team or a
     tank; none in open water, with a world or a task, and with ardusub."""
     positioning: str = "none"
     """(NAME) Position fixes on the robot's link: none, motion-capture or usbl."""
     firmware: Literal["mcu", "ardusub"] = "mcu"
-    """(NAME) What steers the motors: mcu, the motor controller of `finssim run`, or ardusub, an autopilot that answers
-    as ArduSub does, over MAVLink, with a compass and a Doppler log."""
+    """(NAME) Firmware: mcu, the motor controller of `finssim run`, or ardusub, an autopilot that behaves like ArduSub
+    over MAVLink, with a compass and a Doppler log."""
     version: Literal["4.1", "4.5", "4.7"] = "4.5"
-    """(VERSION) Of ArduSub, with ardusub: 4.5 is as recorded; 4.1 has no axes of pitch and roll, 4.7 other names of
-    parameters and SURFACE_MAX_THR."""
+    """(VERSION) ArduSub version, with ardusub: 4.5 is as recorded; 4.1 has no pitch and roll axes, 4.7 has other
+    parameter names and SURFACE_MAX_THR."""
     seed: int = 1
     """Seed of every random number; equal seeds give equal results."""
 
     def wet(self, spec: PlantSpec) -> PlantSpec:
-        """Return a plant in the water of the water file.
+        """Return the plant with the water of the water file.
 
         Raises:
             SurroundingsError: The file is refused.
@@ -98,10 +98,10 @@ class SiteChoice:
         return spec.model_copy(update={"circulation": circulation})
 
     def plan(self) -> tuple[PoolPlan, Station]:
-        """Return the pool of one vehicle, and where the vehicle starts.
+        """Return the pool of one vehicle, and the start of the vehicle.
 
         Raises:
-            PlantSpecError: The plant cannot be made, or the start is outside.
+            PlantSpecError: The plant cannot be created, or the start is outside the pool.
         """
         usual: Any = {"pool": "pictures", "tank": "corners"}.get(
             self.site or ("pool" if self.world is None else ""), "none"
@@ -142,7 +142,7 @@ class Ends:
     robot: str = "127.0.0.1:54321"
     """(HOST:PORT) The only robot that may send commands in real time; images are sent to the next port."""
     ground: str = "127.0.0.1:14550"
-    """(HOST:PORT,...) With ardusub: UDP ground stations to send to; every sender to --port is answered, too."""
+    """(HOST:PORT,...) With ardusub: UDP ground stations to send to; every sender to --port also receives frames."""
     tcp: str = "127.0.0.1:5760"
     """(HOST:PORT) With ardusub: TCP address for ground stations; port 0 selects a free one."""
     dvl: str = "127.0.0.1:16171"
@@ -161,7 +161,7 @@ class Ends:
         return host_port(self.robot, "--robot")
 
     def ground_links(self) -> Callable[[], GroundLinks]:
-        """Return a function that opens what an autopilot has instead of the motor controller's wire."""
+        """Return a function that opens the links of an autopilot, which replace the motor controller's link."""
         texts = [] if self.ground == "none" else self.ground.split(",")
         stations = [host_port(text.strip(), "--ground") for text in texts]
         page = None if self.dvl_page is None else host_port(self.dvl_page, "--dvl-page")
@@ -222,8 +222,8 @@ def run(
         single = lockstep or choice.start is not None or choice.world is not None
         if not choice.plant.isdecimal() or single or written:
             raise PlantSpecError(
-                "--team and --task draw their plants, their time is real and their starts are their own: give a seed "
-                "for --plant, leave --lockstep, --start and --world out, and of a task --pool-file and --truth"
+                "--team and --task draw plants and starts, and run in real time: give a seed for --plant, leave "
+                "--lockstep, --start and --world out, with --task also --pool-file and --truth"
             )
         bodies = [load_vehicle(name.strip()) for name in (team or choice.vehicle).split(",")]
         fleet, calibrated = (
@@ -234,12 +234,13 @@ def run(
     plan, begin = choice.plan()
     port, ardusub = ends.port, choice.firmware == "ardusub"
     if not (0 < port or (ardusub and not lockstep and plan.camera is None)) or port > 65533:
-        raise LinkError(f"port {port}: expected 1 to 65533, as the two after it are taken too")
+        raise LinkError(f"port {port}: expected 1 to 65533, as the pool also uses the next two ports")
     if files.pool_file is not None and plan.calibrated is None:
         raise PlantSpecError("--pool-file describes the camera, and --camera none has none: omit one")
 
     def make_world(eye: Any) -> VirtualPool:
-        """Begins to write files: only when every wire is open, lest those of a pool that is running are replaced."""
+        """Create the pool and its files; only called when every link is open, so that files of a running pool are
+        not replaced."""
         world = plan.world(eye, start=begin, seed=choice.seed, truth=files.truth)
         if files.pool_file is not None and plan.calibrated is not None:
             write_pool(plan.calibrated, files.pool_file)
@@ -261,7 +262,7 @@ def _serve_team(
     duration: float,
     timing: PoolTiming,
 ) -> None:
-    """Serve several vehicles, each to a separate robot, from their first addresses on ten ports apart."""
+    """Serve several vehicles, each to a separate robot; their ports are ten apart, from the first addresses on."""
     (bind, port), (host, first) = ends.ours, ends.theirs
     names = fleet.task.agents if isinstance(fleet, TaskSite) else tuple(fleet.worlds)
     if not 0 < port <= 65535 - 10 * len(names):
@@ -303,7 +304,7 @@ def _serve_team(
 
 
 def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[TaskSite, None]:
-    """Return the site of a task in open water, without a camera; its own vehicles are of the first type."""
+    """Return the site of a task in open water, without a camera; its other vehicles are of the first type."""
     fitted = fitted_task(task, bodies[0])
     if len(bodies) not in (1, len(fitted.agents)):
         raise PlantSpecError(
@@ -324,22 +325,22 @@ def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[
 
 
 def swimming(bodies: Sequence[Vehicle], choice: SiteChoice, truth: Path | None) -> tuple[Fleet, Pool | None]:
-    """Return vehicles side by side, robot_1 and so on, and what their robots may know of the one camera.
+    """Return vehicles side by side, robot_1 and so on, and the calibration of the camera for their robots.
 
     Args:
-        bodies: As their files have them.
-        choice: The site; its plant is the seed of the first vehicle's plant and of the camera, the others' follow.
-        truth: Folder that takes NAME.truth of each; none if None.
+        bodies: Vehicles as in their files.
+        choice: The site; its plant is the seed of the first vehicle's plant and of the camera, the other seeds follow.
+        truth: Folder for NAME.truth of each vehicle; None for no truth files.
 
     Raises:
-        PlantSpecError: They have no room, or the camera cannot be there.
+        PlantSpecError: The vehicles do not fit into the site, or the site has no camera.
     """
     site, plant, severity, seed = choice.site or "pool", int(choice.plant), choice.severity, choice.seed
     camera = choice.camera or ("none" if site == "open-water" else "corners")
     if camera == "pictures" and site != "open-water":
-        raise PlantSpecError("the one camera over a team sends corners: give --camera corners, or none")
+        raise PlantSpecError("the camera over a team sends only corners: give --camera corners, or none")
     if site == "open-water" and camera != "none":
-        raise PlantSpecError("no camera hangs over open water: give --camera none, and a positioning")
+        raise PlantSpecError("open water has no overhead camera: give --camera none, and a positioning")
     ours = [numbered(vehicle_at(site, body), i) for i, body in enumerate(bodies)]
     specs = [choice.wet(site_of(site, draw_plant(v, plant + i, severity))) for i, v in enumerate(ours)]
     basin = specs[0].basin
@@ -379,7 +380,7 @@ def swimming(bodies: Sequence[Vehicle], choice: SiteChoice, truth: Path | None) 
 
 
 def _tell_goal(site: TaskSite) -> None:
-    """Print the place of the task's goal, if it does not move."""
+    """Print the pose of the task's goal, if it does not move."""
     if site.task.moving:
         return
     x, y, z = site.referee.arrays.goal_position.numpy()[0]
@@ -388,7 +389,7 @@ def _tell_goal(site: TaskSite) -> None:
 
 
 def _tell_episode(site: Fleet) -> None:
-    """Print the result of the episode, in a line."""
+    """Print the result of the episode in one line."""
     if not isinstance(site, TaskSite):
         return
     if site.referee.over:
@@ -464,7 +465,7 @@ def _realtime(
 def _camera(
     plan: PoolPlan, bind: tuple[str, int], peer: tuple[str, int], *, paced: bool
 ) -> tuple[PictureProcess | None, UdpSender | None, Any]:
-    """The process that draws, or the sink for what is computed here, and the camera for the world."""
+    """Return the process that renders, or the sender for pictures of this process, and the camera of the pool."""
     plans: list[PictureSourcePlan] = [
         plan_or_none for plan_or_none in (plan.camera, plan.onboard) if plan_or_none is not None
     ]
@@ -477,7 +478,7 @@ def _camera(
 
 
 def _next(address: tuple[str, int]) -> tuple[str, int]:
-    """Pictures leave and arrive at the port after that of the motor controller's wire."""
+    """Return the address for pictures: the port after that of the motor controller's link."""
     return address[0], address[1] + 1
 
 

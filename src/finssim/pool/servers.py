@@ -17,19 +17,19 @@ from finssim.robot.lockstep import LockstepError, decode_request, encode_deliver
 from finssim.robot.team import decode_track
 
 MOST_CALLERS = 8
-"""Ground stations that are answered over UDP, and guests of a pool in lock-step: those that called last."""
+"""Largest number of UDP ground stations, or of connections before lock-step: the latest ones are kept."""
 GUEST_PATIENCE = 2.0
 """Time within which a robot's first request must arrive completely [s]."""
 
 
 class LockstepServer:
-    """A pool whose clock advances as far as its one robot asks, and ends when the robot leaves."""
+    """Server of a pool whose clock advances as its only robot requests, and which ends when the robot leaves."""
 
     def __init__(self, address: tuple[str, int]) -> None:
-        """Listen.
+        """Listen for robots.
 
         Args:
-            address: Host and port; port 0 takes a free one (see `address`).
+            address: Host and port; port 0 selects a free one (see `address`).
 
         Raises:
             LinkError: It cannot be bound.
@@ -39,17 +39,17 @@ class LockstepServer:
         self.address: tuple[str, int] = self._listener.getsockname()
 
     def serve(self, world: VirtualPool, *, duration: float = math.inf) -> str:
-        """Wait for a robot and serve it; no other one is accepted.
+        """Wait for a robot and serve it; no other robot is accepted.
 
-        The robot is the first that sends a request. Whoever connects and leaves again, is silent or sends something
-        else is not, and the pool continues to listen.
+        The robot is the first client that sends a valid request. Clients that disconnect, send nothing or send
+        something else are closed, and the pool continues to listen.
 
         Args:
             world: The pool.
-            duration: Longest time of the pool's clock [s]; a request beyond it is refused.
+            duration: Longest time of the pool's clock [s]; later requests are refused.
 
         Returns:
-            Why it ended, in a few words.
+            Reason for the end, in a few words.
         """
         connection, request = self._first_request()
         self.close()
@@ -61,12 +61,14 @@ class LockstepServer:
                 while message is not None:
                     until, sent = decode_request(*message)
                     if until > duration + 1e-9:
-                        connection.sendall(encode_refusal(f"the pool ends at {duration:g} s, as it was told"))
+                        connection.sendall(
+                            encode_refusal(f"the pool ends at {duration:g} s, its given duration")
+                        )
                         return "the time is over"
                     connection.sendall(encode_delivery(world.exchange(until, sent)))
                     message = receive(connection)
             except (LockstepError, PoolClockError) as problem:
-                with suppress(OSError):  # it may not wait for the answer
+                with suppress(OSError):  # the robot may be gone
                     connection.sendall(encode_refusal(str(problem)))
                 return f"{robot[0]}:{robot[1]} was refused: {problem}"
             except OSError as problem:
@@ -74,7 +76,7 @@ class LockstepServer:
         return "the robot has left"
 
     def _first_request(self) -> tuple[socket.socket, tuple[int, bytes]]:
-        """Wait for a request among all that connect; the others are closed."""
+        """Wait for the first valid request of any client; the other clients are closed."""
         guests: list[socket.socket] = []
         robot: socket.socket | None = None
         try:
@@ -93,7 +95,7 @@ class LockstepServer:
                             robot.settimeout(None)
                             return robot, message
                     except LockstepError as problem:
-                        with suppress(OSError):  # it may not wait for the answer
+                        with suppress(OSError):  # the client may be gone
                             guest.sendall(encode_refusal(str(problem)))
                     except OSError:
                         pass
@@ -110,13 +112,13 @@ class LockstepServer:
 
 
 LARGEST = 2048
-"""Bytes taken of a datagram."""
+"""Bytes read of a datagram."""
 MOST_FRAMES = 1024
-"""Taken of UDP by one call, so that a flood cannot hold the loop up."""
+"""Largest number of UDP frames read in one call, so that a flood cannot block the loop."""
 
 
 def whole_frames(data: bytearray) -> list[bytes]:
-    """Cut the MAVLink frames that are complete off a stream, and what is before the first one."""
+    """Remove the complete MAVLink frames from a stream and return them; bytes before the first frame are dropped."""
     frames: list[bytes] = []
     while True:
         starts = [i for i in (data.find(b"\xfd"), data.find(b"\xfe")) if i >= 0]
@@ -131,15 +133,15 @@ def whole_frames(data: bytearray) -> list[bytes]:
 
 
 class GroundLinks:
-    """The router of an autopilot: its frames go to all ground stations, theirs to it and to each other.
+    """Router of an autopilot: its frames go to all ground stations, and theirs go to it and to each other.
 
-    Over UDP stations are those told of and whoever sends, over TCP whoever connects; lines of the Doppler log go to its
-    own clients. A `Transport`: no call waits.
+    UDP stations are the configured ones and all senders, TCP stations all connected clients; lines of the Doppler log
+    go to the log's own clients. This is a `Transport`: no call blocks.
 
     Attributes:
-        address: UDP, of this end.
-        tcp: Where stations connect.
-        dvl: The log's server.
+        address: UDP address of this end.
+        tcp: TCP address for stations.
+        dvl: Server of the Doppler log.
     """
 
     def __init__(
@@ -150,17 +152,17 @@ class GroundLinks:
         dvl: Address,
         page: Address | None = None,
     ) -> None:
-        """Open all; port 0 takes a free one.
+        """Open all sockets; port 0 selects a free one.
 
         Args:
-            bind: UDP, of this end.
-            stations: UDP, that frames go to before they have sent anything.
-            tcp: To listen at.
-            dvl: For the Doppler log.
-            page: For the log's web page; none if None.
+            bind: UDP address of this end.
+            stations: UDP stations that receive frames before they have sent anything.
+            tcp: TCP address to listen on.
+            dvl: TCP address of the Doppler log.
+            page: TCP address of the log's web page; None for no page.
 
         Raises:
-            LinkError: One cannot be bound or found.
+            LinkError: An address cannot be bound or resolved.
         """
         self._fixed = [resolved(station) for station in stations]
         self._callers: deque[Address] = deque(maxlen=MOST_CALLERS)
@@ -178,14 +180,14 @@ class GroundLinks:
         self.tcp = self._streams.address
 
     def receive(self) -> list[bytes]:
-        """Return complete frames of all stations, which the other stations receive too."""
+        """Return complete frames of all stations, and forward them to the other stations."""
         self.dvl.poll()
         frames: list[bytes] = []
         with suppress(BlockingIOError, ConnectionError):
             while len(frames) < MOST_FRAMES:
                 data, sender = self._socket.recvfrom(LARGEST)
                 if sender not in (*self._fixed, *self._callers):
-                    self._callers.append(sender)  # and forget the one that came first, if they are too many
+                    self._callers.append(sender)  # drops the oldest station if there are too many
                 frames += self._pass_on(bytearray(data), sender)
         for station, stream, data in self._streams.receive():
             stream += data
@@ -200,11 +202,11 @@ class GroundLinks:
             self._broadcast(data)
 
     def close(self) -> None:
-        """Let everyone go."""
+        """Close all connections."""
         self._stack.close()
 
     def describe(self) -> str:
-        """Return the connected stations."""
+        """Return the number of connected stations as text."""
         return f"{len(self._callers)} stations over UDP, {len(self._streams.clients)} over TCP"
 
     def _pass_on(self, stream: bytearray, source: object) -> list[bytes]:
@@ -214,10 +216,10 @@ class GroundLinks:
         return frames
 
     def _broadcast(self, frame: bytes, source: object = None) -> None:
-        """To all stations but the source."""
+        """Send a frame to all stations except its source."""
         for address in [*self._fixed, *self._callers]:
             if address != source:
-                with suppress(OSError):  # no receiver there yet
+                with suppress(OSError):  # no receiver at this address yet
                     self._socket.sendto(frame, address)
         for station in list(self._streams.clients):
             if station is not source:
@@ -225,15 +227,15 @@ class GroundLinks:
 
 
 class MediumServer:
-    """A medium's end for robots in other processes: who sends under a name is answered under it."""
+    """End of a medium for robots in other processes: replies to a name go to its latest sender."""
 
     def __init__(self, address: tuple[str, int], medium: Medium, names: tuple[str, ...]) -> None:
-        """Listen.
+        """Listen for messages.
 
         Args:
-            address: Host and port; port 0 takes a free one (see `address`).
-            medium: That carries the messages.
-            names: Who may send.
+            address: Host and port; port 0 selects a free one (see `address`).
+            medium: Medium that carries the messages.
+            names: Names of the allowed senders.
 
         Raises:
             LinkError: It cannot be bound.
@@ -245,7 +247,7 @@ class MediumServer:
         self.address: tuple[str, int] = self._socket.getsockname()
 
     def poll(self, now: float) -> None:
-        """Take what has come and send what has arrived, at the site's clock [s]."""
+        """Receive new messages and send arrived ones, at a time of the site's clock [s]."""
         with suppress(BlockingIOError, ConnectionError):
             while True:
                 data, sender = self._socket.recvfrom(LARGEST)
@@ -253,7 +255,7 @@ class MediumServer:
                 if heard is not None and heard[0] in self._names:
                     self._robots[heard[0]] = sender
                     self._medium.send(now, heard[0], data)
-        for name in self._names:  # what reaches a robot that has not spoken yet is lost
+        for name in self._names:  # messages for a robot that has not sent anything yet are lost
             for data in self._medium.receive(now, name):
                 if name in self._robots:
                     with suppress(OSError):

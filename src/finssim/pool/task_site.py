@@ -1,7 +1,7 @@
-"""A task played through the deployed software: its places, what it moves and commands, and how it scores.
+"""Site of a task that the deployed software performs: start poses, scripted vehicles and scoring.
 
-Every vehicle has a plant, a motor controller and the stack of a robot of its own; they share the water. Where they
-start, where a target goes and what counts as a success is the task's own code, on the true state, as in training.
+Every vehicle has its own plant, motor controller and robot software; all share the water. Start poses, the motion of
+targets and the conditions of success come from the task's own code, on the true state, as in training.
 """
 
 from __future__ import annotations
@@ -49,37 +49,37 @@ from finssim.vehicles import Vehicle
 __all__ = ["Referee", "ScriptedPilot", "TaskSite", "TrueState"]
 
 
-# A vehicle that the task commands, in the virtual site: it gets the true state, and acts by the task's script.
+# A scripted vehicle of the task in the virtual site: it uses the true state and acts by the task's script.
 
 
 Array = NDArray[np.float64]
 
 
 class TrueState:
-    """Replacement of a perception: the plant's own state, always known. Of vehicles that belong to the site alone."""
+    """Replacement of a perception with the plant's own state, for vehicles that the site itself controls."""
 
     let_in = None
-    """Needs no fix to begin with."""
+    """Start position; None, since no fix is needed."""
 
     def __init__(self, world: VirtualPool) -> None:
-        """Give the state of the vehicle in a virtual pool."""
+        """Set the pool whose vehicle's state is returned."""
         self.vehicle, self._world = world.vehicle, world
 
     def telemetry(self, now: float, telemetry: Any, time: float) -> None:
-        """Nothing that is not known already.
+        """Ignore telemetry, as the state is known.
 
         Args:
-            now: When it came [s].
+            now: Time of arrival [s].
             telemetry: Not used.
-            time: When it was measured [s].
+            time: Time of measurement [s].
         """
 
     def picture(self, now: float, picture: Any) -> str:
-        """Nothing that is not known already. `now` is the time [s]."""
+        """Ignore a picture, as the state is known. `now` is the time [s]."""
         return "not used"
 
     def reading(self, now: float) -> Reading:
-        """The plant's state. `now` is the time [s]."""
+        """Return the plant's state. `now` is the time [s]."""
         plant = self._world.plant
         parts = (plant.position, plant.quaternion, plant.nu)
         position, quaternion, nu = (np.asarray(part, float).copy() for part in parts)
@@ -87,7 +87,7 @@ class TrueState:
 
 
 class ScriptedPilot:
-    """Acts as the only vehicle that a task commands does in training: by the task's `command`, from the truth."""
+    """Pilot of the only scripted vehicle of a task, as in training: the task's `command` on the true state."""
 
     needs_state = True
 
@@ -100,16 +100,15 @@ class ScriptedPilot:
         action: str | None = None,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
+        """Args:
             task: A task with one vehicle among its `others`.
-            vehicles: One for each of its places.
-            truth: Where everybody is, by place.
-            action: Mode of the agents' actions; the task's own if None.
-            seed: Of what it does.
+            vehicles: One vehicle for each role of the task.
+            truth: Function that returns the true states of all vehicles, by role.
+            action: Mode of the agents' actions; None for the task's own.
+            seed: Seed of its random motion.
 
         Raises:
-            ControlError: The vehicles cannot do the task.
+            ControlError: The vehicles are not suitable for the task.
         """
         self.task = task = fitted_task(task, vehicles, action)
         (self.name,) = task.others
@@ -123,15 +122,15 @@ class ScriptedPilot:
         task.add_command(self._pipeline, Batch(state, self._arrays, seed))
 
     def describe(self) -> dict[str, Any]:
-        """Whom the task commands."""
+        """Return name, kind, task and period of the pilot."""
         return {"name": self.name, "kind": "script", "task": self.task.name, "period_s": self.period}
 
     def reset(self) -> None:
-        """Begin again."""
+        """Start a new episode."""
         self._state.steps.zero_()
 
     def act(self, reading: Measured, guide: Guide, t: float) -> Array:
-        """Wanted thrusts in canonical order [N], (n,)."""
+        """Return the commanded thrusts in canonical order [N], (n,)."""
         everybody = self._truth()
         for v, name in enumerate(self.task.vehicles):
             track = everybody[name]
@@ -147,7 +146,7 @@ class ScriptedPilot:
 
 
 def truth_of(worlds: Mapping[str, VirtualPool]) -> dict[str, Track]:
-    """The true state of every vehicle, by name."""
+    """Return the true state of every vehicle, by name."""
     out = {}
     for name, world in worlds.items():
         plant = world.plant
@@ -157,17 +156,17 @@ def truth_of(worlds: Mapping[str, VirtualPool]) -> dict[str, Track]:
 
 
 SITE = "site"
-"""Source of a target's position that is no vehicle."""
+"""Sender name of the target's position, if the target is not a vehicle."""
 
 
 @wp.func
 def as_told(state: State, arrays: TaskArrays, w: int):
-    """Replace a task's draws: vehicle and goal are at their given places."""
+    """Do nothing, in place of a task's draws: vehicle and goal are already at their given poses."""
 
 
 @cache
 def _told(kind: type[Task]) -> type[Task]:
-    """Return a task whose start is given instead of drawn, and so is its goal's motion."""
+    """Return a task class whose start and goal motion are given instead of drawn."""
 
     def terms(task: Task) -> Terms:
         declared = kind.terms(task)
@@ -177,14 +176,14 @@ def _told(kind: type[Task]) -> type[Task]:
 
 
 class Referee:
-    """The task itself, of one episode, on the true state.
+    """One episode of the task itself, evaluated on the true state.
 
-    An episode that was played elsewhere is scored too, of a task of one vehicle: `start` tells where it began, the
-    guide where its goal is. Contact forces are not known there, nor in a site without a dock: none is counted.
+    An episode recorded elsewhere can be scored too, for a task with one vehicle: `start` is its initial state, and the
+    guide provides the goal. Contact forces are unknown there, as in a site without a dock, and count as zero.
 
     Attributes:
-        task: Fitted to the vehicles.
-        over: Whether the episode has ended.
+        task: Task, fitted to the vehicles.
+        over: True if the episode has ended.
     """
 
     def __init__(
@@ -197,20 +196,20 @@ class Referee:
         start: Track | None = None,
         action_size: int | None = None,
     ) -> None:
-        """Draw where everybody starts, or put the only vehicle where it was.
+        """Draw the start of all vehicles, or set the recorded start of the only vehicle.
 
         Args:
-            task: A task, its name, or FILE.py:CLASS of one's own.
-            vehicles: One for each of its places.
-            seed: Of the episode.
-            guide: The reference, of a task that follows one; drawn as in training if None.
-            start: Where the vehicle was at the beginning of an episode that was played elsewhere, with a guide that
-                tells where its goal is; drawn if None.
-            action_size: Numbers in the action of a vehicle; those of the task's own action mode if None.
+            task: A task, its name, or FILE.py:CLASS of a user's task.
+            vehicles: One vehicle for each role of the task.
+            seed: Seed of the episode.
+            guide: The reference, for a task that follows one; None to draw it as in training.
+            start: Initial state of the vehicle in an episode recorded elsewhere, with a guide that provides the goal;
+                None to draw it.
+            action_size: Numbers in the action of a vehicle; None for those of the task's own action mode.
 
         Raises:
-            ControlError: A task in plain torch whose memory begins with what is drawn, or one with marks that are drawn
-                with its world, for an episode played elsewhere.
+            ControlError: For an episode recorded elsewhere: a task in plain torch whose initial memory is drawn, or a
+                task with marks that are drawn with its world.
         """
         self.task = task = fitted_task(task, vehicles)
         if start is not None:
@@ -229,7 +228,7 @@ class Referee:
             fill_table(self.arrays.reference, [guide])
         self._guide = guide if start is not None else None
         self.world: Any = None
-        """What a vehicle that sees has around it, drawn as in training."""
+        """World around a vehicle with exteroceptive sensors, drawn as in training."""
         if start is not None:
             self._put({task.vehicles[0]: start})
             self._aim(0.0)
@@ -256,7 +255,7 @@ class Referee:
         return int(self._state.steps.numpy()[0]) * self.task.control_step
 
     def places(self) -> list[tuple[Array, Array]]:
-        """Position and quaternion where every vehicle starts."""
+        """Return start position and quaternion of every vehicle."""
         rows = (self._state.position.numpy()[0], self._state.quaternion.numpy()[0])
         return [(x.astype(float), q.astype(float)) for x, q in zip(*rows, strict=True)]
 
@@ -264,8 +263,8 @@ class Referee:
         """Score the control step that ends now.
 
         Args:
-            truth: Where everybody is, by place.
-            actions: What the agents did, in [-1, 1].
+            truth: True states of all vehicles, by role.
+            actions: Actions of the agents, in [-1, 1].
         """
         if self.over:
             return
@@ -280,7 +279,7 @@ class Referee:
         self.over = bool(a.terminated.numpy()[0] or a.truncated.numpy()[0])
 
     def _put(self, truth: Mapping[str, Track]) -> None:
-        """Write the places of all vehicles."""
+        """Write the states of all vehicles."""
         for v, name in enumerate(self.task.vehicles):
             track = truth[name]
             for row, value in (
@@ -291,7 +290,7 @@ class Referee:
                 getattr(self._state, row).numpy()[0, v] = value
 
     def _aim(self, t: float) -> None:
-        """Put the goal where the guide has it, of an episode that was played elsewhere; t in the episode [s]."""
+        """Set the goal from the guide, in an episode recorded elsewhere; t is the time in the episode [s]."""
         if self._guide is None:
             return
         a, now = self.arrays, self._guide.at(t)
@@ -306,7 +305,7 @@ class Referee:
 
 
 class _Goal:
-    """Current place of the task's goal, as a guide; it knows nothing of the future."""
+    """Current pose of the task's goal, as a guide without a preview of the future."""
 
     name, duration = "task", np.inf
 
@@ -314,7 +313,7 @@ class _Goal:
         self._referee = referee
 
     def at(self, t: Any) -> Reference:
-        """The goal's pose and velocity at a time [s], as it has moved since the last control step."""
+        """Return the goal's pose and velocity at a time [s], extrapolated from the last control step."""
         a, shape = self._referee.arrays, np.shape(t)
         moving = a.target.velocity is not None
         velocity = a.target.velocity.numpy()[0].astype(float) if moving else np.zeros(3)
@@ -326,7 +325,7 @@ class _Goal:
 
 
 def _goal(referee: Referee) -> Guide:
-    """Return the guide of an episode: its path, or where its goal is."""
+    """Return the guide of an episode: its path, or its current goal."""
     points = referee.arrays.path.points
     return _Goal(referee) if points is None else PathGuide(points.numpy()[0].astype(float))
 
@@ -336,23 +335,23 @@ class PositionSources:
     """Sources of the robots' positions."""
 
     pool: Pool | None = None
-    """Camera, water and frames, as the robots know them; None: no camera looks."""
+    """Camera, water and frames, as the robots know them; None for no camera."""
     camera: Callable[[Vehicle], Any] | None = None
-    """Makes the overhead camera of a vehicle; None: there is none."""
+    """Function that creates the overhead camera of a vehicle; None for no camera."""
     positioning: str = "none"
-    """Fixes on every robot's wire: none, motion-capture or usbl."""
+    """Position fixes on every robot's link: none, motion-capture or usbl."""
     let_in: bool = False
-    """True if robots know their position at the start, for dead reckoning."""
+    """True if robots know their start position, for dead reckoning."""
 
 
 class TaskSite(Fleet):
-    """One episode of a task in the virtual site, with everybody by place.
+    """One episode of a task in the virtual site, with vehicles by role.
 
     Attributes:
         referee: The task.
-        runtimes: The robots' software, of those that are not elsewhere.
-        carrier: What carries their messages: `medium`.
-        scored: Control steps of the episode so far.
+        runtimes: Software of the robots in this process.
+        carrier: Medium of their messages, same as `medium`.
+        scored: Number of control steps of the episode so far.
     """
 
     def __init__(
@@ -367,20 +366,21 @@ class TaskSite(Fleet):
         guide: Guide | None = None,
         record: Path | None = None,
     ) -> None:
-        """Put everybody where the task starts.
+        """Put all vehicles at the start poses of the task.
 
         Args:
-            task: A task, its name, or FILE.py:CLASS of one's own.
-            vehicles: One for each of its places, as its robot knows it.
-            plants: True vehicle and its plant, for each place.
-            pilots: Who steers an agent, by its place; None: they are elsewhere, and `runtimes` holds the others alone.
+            task: A task, its name, or FILE.py:CLASS of a user's task.
+            vehicles: One vehicle for each role, as its robot knows it.
+            plants: True vehicle and its plant, for each role.
+            pilots: Function that returns the pilot of an agent, by its role; None if agents are in other processes, so
+                that `runtimes` contains only the other vehicles.
             positions: Sources of the robots' positions.
-            seed: Of the episode, of instruments and of what is lost.
-            guide: The reference, of a task that follows one; drawn as in training if None.
-            record: Folder that takes PLACE.mcap and PLACE.truth of every agent; None: nothing is kept.
+            seed: Seed of the episode, of instruments and of losses.
+            guide: The reference, for a task that follows one; None to draw it as in training.
+            record: Folder for ROLE.mcap and ROLE.truth of every agent; None for no records.
 
         Raises:
-            ControlError, PlantSpecError: Task, vehicles and guide do not fit, or there is no such positioning.
+            ControlError, PlantSpecError: Task, vehicles and guide do not match, or the positioning does not exist.
         """
         steering = (
             {} if pilots is None else {name: pilots(name) for name in fitted_task(task, vehicles).agents}
@@ -438,7 +438,7 @@ class TaskSite(Fleet):
             )
 
     def _place_dock(self, worlds: Mapping[str, VirtualPool]) -> None:
-        """Put the dock of a task that has one where its goal is, for the contact forces."""
+        """Put the dock of a task at its goal, for the contact forces."""
         for world in worlds.values() if self.task.dock() is not None else ():
             funnel = world.plant.simulator.funnel
             funnel.position.assign(self.referee.arrays.goal_position)
@@ -454,7 +454,7 @@ class TaskSite(Fleet):
         team: Team | None,
         record: Path | None,
     ) -> Runtime:
-        """Return the software of the robot at a place."""
+        """Return the software of the robot with a role."""
         about = {"command": "python -m studies.stack", "guide": self._guide.name, "armed": True}
         return Runtime(
             vehicle,
@@ -470,14 +470,14 @@ class TaskSite(Fleet):
         )
 
     def _eyes(self, vehicle: Vehicle, seed: int) -> Any:
-        """The vehicle's own sensors that the task observes, in the world of its episode."""
+        """Return the vehicle's own sensors that the task observes, in the world of its episode."""
         if self.referee.world is None:
             return None
         names = [*(picture.name for picture in self.task.pictures), *self.task.ranges]
         return self.referee.world.sensors(vehicle, names, seed)
 
     def run(self, duration: float | None = None) -> dict[str, float]:
-        """Play until the task ends, or for a time from the start of the last robot [s]; its time limit if None.
+        """Run until the task ends, or for a time from the start of the last robot [s]; None for the task's time limit.
 
         Returns:
             The task's metrics, in the units that `finssim tasks show` states.
@@ -511,18 +511,18 @@ class TaskSite(Fleet):
         return self.referee.over
 
     def turn(self, now: float, due: bool) -> None:
-        """Score; the episode begins when every agent's thrusters have been enabled."""
+        """Score the true state; the episode begins when the thrusters of all agents are enabled."""
         if self.scored or all(self.worlds[name].firmware.driving for name in self.task.agents):
             self.score(now)
         elif due:
             self.tell_target()
 
     def score(self, now: float, since: float | None = None) -> None:
-        """Let the task score what is true, as often as a control step has passed.
+        """Score the true state with the task, once per control step.
 
         Args:
-            now: [s]; NaN while nobody has begun.
-            since: When the episode began [s]; with the first call if None.
+            now: Time [s]; NaN before any robot has started.
+            since: Start of the episode [s]; None for the time of the first call.
         """
         if math.isnan(self._since):
             self._since = now if since is None else since
@@ -531,13 +531,13 @@ class TaskSite(Fleet):
             self.scored += 1
             self.referee.look(truth_of(self.worlds), self._actions)
             self.tell_target()
-        # A robot that has just decided acts from now on: what is scored is what was done until now.
+        # A new action takes effect from now on: the step is scored with the previous one.
         self._actions = {
             name: getattr(runtime.pilot, "action", np.zeros(0)) for name, runtime in self.runtimes.items()
         }
 
     def _target(self) -> Track | None:
-        """Return the drifting object of a task that has one; for a robot elsewhere also a goal that moves."""
+        """Return the drifting object of a task, if any; for a robot in another process also a moving goal."""
         a, net = self.referee.arrays, self.referee.arrays.net
         if self._goal_is_told:
             q = a.goal_quaternion.numpy()[0].astype(float)
@@ -550,7 +550,7 @@ class TaskSite(Fleet):
         return Track(net.target.numpy()[0].astype(float), level, nu)
 
     def tell_target(self) -> None:
-        """Send the target's position, by the site's own positioning, to all."""
+        """Send the target's position from the site's own positioning to all vehicles."""
         target = self._target()
         if target is not None:
             now = max(world.time for world in self.worlds.values())
@@ -561,11 +561,11 @@ class TaskSite(Fleet):
 
 
 BELOW = 10.0
-"""Depth of the water below the deepest point of a path, at least [m]."""
+"""Smallest depth of the water below the deepest point of a path [m]."""
 
 
 def _deep_enough(spec: PlantSpec, arrays: TaskArrays) -> PlantSpec:
-    """Return the plant in water in which the episode's path has room, if it has one."""
+    """Return the plant in water that is deep enough for the episode's path, if it has one."""
     if arrays.path.points is None:
         return spec
     depth = BELOW - float(arrays.path.points.numpy()[0, :, 2].min())
@@ -574,7 +574,7 @@ def _deep_enough(spec: PlantSpec, arrays: TaskArrays) -> PlantSpec:
 
 
 def _limits(vehicle: Vehicle, basin: Basin) -> BridgeSettings:
-    """The bridge's limits, with the basin for a workspace."""
+    """Return the bridge's limits, with the basin as the workspace."""
     half = np.array([0.5 * basin.length, 0.5 * basin.width])
     return BridgeSettings.of(
         vehicle,

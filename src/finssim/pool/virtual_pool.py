@@ -1,4 +1,4 @@
-"""The virtual pool: plant, instruments and firmware on one clock, and the frames on their way to and from a robot."""
+"""Virtual pool: plant, instruments and firmware on one clock, and frames in transit to and from a robot."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 
-# The truth file: what really happened in the pool, written as it happens, for scoring afterwards alone.
+# Truth file: the true states in the pool, written continuously, only for later scoring.
 
 
 Array = NDArray[np.float64]
@@ -54,20 +54,20 @@ Array = NDArray[np.float64]
 FORMAT = "finssim-truth-1"
 
 FLUSH = 50
-"""Records after which they are handed to the system: half a second at 100 a second is lost at most."""
+"""Number of records after which the file is flushed: at most half a second at 100 Hz is lost."""
 
 log = logging.getLogger(__name__)
 
 
 class TruthError(ValueError):
-    """A file that is no truth file."""
+    """A file that is not a truth file."""
 
 
 class Truth(NamedTuple):
-    """A truth file's records, by time."""
+    """Records of a truth file, by time."""
 
     header: dict[str, Any]
-    """Vehicle, its digest, plant, severity, seed and names of the thrusters and, if any, other actuators."""
+    """Vehicle, its digest, plant, severity, seed, and names of the thrusters and of other actuators, if any."""
     time: Array
     """[s], (k,)"""
     position: Array
@@ -75,32 +75,32 @@ class Truth(NamedTuple):
     quaternion: Array
     """Body to world, xyzw, (k, 4)."""
     nu: Array
-    """Body frame [m/s, rad/s], (k, 6)."""
+    """Twist, body frame [m/s, rad/s], (k, 6)."""
     shaft_rpm: Array
-    """Canonical order [rpm], (k, n)."""
+    """Shaft speeds, canonical order [rpm], (k, n)."""
     thrust: Array
-    """Delivered, canonical order [N], (k, n)."""
+    """Delivered thrust, canonical order [N], (k, n)."""
     voltage: Array
     """Voltage of the battery [V], (k,)."""
     current: Array
     """Velocity of the water at the body, world frame [m/s], (k, 3)."""
     actuators: Array
-    """Values of the actuators besides thrusters, in the header's order [rad, m³ or m], (k, m)."""
+    """Values of the actuators other than thrusters, in the header's order [rad, m³ or m], (k, m)."""
 
 
 class TruthWriter:
-    """Appends records of fixed length after one line of JSON: a file that was cut off anywhere still opens.
+    """Writer of a truth file: records of fixed length after one line of JSON, so that a truncated file is readable.
 
-    A full disk ends the file, with a warning, and not the pool: the vehicle must not stop for a log.
+    A full disk ends the file with a warning, but not the pool: the vehicle must not stop because of a log.
     """
 
     def __init__(self, path: str | Path, thrusters: Sequence[str], header: dict[str, Any]) -> None:
-        """Start a file.
+        """Create the file.
 
         Args:
-            path: Where; an earlier file there is replaced.
+            path: Path of the file; an existing file is replaced.
             thrusters: Names in canonical order.
-            header: What a reader should know besides.
+            header: Additional entries of the header.
         """
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ class TruthWriter:
             self._file = None
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Write the remaining records and close the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -140,7 +140,7 @@ def read_truth(path: str | Path) -> Truth:
     """Return the records of a truth file, up to its last complete one.
 
     Raises:
-        TruthError: It is not there or no truth file.
+        TruthError: The file does not exist or is not a truth file.
     """
     data = read_bytes(Path(path), TruthError, limit=1 << 30)
     try:
@@ -148,7 +148,7 @@ def read_truth(path: str | Path) -> Truth:
         if header["format"] != FORMAT:
             raise KeyError
     except (ValueError, KeyError, TypeError):
-        raise TruthError(f"{path}: is no truth file: give one that 'finssim pool --truth' wrote") from None
+        raise TruthError(f"{path}: is not a truth file: give one that 'finssim pool --truth' wrote") from None
     n = len(header["thrusters"])
     fields = {
         "position": 3,
@@ -171,61 +171,61 @@ def read_truth(path: str | Path) -> Truth:
     return Truth(header=header, time=time, **columns)
 
 
-# Faults of the wire and of the instruments, switched on by experiments: what a robot must survive.
+# Faults of link and instruments that experiments switch on, to test the robustness of a robot.
 
 
 REORDERED = 0.025
-"""Additional delay of a frame that is overtaken [s]: behind the two that follow it at 100 Hz."""
+"""Additional delay of a frame that is overtaken [s]: it arrives after the next two at 100 Hz."""
 
 PROBABILITIES = ("drop", "drop_commands", "corrupt", "reorder", "duplicate")
 NUMBERS = {f.name: f.values for f in TELEMETRY.payload if f.code == "f"}
-"""Telemetry fields that can be NaN, and how many values each has (0: one per motor output)."""
+"""Telemetry fields that can be NaN, and their number of values (0: one per motor output)."""
 SPOILABLE = {*NUMBERS, *(f"{name}.{i}" for name, values in NUMBERS.items() for i in range(values or 8))}
 
 
 class FaultError(ValueError):
-    """A fault that cannot be: a probability out of range, a field that no frame has."""
+    """An invalid fault: a probability out of range, or a field that no frame has."""
 
 
 @dataclass
 class AutopilotFaults:
-    """Active faults of an `ArduSub` and of what is connected to it."""
+    """Active faults of an `ArduSub` and of devices connected to it."""
 
     dvl_silent: bool = False
-    """True if the Doppler log sends nothing, to nobody."""
+    """True if the Doppler log sends nothing to any client."""
     north: float = 0.0
-    """Turn of its north, east positive, as by a disturbed compass [rad]."""
+    """Error of its north, east positive, as by a disturbed compass [rad]."""
     no_heartbeat: bool = False
-    """True if its HEARTBEAT is lost, and nothing else."""
+    """True if only its HEARTBEAT is lost."""
     no_ground_heartbeat: bool = False
-    """True if HEARTBEAT of the ground station is lost on its way to it."""
+    """True if the HEARTBEAT of the ground station does not reach it."""
     position_lag: float = 0.0
-    """Age of the own position that it sends as the present one [s]."""
+    """Age of its own position, which it sends as the present one [s]."""
     leak: bool = False
-    """True if there is water at its leak sensor."""
+    """True if its leak sensor detects water."""
     battery_voltage: float = 0.0
     """Reading of its battery monitor [V]; the true voltage if 0."""
 
 
 @dataclass
 class Faults:
-    """Active faults; every field may be changed at any time, all draws come from the seed."""
+    """Active faults; every field may be changed at any time, and all random numbers follow from the seed."""
 
     seed: int = 0
     drop: float = 0.0
-    """Chance that a frame from the vehicle is lost."""
+    """Probability that a frame from the vehicle is lost."""
     drop_commands: float = 0.0
-    """Chance that a frame to the vehicle is lost."""
+    """Probability that a frame to the vehicle is lost."""
     corrupt: float = 0.0
-    """Chance that a frame has one to eight bits turned over."""
+    """Probability that one to eight bits of a frame are inverted."""
     reorder: float = 0.0
-    """Chance that a frame is overtaken by those behind it."""
+    """Probability that a frame is overtaken by later ones."""
     duplicate: float = 0.0
-    """Chance that a frame comes twice."""
+    """Probability that a frame arrives twice."""
     freeze_sensors: bool = False
     """True if instruments are frozen; sequence numbers and clock continue."""
     nan_field: str = ""
-    """Telemetry field sent as NaN, `depth` or an element of one, `gyro.2`; none if empty."""
+    """Telemetry field that is sent as NaN, such as `depth`, or one element of it, such as `gyro.2`; none if empty."""
     freeze_depth: bool = False
     """True if the pressure gauge is frozen."""
     autopilot: AutopilotFaults = field(default_factory=AutopilotFaults)
@@ -252,7 +252,7 @@ class Faults:
         return probability > 0.0 and self._random.random() < probability
 
     def reading(self, sample: FirmwareSample) -> FirmwareSample:
-        """Return the readings of the instruments, with the pressure gauge frozen if so."""
+        """Return the readings of the instruments, with a frozen pressure gauge if this fault is active."""
         if not self.freeze_depth:
             self._frozen_depth = None
             return sample
@@ -260,7 +260,7 @@ class Faults:
         return sample._replace(depth=depth, pressure=pressure)
 
     def encode(self, telemetry: Telemetry) -> bytes:
-        """Frame of a snapshot, with instruments frozen and fields spoiled as asked."""
+        """Return the frame of a snapshot, with frozen instruments and invalid fields as set."""
         if not self.freeze_sensors:
             self._frozen = None
         else:
@@ -281,8 +281,8 @@ class Faults:
         )
 
     def arrivals(self, time: float, frame: bytes) -> list[tuple[float, bytes]]:
-        """When [s] and how a frame that should arrive at a time [s] does so: lost, twice, late, with wrong bits."""
-        if frame[:1] == b"{":  # a line of a Doppler log, over TCP, which loses and spoils nothing
+        """Return the actual arrivals [s] of a frame due at a time [s]: it may be lost, doubled, late or corrupted."""
+        if frame[:1] == b"{":  # a line of a Doppler log over TCP, which neither loses nor corrupts data
             return [(time, frame)]
         if self.lost():
             return []
@@ -298,8 +298,8 @@ class Faults:
 
 
 def _with_nan(frame: bytes, name: str, outputs: int) -> bytes:
-    """Return the frame with one field NaN, or one element of it, and a right CRC: no checksum detects a controller's
-    NaN."""
+    """Return the frame with one field, or one element of it, NaN and a correct CRC: no checksum detects a
+    controller's NaN."""
     field, _, element = name.partition(".")
     body = bytearray(frame[len(TELEMETRY.magic) : -2])
     at = 0
@@ -313,31 +313,31 @@ def _with_nan(frame: bytes, name: str, outputs: int) -> bytes:
 
 
 PoseAt = Callable[[float], tuple[Array, Array]]
-"""Time [s] -> position (3,) and quaternion xyzw (4,) of the body in the world."""
+"""Time [s] -> position (3,) and quaternion xyzw (4,) of the body in the world frame."""
 
 REMEMBERED = 1.0
-"""Duration that `pose_at` covers: longer than any exposure and its latency [s]."""
+"""Duration of the past that `pose_at` covers: longer than any exposure plus latency [s]."""
 
 
 class PoolClockError(ValueError):
-    """The pool was asked to go back in time."""
+    """A request to advance the pool to a past time."""
 
 
 class VehicleObserver(Protocol):
-    """An observer of the vehicle from outside."""
+    """External observer of the vehicle, such as a camera."""
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> Sequence[Picture]:
-        """Pictures that arrive after t0 and not after t1; exposures may lie up to `REMEMBERED` seconds back."""
+        """Return the pictures that arrive in (t0, t1]; exposures may lie up to `REMEMBERED` seconds in the past."""
 
 
 class VirtualPool:
-    """The vehicle and its room. Only frames and pictures leave it; `exchange` is all that a robot may call.
+    """Vehicle and pool. Only frames and pictures leave it; a robot may only call `exchange`.
 
     Attributes:
-        plant: The truth; for the truth file, the viewer's ghost and tests.
-        firmware: The motor controller's program, or the autopilot's.
-        faults: What is wrong with wire and instruments.
-        time: Up to which everything has happened [s].
+        plant: True state; for the truth file, the viewer and tests.
+        firmware: Program of the motor controller, or of the autopilot.
+        faults: Active faults of link and instruments.
+        time: Time up to which the pool has been simulated [s].
     """
 
     def __init__(
@@ -360,19 +360,19 @@ class VirtualPool:
         Args:
             vehicle: Its file.
             spec: The plant.
-            camera: Overhead; none if None.
-            positioning: Motion capture or acoustics, whose fixes come on the robot's wire; none if None.
+            camera: Overhead camera; None for no camera.
+            positioning: Motion capture or acoustic positioning, with fixes on the robot's link; None for neither.
             start: Position, world frame [m], and quaternion, body to world, xyzw.
-            seed: Of instruments, speed measurements and the wire.
-            truth: File that is written; none if None.
-            truth_period: Between its records [s], taken to whole physics steps.
-            firmware: mcu: a motor controller that takes shaft speeds; ardusub: an autopilot that takes axes over
-                MAVLink, and turns the motors by pulses alone.
-            world: One copy of a world, whose things the hull meets; with its basin in place of that of `spec`.
-            dock: A funnel in the water, at `plant.simulator.funnel`.
+            seed: Seed of instruments, speed measurements and link.
+            truth: Truth file to write; None for no file.
+            truth_period: Period of its records [s], rounded to whole physics steps.
+            firmware: mcu: a motor controller that receives shaft speeds; ardusub: an autopilot that receives axes over
+                MAVLink and drives the motors only by pulses.
+            world: Single instance of a world whose objects the hull can touch; its basin replaces that of `spec`.
+            dock: Funnel in the water, at `plant.simulator.funnel`.
 
         Raises:
-            PlantSpecError: The plant is not of this vehicle.
+            PlantSpecError: The plant is for another vehicle.
             ControlError: There is no autopilot for this vehicle.
         """
         imu = vehicle.sensors.imu
@@ -403,8 +403,8 @@ class VirtualPool:
             return Firmware(self.vehicle, self.spec)
         if self.vehicle.actuators:
             raise PlantSpecError(
-                f"firmware {name} moves thrusters alone, but {self.vehicle.name} has "
-                f"{', '.join(self.vehicle.actuators)}: take firmware mcu"
+                f"firmware {name} moves only thrusters, but {self.vehicle.name} has "
+                f"{', '.join(self.vehicle.actuators)}: use firmware mcu"
             )
         try:
             from finssim.pool.ardusub import ArduSub
@@ -415,7 +415,7 @@ class VirtualPool:
         return ArduSub(self.vehicle, self.spec)
 
     def exchange(self, until: float, sent: Sequence[bytes] = ()) -> Delivery:
-        """Advance the world, with the frames that the robot sends now.
+        """Advance the pool, with the frames that the robot sends now.
 
         Args:
             until: Robot's clock [s].
@@ -428,9 +428,7 @@ class VirtualPool:
             PoolClockError: `until` lies in the past.
         """
         if not until >= self.time:
-            raise PoolClockError(
-                f"exchange until {until} s, but it is {self.time} s already: time goes forward"
-            )
+            raise PoolClockError(f"exchange until {until} s is in the past: the pool is at {self.time} s")
         for data in sent:
             if not self.faults.lost(commands=True):
                 self._send(self._down, self.time + self._random.uniform(*self.spec.firmware.downlink), data)
@@ -448,7 +446,8 @@ class VirtualPool:
         return Delivery(until, tuple(frames), tuple(pictures))
 
     def pose_at(self, time: float) -> tuple[Array, Array]:
-        """Return the pose of the vehicle at a time of the last second, between physics steps; the nearest beyond them.
+        """Return the pose of the vehicle at a time in the last second, interpolated; the nearest pose outside this
+        range.
 
         Args:
             time: Robot's clock [s].
@@ -466,7 +465,7 @@ class VirtualPool:
         return (1.0 - s) * x0 + s * x1, q / np.linalg.norm(q)
 
     def reboot(self) -> None:
-        """Restart the motor controller, as a brown-out does."""
+        """Restart the motor controller, as after a voltage drop."""
         self.firmware.reboot(self.plant.time)
 
     def close(self) -> None:
@@ -475,7 +474,7 @@ class VirtualPool:
             self._truth.close()
 
     def _advance(self) -> None:
-        """One physics step: firmware first, then motors and body, then instruments if they are due."""
+        """Run one physics step: first the firmware, then motors and body, then instruments if they are due."""
         plant, firmware = self.plant, self.firmware
         now = plant.time
         while self._down and self._down[0][0] <= now:

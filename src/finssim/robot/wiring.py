@@ -185,7 +185,7 @@ def link_of(robot: str, vehicle: Vehicle) -> Link:
         return McuLink(vehicle.mcu.outputs, len(vehicle.actuators))
     if vehicle.actuators:
         raise LinkError(
-            f"--robot mavlink moves thrusters alone, but {vehicle.name} has {', '.join(vehicle.actuators)}: connect "
+            f"--robot mavlink moves only thrusters, but {vehicle.name} has {', '.join(vehicle.actuators)}: connect "
             "its motor controller"
         )
     try:
