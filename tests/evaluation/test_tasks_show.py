@@ -37,8 +37,8 @@ def test_rewards_ends_and_totals_are_told_in_words(name):
     """Each is a sentence, without source code."""
     told = describe_task(name)
     for one in (*told["reward"]["terms"], *told["ends"], *told["totals"]):
-        assert one["told"].endswith("."), one
-        assert not re.search(r"\bp\.|\bw[,\]]|wp\.|\[0\]|>=| \* ", one["told"]), one
+        assert one["meaning"].endswith("."), one
+        assert not re.search(r"\bp\.|\bw[,\]]|wp\.|\[0\]|>=| \* ", one["meaning"]), one
 
 
 @pytest.mark.slow
@@ -50,7 +50,7 @@ def test_what_is_told_is_what_the_environment_has(name):
     assert sum(part["size"] for part in told["observation"]["parts"]) == env.observation_size
     assert told["action"]["size"] == env.action_size and len(told["agents"]) == env.agents
     assert told["title"] and told["success"] != "as defined by metrics" and told["baselines"]
-    assert len(told["reward"]["weights"]) > 4 and "\n" in told["reward"]["told"]
+    assert len(told["reward"]["weights"]) > 4 and "\n" in told["reward"]["meaning"]
     first = told["action"]["components"][0]
     if told["action"]["mode"].startswith("course"):
         speeds = course_speeds(env.simulator.vehicles[0])
@@ -72,7 +72,7 @@ def test_a_task_is_shown_for_a_vehicle(capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["action"]["size"] == 8 and told["action"]["components"][0]["unit"] == "N"
     settings = {one["name"]: one for one in told["settings"]}
-    assert settings["tilt"]["told"] == "Largest roll and pitch at the start [rad]."
+    assert settings["tilt"]["meaning"] == "Largest roll and pitch at the start [rad]."
     assert finssim("tasks", "show", "pursuit", "--vehicle", "warpauv", "--json") == 0
     settings = {one["name"]: one["value"] for one in json.loads(capsys.readouterr().out)["settings"]}
     assert settings["prey_drive"]["level"] is None  # it never tips over

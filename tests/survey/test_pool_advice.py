@@ -7,7 +7,7 @@ import pytest
 
 from finssim.core.optics import Interface, Lens
 from finssim.survey.pool_findings import numbers
-from finssim.survey.pool_fit import calibrate_pool, doubted
+from finssim.survey.pool_fit import calibrate_pool, with_critical_findings
 from finssim.survey.pool_model import PoolFitSettings
 from finssim.trials.findings import CalibrationError
 
@@ -173,7 +173,7 @@ def test_points_without_water_are_noticed():
     told = PoolFitSettings(
         fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), index_sigma=0.0, survey_sigma=0.0005
     )
-    fit = doubted(calibrate_pool(observations(points, pixels), TANK_LENS, told))
+    fit = with_critical_findings(calibrate_pool(observations(points, pixels), TANK_LENS, told))
     assert codes(fit)[0] == "straight_better"
 
 
@@ -183,7 +183,7 @@ def test_points_in_water_raise_no_doubt(box):
     fit = calibrate_pool(
         survey(overhead(), WATER, box, 60), PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0)
     )
-    assert doubted(fit).findings == fit.findings
+    assert with_critical_findings(fit).findings == fit.findings
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_centimetres_for_metres_are_refused(option, value):
     with pytest.raises(
         CalibrationError, match=f"surface: {option.removeprefix('water_')} 100 puts the plane 100 m.*unit"
     ):
-        doubted(fit)
+        with_critical_findings(fit)
 
 
 @pytest.mark.parametrize(("pixels", "refused"), [(4.0, False), (30.0, True)])
@@ -208,13 +208,13 @@ def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
         fit.model.interface, offset=-float(fit.model.interface.normal @ fit.model.camera.position)
     )
     touching = replace(fit, model=replace(fit.model, interface=plane))
-    assert doubted(touching).findings == fit.findings
+    assert with_critical_findings(touching).findings == fit.findings
     poor = replace(touching, residual=np.full_like(fit.residual, pixels / np.sqrt(2.0)))
     if refused:
         with pytest.raises(CalibrationError, match="on the plane itself"):
-            doubted(poor)
+            with_critical_findings(poor)
     else:
-        assert codes(doubted(poor))[0] == "camera_on_plane"
+        assert codes(with_critical_findings(poor))[0] == "camera_on_plane"
 
 
 @pytest.mark.slow
@@ -224,14 +224,14 @@ def test_a_flat_left_handed_survey_is_warned_of():
     left = survey(overhead(), WATER, FLOOR, 40)
     left = replace(left, points=left.points * turn)
     told = PoolFitSettings(fit=FIT)
-    assert codes(doubted(calibrate_pool(left, PLUMB_BOB, told)))[0] == "handedness_open"
+    assert codes(with_critical_findings(calibrate_pool(left, PLUMB_BOB, told)))[0] == "handedness_open"
     with pytest.raises(CalibrationError, match="other side"):
         calibrate_pool(left, PLUMB_BOB, replace(told, water_height=1.0))
     down = calibrate_pool(left, PLUMB_BOB, replace(told, water_height=-1.0))
-    assert doubted(down).findings == down.findings
+    assert with_critical_findings(down).findings == down.findings
     solid = survey(overhead(), WATER, SOLID, 40)
     down = calibrate_pool(replace(solid, points=solid.points * turn * [1, 1, -1]), PLUMB_BOB, told)
-    assert doubted(down).findings == down.findings
+    assert with_critical_findings(down).findings == down.findings
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def describe_task(
         {
             "first": entry.indices[0],
             **{name: getattr(part, name) for name in ("name", "size", "unit", "scale", "clip")},
-            "told": _text(the_task, part),
+            "meaning": _text(the_task, part),
         }
         for entry, part in zip(entries, the_task.observation, strict=True)
     ]
@@ -97,9 +97,10 @@ def describe_task(
         "time_limit_s": the_task.time_limit,
         "reward": _reward(the_task),
         "ends": [
-            {"name": item.name, "reward": item.reward, "told": _text(the_task, item)} for item in terms.ends
+            {"name": item.name, "reward": item.reward, "meaning": _text(the_task, item)}
+            for item in terms.ends
         ],
-        "totals": [{"name": item.name, "told": _text(the_task, item)} for item in terms.totals],
+        "totals": [{"name": item.name, "meaning": _text(the_task, item)} for item in terms.totals],
         "success": the_task.success_rule(),
         "settings": _settings(the_task),
         "training_noise": seen_with(the_task.training_noise, vehicles[0]),
@@ -148,16 +149,17 @@ def _reward(task: Task) -> dict[str, Any]:
     weights = asdict(reward) if is_dataclass(reward) and not isinstance(reward, type) else {}
     text = inspect.getdoc(type(reward) if weights else reward) if weights or callable(reward) else ""
     terms = [
-        {"name": term.name, "weight": term.weight, "told": _text(task, term)} for term in task.terms().rewards
+        {"name": term.name, "weight": term.weight, "meaning": _text(task, term)}
+        for term in task.terms().rewards
     ]
-    return {"terms": terms, "weights": weights, "told": text or ""}
+    return {"terms": terms, "weights": weights, "meaning": text or ""}
 
 
 def _settings(task: Task) -> list[dict[str, Any]]:
     """Return the settings, with the ranges that are drawn in every episode."""
     docs, values = attribute_docs(type(task)), task.record()
     names = (field.name for field in fields(task) if field.name not in SEPARATE)
-    return [{"name": name, "value": _limited(values[name]), "told": docs.get(name, "")} for name in names]
+    return [{"name": name, "value": _limited(values[name]), "meaning": docs.get(name, "")} for name in names]
 
 
 def _limited(value: Any) -> Any:
@@ -216,7 +218,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
     parts = {
         "Observation, of one agent: each over its scale, within ± clip": (result["observation"]["parts"], ""),
         "Action: limits at -1 and 1": (result["action"]["components"], ""),
-        "Reward, in every step": (result["reward"]["terms"], result["reward"]["told"]),
+        "Reward, in every step": (result["reward"]["terms"], result["reward"]["meaning"]),
         "Ends": (result["ends"], ""),
         "Counted": (result["totals"], ""),
         "Settings": (result["settings"], ""),
@@ -227,7 +229,7 @@ def tables_of(result: Mapping[str, Any]) -> list[Table]:
         *(
             Table(
                 title=title,
-                heads=[head.replace("told", "meaning") for head in (rows or ({},))[0]],
+                heads=list((rows or ({},))[0]),
                 rows=[[_value(value) for value in row.values()] for row in rows],
                 left=range(9),
                 note=note,

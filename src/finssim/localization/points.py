@@ -156,7 +156,9 @@ def run_project(
         "v": _cells(projection.pixels[:, 1], 6),
         "status": _status_names(projection.status),
     }
-    _give(table, columns, projection.status, "project", "points have a pixel in the image", out, as_json)
+    _write_result(
+        table, columns, projection.status, "project", "points have a pixel in the image", out, as_json
+    )
 
 
 def run_backproject(
@@ -205,7 +207,7 @@ def run_backproject(
         by_pixel = plane_jacobian(scene.camera, scene.interface, points, normal)[..., :2]
         sigma = pixel_std * np.sqrt(np.sum(by_pixel**2, axis=-1))
         columns |= {f"sigma_{axis}": _cells(sigma[:, i], 9) for i, axis in enumerate("xyz")}
-    _give(table, columns, status, "backproject", "pixels have a point", out, as_json)
+    _write_result(table, columns, status, "backproject", "pixels have a point", out, as_json)
 
 
 def _plane(table: PointTable, z: float | None, plane: str | None) -> tuple[Array, Array | float]:
@@ -241,7 +243,7 @@ def _status_names(status: npt.NDArray[np.int8]) -> list[str]:
     return [Status(i).name.lower() for i in status.tolist()]
 
 
-def _give(
+def _write_result(
     table: PointTable,
     columns: dict[str, list[str]],
     status: npt.NDArray[np.int8],

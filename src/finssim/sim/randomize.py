@@ -409,10 +409,10 @@ class PrivilegedNumbers:
     """Scaled drawn numbers that agents, the first vehicles, observe as privileged information."""
 
     agents: int  # number of agents that observe them; 0: none
-    told: wp.array(dtype=int)  # columns of these numbers
+    columns: wp.array(dtype=int)  # columns of these numbers
     nominal: wp.array(dtype=float)  # nominal value in the unit of the entry
     scale: wp.array(dtype=float)  # reciprocal of the unit of scaling
-    now: wp.array2d(dtype=float)  # (worlds, agents * told), (value - nominal) * scale
+    now: wp.array2d(dtype=float)  # (worlds, agents * columns), (value - nominal) * scale
     before: wp.array2d(dtype=float)  # the same numbers in the previous episode [-]
 
 
@@ -474,11 +474,11 @@ def finish_values(d: DrawnArrays, w: int, v: int):
 def write_privileged(d: DrawnArrays, w: int, v: int):
     """Write the privileged numbers of an agent, and save those of the previous episode."""
     p = d.privileged
-    size = p.told.shape[0]
+    size = p.columns.shape[0]
     for i in range(size):
         column = v * size + i
         p.before[w, column] = p.now[w, column]
-        p.now[w, column] = (d.values[w, v, p.told[i]] - p.nominal[i]) * p.scale[i]
+        p.now[w, column] = (d.values[w, v, p.columns[i]] - p.nominal[i]) * p.scale[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -622,11 +622,11 @@ class Randomization:
             measurement: Errors of the controllers' observations without randomisation, by (world, vehicle).
             agents: Number of agents, the first vehicles, which observe the privileged numbers.
             privileged: Arrays of the scaled privileged numbers [-] of this and of the previous episode, each (worlds,
-                agents * P) with P = `len(told(...))`.
+                agents * P) with P = `len(privileged_names(...))`.
         """
         return Draws(self, simulator, measurement, agents, privileged)
 
-    def told(self, thrusters: int) -> list[str]:
+    def privileged_names(self, thrusters: int) -> list[str]:
         """Return the names of the privileged numbers of an agent: the entries that vary, without directions and phases.
 
         Args:
@@ -634,7 +634,7 @@ class Randomization:
         """
         names = set(drawn_entries(self.ranges, thrusters))
         names |= {"current.x", "current.y"} if "current" in names else set()
-        return [e.name for e in ENTRIES if e.told and e.name in names]
+        return [e.name for e in ENTRIES if e.privileged and e.name in names]
 
 
 class Draws:
@@ -683,11 +683,11 @@ class Draws:
         d.volume_with_mass = int(randomization.ranges.volume == "with_mass")
         d.water, d.sensors = int(randomization.moves_water), int(randomization.changes_sensors)
         d.drift, d.tether = (int(randomization._draws(f"{name}.")) for name in ("current_drift", "tether"))
-        names = self.told if privileged else []
+        names = self.privileged_names if privileged else []
         columns = [INDEX[name] for name in names]
         p = PrivilegedNumbers()
         p.agents = agents if privileged else 0
-        p.told = wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device)
+        p.columns = wp.array(np.array(columns, np.int32), dtype=wp.int32, device=device)
         for field, values in (
             ("nominal", self.nominal[columns]),
             ("scale", [self._scale(n) for n in names]),
@@ -699,9 +699,9 @@ class Draws:
         return d
 
     @property
-    def told(self) -> list[str]:
+    def privileged_names(self) -> list[str]:
         """Names of the privileged numbers of an agent."""
-        return self.randomization.told(max(len(v.thrusters) for v in self.simulator.vehicles))
+        return self.randomization.privileged_names(max(len(v.thrusters) for v in self.simulator.vehicles))
 
     def _scale(self, name: str) -> float:
         """Return the reciprocal of the greatest deviation of an entry from its nominal value."""

@@ -33,7 +33,7 @@ class DrawnNumber:
     """True if the number is drawn once per world and not for each vehicle."""
     angle: bool = False
     """True for a direction or phase, which is always drawn from the full circle."""
-    told: bool = True
+    privileged: bool = True
     """True if the number is a privileged observation where it varies."""
     stream: int = -1
     """Stream of its random numbers, independent of other entries."""
@@ -62,24 +62,24 @@ def _table() -> Iterator[DrawnNumber]:
     for name in SENSORS:
         yield DrawnNumber(f"sensors.{name}", _sensor_unit(name), 0.0)
     yield from (
-        DrawnNumber("current", "m/s", 0.0, world=True, told=False),
+        DrawnNumber("current", "m/s", 0.0, world=True, privileged=False),
         DrawnNumber("vertical_current", "m/s", 0.0, world=True),
     )
-    yield DrawnNumber("current.direction", "rad", 0.0, world=True, angle=True, told=False)
+    yield DrawnNumber("current.direction", "rad", 0.0, world=True, angle=True, privileged=False)
     yield from (
         DrawnNumber(f"current.{axis}", "m/s", 0.0, world=True) for axis in "xy"
     )  # from speed and direction
     yield DrawnNumber("current_drift.deviation", "m/s", 0.0, world=True)
     yield DrawnNumber("current_drift.time", "s", 0.0, world=True)
-    yield DrawnNumber("waves.count", "1", 0.0, world=True, told=False)
+    yield DrawnNumber("waves.count", "1", 0.0, world=True, privileged=False)
     for i in range(MAX_WAVES):
         yield DrawnNumber(f"waves.{i}.amplitude", "m", 0.0, world=True)
         yield DrawnNumber(f"waves.{i}.wavelength", "m", 1.0, world=True)
         for name in ("heading", "phase"):
-            yield DrawnNumber(f"waves.{i}.{name}", "rad", 0.0, world=True, angle=True, told=False)
+            yield DrawnNumber(f"waves.{i}.{name}", "rad", 0.0, world=True, angle=True, privileged=False)
     yield DrawnNumber("sea.height", "m", 0.0, world=True)
     yield DrawnNumber("sea.period", "s", 1.0, world=True)
-    yield DrawnNumber("sea.heading", "rad", 0.0, world=True, angle=True, told=False)
+    yield DrawnNumber("sea.heading", "rad", 0.0, world=True, angle=True, privileged=False)
     yield DrawnNumber("current_profile.scale", world=True)
     yield DrawnNumber("current_profile.turn", "rad", 0.0, world=True)
 

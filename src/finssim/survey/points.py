@@ -74,9 +74,9 @@ class TableRow:
         """Return the pixel, (2,)."""
         return np.array([self.numbers["u"], self.numbers["v"]])
 
-    def placed(self, name: str, points: Array) -> Placed:
+    def placed(self, name: str, points: Array) -> SurveyedPoints:
         """Return surveyed points with the row's standard error and flags. Points are in [m]."""
-        return Placed(
+        return SurveyedPoints(
             name,
             points,
             self.numbers.get("sigma", math.nan),
@@ -215,7 +215,7 @@ def _recognised(names: Sequence[str]) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class SurveyedPoints:
     """Points that share one survey error because they were surveyed together: a tag's corners, or a single point."""
 
     name: str
@@ -239,11 +239,11 @@ class Survey:
     """Surveyed points and tags."""
 
     path: str
-    points: dict[str, Placed] = field(default_factory=dict)
+    points: dict[str, SurveyedPoints] = field(default_factory=dict)
     """Single points by id."""
-    tags: dict[int, Placed] = field(default_factory=dict)
+    tags: dict[int, SurveyedPoints] = field(default_factory=dict)
     """Fixed tags by id."""
-    locations: dict[str, list[tuple[int | None, Placed]]] = field(default_factory=dict)
+    locations: dict[str, list[tuple[int | None, SurveyedPoints]]] = field(default_factory=dict)
     """Image -> tags surveyed for it (id, or None for the only one visible)."""
     findings: tuple[Finding, ...] = ()
 
@@ -318,7 +318,7 @@ def read_survey(
 
 def _surveyed(
     table: SurveyTable, row: TableRow, edges: tuple[float | None, Mapping[int, float]], z: float | None
-) -> tuple[str, int | None, Placed]:
+) -> tuple[str, int | None, SurveyedPoints]:
     """Return the name of a row, the id of its tag (None: a point, or any tag), and its points."""
     of_any, of_tags = edges
     named = row.words.get("tag", "").removesuffix(".0")
@@ -353,7 +353,7 @@ def _bundle(path: Path) -> Survey:
             "sizes of tags"
         )
     placed = {
-        tag: Placed(
+        tag: SurveyedPoints(
             f"tag {tag}", pose.position + quat_rotate(pose.orientation, corners(layout.sizes[tag])), math.nan
         )
         for tag, pose in layout.poses.items()
@@ -472,7 +472,7 @@ class _Match(NamedTuple):
 
     image: str
     name: str
-    placed: Placed
+    placed: SurveyedPoints
     corner: int
     pixel: Array
 
@@ -567,7 +567,7 @@ def _match_table(rows: _Rows, table: SurveyTable, survey: Survey) -> None:
             rows.add(_Match(row.words.get("image", ""), name, placed, corner, row.pixel))
 
 
-def _find(survey: Survey, name: str) -> tuple[Placed | None, int]:
+def _find(survey: Survey, name: str) -> tuple[SurveyedPoints | None, int]:
     """Return a point by its id, even if one file writes 7 and the other 7.0, or a tag's corner by `tag/0`."""
     if name in survey.points:
         return survey.points[name], 0

@@ -30,7 +30,7 @@ from finssim.identification.report import (
 from finssim.localization.camera_file import CameraFile, load_camera
 from finssim.localization.overhead_camera import Pool, write_pool
 from finssim.survey.points import Observations
-from finssim.survey.pool_fit import PoolFit, calibrate_pool, doubted
+from finssim.survey.pool_fit import PoolFit, calibrate_pool, with_critical_findings
 from finssim.survey.pool_refine import HeldOut
 from finssim.survey.survey_file import load_survey_file
 from finssim.trials.findings import CalibrationError, plain
@@ -235,7 +235,9 @@ def run(
     lens_stated = bool({"focal_sigma", "center_sigma"} & survey_file.settings.keys()) or any(
         (focal_sigma, center_sigma)
     )
-    pool_fit = doubted(calibrate_pool(observed, camera_file.lens, settings), lens_stated=lens_stated)
+    pool_fit = with_critical_findings(
+        calibrate_pool(observed, camera_file.lens, settings), lens_stated=lens_stated
+    )
     hashes = {
         str(path): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in map(Path, [*inputs, *survey_file.sources, camera])

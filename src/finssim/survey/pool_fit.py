@@ -44,7 +44,7 @@ from finssim.survey.pool_refine import (
 from finssim.survey.pool_search import search
 from finssim.trials.findings import CalibrationError, Finding, finding
 
-__all__ = ["PoolFit", "calibrate_pool", "doubted"]
+__all__ = ["PoolFit", "calibrate_pool", "with_critical_findings"]
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def estimates(fit: Refined, settings: PoolFitSettings) -> tuple[dict[str, Estima
     rows, moved = {}, (np.abs(G) > 1e-12).any(axis=1)
     for (name, (unit, value)), variance, moves in zip(table.items(), np.diagonal(V), moved, strict=True):
         std = float(np.sqrt(max(0.0, variance)))
-        note = _doubt(name, std, fit, settings) if moves else AS_STATED
+        note = _uncertainty_note(name, std, fit, settings) if moves else AS_STATED
         rows[name] = Estimate.within(name, value, quantile * std, unit, not note, note)
     names = [name for name, moves in zip(table, moved, strict=True) if moves]
     return rows, correlation(names, V[np.ix_(moved, moved)])
@@ -106,7 +106,7 @@ def _quantities(model: PoolModel, surface: bool) -> dict[str, tuple[str, float]]
     return rows | {name: ("1", x) for name, x in zip(LENS_NAMES[3:], lens.distortion, strict=False)}
 
 
-def _doubt(name: str, std: float, fit: Refined, settings: PoolFitSettings) -> str:
+def _uncertainty_note(name: str, std: float, fit: Refined, settings: PoolFitSettings) -> str:
     """Return the source of a number that the pictures do not determine; empty if they do."""
     model, prior = fit.model, fit.prior
     reach = model.clearance + max(model.depth, 0.0)
@@ -376,7 +376,7 @@ LEAST_THICKNESS = 0.02
 mirror image."""
 
 
-def doubted(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
+def with_critical_findings(fit: PoolFit, *, lens_stated: bool = True) -> PoolFit:
     """Return the calibration with critical findings put first.
 
     Args:

@@ -19,8 +19,8 @@ from finssim.localization.detection.families import corners, family_named
 from finssim.survey.points import (
     METRES,
     Observations,
-    Placed,
     Survey,
+    SurveyedPoints,
     observe,
     observe_combined,
     read_survey,
@@ -43,7 +43,7 @@ class SurveyFile:
     """Arguments of `PoolFitSettings` that the file specifies."""
     points: Path | None = None
     """Table of surveyed points or tags; None if there is a grid, or if the inputs contain the points."""
-    grid: Mapping[int, Placed] = field(default_factory=dict)
+    grid: Mapping[int, SurveyedPoints] = field(default_factory=dict)
     """Tags of a board, by their ids."""
     unit: str | None = None
     """Unit of lengths in tables that state none; None: metres."""
@@ -232,7 +232,7 @@ def _word(fields: Fields, key: str) -> str | None:
     return None if fields.take(key) is None else fields.word(key)
 
 
-def _grid(fields: Fields) -> dict[int, Placed]:
+def _grid(fields: Fields) -> dict[int, SurveyedPoints]:
     """Return the tags of a board, by their ids.
 
     Ids increase along the board's x, then from row to row; `spacing` is the distance of centres along the
@@ -257,5 +257,5 @@ def _grid(fields: Fields) -> dict[int, Placed]:
         for column in range(columns):
             flat = corners(edge) + np.array([column * dx, row * dy, 0.0])
             tag = first + row * columns + column
-            tags[tag] = Placed(f"tag {tag}", np.asarray(position) + quat_rotate(turn, flat), sigma)
+            tags[tag] = SurveyedPoints(f"tag {tag}", np.asarray(position) + quat_rotate(turn, flat), sigma)
     return tags

@@ -277,7 +277,7 @@ class Environment:
             )
         if privileged and randomization is not None:
             max_thrusters = max(len(vehicle.thrusters) for vehicle in self.simulator.vehicles)
-            self.privileged_names = randomization.told(max_thrusters)
+            self.privileged_names = randomization.privileged_names(max_thrusters)
         shape, arrays = (self.worlds, self.agents * len(self.privileged_names)), self.arrays
         for name in ("privileged", "final_privileged"):
             setattr(arrays, name, wp.zeros(shape, dtype=wp.float32, device=self.device))

@@ -10,10 +10,10 @@ import yaml
 from finssim.control import ControlError
 from finssim.extensions.ros2 import Ros2Error
 from finssim.extensions.ros2.up import (
-    EVERYWHERE,
+    COMMON_PARAMETERS,
     GRAPHS,
+    NODE_PARAMETERS,
     NODES,
-    TAKES,
     Options,
     VehicleNames,
     plan_of,
@@ -56,7 +56,7 @@ def told(graph, tmp_path, **choices):
     found = {key.rsplit("/", 1)[-1]: value["ros__parameters"] for key, value in tree.items()}
     robots = [found[node] for node in found if node not in ("sim", "virtual_pool")]
     alike = set.intersection(*(set(parameters) for parameters in robots))
-    return {"**": {name: robots[0][name] for name in alike & set(EVERYWHERE.split())}, **found}
+    return {"**": {name: robots[0][name] for name in alike & set(COMMON_PARAMETERS.split())}, **found}
 
 
 @pytest.mark.parametrize(
@@ -150,10 +150,10 @@ def test_time_of_a_graph_is_that_of_its_world(graph):
 
 def test_every_option_of_a_node_is_a_parameter_of_it():
     """By its name, in the node's source or in that of every node."""
-    for node, names in TAKES.items():
+    for node, names in NODE_PARAMETERS.items():
         assert not [name for name in names.split() if f'self.parameter("{name}"' not in source(node)]
     common = Path(importlib.util.find_spec("finssim.extensions.ros2.nodes.robot_node").origin).read_text()
-    names = set(EVERYWHERE.split()) - {"use_sim_time", "frame_prefix"}
+    names = set(COMMON_PARAMETERS.split()) - {"use_sim_time", "frame_prefix"}
     assert not [name for name in names if f'self.parameter("{name}"' not in common]
 
 

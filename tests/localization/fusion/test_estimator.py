@@ -218,10 +218,10 @@ def test_the_state_never_runs_away(mode, all_silent):
         np.testing.assert_array_equal(x.x[3:5], 0.0)
         assert np.isfinite(x.P).all() and math.isfinite(x.yaw)
         assert np.linalg.eigvalsh(x.P)[0] > -1e-6
-    doubt = [x.P[0, 0] for x in found]
-    assert all(b >= a * (1 - 1e-9) for a, b in zip(doubt, doubt[1:], strict=False))
-    assert doubt[-1] <= Settings().largest_variance * 1.001  # of the IMU, with a lever of 5 cm
-    assert doubt[1] > 0.1
+    extra_variance = [x.P[0, 0] for x in found]
+    assert all(b >= a * (1 - 1e-9) for a, b in zip(extra_variance, extra_variance[1:], strict=False))
+    assert extra_variance[-1] <= Settings().largest_variance * 1.001  # of the IMU, with a lever of 5 cm
+    assert extra_variance[1] > 0.1
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ BEHIND, ABOVE = 3.2, 1.1
 """Distance of the camera behind and above the vehicle [vehicle lengths]."""
 
 
-class Onlooker:
+class ChaseCamera:
     """Renderer of one world, with its vehicles as boxes, and a ball at the goal unless the world contains a
     landmark.
 

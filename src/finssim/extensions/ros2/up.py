@@ -39,7 +39,7 @@ __all__ = [
     "GRAPHS",
     "MCU_PORT",
     "NODES",
-    "TAKES",
+    "NODE_PARAMETERS",
     "Options",
     "GraphNode",
     "GraphPlan",
@@ -333,8 +333,8 @@ def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
     values: dict[str, Any] = {**given}
     for _, option in each_option():
         name, kind = option.name, str(option.type)
-        if name in given and any(word in kind for word in MEANT):
-            convert, expected = MEANT[next(word for word in MEANT if word in kind)]
+        if name in given and any(word in kind for word in LAUNCH_CONVERTERS):
+            convert, expected = LAUNCH_CONVERTERS[next(word for word in LAUNCH_CONVERTERS if word in kind)]
             try:
                 values[name] = convert(given[name])
             except (KeyError, ValueError):
@@ -346,7 +346,7 @@ def launched(graph: str, given: Mapping[str, str]) -> GraphPlan:
     return plan_of(graph, Options.of({**nothing, **values}), pool_file, since=time.time())
 
 
-MEANT: dict[str, tuple[Callable[[str], Any], str]] = {
+LAUNCH_CONVERTERS: dict[str, tuple[Callable[[str], Any], str]] = {
     "bool": (lambda word: {"true": True, "false": False}[word.lower()], "true or false"),
     "float": (float, "a number"),
     "int": (int, "an integer"),
@@ -414,7 +414,7 @@ def plan_of(
                 below = "team" if several else namespace
             elif node == "recorder" and (graph == "sim" or blind):
                 given = {**values, "pool_file": None}
-            takes = f"{EVERYWHERE} {TAKES[node]}".split()
+            takes = f"{COMMON_PARAMETERS} {NODE_PARAMETERS[node]}".split()
             nodes.append(
                 GraphNode(node, below, {key: given[key] for key in takes if given.get(key) is not None})
             )
@@ -515,8 +515,10 @@ def _check(graph: str, o: Options) -> None:
         raise Ros2Error(
             "--real-time-factor 0: expected more than 0, or --lockstep, in which 0 means without limit"
         )
-    takes = {word for node in GRAPHS[graph] for word in TAKES[node].split()} | set(ALWAYS.split())
-    takes |= set(BESIDES[graph].split())
+    takes = {word for node in GRAPHS[graph] for word in NODE_PARAMETERS[node].split()} | set(
+        COMMON_OPTIONS.split()
+    )
+    takes |= set(EXTRA_OPTIONS[graph].split())
     stated = o.values()
     for _, option in each_option():
         value = stated[option.name]
@@ -671,10 +673,10 @@ GRAPHS = {"sim": ("sim", "controller"), "robot": ROBOT, "pool": ("virtual_pool",
 WORLDS = ("sim", "virtual_pool")
 """Nodes that simulate a world and determine the time of their graph, which ends with them."""
 
-EVERYWHERE = "vehicle robot site frame_prefix number use_sim_time lockstep pool_since"
+COMMON_PARAMETERS = "vehicle robot site frame_prefix number use_sim_time lockstep pool_since"
 """Parameters of every node."""
 
-TAKES = {
+NODE_PARAMETERS = {
     "camera": "pictures pictures_bind pool_file",
     "controller": "policy task goal trajectory",
     "hardware_bridge": "bind need_reading",
@@ -688,9 +690,9 @@ TAKES = {
 }
 """Node -> its parameters that options set, by the names of the options if these are equal."""
 
-ALWAYS = "vehicle namespace frame_prefix site arm record teleop duration lockstep"
+COMMON_OPTIONS = "vehicle namespace frame_prefix site arm record teleop duration lockstep"
 """Options of every graph."""
-BESIDES = {"sim": "", "robot": "robot port camera real_time_factor", "pool": ""}
+EXTRA_OPTIONS = {"sim": "", "robot": "robot port camera real_time_factor", "pool": ""}
 """Graph -> further options."""
 SHARED = ("goal", "trajectory", "let_in")
 """Options that have a value for each vehicle of a team."""

@@ -325,7 +325,7 @@ class Chase(OpenWater):
     prey_drive: DriveNumbers | None = field(default=None, repr=False)
     """Thrusters of the prey; determined from its vehicle."""
 
-    def chased(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
+    def with_prey_speed(self, part: float, vehicles: Sequence[Vehicle], **changes: Any) -> Any:
         """Return the task with the prey's thrust of its vehicle, and with its speed.
 
         Args:
@@ -529,7 +529,7 @@ class Pursuit(Chase):
 
     def fitted(self, vehicles: Sequence[Vehicle]) -> "Pursuit":
         """Return the task with the prey's speed and thrust adapted to the vehicles: pursuer, prey."""
-        return self.chased(self.prey_speed, vehicles)
+        return self.with_prey_speed(self.prey_speed, vehicles)
 
     def success_rule(self) -> str:
         """See `Task`."""
@@ -871,7 +871,9 @@ class TeamPursuit(TeamTask, Chase):
     def fitted(self, vehicles: Sequence[Vehicle]) -> "TeamPursuit":
         """Return the task with the prey's speed, size and thrust adapted to the vehicles: herder, netters, prey."""
         size = vehicles[-1].body.size
-        return self.chased(self.rules.prey_speed, vehicles, prey_radius=float(0.25 * (size[0] + size[1])))
+        return self.with_prey_speed(
+            self.rules.prey_speed, vehicles, prey_radius=float(0.25 * (size[0] + size[1]))
+        )
 
     def success_rule(self) -> str:
         """See `Task`."""

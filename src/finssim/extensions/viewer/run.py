@@ -15,7 +15,7 @@ from finssim.robot.interrupt import interruptible, interrupting
 from finssim.vehicles import load_vehicle
 
 _DRIVEN = {"policy", "task", "goal", "trajectory", "seed"}
-HEEDED = {
+USED_OPTIONS = {
     "pool": _DRIVEN | {"plant", "severity", "camera", "world"},
     "sim": _DRIVEN | {"hydrodynamics"},
     "record": {"truth", "truth_offset", "basin", "world", "seed"},
@@ -172,9 +172,9 @@ def _check(choice: SourceChoice) -> str:
             f"{choice.source}: no such file or folder; give pool, sim, a record (.mcap) or a run's folder"
         )
     usual = SourceChoice()
-    for name in sorted(set().union(*HEEDED.values()) - HEEDED[kind]):
+    for name in sorted(set().union(*USED_OPTIONS.values()) - USED_OPTIONS[kind]):
         if getattr(choice, name) != getattr(usual, name):
-            takers = " and ".join(other for other in HEEDED if name in HEEDED[other])
+            takers = " and ".join(other for other in USED_OPTIONS if name in USED_OPTIONS[other])
             raise ViewError(f"--{name.replace('_', '-')} is for {takers}, not for a {kind}: omit it")
     return kind
 

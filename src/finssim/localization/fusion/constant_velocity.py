@@ -139,7 +139,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
         """Predict the reading of a compass, pool frame [rad]."""
         if self.settings.aids is None:
             return "no compass"
-        return self.yaw(track)._replace(doubt=self.settings.aids.heading_bias**2)
+        return self.yaw(track)._replace(extra_variance=self.settings.aids.heading_bias**2)
 
     def velocity(self, track: PlaneTrack) -> Prediction | str:
         """Predict the reading of a Doppler log, body frame [m/s], at the body origin and with the present heading."""
@@ -175,7 +175,7 @@ class ConstantVelocity(Filter[PlaneTrack]):
             x=x,
             P=P,
             yaw=yaw.yaw if has_yaw else math.nan,
-            yaw_variance=yaw.variance + track.doubt("yaw") if has_yaw else math.nan,
+            yaw_variance=yaw.variance + track.extra_variance("yaw") if has_yaw else math.nan,
             yaw_rate=track.rate - yaw.bias if track.rate is not None and track.heard(time) else math.nan,
             roll=track.roll if has_imu else math.nan,
             pitch=track.pitch if has_imu else math.nan,

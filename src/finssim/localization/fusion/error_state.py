@@ -365,7 +365,7 @@ class ErrorState(Filter[InertialTrack]):
             x=x,
             P=T @ state.P @ T.T,
             yaw=float(yaw[0]),
-            yaw_variance=float((H @ state.P @ H.T)[0, 0]) + track.doubt("yaw"),
+            yaw_variance=float((H @ state.P @ H.T)[0, 0]) + track.extra_variance("yaw"),
             yaw_rate=float(H[0, A] @ R @ rates),
             roll=roll,
             pitch=pitch,

@@ -123,7 +123,7 @@ class GateMemory:
     rival: Rival | None = None
 
     @property
-    def doubt(self) -> float:
+    def extra_variance(self) -> float:
         """Variance that a rival or a run of refused measurements adds to the state's variance [units²]."""
         if self.rival is not None:
             return self.rival.offset**2 * self.rival.held / (self.rival.held + self.rival.won)

@@ -138,7 +138,7 @@ class Prediction(NamedTuple):
     """Value in the unit of the measurement, (m,)."""
     H: Array
     """Jacobian with respect to the errors of `part`, in their units, (m, n)."""
-    doubt: Array | float | None = None
+    extra_variance: Array | float | None = None
     """Covariance of errors that the filter does not estimate, such as an offset of the sensor, in the unit of the
     measurement, (m, m); None: zero."""
     turning: float = 0.0
@@ -164,9 +164,9 @@ class FilterMemory:
         """Time of the latest accepted position fix or Doppler velocity [s]; -inf before the first."""
         return max(self.seen.get("vision", -math.inf), self.seen.get("velocity", -math.inf))
 
-    def doubt(self, name: str) -> float:
+    def extra_variance(self, name: str) -> float:
         """Return the variance that a sensor's gate adds to that of the state [units²]."""
-        return self.gates[name].doubt if name in self.gates else 0.0
+        return self.gates[name].extra_variance if name in self.gates else 0.0
 
     def times(self) -> dict[str, float | None]:
         """Return the times of the latest accepted samples [s], by their field names in `PoseEstimate`."""
@@ -272,8 +272,8 @@ class Filter(ABC, Generic[T]):
         if sensor.angle:
             residual = np.array([wrapped(residual.item())])
         R = sensor.noise(sample, self.settings)
-        if predicted.doubt is not None:
-            R = R + predicted.doubt
+        if predicted.extra_variance is not None:
+            R = R + predicted.extra_variance
         if predicted.turning:
             R = R + predicted.turning * float(reading @ reading) * np.eye(len(reading))
         state = getattr(track, predicted.part)

@@ -150,7 +150,7 @@ def axes_of_up(up: npt.ArrayLike) -> Array:
     return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
 
 
-def inflation(missed: Array, parameters: int, std: float) -> float:
+def inflation(residual_norms: Array, parameters: int, std: float) -> float:
     """Return the factor [-] on a variance if residuals are larger than noise explains.
 
     It is 1 up to the 99 % quantile of chi² (Wilson and Hilferty's approximation), and the ratio to that
@@ -161,10 +161,10 @@ def inflation(missed: Array, parameters: int, std: float) -> float:
         parameters: Number of fitted parameters.
         std: Standard deviation of a point, per axis [px].
     """
-    dof = max(2 * len(missed) - parameters, 1)
+    dof = max(2 * len(residual_norms) - parameters, 1)
     k = 2.0 / (9.0 * dof)
     quantile = dof * (1.0 - k + 2.326 * math.sqrt(k)) ** 3
-    return max(1.0, float(missed @ missed) / std**2 / quantile)
+    return max(1.0, float(residual_norms @ residual_norms) / std**2 / quantile)
 
 
 # Correspondences between corners in a picture and corners on the vehicle.

@@ -142,19 +142,19 @@ def refractive_bundle(
     if not minima:
         return refused(method, "the corners show no pose in the water", pairs.rejected, tags=pairs.tags)
     choice = choose(minima, constraints, pixel_std)
-    reason = _doubt(choice, pixel_std)
+    reason = _rejection(choice, pixel_std)
     if reason:
         return refused(method, reason, pairs.rejected, tags=pairs.tags)
     return measured(method, choice.best, choice.covariance(pixel_std), pairs)
 
 
-def _doubt(choice: BestMinimum, pixel_std: float) -> str:
+def _rejection(choice: BestMinimum, pixel_std: float) -> str:
     """Return the reason why the best pose is not reliable; empty if it is."""
     best, second = choice.best, choice.second
     if not best.converged:
         return f"did not converge in {best.iterations} steps"
     limit = max(WORST, 8.0 * pixel_std)
-    far, count = int((best.missed > limit).sum()), len(best.missed)
+    far, count = int((best.residual_norms > limit).sum()), len(best.residual_norms)
     if 4 * far > count:
         return f"residual too large: {far} of {count} corners miss by more than {limit:.1f} px"
     if second is not None and choice.gap < SURE and choice.turned > NEAR:

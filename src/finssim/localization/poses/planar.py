@@ -49,15 +49,15 @@ class RigidFit:
     """Jacobian J weighted by the curvature of rho [-, m], (n, 2, 3)."""
     A: Array
     """Scale from metres to pixels [px/m], (n, 2, 2)."""
-    missed: Array
+    residual_norms: Array
     """Residual of each point, as a distance [px], (n,)."""
     iterations: int
     converged: bool
 
     @property
     def rms(self) -> float:
-        """Root mean square of `missed` [px]."""
-        return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
+        """Root mean square of `residual_norms` [px]."""
+        return math.sqrt(float(self.residual_norms @ self.residual_norms) / len(self.residual_norms))
 
     def response(self, shared: Array) -> Array:
         """Return the sensitivity of the motion to errors that move many points jointly.
@@ -73,7 +73,7 @@ class RigidFit:
 
     def inflation(self, std: float) -> float:
         """Return the factor on the variance if the residuals exceed noise of `std` [px]."""
-        return inflation(self.missed, 3, std)
+        return inflation(self.residual_norms, 3, std)
 
 
 def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | None:
@@ -111,7 +111,7 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
     if inverse is None:
         return None
     pose = (float(now.xi[0]), float(now.xi[1]), math.remainder(float(now.xi[2]), math.tau))
-    return RigidFit(pose, inverse, now.weighted_J, A, now.missed, steps, converged)
+    return RigidFit(pose, inverse, now.weighted_J, A, now.residual_norms, steps, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class _State:
     H: Array
     g: Array
     weighted_J: Array
-    missed: Array
+    residual_norms: Array
 
 
 def _damped_inverse(H: Array, damping: float) -> Array | None:
@@ -208,17 +208,17 @@ def _evaluate(xi: tuple[float, float, float], Q: Array, points: Array, A: Array,
     in_pixels = A @ change
     miss, J = in_pixels[:, :, 0], in_pixels[:, :, 1:]
     squares = (miss * miss) @ _ONES
-    missed = np.sqrt(squares)
+    residual_norms = np.sqrt(squares)
     flat = J.reshape(-1, 3)
-    if missed.max() <= huber:
-        return _State(xi, float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, missed)
-    weight, cost = huber_weight(missed, huber), float(huber_loss(missed, huber).sum())
+    if residual_norms.max() <= huber:
+        return _State(xi, float(squares.sum()), flat.T @ flat, flat.T @ miss.ravel(), J, residual_norms)
+    weight, cost = huber_weight(residual_norms, huber), float(huber_loss(residual_norms, huber).sum())
     # Where rho grows linearly, it curves only across the residual; weights alone would converge slowly.
-    towards = np.where(missed > huber, 1.0 / np.maximum(missed, huber), 0.0)[:, None] * miss
+    towards = np.where(residual_norms > huber, 1.0 / np.maximum(residual_norms, huber), 0.0)[:, None] * miss
     across = J - towards[:, :, None] * np.einsum("ij,ijk->ik", towards, J)[:, None, :]
     weighted = weight[:, None, None] * across
     g = flat.T @ (weight[:, None] * miss).ravel()
-    return _State(xi, cost, weighted.reshape(-1, 3).T @ flat, g, weighted, missed)
+    return _State(xi, cost, weighted.reshape(-1, 3).T @ flat, g, weighted, residual_norms)
 
 
 _UNIT, _ONES = np.eye(2), np.ones(2)
@@ -409,8 +409,8 @@ def _solve(
         text = ", ".join(f"{n} {name}" for name, n in rejected.items())
         return f"fewer than {FEWEST} corners have a ray to their height ({text})", used, rejected
     fit = _fit(corners, level, used, pixel_std)
-    if fit is not None and fit.missed.max() > limit:
-        far = fit.missed > limit
+    if fit is not None and fit.residual_norms.max() > limit:
+        far = fit.residual_norms > limit
         few = 2 * int(far.sum()) < len(far) and len(far) - int(far.sum()) >= FEWEST
         retained = (
             _without(used, far) if few else _without_a_tag(corners, level, used, pixel_std, limit, tags)
@@ -425,7 +425,7 @@ def _solve(
         return "the corners are too close together to determine the heading", used, rejected
     if not fit.converged:
         return f"did not converge in {fit.iterations} steps", used, rejected
-    if fit.missed.max() > limit:
+    if fit.residual_norms.max() > limit:
         return f"residual too large: {fit.rms:.1f} px even without outliers", used, rejected
     return fit, used, rejected
 
@@ -445,7 +445,7 @@ def _without_a_tag(
         retained = used.copy()
         retained[4 * i : 4 * i + 4] = False
         fit = _fit(corners, level, retained, pixel_std) if FEWEST <= retained.sum() < used.sum() else None
-        if fit is not None and fit.converged and fit.missed.max() <= limit:
+        if fit is not None and fit.converged and fit.residual_norms.max() <= limit:
             agreeing.append(retained)
     return agreeing[0] if len(agreeing) == 1 else None
 

@@ -105,7 +105,7 @@ def mirrored(R_pb: Array, sight_p: Array, normal_b: Array) -> Array:
 
 # Refinement of a pose with all six degrees of freedom, by the reprojection error.
 
-See = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
+ProjectionFunction = Callable[[Array], tuple[Array, Array, npt.NDArray[np.bool_]]]
 """Function of points, pool frame (n, 3), that returns pixels (n, 2), derivatives by the point (n, 2, 3), and
 a visibility mask (n,)."""
 ExtraRows = Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -130,7 +130,7 @@ class RefinedPose:
     """Shift of the complete picture [px], (2,); zero without prior knowledge."""
     cost: float
     """Sum of Huber's rho over the points, and of the squared residuals of prior knowledge [px²]."""
-    missed: Array
+    residual_norms: Array
     """Reprojection error of each point, as a distance [px], (n,)."""
     H: Array
     """Weighted J'J by position [m], rotation about pool axes [rad] and, with prior knowledge, the shift, (6,
@@ -145,22 +145,22 @@ class RefinedPose:
 
     @property
     def rms(self) -> float:
-        """Root mean square of `missed` [px]."""
-        return math.sqrt(float(self.missed @ self.missed) / len(self.missed))
+        """Root mean square of `residual_norms` [px]."""
+        return math.sqrt(float(self.residual_norms @ self.residual_norms) / len(self.residual_norms))
 
     def covariance(self, pixel_std: float) -> Array:
         """Return the covariance of position [m] and rotation about pool axes [rad], (6, 6).
 
         Without prior knowledge it is enlarged if the residuals clearly exceed the noise.
         """
-        factor = inflation(self.missed, 6, pixel_std) if len(self.H) == 6 else 1.0
+        factor = inflation(self.residual_norms, 6, pixel_std) if len(self.H) == 6 else 1.0
         scale = 1.0 / np.sqrt(np.diagonal(self.H))
         inverse = np.linalg.pinv(self.H * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
         return np.asarray(inverse[:6, :6] * (pixel_std**2 * factor))
 
 
 def refine_pose(
-    see: See,
+    see: ProjectionFunction,
     points_b: Array,
     pixels: Array,
     position: Array,
@@ -211,7 +211,7 @@ def refine_pose(
 
 
 def _linearised(
-    see: See,
+    see: ProjectionFunction,
     points_b: Array,
     pixels: Array,
     huber: float,
@@ -225,26 +225,31 @@ def _linearised(
     if not visible.all():
         return None
     miss = projected + shift - pixels
-    missed = np.sqrt(np.sum(miss * miss, axis=1))
+    residual_norms = np.sqrt(np.sum(miss * miss, axis=1))
     parts = [by_point, -by_point @ skew(arms)]
     if extra_rows is not None:
         parts.append(np.broadcast_to(np.eye(2), (len(miss), 2, 2)))
     J = np.concatenate(parts, axis=-1)
-    weight, cost = huber_weight(missed, huber), float(huber_loss(missed, huber).sum())
+    weight, cost = huber_weight(residual_norms, huber), float(huber_loss(residual_norms, huber).sum())
     weighted = (weight[:, None, None] * J).reshape(-1, J.shape[-1])
     H, g = weighted.T @ J.reshape(-1, J.shape[-1]), weighted.T @ miss.ravel()
     curvature = H
     if extra_rows is not None:
         # Close to the minimum Newton's curvature converges faster; far away, weights alone are more robust.
-        along = np.where(missed > huber, np.sqrt(weight) / np.maximum(missed, huber), 0.0)[:, None] * miss
+        along = (
+            np.where(residual_norms > huber, np.sqrt(weight) / np.maximum(residual_norms, huber), 0.0)[
+                :, None
+            ]
+            * miss
+        )
         flat = np.einsum("ij,ijk->ik", along, J)
         r, K = extra_rows(position, rotation, shift)
         cost, g, H = cost + float(r @ r), g + K.T @ r, H + K.T @ K
         curvature = H - flat.T @ flat
-    return RefinedPose(position, rotation, shift, cost, missed, H, curvature, g)
+    return RefinedPose(position, rotation, shift, cost, residual_norms, H, curvature, g)
 
 
-def through_lens(lens: Lens, R: Array | None = None, position: Array | None = None) -> See:
+def through_lens(lens: Lens, R: Array | None = None, position: Array | None = None) -> ProjectionFunction:
     """Return the function that images points without refraction, in the optical frame or in one with a given
     camera pose.
 
@@ -263,7 +268,7 @@ def through_lens(lens: Lens, R: Array | None = None, position: Array | None = No
     return see
 
 
-def through_water(pool: Pool) -> See:
+def through_water(pool: Pool) -> ProjectionFunction:
     """Return the function that images points, refracted at the interface, or straight on the camera's side of it."""
     camera, interface = pool.camera, pool.interface
     straight = through_lens(camera.lens, camera.R_pc, camera.position)
@@ -292,7 +297,7 @@ def _distinct(poses: Iterable[RefinedPose | None]) -> list[RefinedPose]:
 
 
 def minima_from(
-    see: See, pairs: Correspondences, starts: Iterable[tuple[Array, Array]], huber: float
+    see: ProjectionFunction, pairs: Correspondences, starts: Iterable[tuple[Array, Array]], huber: float
 ) -> list[RefinedPose]:
     """Return the distinct minima reached from the starts, the best first: after a few steps, only distinct
     ones continue.

@@ -71,7 +71,7 @@ class Modes:
         self._node.event("mode", mode)
         return True
 
-    def told(self, stamp: int, runtime: Runtime) -> Any:
+    def policy_info(self, stamp: int, runtime: Runtime) -> Any:
         """Return the PolicyInfo of the latest decision."""
         pilot = self._pilots[self.switch.mode]
         values: dict[str, Any] = {
@@ -177,7 +177,7 @@ class ControllerNode(RobotNode):
         if self.runtime.started != began and not math.isnan(self.runtime.started):
             self._show(self.runtime.guide, self.runtime.started)
         if self.runtime.counters.decisions > before:
-            self.send("policy", self.modes.told(self.ns(now), self.runtime))
+            self.send("policy", self.modes.policy_info(self.ns(now), self.runtime))
 
     def _on_own(self, name: str, message: Any) -> None:
         """Queue a reading of an onboard sensor for a policy with perception; invalid ones are ignored."""

@@ -15,7 +15,7 @@ import rclpy
 
 from finssim.extensions.ros2.nodes.conversions import nanoseconds, reading_of, ros_type
 from finssim.extensions.ros2.nodes.robot_node import LEFT, LISTENING, RobotNode
-from finssim.extensions.ros2.up import EVERYWHERE, GraphPlan
+from finssim.extensions.ros2.up import COMMON_PARAMETERS, GraphPlan
 from finssim.robot.bridge import Event
 from finssim.robot.messages import Telemetry, ThrusterCommand
 from finssim.robot.reading import Reading
@@ -46,16 +46,16 @@ class RemoteReadings:
         if all(map(math.isfinite, message.position_std)):
             self._match()
         else:  # the position is unknown, so there is no odometry with it
-            self._give(message, None)
+            self._update(message, None)
 
     def _match(self) -> None:
         status, odometry = self._status, self._odometry
         if status is None or odometry is None:
             return
         if nanoseconds(status.header.stamp) == nanoseconds(odometry.header.stamp):
-            self._give(status, odometry)
+            self._update(status, odometry)
 
-    def _give(self, status: Any, odometry: Any) -> None:
+    def _update(self, status: Any, odometry: Any) -> None:
         self._status = None
         self._take(reading_of(status, odometry, self._node.seconds(status.header.stamp)))
 
@@ -229,6 +229,6 @@ class Watcher(RobotNode):
 
 def _words(parameters: Mapping[str, Any]) -> list[str]:
     """Return the arguments with the parameters that are common to all nodes."""
-    words = {name: parameters[name] for name in EVERYWHERE.split() if name in parameters}
+    words = {name: parameters[name] for name in COMMON_PARAMETERS.split() if name in parameters}
     texts = (f"{name}:={json.dumps(value)}" for name, value in words.items())
     return [word for text in texts for word in ("-p", text)]
