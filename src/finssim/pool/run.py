@@ -212,7 +212,7 @@ def run(
         PlantSpecError, LinkError, GoalError, VehicleError, OutputError: What cannot be used.
     """
     logging.basicConfig(level=logging.WARNING, format="finssim: %(message)s", stream=sys.stderr)
-    positioning_of(choice.positioning, choice.seed)  # refuses what is none
+    positioning_of(choice.positioning, choice.seed)  # refuses an unknown name
     longest = math.inf if duration is None else duration
     timing = timing or PoolTiming()
     if task is not None or team is not None:

@@ -618,7 +618,7 @@ class BridgeClock:
         self._started = False
 
     def wrong(self, now: float) -> str:
-        """Note the time of a call, and return what is wrong with it; "" if nothing. `now` is the time [s]."""
+        """Store the time of a call, and return the problem with it; "" if there is none. `now` is the time [s]."""
         if not math.isfinite(now):
             return "the clock is not a number"
         step = now - self.now if self._started else 0.0
@@ -989,7 +989,7 @@ class Bridge:
             self._wait(now, want, limited=not pause)
 
     def _pause(self, now: float) -> str:
-        """Return what the device between the bridge and the motors waits for; "" if nothing."""
+        """Return the condition for which the device between bridge and motors waits; "" if none."""
         return self.autopilot.pause(now) if self.autopilot is not None else ""
 
     def _wait(self, now: float, want: str, *, limited: bool) -> None:

@@ -67,7 +67,7 @@ def draw(
     normal: int,
 ):
     """Fill rows with draws from [0, 1), or from a standard normal, that depend only on seed, world, episode, step
-    and place."""
+    and `place`, a number of the draw."""
     w = wp.tid()
     world_seed = wp.rand_init(seed + 15485863 * episode[w], w)
     rng = wp.rand_init(wp.randi(world_seed) + 104729 * steps[w], place)

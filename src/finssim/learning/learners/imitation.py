@@ -78,7 +78,7 @@ def demonstrations_for(environment: Environment, folder: str) -> Demonstrations:
     """Load a data set that fits an environment.
 
     Raises:
-        LearningError: None is named, or it is of another task, vehicle or action mode.
+        LearningError: No data set is named, or it is from another task, vehicle or action mode.
         DatasetError: It cannot be read.
     """
     if not folder:
