@@ -1,10 +1,10 @@
 """ArduSub's mixer: conversion of a pilot's six axes to pulses and thrusts of the motors, and back.
 
-out = rpy + linear, limited by the rule of the frame,   pulse = 1500 + 400 direction out,   T = c± ω|ω|, ω =
-ESC(pulse)
+    out = rpy + linear, limited by the rule of the frame,   pulse = 1500 + 400 direction out
+    T = c± ω|ω|,   ω = ESC(pulse)
 
-The batch mixes for all worlds, the robot and the virtual firmware for one vehicle, with the same function and
-numbers.
+The batch mixes for all worlds, the robot and the virtual firmware for one vehicle, with the same function
+and numbers.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,valid-type,misc,untyped-decorator"
 

@@ -387,8 +387,8 @@ def read_trajectory(path: Path) -> Trajectory:
     """Return a trajectory from a file.
 
     CSV: a header `t,x,y,z` or `t,x,y,z,yaw`, one row per point. YAML: `points`, a list of such rows, or
-        `shape`, a mapping of `kind` (key of `SHAPES`) and its arguments such as radius and duration;
-        optionally `name`, `heading` (fixed or tangent) and `yaw` [rad].
+    `shape`, a mapping of `kind` (key of `SHAPES`) and its arguments such as radius and duration; optionally `name`,
+    `heading` (fixed or tangent) and `yaw` [rad].
 
     Raises:
         ControlError: The file cannot be read, or its content is not a trajectory; one sentence with the file's name.

@@ -1,12 +1,12 @@
 """The paper's metrics of station keeping (T1, Table IV) and of trajectory tracking (T2, Table V).
 
-T1: a trial holds one goal for 60 s. Its samples are resampled to 10 Hz; a grid point in a gap of more than
-    0.25 s between samples has no value, and a trial with values at less than 0.9 of the window's points has
-    no late errors. Names are the paper's: e_y is the vertical error, as the paper's y axis points up.
+T1: a trial holds one goal for 60 s. Its samples are resampled to 10 Hz; a grid point in a gap of more than 0.25 s
+between samples has no value, and a trial with values at less than 0.9 of the window's points has no late errors.
+Names are the paper's: e_y is the vertical error, as the paper's y axis points up.
 
-T2: the paper reports three errors against the reference at the same time: horizontal RMSE, vertical RMSE and
-    the 95th percentile of the distance. The other metrics are those named in its published configuration;
-    where it gives no formula, the definition is ours and is documented here.
+T2: the paper reports three errors against the reference at the same time: horizontal RMSE, vertical RMSE and the 95th
+percentile of the distance. The other metrics are those named in its published configuration; where it gives no
+formula, the definition is ours and is documented here.
 """
 
 from __future__ import annotations

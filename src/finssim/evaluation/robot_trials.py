@@ -138,14 +138,15 @@ class TrialStages:
         recorder: Recorder | None = None,
     ) -> None:
         """
-        trial: Trial to play.
-        vehicle: Vehicle in the robot's model.
-        start: Start of the trial.
-        bounds: Alternative bounds that are close enough, as of `start_bounds`.
-        by_hand: True if the operator carries the vehicle to the start and presses enter; False: the tuned PID
-            steers it there.
-        attendant: Operator; None to start the approach as soon as the state is known, without confirmation.
-        recorder: Recorder of the trial itself, without the approach.
+        Args:
+            trial: Trial to play.
+            vehicle: Vehicle in the robot's model.
+            start: Start of the trial.
+            bounds: Alternative bounds that are close enough, as of `start_bounds`.
+            by_hand: True if the operator carries the vehicle to the start and presses enter; False: the tuned PID
+                steers it there.
+            attendant: Operator; None to start the approach as soon as the state is known, without confirmation.
+            recorder: Recorder of the trial itself, without the approach.
         """
         self._trial, self._vehicle, self._start, self._bounds = trial, vehicle, start, bounds
         self._by_hand, self._attendant, self._recorder = by_hand, attendant, recorder

@@ -174,8 +174,8 @@ class Fit:
     def vehicle(self) -> Vehicle:
         """Calibrated vehicle: all numbers that the fit did not determine keep their values and origins.
 
-        CalibrationError: The estimates do not form a vehicle that can be simulated.
-            CalibrationError: The estimates make no vehicle that can be simulated.
+        Raises:
+            CalibrationError: The estimates do not form a vehicle that can be simulated.
         """
         from finssim.identification.vehicle_file import calibrated
 

@@ -1,4 +1,13 @@
-"""Synthetic trials: programmes run in the simulator, measured with noise, logged as by a robot."""
+"""Synthetic trials: programmes run in the simulator, measured with noise, logged as by a robot.
+
+Row k of a trial at `rate` has time t_k = k / rate and contains
+
+- the state at t_k: velocity of the body origin, attitude, position, angular rate, and the specific force measured by an
+  accelerometer at the IMU's position (later by the sensor's latency if the vehicle's own sensors measure);
+- commands that are constant over [t_k, t_k + 1/rate);
+- applied inputs (`rpm_*`, `force_*`, `tau_*`, `actuator_*`) at t_k, as in telemetry (they are continuous, since motors
+  have a lag).
+"""
 
 from __future__ import annotations
 

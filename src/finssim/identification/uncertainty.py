@@ -1,8 +1,8 @@
 """Uncertainty of estimates: the evidence of every trial, and the agreement between trials.
 
-Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the
-    normal matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ
-    s_g = 0. No other data is needed.
+Notation: a fit minimises Σ_g |W_g^½ r_g(theta)|² over trials g. Trial g contributes N_g = J_gᵀ W J_g to the normal
+matrix and s_g = J_gᵀ W r_g to the score, r = measured - predicted, both at the solution, where Σ s_g = 0. No other
+data is needed.
 """
 
 from __future__ import annotations

@@ -623,8 +623,8 @@ def without_spikes(t: Array, y: Array) -> NDArray[np.bool_]:
         t: Times [s], (n,).
         y: Values in any unit, (n, c).
 
-    Mask, (n,); at most a twentieth of the samples is rejected, since spikes are rare.
-        (n,); at most a twentieth is refused, for what happens more often is no spike.
+    Returns:
+        Mask, (n,); at most a twentieth of the samples is rejected, since spikes are rare.
     """
     n = len(t)
     if n < 9:

@@ -1,4 +1,8 @@
-"""Reader of the numbers that Python and MATLAB files assign to names; the files are not executed."""
+"""Reader of the numbers that Python and MATLAB files assign to names; the files are not executed.
+
+Constants, arithmetic, matrices and a few known functions are evaluated. Any other assignment is skipped, and its name
+has no value afterwards. MATLAB statements are first converted to Python.
+"""
 
 from __future__ import annotations
 
