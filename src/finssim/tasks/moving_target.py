@@ -53,11 +53,11 @@ OBSERVATION = (
 class TargetReward:
     """Weights of the reward; each term has one reason.
 
-    near = exp(-e / near_scale), e the distance to the target, u the speed relative to it
+    c = exp(-e / near_scale), e the distance to the target, u the speed relative to it
 
-    r = near_weight · near                       a slope that does not vanish at the target: centimetres count
+    r = near · c                                 a slope that does not vanish at the target: centimetres count
       - distance · e                             a slope everywhere: a distant target is caught up with
-      + match · near · exp(-u / match_scale)     match the target's velocity, but only close to it: approach it first
+      + match · c · exp(-u / match_scale)        match the target's velocity, but only close to it: approach it first
       - spin · min(|ω|, 2)                       the attitude is free and not observed; continuous turning is not wanted
       - action · mean(a²)                        the cheapest thrusts that suffice
       - change · mean(Δa²)                       commands that a motor can follow, no chatter
