@@ -162,7 +162,12 @@ def test_times_may_be_the_index_and_dates():
         ({"time": "clock"}, "no column 'clock' with the times; its columns are t, speed"),
         ({"columns": {"u": "sped"}}, "no column 'sped', did you mean 'speed'"),
         ({"columns": {"uu": "speed"}}, "names 'uu', did you mean 'u'"),
+        ({"columns": {"speed": "u"}}, "a trial's column first and the frame's second: write {'u': 'speed'}"),
         ({"units": {"speed": "m"}}, "units names 'speed'"),
+        (
+            {"columns": {"u": "speed"}, "units": {"speed": "m/s"}},
+            "units names 'speed', the frame's name of 'u': write 'u'",
+        ),
         ({"units": {"depth": "kg"}}, "invalid unit"),
         ({"units": {"t": "fortnight"}}, "is 'fortnight', expected one of s, ms"),
         ({"axes": "NWU"}, "is 'NWU', expected FLU, FRD"),
@@ -180,6 +185,27 @@ def test_what_is_no_table_is_refused():
         fs.Trial.from_frame([1, 2])
     with pytest.raises(CalibrationError, match="expected one-dimensional ones of equal length"):
         fs.Trial.from_frame({"t": np.arange(5.0), "u": np.arange(4.0)})
+    import pandas as pd
+
+    with pytest.raises(CalibrationError, match="column 'u' occurs twice"):
+        fs.Trial.from_frame(pd.DataFrame(np.zeros((5, 3)), columns=["t", "u", "u"]))
+
+
+@pytest.mark.parametrize(("unit", "n"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_times_that_are_not_in_seconds_are_refused_with_their_unit(unit, n):
+    """The remedy works: the same table with this unit is a trial."""
+    table = {"t": n * 0.05 * np.arange(50), "u": np.linspace(0.0, 1.0, 50)}
+    with pytest.raises(CalibrationError, match=rf"are in {unit}, .*units={{'t': '{unit}'}}"):
+        fs.Trial.from_frame(table)
+    assert fs.Trial.from_frame(table, units={"t": unit}).duration == pytest.approx(2.45)
+
+
+def test_a_fit_without_trials_and_one_axis_by_name():
+    with pytest.raises(CalibrationError, match="no trials were given"):
+        fs.identify("finsrov", [])
+    trial = fs.Trial.from_frame({"t": 0.05 * np.arange(50), "u": np.ones(50), "tau_x": np.ones(50)})
+    with pytest.raises(CalibrationError, match="unknown axis 'yow'"):
+        fs.identify("finsrov", trial, axes="yow")
 
 
 # -- a study ----------------------------------------------------------------------------------------------------------
@@ -222,5 +248,5 @@ def test_a_task_without_a_figure_and_one_that_is_not_for_the_pool_are_refused():
         fs.run_in_pool("pid", vehicle="bluerov2_heavy", firmware="px4")
     with pytest.raises(EvaluationError, match="unknown site 'lake'"):
         fs.run_in_pool("pid", site="lake")
-    with pytest.raises(ValueError, match="P99"):
+    with pytest.raises(EvaluationError, match="unknown setpoint 'P99'; available: P01, P02"):
         fs.run_in_pool("pid", targets=["P99"])

@@ -57,11 +57,14 @@ def identify(
     """
     from finssim.identification.hydrodynamics import fit_hydrodynamics
     from finssim.identification.report import usable
+    from finssim.trials.findings import CalibrationError
     from finssim.trials.trial import Trial
     from finssim.trials.trial_files import load_trials
 
     body = load_vehicle(vehicle)
     given = [trials] if isinstance(trials, Trial | str | Path) else list(trials)
+    if not given:
+        raise CalibrationError("no trials were given: expected one or more trials or paths of trials")
     read = [t for item in given for t in ([item] if isinstance(item, Trial) else load_trials([item]))]
     used, remarks = usable(read)
     remarks += [item.about(trial.name) for trial in used for item in trial.findings]
@@ -69,8 +72,8 @@ def identify(
         fit = fit_hydrodynamics(
             used,
             body,
-            axes=axes,
-            estimate=estimate,
+            axes=[axes] if isinstance(axes, str) else axes,
+            estimate=[estimate] if isinstance(estimate, str) else estimate,
             damping=damping,
             held_out=[trial for trial in read if trial.header.role == "held-out"],
             progress=show,
@@ -248,7 +251,9 @@ def run_in_pool(
     name = str(controller.folder if isinstance(controller, Policy) else controller)
     about = make_pilot(name, body, task=task).describe()
     eyes = f"seen by {camera}" if firmware == "mcu" else firmware
-    names = FORMS[task].targets if targets is None else targets
+    names = FORMS[task].targets if targets is None else [targets] if isinstance(targets, str) else targets
+    if task == "t1" and (unknown := [name for name in names if name not in FORMS[task].targets]):
+        raise EvaluationError(f"unknown setpoint '{unknown[0]}'; available: {', '.join(FORMS[task].targets)}")
     measures, trials = [], []
     with silent(not progress), progress_bar(f"virtual pool, plant {plant}") as show:
         for k, target in enumerate(names):

@@ -172,12 +172,18 @@ REFUSED = [
     ),
     ({"hydrodynamics": "simplifed"}, "did you mean 'simplified'?"),
     ({"integrator": "rk45"}, "unknown integrator 'rk45'; available: midpoint, rk4; did you mean 'rk4'?"),
-    ({"worlds": 0}, "worlds=0, substeps=4: expected at least one, and one vehicle"),
-    ({"substeps": 0}, "worlds=1, substeps=0: expected at least one, and one vehicle"),
+    ({"worlds": 0}, "worlds is 0, expected at least 1"),
+    ({"substeps": 0}, "substeps is 0, expected at least 1"),
     ({"control_step": 0.0}, "control_step is 0.0 s, expected a finite time above 0 s"),
     ({"control_step": float("nan")}, "control_step is nan s, expected a finite time above 0 s"),
     ({"device": "tpu"}, "device 'tpu' is not available here; available: cpu"),
 ]
+
+
+def test_an_unknown_field_of_the_state_is_refused_by_name():
+    simulator = Simulator("finsrov")
+    with pytest.raises(SimulatorError, match="unknown field of the state 'positon'.*did you mean 'position'"):
+        simulator.numpy("positon")
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED)
@@ -197,7 +203,7 @@ def test_a_vehicle_without_the_model_or_without_a_file_is_refused():
         Simulator("lauv", hydrodynamics="mesh")
     with pytest.raises(VehicleError, match="finsrow"):
         Simulator("finsrow")
-    with pytest.raises(SimulatorError, match="one vehicle"):
+    with pytest.raises(SimulatorError, match="vehicles is 0, expected at least 1"):
         Simulator([])
 
 

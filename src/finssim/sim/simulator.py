@@ -32,7 +32,7 @@ from finssim.sim.packed import Packed
 from finssim.sim.plant_arrays import SimulatorError, build_plant
 from finssim.sim.site import Dock, RectangularPool, TetherLine
 from finssim.sim.solids import WorldSolids, layout_of, pool_of, refresh_clearing
-from finssim.sim.state import HISTORY, VehicleState, clear_actuators, new_state
+from finssim.sim.state import HISTORY, State, VehicleState, clear_actuators, new_state
 from finssim.sim.step import MOST_PARTS, Features, SimSurroundings, Vehicles, physics_kernel, tick
 from finssim.sim.water import Water
 from finssim.vehicles import Vehicle, load_vehicle
@@ -112,10 +112,9 @@ class Simulator:
         self.vehicles = [load_vehicle(v) for v in crew]
         self.hydrodynamics = checked_choice(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
         self.integrator = checked_choice(integrator, INTEGRATORS, "integrator")
-        if worlds < 1 or substeps < 1 or not self.vehicles:
-            raise SimulatorError(
-                f"worlds={worlds}, substeps={substeps}: expected at least one, and one vehicle"
-            )
+        for name, count in (("worlds", worlds), ("substeps", substeps), ("vehicles", len(self.vehicles))):
+            if count < 1:
+                raise SimulatorError(f"{name} is {count}, expected at least 1")
         if not (math.isfinite(control_step) and control_step > 0.0):
             raise SimulatorError(f"control_step is {control_step} s, expected a finite time above 0 s")
         if threads is not None and threads < 1:
@@ -364,15 +363,18 @@ class Simulator:
 
     def numpy(self, name: str) -> NDArray[Any]:
         """Return a field of `state` as NumPy; on a CPU a view that shares memory, on a GPU a copy."""
-        return getattr(self.state, name).numpy()
+        return self._field(name).numpy()
 
     def torch(self, name: str) -> Any:
         """Return a field of `state` as a torch tensor that shares memory on its device."""
-        return wp.to_torch(getattr(self.state, name), requires_grad=False)
+        return wp.to_torch(self._field(name), requires_grad=False)
+
+    def _field(self, name: str) -> Any:
+        """Return the array of a field of `state`."""
+        return getattr(self.state, checked_choice(name, tuple(State.vars), "field of the state"))
 
     def set_thrust(self, force: ArrayLike) -> None:
         """Command thruster forces.
-        Command thruster forces.
 
         Args:
             force: Forces along the thrusters' axes [N], shape broadcastable to (worlds, vehicles, n), n thrusters in

@@ -205,9 +205,11 @@ class Trial:
         if t.ndim != 1 or len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
             raise CalibrationError(f"{self.name}: t is not at least 2 strictly increasing times in s")
         if (step := float(np.median(np.diff(t)))) > SLOWEST:
+            unit = next((unit for unit, n in (("ms", 1e3), ("us", 1e6)) if step <= SLOWEST * n), "ns")
             raise CalibrationError(
                 f"{self.name}: t has a row every {step:.3g} s, expected one every {SLOWEST:g} s at least: if its times "
-                "are in ms, import it with a map of the time's unit (time: {column: t, unit: ms})"
+                f"are in {unit}, import it with a map of the time's unit (time: {{column: t, unit: {unit}}}), or give "
+                f"Trial.from_frame units={{'t': '{unit}'}}"
             )
         for column, values in self.channels.items():
             if column_of(column) is None:

@@ -44,13 +44,23 @@ def trial_from_frame(
     table = _table(frame, time, name)
     if columns is None:
         columns = {column: column for column in table.columns if column_of(column) is not None}
+    for column, given in columns.items():
+        if column_of(column) is None and column in table.columns and column_of(str(given)) is not None:
+            raise CalibrationError(
+                f"{name}: columns maps '{column}' to '{given}', expected a trial's column first and the frame's "
+                f"second: write {{'{given}': '{column}'}}"
+            )
     units = dict(units or {})
     unit_of_time = units.pop("t", "s")
     for column in units:
         if column not in columns:
             known = ["t", *columns]
+            own = next(
+                (c for c, given in (("t", time), *columns.items()) if given == column and c != column), None
+            )
+            hint = f", the frame's name of '{own}': write '{own}';" if own else did_you_mean(column, known)
             raise CalibrationError(
-                f"{name}: units names '{column}'{did_you_mean(column, known)} expected some of {', '.join(known)}"
+                f"{name}: units names '{column}'{hint} expected some of {', '.join(known)}"
             )
     if time not in table.columns:
         raise CalibrationError(
@@ -83,7 +93,9 @@ def _table(frame: Any, time: str, name: str) -> ColumnTable:
             frame = frame.assign(**{time: np.asarray(index)})
         columns = {str(column): frame[column] for column in frame.columns}
         if len(columns) < len(frame.columns):
-            raise CalibrationError(f"{name}: two columns have the same name: rename one")
+            names = [str(column) for column in frame.columns]
+            twice = next(column for column in columns if names.count(column) > 1)
+            raise CalibrationError(f"{name}: column '{twice}' occurs twice: rename one")
     elif isinstance(frame, Mapping):
         columns = {str(column): values for column, values in frame.items()}
     else:

@@ -250,7 +250,8 @@ def _by_names(table: ColumnTable, label: str) -> SourceMap:
     if time is None or not recognised:
         missing = "time" if time is None else "column with the name of a trial's column"
         raise CalibrationError(
-            f"{label}: no {missing}; its columns are {_column_list(table)}: write a map file and give it with --map"
+            f"{label}: no {missing}; its columns are {_column_list(table)}: describe them in a map file, such as "
+            f"'files: {{\"{label}\": {{time: COLUMN, columns: {{u: COLUMN}}}}}}', and give it with --map"
         )
     phase = "phase" if "phase" in table.words else None
     unit = "s" if time in table.numbers else "date"
