@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from finssim.pool.positioning import Mail, Shutter
+from finssim.pool.positioning import ArrivalQueue, Shutter
 
 SETTINGS = {"rate": 30.0, "exposure": 0.006, "latency": 0.045, "jitter": 0.0, "dropout": 0.0, "seed": 1}
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -65,10 +65,10 @@ def test_lost_pictures_leave_a_gap_in_the_sequence():
     assert found[-1].sequence > len(found)
 
 
-def test_mail_arrives_once_and_in_time():
+def test_pictures_arrive_once_and_in_time():
     """A picture is there from its arrival on, and given once."""
-    mail = Mail()
+    queue = ArrivalQueue()
     sent = exposures(1.0)
-    mail.post(sent)
-    assert mail.arrived(sent[3].arrival - 1e-6) == sent[:3]
-    assert mail.arrived(sent[3].arrival) == sent[3:4] and mail.arrived(99.0) == sent[4:]
+    queue.post(sent)
+    assert queue.arrived(sent[3].arrival - 1e-6) == sent[:3]
+    assert queue.arrived(sent[3].arrival) == sent[3:4] and queue.arrived(99.0) == sent[4:]

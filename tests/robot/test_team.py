@@ -86,7 +86,7 @@ def test_nothing_is_decided_before_all_have_been_heard():
 def test_everybody_has_a_turn_and_tells_nothing_of_an_unknown_place():
     """Every second, a third of a second after the first; NaN is kept to oneself."""
     team = Team("herder", (), period=1.0, turn=1.0 / 3.0)
-    times = [k / 60 for k in range(180) if team.tell(k / 60, reading(k / 60))]
+    times = [k / 60 for k in range(180) if team.datagrams_to_send(k / 60, reading(k / 60))]
     np.testing.assert_allclose(times, [1 / 3, 4 / 3, 7 / 3], atol=1 / 60)
     lost = Reading(5.0, np.full(3, np.nan), HERE.quaternion, HERE.nu, False)
-    assert team.tell(5.0, lost) == []
+    assert team.datagrams_to_send(5.0, lost) == []

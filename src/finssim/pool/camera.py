@@ -17,7 +17,7 @@ from finssim.localization.detection.detector import adjugate, from_square
 from finssim.localization.detection.families import bitmap, family_named
 from finssim.localization.overhead_camera import Pool
 from finssim.pool.plant_spec import Basin, PlantSpecError, Severity, basin_of, by_severity
-from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
+from finssim.pool.positioning import ArrivalQueue, Exposure, PoseAt, Shutter
 from finssim.robot.messages import Picture, TagCorners
 from finssim.sim import overhead_camera as oc
 from finssim.sim.overhead_camera import Ripples
@@ -676,7 +676,7 @@ class PoolCamera:
                 seed=seed,
             )
         self._shutter = s.shutter(seed)
-        self._mail = Mail()
+        self._arrivals = ArrivalQueue()
         self._R_pw, self._t_pw = site.T_pw[:3, :3], site.T_pw[:3, 3]
         self._q_pw = np.asarray(site.world_orientation)
 
@@ -695,8 +695,8 @@ class PoolCamera:
 
         Times are in [s].
         """
-        self._mail.post(self._shutter.advance(t0, t1, pose_at))
-        return self._mail.arrived(t1)
+        self._arrivals.post(self._shutter.advance(t0, t1, pose_at))
+        return self._arrivals.arrived(t1)
 
     def develop(self, exposure: Exposure) -> Picture:
         """Return the robot's picture of an exposure."""

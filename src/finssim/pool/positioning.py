@@ -89,7 +89,7 @@ class Shutter:
             self._sequence, self._opened = self._sequence + 1, None
 
 
-class Mail:
+class ArrivalQueue:
     """Queue of pictures before their arrival, in the order of arrival."""
 
     def __init__(self) -> None:
@@ -153,14 +153,14 @@ class Positioning:
         self._shutter = Shutter(
             rate=s.rate, exposure=0.0, latency=s.latency, jitter=s.jitter, dropout=s.dropout, seed=seed
         )
-        self._mail, self._random = Mail(), np.random.default_rng([seed, 0xF1])
+        self._arrivals, self._random = ArrivalQueue(), np.random.default_rng([seed, 0xF1])
 
     def advance(self, t0: float, t1: float, pose_at: PoseAt) -> list[tuple[float, bytes]]:
         """Return the frames that arrive in (t0, t1], each with its arrival [s], oldest first; `pose_at` as for a
         camera."""
-        self._mail.post(self._shutter.advance(t0, t1, pose_at))
+        self._arrivals.post(self._shutter.advance(t0, t1, pose_at))
         frames = []
-        for fix in self._mail.arrived(t1):
+        for fix in self._arrivals.arrived(t1):
             s, (position, quaternion) = self.settings, fix.start
             x = position + s.std * self._random.standard_normal(3)
             wrong, turned = self._random.random() < s.outliers, s.yaw_std * self._random.standard_normal()

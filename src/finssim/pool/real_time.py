@@ -150,7 +150,7 @@ def serve_realtime(
             if due and site.medium is not None:
                 sent[name] = runtime.step(now, frames[name], (), site.medium.receive(now, name))
                 frames[name] = []
-                for datagram in runtime.told:
+                for datagram in runtime.team_datagrams:
                     site.medium.send(now, name, datagram)
         steps = math.floor(now * RATE)
         if wires.messages is not None:

@@ -682,7 +682,7 @@ class Supervision:
         else:
             self.tilts["estimator"].accept(now, pose[1])
 
-    def danger(self, now: float) -> str:
+    def fault_reason(self, now: float) -> str:
         """Return the condition that must stop the thrusters until an operator acknowledges it; "" if there is none.
 
         `now` is the time [s].
@@ -710,7 +710,7 @@ class Supervision:
         side = "" if pose is None else self.workspace.left(pose[0])
         return side and f"left the workspace: {side}"
 
-    def want(self, now: float, since: float) -> str:
+    def hold_reason(self, now: float, since: float) -> str:
         """Return the transient condition that prevents thrust: no state, or no command, counted from `since` [s] on."""
         # The estimator first: without a state, a controller sends no commands.
         reason = self._estimator(now)
@@ -719,9 +719,9 @@ class Supervision:
         late = now - max(self.commander.received, since) > self.settings.command_timeout
         return f"no command for {self.settings.command_timeout:g} s" if late else ""
 
-    def unfit(self, now: float) -> str:
+    def arming_refusal(self, now: float) -> str:
         """Return why arming is refused; "" if it is not. `now` is the time [s]."""
-        reason = self.danger(now) or self._estimator(now)
+        reason = self.fault_reason(now) or self._estimator(now)
         if reason:
             return reason
         rivals = self.commander.sources(now)
@@ -973,30 +973,34 @@ class Bridge:
             return f"acknowledge the fault first: {self.reason}"
         if self.state != "disarmed":
             return f"it is in state {self.state} already"
-        return self._pause(now) or self._watchdogs.unfit(now)
+        return self._pause(now) or self._watchdogs.arming_refusal(now)
 
     def _watch(self, now: float) -> None:
         """Evaluate the watchdogs, and enter fault or hold, or continue."""
         lost = self.autopilot.alarm(now) if self.autopilot is not None else ""
-        danger = lost or self._watchdogs.danger(now)
-        if danger:
-            return self._fault(danger)
+        fault_reason = lost or self._watchdogs.fault_reason(now)
+        if fault_reason:
+            return self._fault(fault_reason)
         pause = self._pause(now)
-        want = "the operator holds" if self._operator else pause or self._watchdogs.want(now, self._armed_at)
-        if want and self.state == "armed":
-            self._hold(want)
+        hold_reason = (
+            "the operator holds"
+            if self._operator
+            else pause or self._watchdogs.hold_reason(now, self._armed_at)
+        )
+        if hold_reason and self.state == "armed":
+            self._hold(hold_reason)
         if self.state == "hold":
-            self._wait(now, want, limited=not pause)
+            self._wait(now, hold_reason, limited=not pause)
 
     def _pause(self, now: float) -> str:
         """Return the condition for which the device between bridge and motors waits; "" if none."""
         return self.autopilot.pause(now) if self.autopilot is not None else ""
 
-    def _wait(self, now: float, want: str, *, limited: bool) -> None:
+    def _wait(self, now: float, hold_reason: str, *, limited: bool) -> None:
         """Process a hold: continue with the first command after the condition passed, or fault after the limit, if
         any."""
-        if want:
-            self.reason, self._passed_at = want, None
+        if hold_reason:
+            self.reason, self._passed_at = hold_reason, None
         elif self._passed_at is None:
             self._passed_at = now
         elif self._commander.received > self._passed_at:

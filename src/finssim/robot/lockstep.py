@@ -318,7 +318,7 @@ def run_together(
                 sent[name] = runtime.step(now, delivery.frames, delivery.pictures, heard)
                 runtime.sent(now)
             for name, (runtime, _) in stacks.items() if carrier is not None else ():
-                for datagram in runtime.told:
+                for datagram in runtime.team_datagrams:
                     carrier.send(now, name, datagram)
             show()
             if until():

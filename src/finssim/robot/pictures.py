@@ -100,7 +100,7 @@ LARGEST = 64 * 2**20
 
 
 @dataclass(frozen=True)
-class Posted:
+class ReceivedPicture:
     """A picture and its sender's times."""
 
     picture: Picture
@@ -133,7 +133,7 @@ def encode_picture(picture: Picture, *, late: float = 0.0, compress: bool = Fals
     return b"".join([head, name, *tags, data])
 
 
-def decode_picture(data: bytes) -> Posted | None:
+def decode_picture(data: bytes) -> ReceivedPicture | None:
     """Return the picture; None if the bytes are invalid. Never raises an exception."""
     if len(data) < _HEAD.size:
         return None
@@ -158,7 +158,7 @@ def decode_picture(data: bytes) -> Posted | None:
         return None
     if ranges is not None and np.isnan(ranges).any():
         return None
-    return Posted(Picture(time, sequence, image, tags, source, ranges), late)
+    return ReceivedPicture(Picture(time, sequence, image, tags, source, ranges), late)
 
 
 def _tags(data: bytes, n: int) -> tuple[TagCorners, ...] | None:

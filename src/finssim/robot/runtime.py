@@ -284,7 +284,7 @@ class Runtime:
         self.perception = perception
         self.bridge = bridge or Bridge(vehicle)
         self.recorder, self.team = recorder, team
-        self.told: list[bytes] = []
+        self.team_datagrams: list[bytes] = []
         """Datagrams of the last step for the other vehicles."""
         self.counters = Counters()
         self.reading: Reading | None = None
@@ -321,7 +321,7 @@ class Runtime:
             heard: Datagrams from the other vehicles.
 
         Returns:
-            Datagrams to send to the motor controller now; those for the other vehicles are in `told`.
+            Datagrams to send to the motor controller now; those for the other vehicles are in `team_datagrams`.
         """
         self.counters.steps += 1
         self.intake.take(now, frames, pictures)
@@ -330,7 +330,7 @@ class Runtime:
         self.link.notes.clear()
         reading = self.perception.reading(now)
         if self.team is not None:
-            self.told = self.team.tell(now, reading)
+            self.team_datagrams = self.team.datagrams_to_send(now, reading)
             self.team.hear(now, heard)
             reading = self.team.known(reading)
         if self.intake.pictures:

@@ -124,7 +124,7 @@ class Team:
             return reading
         return replace(reading, ready=False, reason=f"nothing heard of {', '.join(missing)}")
 
-    def tell(self, now: float, reading: Reading) -> list[bytes]:
+    def datagrams_to_send(self, now: float, reading: Reading) -> list[bytes]:
         """Return the datagrams to send now: none outside this vehicle's turn, or while its position is unknown.
 
         `now` is the time [s].

@@ -106,7 +106,7 @@ def run_realtime(
                 if clock() - now < runtime.bridge.settings.command_timeout:
                     for data in outgoing:
                         transport.send(data)
-                for data in runtime.told if mates is not None else ():
+                for data in runtime.team_datagrams if mates is not None else ():
                     mates.send(data)
                 runtime.sent(clock())
                 show(runtime)

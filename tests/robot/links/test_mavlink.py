@@ -345,7 +345,7 @@ def test_a_quiet_instrument_has_not_frozen():
                 mavlink.MAVLink_attitude_message(round(1000 * now), tilt, 0.0, 0.0, tilt, 0.0, 0.0),
             ):
                 runtime.step(now, [(now, bytes(message.pack(auto)))])
-        return runtime.bridge._watchdogs.danger(now)
+        return runtime.bridge._watchdogs.fault_reason(now)
 
     assert "frozen" not in play(1.0, 1.0)
     assert "the quaternion and gyro has repeated" in play(3.0, 0.0)

@@ -11,7 +11,7 @@ import warp as wp
 
 from finssim.extensions.perception import RangeBatch, WorldBatch, WorldLayout, sensor_of
 from finssim.extensions.perception.description import World
-from finssim.pool.positioning import Exposure, Mail, PoseAt, Shutter
+from finssim.pool.positioning import ArrivalQueue, Exposure, PoseAt, Shutter
 from finssim.robot.messages import Picture
 from finssim.vehicles import Vehicle
 
@@ -78,7 +78,7 @@ class OnboardSensors:
         self.batch, self._seed = world, seed
         names = list(vehicle.perception) if names is None else names
         self.sensors = {name: sensor_of(world, vehicle, name) for name in names}
-        self._shutters, self._mail = Shutters(vehicle, names, seed), Mail()
+        self._shutters, self._arrivals = Shutters(vehicle, names, seed), ArrivalQueue()
         # Kernels are compiled before the start, and automatic exposure begins with pictures of the site.
         here = world.world.viewpoint.pose
         for name in [*names] * SETTLING:
@@ -93,8 +93,8 @@ class OnboardSensors:
             pose_at: Function of a time in [t0, t1] that returns position [m] and orientation (xyzw) of the
                 body, world frame.
         """
-        self._mail.post(self._shutters.advance(t0, t1, pose_at))
-        return [self.develop(exposure) for exposure in self._mail.arrived(t1)]
+        self._arrivals.post(self._shutters.advance(t0, t1, pose_at))
+        return [self.develop(exposure) for exposure in self._arrivals.arrived(t1)]
 
     def develop(self, exposure: Exposure) -> Picture:
         """Return the reading of the sensor that an exposure names."""
