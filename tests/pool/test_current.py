@@ -5,23 +5,23 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finssim.pool.plant import Gyre, circulation_at, gyre
+from finssim.pool.plant import CirculationData, circulation_at, circulation_data
 from finssim.pool.plant_spec import Basin, Circulation, Eddy
 
 EDDIES = (
     Eddy(cells=1, speed=0.03, unsteadiness=0.3, period=60.0, phase=0.4),
     Eddy(cells=2, speed=0.02, unsteadiness=0.2, period=90.0, phase=2.0, sense=-1),
 )
-GYRE = gyre(Circulation(eddies=EDDIES, floor_share=0.5), Basin())
+CIRCULATION = circulation_data(Circulation(eddies=EDDIES, floor_share=0.5), Basin())
 
 
 @wp.kernel(enable_backward=False)
-def evaluate(water: Gyre, place: wp.array(dtype=wp.vec3), t: float, out: wp.array(dtype=wp.vec3)):
+def evaluate(water: CirculationData, place: wp.array(dtype=wp.vec3), t: float, out: wp.array(dtype=wp.vec3)):
     i = wp.tid()
     out[i] = circulation_at(water, place[i], t)
 
 
-def at(places, t=0.0, water=GYRE):
+def at(places, t=0.0, water=CIRCULATION):
     """Velocities at some places, (k, 3)."""
     place = wp.array(np.asarray(places, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device="cpu")
     out = wp.zeros_like(place)
@@ -49,7 +49,7 @@ def test_no_water_appears_or_vanishes(x, y, t):
 def test_the_largest_speed_is_the_one_that_is_asked_for():
     """One cell of 0.05 m/s at the surface reaches that somewhere and exceeds it nowhere; sense 1 is anticlockwise."""
     alone = Eddy(cells=1, speed=0.05, unsteadiness=0.0, period=1.0, phase=0.0)
-    water = gyre(Circulation(eddies=(alone,)), Basin())
+    water = circulation_data(Circulation(eddies=(alone,)), Basin())
     grid = [(x, y, 0.0) for x in np.linspace(-2, 2, 41) for y in np.linspace(-1, 1, 41)]
     assert 0.049 < np.abs(at(grid, water=water)).max() < 0.05001
     right, top = at([(1.0, 0.0, 0.0), (0.0, 0.5, 0.0)], water=water)

@@ -6,7 +6,7 @@ import warp as wp
 
 from finssim.physics.types import vec6
 from finssim.pool import draw_plant
-from finssim.pool.plant import Plant, Slack, dragged_line, slack_line, slack_pull
+from finssim.pool.plant import Plant, SlackTetherData, dragged_line, slack_line, slack_pull
 from finssim.pool.plant_spec import Basin, Circulation, Eddy, HullDrag, SlackTether
 from finssim.vehicles import load_vehicle
 
@@ -16,7 +16,7 @@ TETHER = SlackTether(
 
 
 @wp.kernel(enable_backward=False)
-def evaluate(line: Slack, position: wp.vec3, out: wp.array(dtype=vec6)):
+def evaluate(line: SlackTetherData, position: wp.vec3, out: wp.array(dtype=vec6)):
     out[0] = slack_pull(line, position, wp.quat_identity())
 
 

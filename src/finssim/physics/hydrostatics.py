@@ -18,7 +18,7 @@ class WaterWrench:
 
 
 @wp.struct
-class Afloat:
+class BodyMotion:
     """Pose and motion of a vehicle: the input of a hydrodynamic model."""
 
     position: wp.vec3  # body origin, world frame [m]

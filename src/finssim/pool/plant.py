@@ -36,7 +36,7 @@ from finssim.vehicles.hydrodynamics import MeshSet
 
 
 @wp.struct
-class Gyre:
+class CirculationData:
     """Circulation, by mode."""
 
     count: int
@@ -53,7 +53,7 @@ class Gyre:
 
 
 @wp.func
-def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
+def circulation_at(circulation: CirculationData, position: wp.vec3, t: float) -> wp.vec3:
     """Return the velocity of the water, world frame [m/s].
 
     From the stream function psi = A sin(πX) sin(cπX) sin²(πY), with X and Y from wall to wall and c cells:
@@ -61,40 +61,42 @@ def circulation_at(gyre: Gyre, position: wp.vec3, t: float) -> wp.vec3:
     along y is A π / length for c = 1, that along x A π / width.
 
     Args:
-        gyre: The circulation.
+        circulation: The circulation.
         position: World frame [m].
         t: Time [s].
 
     Returns:
         The uniform current and, within the walls, the horizontal velocity of the eddies [m/s].
     """
-    X = position[0] / gyre.length + 0.5
-    Y = position[1] / gyre.width + 0.5
+    X = position[0] / circulation.length + 0.5
+    Y = position[1] / circulation.width + 0.5
     if X <= 0.0 or X >= 1.0 or Y <= 0.0 or Y >= 1.0:
-        return gyre.stream
+        return circulation.stream
     sx = wp.sin(wp.pi * X)
     cx = wp.cos(wp.pi * X)
     sy = wp.sin(wp.pi * Y)
     cy = wp.cos(wp.pi * Y)
-    height = wp.clamp(1.0 + position[2] / gyre.depth, 0.0, 1.0)
-    share = gyre.floor_share + (1.0 - gyre.floor_share) * height
+    height = wp.clamp(1.0 + position[2] / circulation.depth, 0.0, 1.0)
+    share = circulation.floor_share + (1.0 - circulation.floor_share) * height
     u = float(0.0)
     v = float(0.0)
-    for i in range(gyre.count):
-        c = gyre.cells[i]
+    for i in range(circulation.count):
+        c = circulation.cells[i]
         sc = wp.sin(c * wp.pi * X)
         cc = wp.cos(c * wp.pi * X)
-        now = gyre.speed[i] * (1.0 + gyre.unsteadiness[i] * wp.sin(gyre.rate[i] * t + gyre.phase[i]))
+        now = circulation.speed[i] * (
+            1.0 + circulation.unsteadiness[i] * wp.sin(circulation.rate[i] * t + circulation.phase[i])
+        )
         # A is chosen so that the larger of the two components has the mode's speed.
-        A = now * wp.min(gyre.width, gyre.length / c) / wp.pi
-        u += A * sx * sc * (2.0 * wp.pi / gyre.width) * sy * cy
-        v -= A * (wp.pi / gyre.length) * (cx * sc + c * sx * cc) * sy * sy
-    return gyre.stream + share * wp.vec3(u, v, 0.0)
+        A = now * wp.min(circulation.width, circulation.length / c) / wp.pi
+        u += A * sx * sc * (2.0 * wp.pi / circulation.width) * sy * cy
+        v -= A * (wp.pi / circulation.length) * (cx * sc + c * sx * cc) * sy * sy
+    return circulation.stream + share * wp.vec3(u, v, 0.0)
 
 
-def gyre(circulation: Circulation, basin: Basin, device: Any = "cpu") -> Gyre:
+def circulation_data(circulation: Circulation, basin: Basin, device: Any = "cpu") -> CirculationData:
     """Return the circulation as a struct for kernels."""
-    out = Gyre()
+    out = CirculationData()
     modes = circulation.eddies
     out.count = len(modes)
     out.length, out.width, out.depth = basin.length, basin.width, basin.depth
@@ -212,7 +214,7 @@ def propeller_bank(vehicle: Vehicle, spec: PlantSpec, device: Any = "cpu") -> Pr
 
 
 @wp.struct
-class Slack:
+class SlackTetherData:
     """Tether that pulls only near its full length; a stiffness of 0 means no tether."""
 
     anchor: wp.vec3  # world frame [m]
@@ -223,7 +225,7 @@ class Slack:
 
 
 @wp.func
-def slack_pull(line: Slack, position: wp.vec3, q: wp.quat) -> vec6:
+def slack_pull(line: SlackTetherData, position: wp.vec3, q: wp.quat) -> vec6:
     """Return the wrench of the tether on the vehicle about its origin, body frame [N, N m].
 
     With the distance e beyond the start and the distance s from there to straight: F = k e²/(2 s) for e < s, then
@@ -246,9 +248,9 @@ def slack_pull(line: Slack, position: wp.vec3, q: wp.quat) -> vec6:
     return join(force, wp.cross(line.attachment, force))
 
 
-def slack_line(tether: SlackTether | None) -> Slack:
+def slack_line(tether: SlackTether | None) -> SlackTetherData:
     """Return the tether as a struct for kernels."""
-    line = Slack()
+    line = SlackTetherData()
     if tether is not None:
         line.anchor, line.attachment = wp.vec3(*tether.anchor), wp.vec3(*tether.attachment)
         line.stretch = tether.slack_share * tether.length
@@ -514,8 +516,8 @@ class Machinery:
     motors: MotorBank
     propellers: PropellerBank
     hidden: Hidden
-    circulation: Gyre
-    line: Slack
+    circulation: CirculationData
+    line: SlackTetherData
 
 
 @wp.kernel(enable_backward=False)
@@ -631,7 +633,10 @@ class Plant:
             propellers,
             _hidden(vehicle, spec),
         )
-        machinery.circulation, machinery.line = gyre(spec.circulation, spec.basin), slack_line(spec.tether)
+        machinery.circulation, machinery.line = (
+            circulation_data(spec.circulation, spec.basin),
+            slack_line(spec.tether),
+        )
         # Different random numbers for every plant: consecutive seeds must not share any.
         key = int(np.random.SeedSequence([seed, 71]).generate_state(1)[0] >> 1)
         inputs = [s.state, s.command.array, s.water, machinery, self.step, motor_steps, key]

@@ -60,7 +60,7 @@ class StateDerivative:
 
 
 @wp.struct
-class Touch:
+class ContactLoads:
     """Wrench and forces of walls, a dock and the solids of a world on a vehicle."""
 
     tau: vec6  # wrench about the body origin, body frame [N, N m]

@@ -13,7 +13,7 @@ from finssim.physics.damping import twist_at, wrench_from
 from finssim.physics.funnel import Funnel, funnel_within, funnel_wrench
 from finssim.physics.hydrodynamics import HYDRODYNAMICS
 from finssim.physics.hydrodynamics.mesh import HullMesh, drag_slope
-from finssim.physics.hydrostatics import Afloat
+from finssim.physics.hydrostatics import BodyMotion
 from finssim.physics.inertia import (
     coriolis_wrench,
     rigid_body_momentum,
@@ -63,8 +63,8 @@ from finssim.physics.water import Flow, WaterArrays, flow_at
 from finssim.sim.midpoint import (
     DOCK_STEP,
     WALL_STEP,
+    ContactLoads,
     StateDerivative,
-    Touch,
     lead_of,
     relaxation_of,
     relaxed,
@@ -159,7 +159,7 @@ MODULE_OPTIONS = {
 
 
 @wp.struct
-class Course:
+class SubstepState:
     """State of a vehicle during the substeps of a control step."""
 
     start: wp.vec3  # body origin at the start of the control step, world frame [m]
@@ -235,7 +235,7 @@ class Rates:
 
 
 @wp.struct
-class Beat:
+class ControlStep:
     """The current control step."""
 
     step: int  # number since the reset
@@ -305,7 +305,7 @@ def relaxation_function(model: str, terms: tuple[Item, ...] = ()) -> Any:
 
     @wp.func
     def relaxed_by(
-        vehicles: Vehicles, hull: HullMesh, water: WaterArrays, w: int, v: int, body: Afloat, thrust: vec8,
+        vehicles: Vehicles, hull: HullMesh, water: WaterArrays, w: int, v: int, body: BodyMotion, thrust: vec8,
         share: vec6,
     ) -> vec6:  # fmt: skip
         """Return θ [-] of each axis by all of the damping, scaled by the fraction `share` [-] at the surface."""
@@ -401,7 +401,7 @@ def motion_function(
                 water_b = wp.quat_rotate_inv(q, flow.velocity)
                 if wp.static(added_mass):
                     nu_r = nu - join(water_b, wp.vec3(0.0))
-        body = Afloat()
+        body = BodyMotion()
         body.position = position
         body.q = q
         body.up = up
@@ -479,9 +479,9 @@ def contact_function(walls: bool, funnel: bool, solids: bool) -> Any:
     def contact_at(
         plant: wp.array2d(dtype=VehicleParameters), obstacles: Obstacles, clearing: wp.vec4, w: int, v: int,
         position: wp.vec3, q: wp.quat, nu: vec6,
-    ) -> Touch:  # fmt: skip
+    ) -> ContactLoads:  # fmt: skip
         """Return the wrench of walls, dock and solids, and the magnitudes of the forces of the latter two."""
-        out = Touch()
+        out = ContactLoads()
         if wp.static(walls):
             out.tau = contact_wrench(obstacles.walls, position, q, nu, plant[w, v].half_size)
         if wp.static(funnel):
@@ -504,15 +504,15 @@ def lag_function(speed_lag: bool, play: bool) -> Any:
 
     @wp.func
     def lag_at(
-        commands: wp.array3d(dtype=vec8), plant: wp.array2d(dtype=VehicleParameters), w: int, v: int, beat: Beat,
-        k: int, actuator: vec8,
+        commands: wp.array3d(dtype=vec8), plant: wp.array2d(dtype=VehicleParameters), w: int, v: int,
+        timing: ControlStep, k: int, actuator: vec8,
     ) -> Lagged:  # fmt: skip
         """Return the actuators in substep k: their values at its end, and the thrusts of their mean values."""
         out = Lagged()
-        max_change = beat.h * plant[w, v].slew
-        elapsed = float(wp.max(k, 0)) * beat.h
-        rate = 1.0 / beat.control_step
-        target = delayed_command(commands, w, v, beat.head, elapsed, plant[w, v].delay, beat.h, rate)
+        max_change = timing.h * plant[w, v].slew
+        elapsed = float(wp.max(k, 0)) * timing.h
+        rate = 1.0 / timing.control_step
+        target = delayed_command(commands, w, v, timing.head, elapsed, plant[w, v].delay, timing.h, rate)
         if wp.static(play):
             target = beyond_play(target, actuator, plant[w, v].play)
         mean = first_order(actuator, target, plant[w, v].beta, 0.5 * max_change)
@@ -540,27 +540,29 @@ def recoil_function(speed_lag: bool, terms: tuple[Item, ...]) -> Any:
         return mass_matrix(plant.mass, r_g, plant.inertia + symmetric_inertia(shift), plant.M_A)
 
     @wp.func
-    def recoiled(vehicles: Vehicles, density: float, w: int, v: int, before: vec8, course: Course) -> Course:
-        """Return the course after the masses have moved from their positions `before`, with conserved momentum.
+    def recoiled(
+        vehicles: Vehicles, density: float, w: int, v: int, before: vec8, motion: SubstepState
+    ) -> SubstepState:
+        """Return the state after the masses have moved from their positions `before`, with conserved momentum.
 
         d = -M⁻¹ (c - c_before),   π = M_before nu,   nu' = M⁻¹ (π - C(d) π)
 
         The body is displaced by d, where the rate of c is the masses' momentum relative to the body. nu is the body's
         velocity when the masses are at rest: M nu is the total momentum.
         """
-        out = course
-        q, nu, plant = course.quaternion, course.velocity, vehicles.plant[w, v]
+        out = motion
+        q, nu, plant = motion.quaternion, motion.velocity, vehicles.plant[w, v]
         up = up_in_body(q)
-        depth = -(course.start[2] + course.moved[2])
+        depth = -(motion.start[2] + motion.moved[2])
         last = thrust_of(vehicles.plant, w, v, before)
-        now = thrust_of(vehicles.plant, w, v, course.actuator)
+        now = thrust_of(vehicles.plant, w, v, motion.actuator)
         change = carried(vehicles.extra, w, v, nu, up, depth, density, now)
         change -= carried(vehicles.extra, w, v, nu, up, depth, density, last)
         momentum = carrying(plant, mass_shift(vehicles.extra, w, v, nu, up, depth, density, last)) * nu
         M = carrying(plant, mass_shift(vehicles.extra, w, v, nu, up, depth, density, now))
         d = solve_spd(M, -change)
         out.velocity = solve_spd(M, momentum - coriolis_wrench(momentum, d))
-        out.moved = course.moved + wp.quat_rotate(q, linear(d))
+        out.moved = motion.moved + wp.quat_rotate(q, linear(d))
         out.quaternion = rotate_by(q, angular(d), 1.0)
         out.x_dot = position_rate(out.quaternion, out.velocity)
         return out
@@ -593,10 +595,10 @@ def rates_function(features: Features) -> Any:
         on.t = start.t + h
         on.t_step = start.t_step + h
         if wp.static(contacts):
-            touch = contact_at(
+            loads = contact_at(
                 vehicles.plant, around.obstacles, clearing, w, v, on.position, on.quaternion, on.velocity
             )
-            on.other += touch.tau
+            on.other += loads.tau
         out.x_dot = position_rate(on.quaternion, on.velocity)
         out.q_dot = quaternion_rate(on.quaternion, angular(on.velocity))
         out.nu_dot = motion_at(vehicles, around.hull, around.water, around.tether, w, v, on).nu_dot
@@ -614,34 +616,34 @@ def runge_kutta_function(features: Features) -> Any:
 
     @wp.func
     def substep(
-        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
-        k: int, course: Course,
-    ) -> Course:  # fmt: skip
-        """Return the course after substep k."""
-        out = Course()
-        h = beat.h
-        q = course.quaternion
-        clearing = course.clearing
-        lagged = lag_at(commands, vehicles.plant, w, v, beat, k, course.actuator)
+        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int,
+        timing: ControlStep, k: int, motion: SubstepState,
+    ) -> SubstepState:  # fmt: skip
+        """Return the state after substep k."""
+        out = SubstepState()
+        h = timing.h
+        q = motion.quaternion
+        clearing = motion.clearing
+        lagged = lag_at(commands, vehicles.plant, w, v, timing, k, motion.actuator)
         start = Instant()
-        start.position = course.start + course.moved
+        start.position = motion.start + motion.moved
         start.quaternion = q
-        start.velocity = course.velocity
+        start.velocity = motion.velocity
         start.thrust = lagged.thrust
         start.pushed = lagged.pushed
         start.other = vehicles.command[w, v].disturbance
         start.t_step = float(k) * h
-        start.t = float(beat.step) * beat.control_step + start.t_step
-        out.greatest = course.greatest
-        out.impulse = course.impulse
-        out.struck = course.struck
+        start.t = float(timing.step) * timing.control_step + start.t_step
+        out.greatest = motion.greatest
+        out.impulse = motion.impulse
+        out.struck = motion.struck
         if wp.static(contacts):
-            touch = contact_at(
+            loads = contact_at(
                 vehicles.plant, around.obstacles, clearing, w, v, start.position, q, start.velocity
             )
-            out.greatest = wp.max(course.greatest, touch.push)
-            out.impulse = course.impulse + h * touch.push
-            out.struck = wp.max(course.struck, touch.strike)
+            out.greatest = wp.max(motion.greatest, loads.push)
+            out.impulse = motion.impulse + h * loads.push
+            out.struck = wp.max(motion.struck, loads.strike)
         rates, mean = Rates(), Rates()
         # Warp unrolls loops over constants: four copies of the equation of motion would be slower to compile and run.
         stages = int(4)
@@ -653,15 +655,15 @@ def runge_kutta_function(features: Features) -> Any:
             mean.x_dot += share * rates.x_dot
             mean.q_dot += share * rates.q_dot
             mean.nu_dot += share * rates.nu_dot
-        out.start = course.start
-        out.moved = course.moved + h * mean.x_dot
+        out.start = motion.start
+        out.moved = motion.moved + h * mean.x_dot
         out.quaternion = wp.normalize(q + h * mean.q_dot)
-        out.velocity = course.velocity + h * mean.nu_dot
+        out.velocity = motion.velocity + h * mean.nu_dot
         out.actuator = lagged.after
         out.coasting = rates.nu_dot - lagged.pushed
         out.x_dot = position_rate(out.quaternion, out.velocity)
-        out.jerk = course.jerk
-        out.pressed = course.pressed
+        out.jerk = motion.jerk
+        out.pressed = motion.pressed
         out.clearing = clearing
         return out
 
@@ -683,23 +685,23 @@ def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
         h: float,
         wet: float,
         nu_dot: vec6,
-        course: Course,
-    ) -> Course:
-        """Return the course after a substep [s] of a vehicle that may be in contact, in shorter steps."""
-        out = Course()
-        out.start = course.start
-        out.clearing = course.clearing
-        out.actuator = course.actuator
-        out.coasting = course.coasting
-        out.jerk = course.jerk
-        moved = course.moved
-        q = course.quaternion
-        nu = course.velocity
-        x_dot = course.x_dot
+        motion: SubstepState,
+    ) -> SubstepState:
+        """Return the state after a substep [s] of a vehicle that may be in contact, in shorter steps."""
+        out = SubstepState()
+        out.start = motion.start
+        out.clearing = motion.clearing
+        out.actuator = motion.actuator
+        out.coasting = motion.coasting
+        out.jerk = motion.jerk
+        moved = motion.moved
+        q = motion.quaternion
+        nu = motion.velocity
+        x_dot = motion.x_dot
         pressed = vec6()
-        greatest = course.greatest
-        impulse = course.impulse
-        struck = course.struck
+        greatest = motion.greatest
+        impulse = motion.impulse
+        struck = motion.struck
         parts = int(wp.ceil(h / wp.static(contact_step) - 1.0e-4))
         if wp.static(solids):
             parts = wp.max(parts, int(wp.ceil(h / obstacles.solids.step - 1.0e-4)))
@@ -707,11 +709,11 @@ def bump_function(walls: bool, funnel: bool, solids: bool) -> Any:
         for _ in range(parts):
             moved = moved + 0.5 * d * x_dot
             q = rotate_by(q, angular(nu), 0.5 * d)
-            touch = contact_at(vehicles.plant, obstacles, course.clearing, w, v, course.start + moved, q, nu)
-            greatest = wp.max(greatest, touch.push)
-            impulse += d * touch.push
-            struck = wp.max(struck, touch.strike)
-            push = yielding(vehicles.plant, w, v, wet, touch.tau)
+            loads = contact_at(vehicles.plant, obstacles, motion.clearing, w, v, motion.start + moved, q, nu)
+            greatest = wp.max(greatest, loads.push)
+            impulse += d * loads.push
+            struck = wp.max(struck, loads.strike)
+            push = yielding(vehicles.plant, w, v, wet, loads.tau)
             pressed += push / float(parts)
             nu = nu + d * (nu_dot + push)
             q = rotate_by(q, angular(nu), 0.5 * d)
@@ -742,20 +744,20 @@ def nearness_function(walls: bool, funnel: bool, solids: bool) -> Any:
         h: float,
         half_size: wp.vec3,
         guess: vec6,
-        course: Course,
+        motion: SubstepState,
     ) -> bool:
         """Return True if a vehicle could touch something within a substep h [s], at an estimate of its
         acceleration."""
         near = bool(False)  # a variable, because Warp only lets branches change variables
-        nu = course.velocity
+        nu = motion.velocity
         turn = wp.length(angular(nu)) + h * wp.length(angular(guess))
         slack = wp.length(linear(nu)) + h * wp.length(linear(guess)) + turn * wp.length(half_size)
         if wp.static(walls):
-            near = walls_within(obstacles.walls, position, course.quaternion, half_size, h * slack)
+            near = walls_within(obstacles.walls, position, motion.quaternion, half_size, h * slack)
         if wp.static(funnel):
             near = near or funnel_within(obstacles.funnel, w, position, half_size, h * slack)
         if wp.static(solids):
-            near = near or solids_within(course.clearing, position, half_size, h * slack)
+            near = near or solids_within(motion.clearing, position, half_size, h * slack)
         return near
 
     return is_near
@@ -771,32 +773,32 @@ def midpoint_function(features: Features) -> Any:
 
     @wp.func
     def substep(
-        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int, beat: Beat,
-        k: int, course: Course,
-    ) -> Course:  # fmt: skip
-        """Return the course after substep k; -1 only computes the extrapolation."""
-        out = Course()
-        h = beat.h
-        q = course.quaternion
-        nu = course.velocity
-        position = course.start + course.moved
+        commands: wp.array3d(dtype=vec8), vehicles: Vehicles, around: SimSurroundings, w: int, v: int,
+        timing: ControlStep, k: int, motion: SubstepState,
+    ) -> SubstepState:  # fmt: skip
+        """Return the state after substep k; -1 only computes the extrapolation."""
+        out = SubstepState()
+        h = timing.h
+        q = motion.quaternion
+        nu = motion.velocity
+        position = motion.start + motion.moved
         step_h = wp.where(k < 0, 0.0, 1.0) * h
-        lagged = lag_at(commands, vehicles.plant, w, v, beat, k, course.actuator)
-        guess = course.coasting + lagged.pushed
+        lagged = lag_at(commands, vehicles.plant, w, v, timing, k, motion.actuator)
+        guess = motion.coasting + lagged.pushed
         near = bool(False)
         if wp.static(contacts):
             half_size = vehicles.plant[w, v].half_size
-            near = is_near(around.obstacles, w, position, h, half_size, guess, course)
+            near = is_near(around.obstacles, w, position, h, half_size, guess, motion)
         # A vehicle that leans on a wall does not fall through it, so the water's forces must not include such a fall.
         # The predicted push of a wall stops a vehicle at most: a predicted rebound would amplify itself. A dock's push
         # is short.
         lead = h * lead_of(nu, h)
         nu_middle = nu + lead * guess
-        push_ahead = lead * course.pressed
+        push_ahead = lead * motion.pressed
         if wp.static(not funnel):
             push_ahead = wp.min(wp.max(push_ahead, wp.min(-nu_middle, vec6())), wp.max(-nu_middle, vec6()))
         middle = Instant()
-        middle.position = position + 0.5 * h * course.x_dot
+        middle.position = position + 0.5 * h * motion.x_dot
         middle.quaternion = q + 0.5 * h * quaternion_rate(q, angular(nu))
         middle.velocity = nu_middle + push_ahead
         middle.before = nu
@@ -804,21 +806,21 @@ def midpoint_function(features: Features) -> Any:
         middle.pushed = lagged.pushed
         middle.other = vehicles.command[w, v].disturbance
         middle.t_step = float(wp.max(k, 0)) * h + 0.5 * h
-        middle.t = float(beat.step) * beat.control_step + middle.t_step
+        middle.t = float(timing.step) * timing.control_step + middle.t_step
         middle.h = h
-        motion = motion_at(vehicles, around.hull, around.water, around.tether, w, v, middle)
-        nu_dot = relaxed(motion.nu_dot, guess, motion.relaxation, vehicles.plant[w, v].r_m)
-        out.start = course.start
-        out.clearing = course.clearing
-        out.moved = course.moved
+        derivative = motion_at(vehicles, around.hull, around.water, around.tether, w, v, middle)
+        nu_dot = relaxed(derivative.nu_dot, guess, derivative.relaxation, vehicles.plant[w, v].r_m)
+        out.start = motion.start
+        out.clearing = motion.clearing
+        out.moved = motion.moved
         out.quaternion = q
         out.velocity = nu
-        out.x_dot = course.x_dot
-        out.greatest = course.greatest
-        out.impulse = course.impulse
-        out.struck = course.struck
-        out.actuator = course.actuator
-        out.pressed = course.pressed
+        out.x_dot = motion.x_dot
+        out.greatest = motion.greatest
+        out.impulse = motion.impulse
+        out.struck = motion.struck
+        out.actuator = motion.actuator
+        out.pressed = motion.pressed
         out.jerk = nu_dot - guess
         out.coasting = nu_dot - lagged.pushed
         if k >= 0:
@@ -829,10 +831,10 @@ def midpoint_function(features: Features) -> Any:
             out.quaternion = rotate_by(q, 0.5 * (angular(nu) + angular(nu_new)), step_h)
             out.velocity = nu_new
             out.x_dot = position_rate(out.quaternion, nu_new)
-            out.moved = course.moved + 0.5 * step_h * course.x_dot + 0.5 * step_h * out.x_dot
+            out.moved = motion.moved + 0.5 * step_h * motion.x_dot + 0.5 * step_h * out.x_dot
         else:
             if wp.static(contacts):
-                out = bump(vehicles, around.obstacles, w, v, h, motion.wet, nu_dot, out)
+                out = bump(vehicles, around.obstacles, w, v, h, derivative.wet, nu_dot, out)
         return out
 
     return substep
@@ -840,13 +842,13 @@ def midpoint_function(features: Features) -> Any:
 
 @cache
 def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
-    """Return the Warp functions that start the course of a control step and that write its final state."""
+    """Return the Warp functions that begin a control step and that write its final state."""
     thrust_of = thrust_function(speed_lag)
 
     @wp.func
-    def set_out(state: State, vehicles: Vehicles, w: int, v: int, head: int) -> Course:
-        """Return the course at the start of a control step, with the newest command in the delay line."""
-        out = Course()
+    def begin_step(state: State, vehicles: Vehicles, w: int, v: int, head: int) -> SubstepState:
+        """Return the state at the start of a control step, with the newest command in the delay line."""
+        out = SubstepState()
         plant = vehicles.plant
         newest = admissible(
             vehicles.command[w, v].thrust, plant[w, v].force_min, plant[w, v].force_max, plant[w, v].dead_minus,
@@ -868,33 +870,39 @@ def ends_of(speed_lag: bool, funnel: bool, solids: bool) -> tuple[Any, Any]:
         return out
 
     @wp.func
-    def arrive(
-        state: State, vehicles: Vehicles, around: SimSurroundings, w: int, v: int, slot: int, course: Course
+    def end_step(
+        state: State,
+        vehicles: Vehicles,
+        around: SimSurroundings,
+        w: int,
+        v: int,
+        slot: int,
+        motion: SubstepState,
     ):
         """Write the final state of the vehicle, unless a number stopped being finite."""
-        position = course.start + course.moved
-        q = wp.normalize(course.quaternion)
-        state.history[slot, w, v] = snapshot(position, q, course.velocity)
-        if not is_finite(position, q, course.velocity):
+        position = motion.start + motion.moved
+        q = wp.normalize(motion.quaternion)
+        state.history[slot, w, v] = snapshot(position, q, motion.velocity)
+        if not is_finite(position, q, motion.velocity):
             state.broken[w] = 1
             return
         now = state.vehicle
         now[w, v].position = position
         now[w, v].quaternion = q
-        now[w, v].velocity = course.velocity
-        delivered = thrust_of(vehicles.plant, w, v, course.actuator)
+        now[w, v].velocity = motion.velocity
+        delivered = thrust_of(vehicles.plant, w, v, motion.actuator)
         now[w, v].acceleration = (
-            course.coasting + 0.5 * course.jerk + course.pressed + vehicles.plant[w, v].G * delivered
+            motion.coasting + 0.5 * motion.jerk + motion.pressed + vehicles.plant[w, v].G * delivered
         )
-        now[w, v].coasting = course.coasting
-        now[w, v].pressed = course.pressed
-        now[w, v].actuator = course.actuator
+        now[w, v].coasting = motion.coasting
+        now[w, v].pressed = motion.pressed
+        now[w, v].actuator = motion.actuator
         now[w, v].thrust = delivered
         if wp.static(funnel):
-            around.obstacles.funnel.force[w, v] = course.greatest
-            around.obstacles.funnel.impulse[w, v] = course.impulse
+            around.obstacles.funnel.force[w, v] = motion.greatest
+            around.obstacles.funnel.impulse[w, v] = motion.impulse
 
-    return set_out, arrive
+    return begin_step, end_step
 
 
 @cache
@@ -909,7 +917,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
     """
     runge_kutta, solids = features.runge_kutta, features.solids
     substep = (runge_kutta_function if runge_kutta else midpoint_function)(features)
-    set_out, arrive = ends_of(features.speed_lag, features.funnel, solids)
+    begin_step, end_step = ends_of(features.speed_lag, features.funnel, solids)
     recoiled = recoil_function(features.speed_lag, features.terms)
 
     @wp.func
@@ -923,11 +931,11 @@ def physics_kernel(features: Features) -> wp.Kernel:
         v: int,
     ):
         """Simulate one control step of one vehicle."""
-        beat = Beat()
-        beat.step = state.steps[w]
-        beat.control_step = control_step
-        beat.h = control_step / float(substeps)
-        slot = beat.step % wp.static(HISTORY)
+        timing = ControlStep()
+        timing.step = state.steps[w]
+        timing.control_step = control_step
+        timing.h = control_step / float(substeps)
+        slot = timing.step % wp.static(HISTORY)
         thrust = vehicles.command[w, v].thrust
         disturbance = vehicles.command[w, v].disturbance
         if not is_finite(wp.vec3(0.0), wp.quat_identity(), disturbance) or not wp.isfinite(
@@ -937,20 +945,20 @@ def physics_kernel(features: Features) -> wp.Kernel:
             state.history[slot, w, v] = snapshot(now[w, v].position, now[w, v].quaternion, now[w, v].velocity)
             state.broken[w] = 1
             return
-        beat.head = beat.step % state.commands.shape[2]
-        course = set_out(state, vehicles, w, v, beat.head)
+        timing.head = timing.step % state.commands.shape[2]
+        motion = begin_step(state, vehicles, w, v, timing.head)
         first = int(0)
         if wp.static(not runge_kutta):
             # The first substep of an episode has nothing to extrapolate: it is computed twice, at first without motion.
-            first = wp.where(beat.step == 0, -1, 0)
+            first = wp.where(timing.step == 0, -1, 0)
         for k in range(first, substeps):
-            after = substep(state.commands, vehicles, around, w, v, beat, k, course)
+            after = substep(state.commands, vehicles, around, w, v, timing, k, motion)
             if wp.static(recoiled is not None):
-                after = recoiled(vehicles, around.water.density, w, v, course.actuator, after)
-            course = after
-        arrive(state, vehicles, around, w, v, slot, course)
+                after = recoiled(vehicles, around.water.density, w, v, motion.actuator, after)
+            motion = after
+        end_step(state, vehicles, around, w, v, slot, motion)
         if wp.static(solids):
-            around.obstacles.solids.force[w, v] = course.struck
+            around.obstacles.solids.force[w, v] = motion.struck
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_step(
@@ -970,7 +978,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
     if not features.lanes:
         return physics_step
 
-    blocks = lane_blocks(set_out, substep, arrive, row_length(features.terms), features.parts)
+    blocks = lane_blocks(begin_step, substep, end_step, row_length(features.terms), features.parts)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=MODULE_OPTIONS)
     def physics_blocks(
@@ -1000,7 +1008,7 @@ WIDE = {"half_length": 1e3, "half_width": 1e3, "depth": 1e3}
 """Example of a pool with distant walls."""
 
 
-def lane_blocks(set_out: Any, substep: Any, arrive: Any, term_numbers: int, parts: int) -> Any:
+def lane_blocks(begin_step: Any, substep: Any, end_step: Any, term_numbers: int, parts: int) -> Any:
     """Return a native function that simulates a group of worlds for a control step, traced from the functions for one.
 
     It excludes worlds whose episode has just begun, that are frozen, whose command is not finite, or that are near a
@@ -1033,17 +1041,17 @@ def lane_blocks(set_out: Any, substep: Any, arrive: Any, term_numbers: int, part
     control_step = trace.symbol("F", "control", 0.1)
     for number in command[0, 0].thrust.numbers + command[0, 0].disturbance.numbers:
         trace.require(trace.apply("M", "finite({})", math.isfinite, number))
-    loop = LaneLoop(trace, "course", lane_function(set_out)(state, vehicles, 0, 0, head))
+    loop = LaneLoop(trace, "motion", lane_function(begin_step)(state, vehicles, 0, 0, head))
     trace.level = 1
     trace.sections[1].append("const I k = all_i(pass);")
     k = trace.symbol("I", "k", 1)
     trace.assume(k < 0, False)
     trace.assume(k >= 0, True)
-    beat = SimpleNamespace(step=step, head=head, control_step=control_step, h=h)
+    timing = SimpleNamespace(step=step, head=head, control_step=control_step, h=h)
     with trace.exploration():
-        loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, beat, k, loop.value()))
+        loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, timing, k, loop.value()))
     trace.level = 2
-    lane_function(arrive)(state, vehicles, around, 0, 0, slot, loop.value())
+    lane_function(end_step)(state, vehicles, around, 0, 0, slot, loop.value())
     source = group_source(
         trace,
         [row, commands, history],

@@ -7,7 +7,7 @@ import warp as wp
 from finssim.physics.damping import damping_wrench, twist_at, wrench_from
 from finssim.physics.hydrodynamics.mesh import HullMesh
 from finssim.physics.hydrostatics import (
-    Afloat,
+    BodyMotion,
     WaterWrench,
     hydrostatic_wrench,
     submerged_fraction,
@@ -25,7 +25,7 @@ def fossen_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    body: Afloat,
+    body: BodyMotion,
     flow: Flow,
 ) -> WaterWrench:
     """Return the hydrostatic and damping wrench of a submerged or surfaced vehicle.

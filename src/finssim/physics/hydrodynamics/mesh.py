@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.core.mesh import check_closed, face_geometry, mesh_centroid, mesh_volume
-from finssim.physics.hydrostatics import Afloat, WaterWrench, hydrostatic_wrench
+from finssim.physics.hydrostatics import BodyMotion, WaterWrench, hydrostatic_wrench
 from finssim.physics.lanes import sum_in_lanes
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.types import angular, join, linear, mat66, vec6, vec8
@@ -374,7 +374,7 @@ def mesh_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    body: Afloat,
+    body: BodyMotion,
     flow: Flow,
 ) -> WaterWrench:
     """Return the wrench on the part of a hull mesh below the instantaneous surface: buoyancy, form drag and skin drag.

@@ -6,7 +6,7 @@ import warp as wp
 
 from finssim.physics.hydrodynamics.fossen import fossen_wrench
 from finssim.physics.hydrodynamics.mesh import HullMesh
-from finssim.physics.hydrostatics import Afloat, WaterWrench
+from finssim.physics.hydrostatics import BodyMotion, WaterWrench
 from finssim.physics.plant import VehicleParameters
 from finssim.physics.water import Flow, WaterArrays
 
@@ -18,7 +18,7 @@ def simplified_wrench(
     water: WaterArrays,
     w: int,
     v: int,
-    body: Afloat,
+    body: BodyMotion,
     flow: Flow,
 ) -> WaterWrench:
     """Return the hydrostatic and damping wrench: tau_H + tau_D(nu)                       (paper, eq. 5)
@@ -38,7 +38,7 @@ def simplified_wrench(
     Returns:
         Same as `fossen_wrench`, with a displaced mass of 0.
     """
-    own = Afloat()
+    own = BodyMotion()
     own.position = body.position
     own.q = body.q
     own.up = body.up
