@@ -33,6 +33,7 @@ def fail(kind: str, number: int = 0):
         raise KeyboardInterrupt
     errors = {
         "refused": OurError("minnow.yaml: mass is -1,\n   expected above 0"),
+        "several": OurError("minnow.yaml: mass is -1\nminnow.yaml: size is 0"),
         "output": OutputError("cannot write x: the disk is full"),
         "system": FileNotFoundError(2, "No such file or directory", "plant.yaml"),
         "fault-key": KeyError("x"),
@@ -51,6 +52,7 @@ def other():
     ("words", "sentence"),
     [
         (["fail", "refused"], "minnow.yaml: mass is -1, expected above 0"),
+        (["fail", "several"], "minnow.yaml: mass is -1; minnow.yaml: size is 0"),
         (["fail", "memory"], "not enough memory: Unable to allocate 83.7 TiB: ask for less"),
         (["fail", "output"], "cannot write x: the disk is full"),
         (["fail", "system"], "plant.yaml: No such file or directory"),

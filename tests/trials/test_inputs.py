@@ -278,6 +278,18 @@ def test_inputs_have_an_end(after, last, ends, pushes):
         assert (np.abs(tau[t > 4.5]).max() > 1.0) == bool(pushes)
 
 
+def test_pulses_in_another_unit_are_not_fitted():
+    """Normalised values and ms taken for µs; a column of zeros, which a disarmed autopilot logs, is none."""
+    t = np.linspace(0.0, 4.0, 40)
+    for scale, wrong in ((1.0, False), (1e-3, True), (0.0, False)):
+        made = trial(
+            {"pwm_T1": scale * (1500.0 + 100.0 * np.sin(t)), "pwm_T2": 0.0 * t, "u": 0.1 * np.sin(t)}, t
+        )
+        assert [one.code for one in implausible(made)] == (["pulse_unit"] if wrong else [])
+    normalised = trial({"pwm_T1": np.sin(t), "u": 0.1 * np.sin(t)}, t)
+    assert "pwm_T1 are -0.7568 to 0.9995 µs" in implausible(normalised)[0].text
+
+
 @pytest.mark.parametrize(
     ("speed", "passive", "code"),
     [

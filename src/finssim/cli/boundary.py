@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -132,4 +133,5 @@ def _is_ours(module: str, script: str) -> bool:
 
 
 def _say(sentence: str) -> None:
+    sentence = re.sub(r"\n(?=\S)", "; ", sentence.strip())  # a line that is not indented is a further fault
     print(f"finssim: {' '.join(sentence.split())}", file=sys.stderr)

@@ -34,6 +34,8 @@ BEYOND = 5.0
 file cannot explain a log."""
 FEW = 97.0
 """Percentile of a speed that is evaluated: a wrong unit affects all samples; outliers are handled by the fit."""
+PULSES = (500.0, 2500.0)
+"""Least and greatest pulse width of any speed controller [µs]; 0 means no pulse."""
 ADRIFT = 1.0
 """Speed that a vehicle may have due to water, waves or handling [m/s]."""
 
@@ -64,7 +66,7 @@ def require_fittable(trials: Sequence[Trial], vehicle: Vehicle) -> None:
 
 
 def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return findings about impossible speeds, and about speeds or kinetic energy that the thrust cannot explain.
+    """Return findings about impossible speeds and pulses, and about motion that the thrust cannot explain.
 
     Args:
         trial: Trial as read.
@@ -78,6 +80,11 @@ def implausible(trial: Trial, vehicle: Vehicle | None = None) -> list[Finding]:
         for name, speed in fastest.items()
         if speed > LIMITS[name]
     ]
+    pulses = {name: trial.series(name)[1] for name in trial.channels if name.startswith("pwm_")}
+    values = np.concatenate([*pulses.values(), np.empty(0)])
+    if np.any(values != 0.0) and not np.any((values >= PULSES[0]) & (values <= PULSES[1])):
+        ends = {"least": float(values.min()), "greatest": float(values.max())}
+        findings.append(finding("pulse_unit", columns=tuple(pulses), **ends))
     if findings or vehicle is None or trial.header.passive:
         return findings
     if isinstance(vehicle.hydrodynamics.get("calibrated"), HydrodynamicSet):

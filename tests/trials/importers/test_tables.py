@@ -318,6 +318,24 @@ def test_a_folder_with_other_files_is_not_overwritten(folder, tmp_path):
     assert (tmp_path / "out" / "log" / "notes.txt").read_text() == "mine"
 
 
+def test_an_earlier_trial_of_the_same_name_is_replaced_with_a_notice(folder, tmp_path, capsys):
+    """The notice is about other data only: the same log may be imported again."""
+    out = tmp_path / "out"
+    for function, replaced in ((np.sin, False), (np.sin, False), (np.cos, True)):
+        import_trials(folder(log__csv=table({"u": function})), out=out)
+        assert ("log: replaced an earlier trial with other data" in capsys.readouterr().err) == replaced
+
+
+def test_two_tables_of_one_name_are_refused(tmp_path):
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "dive.csv").write_text(table({"u": np.sin}))
+    with pytest.raises(
+        CalibrationError, match="b/dive.csv have the same name, 'dive', which names the trial"
+    ):
+        read_trials([tmp_path / "a" / "dive.csv", tmp_path / "b" / "dive.csv"])
+
+
 @pytest.mark.parametrize("name", ["hinsdale.yaml", "full.yaml", "dive.yaml", "bag.yaml"])
 def test_the_maps_of_the_page_are_maps(tmp_path, name):
     """What the page prints can be read."""

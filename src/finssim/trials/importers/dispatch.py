@@ -17,7 +17,7 @@ from finssim.trials.importers.column_map import ColumnMap, SourceMap, SplitRule,
 from finssim.trials.importers.log import Request, TrialStreams, importer_of
 from finssim.trials.importers.table import SUFFIXES, read_stream
 from finssim.trials.trial import Trial
-from finssim.trials.trial_files import write_trial
+from finssim.trials.trial_files import load_trial, write_trial
 from finssim.vehicles import load_vehicle
 
 
@@ -61,11 +61,24 @@ def import_trials(
     folders = []
     for trial in read_trials(logs, column_map=column_map, format=format, vehicle=vehicle, split=split):
         folders.append(Path(out) / trial.name)
+        differs = _differs(folders[-1], trial)
         write_trial(trial, folders[-1])
+        if differs:
+            print(
+                f"{trial.name}: replaced an earlier trial with other data in {folders[-1]}", file=sys.stderr
+            )
         for item in trial.findings:
             print(item.about(trial.name), file=sys.stderr)
     print_folders(folders, as_json)
     return folders
+
+
+def _differs(folder: Path, trial: Trial) -> bool:
+    """Return whether a folder contains another trial with other data."""
+    try:
+        return folder.is_dir() and load_trial(folder).sha256 != trial.sha256
+    except CalibrationError:
+        return False
 
 
 def read_trials(
@@ -148,7 +161,13 @@ def _table_logs(paths: list[Path], mapped: ColumnMap, has_map: bool) -> list[tup
         patterns = [pattern for pattern, _, _ in sources]
         for pattern in patterns:
             if patterns.count(pattern) > 1:
-                twice = ", ".join(path.name for p, path, _ in sources if p == pattern)
+                same = [path for p, path, _ in sources if p == pattern]
+                if not pattern:
+                    raise CalibrationError(
+                        f"{', '.join(map(str, same))} have the same name, '{trial}', which names the trial: rename "
+                        "one, or import them to different folders"
+                    )
+                twice = ", ".join(path.name for path in same)
                 raise CalibrationError(
                     f"{twice} all fit {pattern} of the map for one trial: use {{trial}} in it"
                 )
