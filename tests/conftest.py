@@ -1,11 +1,13 @@
-"""What every test shares: one thread per process, equal examples, processor time by test, the guard of `make quick`."""
+"""Shared test configuration: threads, order of files, processor time by test, and the guard of `make quick`."""
 
 import os
 import signal
 
 # Before any numeric library starts: OpenMP on busy cores slows torch tens of times.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as processors: threads would wait for each other
+if (
+    "PYTEST_XDIST_WORKER" in os.environ
+):  # as many processes as processors: further threads would wait for each other
     os.environ.setdefault("FINSSIM_THREADS", "1")
 
 import gc
@@ -23,21 +25,21 @@ from hypothesis import HealthCheck, settings
 settings.register_profile(
     "finssim",
     deadline=None,  # a first call may compile a kernel
-    derandomize=True,  # equal runs on every machine
+    derandomize=True,  # the same examples on every machine
     database=None,
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("finssim")
 
-# A run in the background inherits an ignored Ctrl-C, and so would the processes that tests interrupt.
+# A background process inherits an ignored Ctrl-C, and so would the processes that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# ---- processor time by test: `--durations N` shows wall-clock time, which neighbours on the machine change
+# ---- processor time by test: `--durations N` shows wall-clock time, which varies with the machine's other load
 
 
 def processor_time() -> float:
-    """Processor time of this process and of its ended children so far [s]."""
+    """Return the processor time of this process and of its ended children so far [s]."""
     children = os.times()
     return time.process_time() + children.children_user + children.children_system
 
@@ -47,7 +49,7 @@ _before = 0.0
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport():
-    """Each report, also from another worker, carries what was spent since the last one [s]."""
+    """Add the processor time since the previous report [s] to each report, also to those of other workers."""
     global _before
     report = yield
     now = processor_time()
@@ -56,7 +58,7 @@ def pytest_runtest_makereport():
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """The N tests of `--durations N` that took the most processor time, and the sum of all."""
+    """Print the N tests that took the most processor time (`--durations N`), and the sum of all tests."""
     if not config.option.durations:
         return
     spent = defaultdict(float)
@@ -70,24 +72,24 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(f"{seconds:7.2f}s {name}")
 
 
-# ---- order: files go to processes as a whole, and the last ones should be short
+# ---- order: each process gets whole files, and the last ones should be short
 
 
 def pytest_collection_modifyitems(items):
-    """Files with many slow tests first; by all their tests, as xdist orders them, trainings and sessions come last."""
+    """Put files with many slow tests first: xdist, which orders by number of tests, would run trainings last."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 
 
-# ---- garbage: one search of all that the tests import takes a second, and every robot in real time begins with one:
-# what is there before the first test of a file is left out of later searches
+# ---- garbage: one collection of all that the tests import takes a second, and every robot in real time begins with
+# one: objects that exist before the first test of a file are excluded from later collections
 
 _file = None
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Import the tests without searching for garbage, which takes a quarter of the time otherwise."""
+    """Import the tests without garbage collection, which otherwise takes a quarter of the time."""
     gc.disable()
     try:
         return (yield)
@@ -95,11 +97,11 @@ def pytest_collection():
         gc.enable()
 
 
-# ---- real time: processes of a test share a clock that is as slow as the machine
+# ---- real time: the processes of a test share a clock that is slowed to the speed of the machine
 
 
 SPIN = 0.7e-3
-"""Processor time of one turn of `_turn` on the machine on which the tests were written [s]."""
+"""Processor time of one call of `_turn` on the machine on which the tests were written [s]."""
 
 
 def _turn() -> None:
@@ -107,7 +109,7 @@ def _turn() -> None:
 
 
 def measured_rate() -> float:
-    """Return how fast a session's clock may run now: the machine's speed, and this process's share of it, at most 1."""
+    """Return the rate at which a session's clock can run now: the speed available to this process, at most 1."""
     began, turns = time.monotonic(), 0
     while time.monotonic() - began < 0.3:
         _turn()
@@ -117,20 +119,20 @@ def measured_rate() -> float:
 
 @pytest.fixture
 def slow_clock(monkeypatch) -> float:
-    """Let the processes that a test starts live on a clock that this machine keeps up with; its rate."""
+    """Slow the clock of processes that a test starts to a rate that this machine sustains, and return the rate."""
     rate = measured_rate()
     monkeypatch.setenv("FINSSIM_CLOCK_RATE", f"{rate:.3f}")
     return rate
 
 
-# ---- the core without its extensions (`make core`): a test that asks the registry for one is skipped
+# ---- the core without its extensions (`make core`): tests that ask the registry for an extension are skipped
 
 ALONE = importlib.util.find_spec("finssim.extensions") is None
 
 
 @contextmanager
 def extensions_missing():
-    """Skip a test in which the registry refuses a task, command or world of an extension that is not there."""
+    """Skip a test in which the registry refuses a task, command or world of an extension that is missing."""
     try:
         yield
     except Exception as error:
@@ -157,7 +159,8 @@ def pytest_runtest_call():
 # ---- `make quick`: no test starts a process
 
 LOOK_UPS = {"fc-list", "git", "gcc", "ld", "ldconfig", "uname"}
-"""What Python, matplotlib (for fonts, without its cache) and FinsSim ask about this machine and this checkout."""
+"""Programs that Python, matplotlib (for fonts, without its cache) and FinsSim call to inspect the machine or
+checkout."""
 
 _guarded = False
 
@@ -175,13 +178,13 @@ def _audit(event: str, arguments: tuple) -> None:
 
 
 def pytest_collection_finish():
-    """What importing the tests took is no test's."""
+    """Exclude the processor time of importing the tests from that of the first test."""
     global _before
     _before = processor_time()
 
 
 def pytest_sessionstart(session):
-    """With -m "not slow", a process that a test starts fails the test."""
+    """Install the guard: with -m "not slow", a test that starts a process fails."""
     if session.config.option.markexpr == "not slow":
         with suppress(ImportError):
             import glfw  # noqa: F401  # which MuJoCo imports; it asks a Python process for its library's version
@@ -197,7 +200,7 @@ def pytest_sessionstart(session):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """The guard is for tests, not for what pytest and its plugins start around them; nor is old garbage a test's."""
+    """Enable the guard only while a test runs, and exclude older objects from its garbage collections."""
     global _file, _guarded
     if item.path != _file:
         _file = item.path

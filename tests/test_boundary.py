@@ -1,4 +1,4 @@
-"""At the command line a refused input is one sentence and status 2; a fault of ours keeps its traceback."""
+"""The command line reports refused input in one sentence with status 2; a bug in FinsSim keeps its traceback."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from finssim.core.files import OutputError
 
 
 class OurError(ValueError):
-    """Stands for a family such as VehicleError."""
+    """Stand-in for an error family such as VehicleError."""
 
 
 OurError.__module__ = "finssim.somewhere"
@@ -24,7 +24,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def fail(kind: str, number: int = 0):
-    """Raise one kind of error, as a handler may."""
+    """Raise one kind of error, as a command may."""
     if kind == "missing":
         import cv2.no_such_part  # noqa: F401
     if kind == "fault":
@@ -63,21 +63,21 @@ def other():
     ],
 )
 def test_a_refused_input_is_one_sentence(capsys, words, sentence):
-    """Standard error holds one line that names what is wrong; standard output nothing; the status is 2."""
+    """Standard error contains one line that names the problem, standard output is empty, and the status is 2."""
     assert run(app, words) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith(f"finssim: {sentence}") and err.count("\n") == 1
 
 
 def test_a_missing_extra_is_named(capsys, monkeypatch):
-    """A library that is not installed names the extra to install."""
+    """The message about a library that is not installed names the extra to install."""
     monkeypatch.setitem(sys.modules, "cv2", None)
     assert run(app, ["fail", "missing"]) == 2
     assert capsys.readouterr().err == "finssim: cv2 is not installed: pip install 'finssim[vision]'\n"
 
 
 def test_a_file_of_ones_own_that_needs_an_extra_names_it(capsys, monkeypatch, tmp_path):
-    """A task in torch, where only the core is installed."""
+    """A user's task that imports torch is refused with the extra to install, where only the core is installed."""
     monkeypatch.setitem(sys.modules, "torch", None)
     (tmp_path / "mine.py").write_text("import torch\n", encoding="utf-8")
     assert run(commands, ["tasks", "show", f"{tmp_path / 'mine.py'}:Mine"]) == 2
@@ -99,7 +99,7 @@ def test_debugging_keeps_every_traceback(monkeypatch):
 
 
 def test_interruption_has_its_status(capsys):
-    """Control-C ends with 130, as the shell expects, and without a traceback."""
+    """Control-C ends the command with status 130, as the shell expects, and without a traceback."""
     assert run(app, ["fail", "interrupt"]) == 130
     assert capsys.readouterr().err == "finssim: interrupted: no incomplete file is left\n"
 

@@ -1,4 +1,4 @@
-"""What is read from outside has a bound, which is checked before anything large is made of it."""
+"""Input from outside has a size limit, which is checked before anything large is allocated."""
 
 import importlib
 import struct
@@ -17,7 +17,7 @@ from finssim.trials.trial_files import read_table
 
 
 def png_header(width, height):
-    """A PNG that announces a size and has a row of it."""
+    """Return a PNG that announces a size and contains a single row."""
 
     def part(kind, body):
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
@@ -29,7 +29,7 @@ def png_header(width, height):
 
 @pytest.mark.parametrize("side", [30_000, 60_000, 2**31 - 1])
 def test_a_picture_is_as_large_as_its_header_says(tmp_path, side, monkeypatch):
-    """900 million pixels and more are refused in one sentence, from a file and from the wire, and never decoded."""
+    """900 million pixels and more are refused in one sentence, from a file and from the network, and never decoded."""
     import cv2
 
     path = tmp_path / "a.png"
@@ -44,7 +44,7 @@ def test_a_picture_is_as_large_as_its_header_says(tmp_path, side, monkeypatch):
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm"])
 def test_every_format_tells_its_size(tmp_path, suffix):
-    """What was written is read back, and its header tells as many columns and rows."""
+    """A written picture reads back, and its size is read from its header alone."""
     path = tmp_path / f"a{suffix}"
     write_picture(np.zeros((20, 31), np.uint8) + 200, path)
     assert budget.picture_size(path.read_bytes()) == (31, 20)
@@ -52,7 +52,8 @@ def test_every_format_tells_its_size(tmp_path, suffix):
 
 
 def test_other_webp_and_tiff_headers_tell_their_size():
-    """WebP with an extended or a lossy header, TIFF of the other byte order, and a header that is cut."""
+    """The size is read from WebP with an extended or a lossy header and from big-endian TIFF, but not from a
+    cut header."""
     extended = b"RIFF\0\0\0\0WEBPVP8X" + bytes(8) + (30).to_bytes(3, "little") + (19).to_bytes(3, "little")
     lossy = b"RIFF\0\0\0\0WEBPVP8 " + bytes(10) + struct.pack("<HH", 31, 20)
     tiff = b"MM\0*" + struct.pack(">IHHHIHHHHIHH", 8, 2, 256, 3, 1, 31, 0, 257, 3, 1, 20, 0)
@@ -61,7 +62,7 @@ def test_other_webp_and_tiff_headers_tell_their_size():
 
 
 def test_a_file_is_read_up_to_its_bound(tmp_path):
-    """A device without end, and a file that is one byte too long."""
+    """A file that is one byte over the limit, and a device without end, are refused."""
     path = tmp_path / "a"
     path.write_bytes(b"12345")
     assert budget.read_bytes(path, CalibrationError, limit=5) == b"12345"
@@ -70,7 +71,7 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
 
 
 def test_a_chunk_is_unpacked_up_to_its_bound():
-    """A zstd chunk of 100 MB in 10 kB is no sound record; one of 1 MB is."""
+    """A zstd chunk that unpacks from 10 kB to 100 MB is not a valid record; one of 1 MB is."""
     zstd = pytest.importorskip("backports.zstd")
     for size, sound in ((1 << 20, True), (100 << 20, False)):
         packed = zstd.compress(bytes(size))
@@ -81,7 +82,7 @@ def test_a_chunk_is_unpacked_up_to_its_bound():
 
 
 def test_a_packed_table_says_how_long_it_is(tmp_path):
-    """A column of 268 million rows, of which none holds a number."""
+    """A column of 268 million empty rows in less than 1 MiB of Parquet is refused."""
     pytest.importorskip("pyarrow")
     import pyarrow
     import pyarrow.parquet
@@ -110,12 +111,12 @@ def reads(what):
     print("a library prints")
     return {"a": [0, 1, 2]}
 """
-"""Stands for a reader in a child process."""
+"""Source of a reader that runs in a child process."""
 
 
 @pytest.mark.slow
 def test_a_child_reads_within_its_memory(tmp_path, monkeypatch):
-    """What it returns comes back; what it refuses, what takes too much and what kills it become a sentence."""
+    """The child's result is returned; a refusal, excessive memory and a crash each become a sentence."""
     (tmp_path / "child_reads.py").write_text(READS)
     monkeypatch.syspath_prepend(tmp_path)
     reads = importlib.import_module("child_reads").reads
@@ -131,7 +132,7 @@ def test_a_child_reads_within_its_memory(tmp_path, monkeypatch):
 
 
 def test_memory_is_limited_for_a_while():
-    """Inside, an array beyond the limit is refused; behind, the limit is gone."""
+    """Inside the context an array beyond the limit is refused; afterwards the limit is lifted."""
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_AS)
     with budget.limited_memory(1 << 30), pytest.raises(MemoryError):

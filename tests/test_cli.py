@@ -1,4 +1,4 @@
-"""The commands, as a person types them."""
+"""The commands, with words as a user types them."""
 
 import json
 import re
@@ -71,14 +71,14 @@ COMMANDS = [
 
 
 def test_commands_are_those_of_the_contract():
-    """No command is missing or left over."""
+    """The commands are exactly those of the contract."""
     assert set(get_command(app).list_commands(None)) == {name for name in COMMANDS if " " not in name}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_an_example_that_the_parser_takes(capsys, command):
-    """Every command's help ends with an example of itself, whose options it has."""
+    """Every command's help ends with an example of that command, whose options exist."""
     assert finssim(*command.split(), "--help") == 0
     help_text = " ".join(capsys.readouterr().out.split())
     example = re.search(rf"Example: (finssim {command}.*?)(?= Arguments:| Options:)", help_text)[1]
@@ -88,13 +88,13 @@ def test_help_has_an_example_that_the_parser_takes(capsys, command):
 
 
 def test_version(capsys):
-    """The version is the package's."""
+    """`--version` prints the package's version."""
     assert finssim("--version") == 0
     assert capsys.readouterr().out == f"finssim {__version__}\n"
 
 
 def test_no_command_shows_the_help(capsys):
-    """`finssim` alone shows what there is."""
+    """`finssim` alone prints the help."""
     assert finssim() == 0
     assert "Identify a vehicle:" in capsys.readouterr().out
 
@@ -109,7 +109,7 @@ def test_vehicles_lists_the_catalogue(capsys):
 
 
 def test_a_vehicle_is_shown_and_drawn(capsys, tmp_path):
-    """`vehicles show` prints the vehicle and writes the picture whole."""
+    """`vehicles show` prints the vehicle and writes a complete picture."""
     assert finssim("vehicles", "show", "finsrov", "--picture", tmp_path / "finsrov.png") == 0
     assert "12.11" in capsys.readouterr().out
     assert (tmp_path / "finsrov.png").read_bytes().startswith(b"\x89PNG")
@@ -124,7 +124,7 @@ def test_a_picture_needs_a_known_format(capsys, tmp_path):
 
 
 def test_a_mistyped_vehicle_gets_its_name(capsys):
-    """An unknown vehicle names the nearest and all there are."""
+    """The refusal of an unknown vehicle names the nearest match and all that exist."""
     sentence = refusal(capsys, "vehicles", "show", "finrov")
     assert "did you mean 'finsrov'?" in sentence and "rexrov" in sentence
 
@@ -136,10 +136,10 @@ def test_doctor_as_json(capsys):
 
 
 def test_simulate_writes_what_it_says(capfd, tmp_path):
-    """The example of the README: a table, where it was written, and nothing on standard error."""
+    """The README's example prints a table and the output path, and nothing on standard error."""
     words = ["simulate", "--vehicle", "finsrov", "--command", "surge=10 yaw=1", "--duration", "1"]
     assert finssim(*words, "--out", tmp_path / "first.csv") == 0
-    capfd.readouterr()  # the first time it may compile, and says so
+    capfd.readouterr()  # the first call may compile, and reports it
     assert finssim(*words, "--out", tmp_path / "run.csv") == 0
     out, err = capfd.readouterr()
     assert err == "" and "delivered wrench" in out and "run.csv" in out.replace("\n", "")
@@ -147,7 +147,7 @@ def test_simulate_writes_what_it_says(capfd, tmp_path):
 
 
 def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
-    """A wrong word in the command, and a place that takes no files."""
+    """A wrong word in the command and an unwritable output directory are each refused in a sentence."""
     words = ["simulate", "--vehicle", "finsrov", "--duration", "1", "--out"]
     assert "did you mean 'surge'?" in refusal(capsys, *words, tmp_path / "run.csv", "--command", "surg=10")
     assert "write elsewhere" in refusal(capsys, *words, "/proc/x/run.csv", "--command", "surge=10")
@@ -155,7 +155,8 @@ def test_simulate_refuses_in_a_sentence(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_training_leaves_a_policy(tmp_path):
-    """Control-C ends with 130, one sentence and no traceback; the policy so far is whole, and says it is not done."""
+    """Control-C ends training with 130, one sentence and no traceback; the policy so far is complete and
+    marked unfinished."""
     out = tmp_path / "hold"
     words = ["train", "t1", "--steps", "2000000", "--out", str(out)]
     run = subprocess.Popen([sys.executable, "-m", "finssim", *words], stderr=subprocess.PIPE, text=True)
@@ -163,7 +164,7 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
     run.send_signal(signal.SIGINT)
     again = threading.Timer(
         20.0, run.send_signal, (signal.SIGINT,)
-    )  # Python drops one that falls into a destructor
+    )  # Python drops an interruption that arrives in a destructor
     again.start()
     said = seen + run.stderr.read()
     again.cancel()
@@ -200,13 +201,13 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
     ],
 )
 def test_train_refuses_in_a_sentence(capsys, tmp_path, words, sentence):
-    """What cannot be trained is refused, and nothing is written."""
+    """A training that is not possible is refused, and nothing is written."""
     assert sentence in refusal(capsys, *words, "--out", tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_train_refuses_a_place_before_it_works(capsys, tmp_path):
-    """A directory with somebody's files, and a place that takes none."""
+    """A directory with other files and an unwritable directory are refused before training begins."""
     (tmp_path / "thesis.tex").touch()
     assert "already holds files" in refusal(capsys, "train", "t1", "--out", tmp_path)
     assert "write elsewhere" in refusal(capsys, "train", "t1", "--out", "/proc/x/policy")
@@ -214,7 +215,7 @@ def test_train_refuses_a_place_before_it_works(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_train_then_evaluate(capfd, tmp_path):
-    """What `train` wrote is what `evaluate` reads; its result is a JSON object and a directory."""
+    """`evaluate` reads the output of `train`; its result is a JSON object and a directory."""
     policy = tmp_path / "policy"
     assert finssim("train", "t1", "--steps", "20000", "--worlds", "64", "--seed", "3", "--out", policy) == 0
     capfd.readouterr()
@@ -240,7 +241,7 @@ def test_train_then_evaluate(capfd, tmp_path):
     ],
 )
 def test_experiments_refuse_in_a_sentence(capsys, words, sentence):
-    """What cannot be evaluated or shown is refused before the work."""
+    """A request that cannot be evaluated or shown is refused before any work begins."""
     assert sentence in refusal(capsys, *words)
 
 
@@ -257,7 +258,7 @@ def test_lists_fit_into_80_columns(words, monkeypatch, capsys):
 
 
 class Dropped:
-    """Its finalizer is interrupted, where Python drops the exception; pydantic's compiled code can drop it as well."""
+    """Object whose finalizer is interrupted, where Python (as pydantic's compiled code may) drops the exception."""
 
     def __del__(self):
         signal.raise_signal(signal.SIGINT)
@@ -278,7 +279,7 @@ def create_a_class():
 
 @pytest.mark.parametrize("work", [drop, create_a_class])
 def test_control_c_that_python_drops_or_wraps_ends_the_command(work, capsys):
-    """The interruption of a finalizer comes again; that of a class is one, though Python 3.11 says RuntimeError."""
+    """An interruption in a finalizer is repeated; one that Python 3.11 wraps in a RuntimeError is recognised."""
     commands = typer.Typer()
     commands.command()(work)
     begun = time.monotonic()
@@ -288,7 +289,7 @@ def test_control_c_that_python_drops_or_wraps_ends_the_command(work, capsys):
 
 @pytest.mark.slow
 def test_a_command_that_handled_control_c_ends_with_its_own_status(tmp_path):
-    """Even where it interrupted `exec`, which creates data classes: `python -m` would end by SIGINT then."""
+    """This holds even for an interrupted `exec`, as in data classes, after which `python -m` would end by SIGINT."""
     (tmp_path / "work.py").write_text("""
 import contextlib, sys, typer
 from finssim.cli import boundary

@@ -1,4 +1,4 @@
-"""`finssim calibrate`, `replay` and `experiment`, as a person types them."""
+"""`finssim calibrate`, `replay` and `experiment`, with words as a user types them."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory):
-    """Simulated trials of surge: six to fit on, two at another level to keep."""
+    """Simulated trials of surge: six to fit on, two at another level to hold out."""
     folder = tmp_path_factory.mktemp("trials")
     words = ["--vehicle", "finsrov", "--simulate"]
     assert finssim("excite", "surge", *words, "--seed", "1", "--out", folder / "fit") == 0
@@ -28,7 +28,7 @@ def trials(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(trials):
-    """A vehicle fitted on them, its report and its ranges."""
+    """A vehicle fitted on the trials, with its report and ranges."""
     words = ["calibrate", "hydrodynamics", trials / "fit", "--vehicle", "finsrov", "--axes", "surge"]
     folder = trials / "fitted"
     outputs = ["--out", folder / "v.yaml", "--report", folder / "report", "--ranges", folder / "r.yaml"]
@@ -38,7 +38,7 @@ def fitted(trials):
 
 @pytest.mark.slow
 def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
-    """The damping of surge is measured now and near the truth; the file remembers its trials; the rest is as before."""
+    """Surge damping becomes measured and near the truth; the file lists its trials; everything else is unchanged."""
     truth, vehicle = load_vehicle("finsrov"), load_vehicle(fitted / "v.yaml")
     d1 = vehicle.hydrodynamic_set("calibrated").linear_damping
     assert vehicle.origin_of("hydrodynamics.calibrated.linear_damping.0").origin == "measured"
@@ -53,7 +53,7 @@ def test_hydrodynamics_writes_vehicle_report_and_ranges(fitted):
 
 @pytest.mark.slow
 def test_hydrodynamics_as_json(capfd, tmp_path, trials):
-    """One object with the keys of the contract, and nothing else on standard output."""
+    """`--json` prints one object with the keys of the contract, and nothing else on standard output."""
     words = ["calibrate", "hydrodynamics", trials / "fit" / "surge_plus_12", "--vehicle", "finsrov"]
     assert finssim(*words, "--axes", "surge", "--json", "--out", tmp_path / "v.yaml") == 0
     found = json.loads(capfd.readouterr().out)
@@ -65,7 +65,7 @@ def test_hydrodynamics_as_json(capfd, tmp_path, trials):
 
 @pytest.mark.slow
 def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
-    """A trial that its header keeps for replay is no part of the fit."""
+    """A trial that its header marks as held out is excluded from the fit, and the command reports it."""
     every = load_trials([trials / "fit"])
     for trial in every:
         role = "held-out" if trial.name == "surge_plus_12" else "fit"
@@ -88,13 +88,13 @@ def test_held_out_trials_are_left_out_and_it_is_said(capsys, tmp_path, trials):
 
 
 def vars_of(trial):
-    """Fields of a trial by name."""
+    """Return the fields of a trial by name."""
     return {name: getattr(trial, name) for name in trial.__dataclass_fields__}
 
 
 @pytest.mark.slow
 def test_replay_labels_what_the_vehicle_was_fitted_on(capfd, tmp_path, trials, fitted):
-    """In-sample trials are named so; held-out ones are scored, as JSON and as a folder."""
+    """In-sample trials are labelled as such; held-out ones are scored, as JSON and as a folder."""
     words = ["replay", trials / "held-out", "--vehicle", fitted / "v.yaml"]
     assert finssim(*words, "--json", "--out", tmp_path / "replay") == 0
     found = json.loads(capfd.readouterr().out)
@@ -105,7 +105,7 @@ def test_replay_labels_what_the_vehicle_was_fitted_on(capfd, tmp_path, trials, f
 
 
 def test_thruster_as_json_and_as_a_vehicle(capfd, tmp_path):
-    """The published table of a T200: the curve is written for every thruster of the group."""
+    """The curve from the published table of a T200 is written for every thruster of the group."""
     table = Path(__file__).parent / "data" / "t200" / "t200_16V_bluerobotics_2019.csv"
     words = ["calibrate", "thruster", table, "--vehicle", "bluerov2", "--out", tmp_path / "v.yaml"]
     assert finssim(*words, "--json") == 0
@@ -153,7 +153,7 @@ HYDRODYNAMICS = ["calibrate", "hydrodynamics", "TRIALS", "--vehicle", "finsrov"]
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypatch, trials, words, sentence):
-    """Before the work, and nothing is written."""
+    """Each request is refused in a sentence before any work begins, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     given = [trials / "fit" if word == "TRIALS" else word for word in words]
     assert sentence in refusal(capsys, *given, notes=True)
@@ -162,7 +162,7 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch, trials):
-    """Ctrl-C while candidates are simulated: a whole vehicle that says so, and status 130."""
+    """Ctrl-C while candidates are simulated leaves a complete vehicle marked as interrupted, and status 130."""
     from finssim.identification import simulation_error
 
     whole = simulation_error.fit_by_simulation
@@ -183,7 +183,7 @@ def test_an_interrupted_fit_leaves_the_best_so_far(capsys, tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_motors_from_steps(capfd, tmp_path):
-    """Simulated steps with logged commands and thrust: lag and delay of the vehicle file come back."""
+    """Simulated steps with logged commands and thrust give back the lag and delay of the vehicle file."""
     words = ["excite", "surge", "--vehicle", "finsrov", "--simulate", "--levels", "6,12"]
     assert finssim(*words, "--inputs", "force,command", "--out", tmp_path / "steps") == 0
     words = ["calibrate", "motor", tmp_path / "steps", "--vehicle", "finsrov", "--out", tmp_path / "v.yaml"]

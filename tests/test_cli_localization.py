@@ -1,4 +1,4 @@
-"""`finssim localize`, `fuse`, `project` and `backproject`, as a person types them: every option, every refusal."""
+"""`finssim localize`, `fuse`, `project` and `backproject`, as a user types them: every option, every refusal."""
 
 import csv
 import io
@@ -42,7 +42,7 @@ TIMES = np.arange(0.2, 2.8, 0.2)
 
 
 def table(path):
-    """Rows of a table, by column."""
+    """Return the rows of a table as columns by name."""
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
@@ -54,7 +54,7 @@ def write_csv(path, names, rows):
 
 
 def seen_at(pool, t, rng=None):
-    """What the camera sees of the vehicle's tags at a time, with 0.2 px of noise if there is a generator."""
+    """Return the camera's view of the vehicle's tags at a time, with 0.2 px of noise if a generator is given."""
     found = []
     for tag, corners in tag_corners_b(FINSROV.tags).items():
         points = corners @ quat_to_matrix(attitude(t)).T + position(t)
@@ -65,7 +65,7 @@ def seen_at(pool, t, rng=None):
 
 
 def write_sensors(folder, items, *, turned=None):
-    """imu.csv and depth.csv of streams; the IMU's columns in the axes of a mount, if one is given."""
+    """Write imu.csv and depth.csv of streams; IMU columns are in the axes of a mount, if one is given."""
     q = np.array([0.0, 0.0, 0.0, 1.0]) if turned is None else quat_conjugate(turned)
     rows = []
     for s in (s for s in items if s.stream == "imu"):
@@ -80,7 +80,7 @@ def write_sensors(folder, items, *, turned=None):
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory):
-    """A pool, what a camera, an IMU and a depth sensor saw of a FinsROV in it, and where it was."""
+    """A pool, recordings of a camera, an IMU and a depth sensor of a FinsROV in it, and the true path."""
     folder = tmp_path_factory.mktemp("localization")
     (folder / "pool.yaml").write_text(POOL)
     pool, rng = load_pool(folder / "pool.yaml"), np.random.default_rng(0)
@@ -102,7 +102,7 @@ def files(tmp_path_factory):
 
 
 def exact(folder, frames):
-    """Depth, tilt and truth without error."""
+    """Write depth, tilt and truth without error."""
     t = np.arange(0.0, SECONDS, 0.01)
     port = position(t) + quat_rotate(attitude(t), np.array([0.0, 0.0, -0.115]))
     write_csv(folder / "depth.csv", ("t", "depth"), np.column_stack([t, 1.0 - port[:, 2]]).tolist())
@@ -117,7 +117,7 @@ def exact(folder, frames):
 
 @pytest.fixture(scope="session")
 def seen(files):
-    """Two pictures, one video of four, and the depth at which the vehicle lies in them: drawn through the water."""
+    """Two pictures and a video of four, rendered through the water, and the depth of the vehicle in them."""
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pupil_apriltags")
     pool = load_pool(files / "pool.yaml")
@@ -151,7 +151,7 @@ DEPTH_SEEN = 1.0 - 0.5 + 0.115
 
 
 def tags_at(where):
-    """The vehicle's tags in the scene, the vehicle level and its heading along x."""
+    """Return the vehicle's tags in the scene, with the vehicle level and heading along x."""
     tags = []
     for tag, mount in FINSROV.tags.mounts.items():
         q = matrix_to_quat(quat_to_matrix(mount.orientation)).tolist()
@@ -173,7 +173,7 @@ KNOWN = ["--depth", "depth.csv", "--imu", "imu.csv"]
 
 
 def localized(files, tmp_path, *words, inputs=("tags.csv",), known=KNOWN, name="out.csv"):
-    """Rows of the table that `finssim localize` writes, run where the files are."""
+    """Return the rows of the table that `finssim localize` writes, run in the folder of the files."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(files)
         assert finssim("localize", *inputs, *LOCALIZE, *known, "--out", tmp_path / name, *words) == 0
@@ -181,12 +181,12 @@ def localized(files, tmp_path, *words, inputs=("tags.csv",), known=KNOWN, name="
 
 
 def column(rows, name):
-    """A column of numbers, NaN where empty."""
+    """Return a column of numbers, with NaN for empty cells."""
     return np.array([float(row[name] or "nan") for row in rows])
 
 
 def test_localize_finds_the_vehicle(files, tmp_path, capsys):
-    """Exact corners, depth and tilt: within 0.2 mm and a hundredth of a degree of the truth."""
+    """Exact corners, depth and tilt locate the vehicle within 0.2 mm and a hundredth of a degree of the truth."""
     rows = localized(files, tmp_path)
     out, err = capsys.readouterr()
     assert err == "" and f"written: {tmp_path / 'out.csv'}" in out
@@ -199,11 +199,11 @@ def test_localize_finds_the_vehicle(files, tmp_path, capsys):
 
 
 DEPTH_ERROR = np.hypot(FINSROV.sensors.depth.noise_std, FINSROV.sensors.depth.bias_initial)
-"""Of FinsROV's pressure sensor [m]."""
+"""Depth error of FinsROV's pressure sensor [m]."""
 
 
 def test_localize_as_json(files, tmp_path, capsys):
-    """One object with its keys, the settings that were used and no table."""
+    """`--json` prints one object with its keys, including the settings that were used, and writes no table."""
     words = ["--pixel-std", "0.25", "--shared-pixel-std", "0.125", "--json"]
     localized(files, tmp_path, *words, "--tilt-std-deg", "0.75")
     out, err = capsys.readouterr()
@@ -242,7 +242,7 @@ def test_localize_as_json(files, tmp_path, capsys):
     ],
 )
 def test_localize_believes_the_errors_that_it_is_told(files, tmp_path, words, larger):
-    """Standard deviations of what the option names grow in every row, by more than a tenth."""
+    """The standard deviations that the option affects grow in every row by more than a tenth."""
     plain = localized(files, tmp_path, name="a.csv")
     rows = localized(files, tmp_path, *words, name="b.csv")
     for name in larger:
@@ -250,14 +250,15 @@ def test_localize_believes_the_errors_that_it_is_told(files, tmp_path, words, la
 
 
 def test_localize_takes_one_depth_for_all(files, tmp_path, capsys):
-    """A number in place of a table, without time: each row lies at that depth of the port."""
+    """A number replaces the depth table: each row has that depth of the port, without time."""
     rows = localized(files, tmp_path, known=["--depth", "0.6", "--imu", "imu.csv"])
     port = column(rows, "z") - 0.115 * np.cos(column(rows, "roll")) * np.cos(column(rows, "pitch"))
     np.testing.assert_allclose(1.0 - port, 0.6, atol=2e-3)
 
 
 def test_localize_reads_the_tilt(files, tmp_path, capsys):
-    """Without --imu the vehicle is taken as level, which is said, and its tags' places lie centimetres off."""
+    """Without --imu the command reports that it assumes a level vehicle, and its tags' positions are off by
+    centimetres."""
     with_it = localized(files, tmp_path, name="a.csv")
     without = localized(files, tmp_path, known=["--depth", "depth.csv"], name="b.csv")
     assert "assumed level, within 2.0 degrees" in capsys.readouterr().out
@@ -270,7 +271,7 @@ def test_localize_reads_the_tilt(files, tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_localize_takes_the_method(files, tmp_path, capsys, method):
-    """Each of them answers by its name; those that need no depth do without."""
+    """Each method is reported by its name; those that need no depth work without it."""
     known = KNOWN if method in NEEDS_DEPTH else []
     rows = localized(files, tmp_path, "--method", method, "--json", known=known)
     found = json.loads(capsys.readouterr().out)
@@ -283,7 +284,7 @@ def test_localize_takes_the_method(files, tmp_path, capsys, method):
 
 
 def test_localize_does_not_interpolate_over_a_long_gap(files, tmp_path, capsys):
-    """Depth at 0.05 and 2.9 s alone: refused by reason."""
+    """With depth only at 0.05 and 2.9 s, the rows between are refused with a reason."""
     write_csv(tmp_path / "depth.csv", ("t", "depth"), [(0.05, 0.6), (2.9, 0.6)])
     known = ["--depth", tmp_path / "depth.csv", "--imu", "imu.csv"]
     rows = localized(files, tmp_path, known=known)
@@ -292,7 +293,7 @@ def test_localize_does_not_interpolate_over_a_long_gap(files, tmp_path, capsys):
 
 
 def test_localize_uses_pool_and_vehicle(files, tmp_path):
-    """Water 10 cm higher puts the vehicle elsewhere, and so does a tag mounted elsewhere."""
+    """A water level 10 cm higher changes the vehicle's position, and so does a tag mounted elsewhere."""
     from finssim.identification.vehicle_file import write_vehicle
     from finssim.vehicles import Provenance
 
@@ -312,7 +313,7 @@ SEEN = {"inputs": ("seen/pictures",), "known": ["--depth", str(DEPTH_SEEN)]}
 
 @pytest.mark.slow
 def test_localize_looks_at_pictures(files, seen, tmp_path, capsys):
-    """A folder of pictures drawn through the water: 1 cm; times from the table, or none."""
+    """Pictures rendered through the water locate the vehicle to 1 cm; times come from the table, or are absent."""
     rows = localized(files, tmp_path, **SEEN)
     for row, true in zip(rows, table(files / "seen" / "truth.csv"), strict=True):
         assert row["image"] == true["image"]
@@ -326,7 +327,7 @@ def test_localize_looks_at_pictures(files, seen, tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["--refine", "edges"], ["--gamma", "2.2"]])
 def test_localize_places_corners_as_it_is_told(files, seen, tmp_path, words):
-    """Another way or encoding gives other corners of the same tags, within 3 cm."""
+    """Another refinement or encoding gives other corners of the same tags, within 3 cm."""
     plain = localized(files, tmp_path, name="a.csv", **SEEN)
     rows = localized(files, tmp_path, *words, name="b.csv", **SEEN)
     off = np.hypot(column(rows, "x") - column(plain, "x"), column(rows, "y") - column(plain, "y"))
@@ -334,7 +335,7 @@ def test_localize_places_corners_as_it_is_told(files, seen, tmp_path, words):
 
 
 def test_localize_looks_at_a_video(files, seen, tmp_path):
-    """Every picture has a name, a time and a place."""
+    """Every frame has a name, a time and a position."""
     rows = localized(files, tmp_path, inputs=("seen/dive.avi",), known=["--depth", str(DEPTH_SEEN)])
     assert [row["image"] for row in rows] == [f"dive.avi#{i}" for i in range(4)]
     np.testing.assert_allclose(np.diff(column(rows, "time")), 0.1, atol=1e-3)
@@ -383,7 +384,7 @@ PLAIN = [*NO_DEPTH, "--depth", "0.5"]
     ],
 )  # fmt: skip
 def test_localize_refuses_in_a_sentence(files, seen, tmp_path, capsys, monkeypatch, words, sentence):
-    """And nothing is written."""
+    """Each request is refused in a sentence, and nothing is written."""
     monkeypatch.chdir(files)
     given = [tmp_path / "out.csv" if word == "OUT" else word for word in words]
     assert sentence in refusal(capsys, *given)
@@ -391,7 +392,7 @@ def test_localize_refuses_in_a_sentence(files, seen, tmp_path, capsys, monkeypat
 
 
 def test_a_wrong_row_is_named_by_file_and_line(files, tmp_path, capsys, monkeypatch):
-    """The table that was there before stays."""
+    """A wrong row is named by file and line, and an earlier output table is kept."""
     monkeypatch.chdir(files)
     lines = (files / "tags.csv").read_text().splitlines()
     lines[3] = lines[3].replace(lines[3].split(",")[3], "left", 1)
@@ -406,7 +407,7 @@ FUSE = ["--pool", "pool.yaml", "--vehicle", "finsrov"]
 
 
 def fused(files, tmp_path, *words, log="log", name="fused.csv"):
-    """Rows of the table that `finssim fuse` writes."""
+    """Return the rows of the table that `finssim fuse` writes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(files)
         assert finssim("fuse", log, *FUSE, "--out", tmp_path / name, *words) == 0
@@ -414,7 +415,7 @@ def fused(files, tmp_path, *words, log="log", name="fused.csv"):
 
 
 def test_fuse_follows_the_vehicle(files, tmp_path, capsys):
-    """60 rows a second, after half a second within 5 cm; what was taken in and the errors are said."""
+    """60 rows a second lie within 5 cm after half a second; the inputs and the errors are reported."""
     rows = fused(files, tmp_path)
     out, err = capsys.readouterr()
     assert err == "" and f"wrote {tmp_path / 'fused.csv'}" in out
@@ -428,7 +429,7 @@ def test_fuse_follows_the_vehicle(files, tmp_path, capsys):
 
 
 def test_fuse_as_json(files, tmp_path, capsys):
-    """One object with its keys, without NaN."""
+    """`--json` prints one object with its keys, without NaN."""
     fused(files, tmp_path, "--json")
     out, err = capsys.readouterr()
     found = json.loads(out)
@@ -440,7 +441,9 @@ def test_fuse_as_json(files, tmp_path, capsys):
     assert found["out"] == str(tmp_path / "fused.csv")
     assert found["accepted"]["vision"] > 20 and found["errors"]["fresh"]["rms_x"] < 0.02
     assert sum(found["states"].values()) == pytest.approx(1.0)
-    assert 0.1 < found["nis_per_dimension"]["vision"] < 1.5  # corners are better than their 0.5 px
+    assert (
+        0.1 < found["nis_per_dimension"]["vision"] < 1.5
+    )  # the corners are better than their nominal 0.5 px
     assert found["health"]["vision_mode"] == "fresh"
 
 
@@ -461,7 +464,7 @@ def test_fuse_writes_at_the_rate(files, tmp_path, rate):
     ],
 )
 def test_fuse_options_change_the_path(files, tmp_path, capsys, words):
-    """Each gives another path through the same samples, and none of them none."""
+    """Each option gives another path from the same samples; without options the path is the same."""
     plain = fused(files, tmp_path, name="a.csv")
     rows = fused(files, tmp_path, *words, "--json", name="b.csv")
     t = column(plain, "t")
@@ -471,7 +474,7 @@ def test_fuse_options_change_the_path(files, tmp_path, capsys, words):
 
 
 def test_fuse_doubts_corners_that_are_said_to_be_poor(files, tmp_path):
-    """A pixel error that is sixteen times larger makes the position less certain."""
+    """A pixel error that is sixteen times larger makes the position more uncertain."""
     plain, rows = (
         fused(files, tmp_path, name="a.csv"),
         fused(files, tmp_path, "--pixel-std", "8", name="b.csv"),
@@ -505,7 +508,7 @@ def test_fuse_doubts_corners_that_are_said_to_be_poor(files, tmp_path):
     ],
 )
 def test_fuse_refuses_in_a_sentence(files, seen, tmp_path, capsys, monkeypatch, words, sentence):
-    """And nothing is written."""
+    """Each request is refused in a sentence, and nothing is written."""
     monkeypatch.chdir(files)
     given = [tmp_path / "out.csv" if word == "OUT" else word for word in words]
     assert sentence in refusal(capsys, *given)
@@ -517,7 +520,7 @@ POINTS = "name,x,y,z\na,0.1,0.2,0.3\nb,-0.7,0.4,0.0\nhigh,0,0,1.5\n"
 
 @pytest.fixture
 def points(files, tmp_path, monkeypatch):
-    """A table of points in the water, and one above it, in a folder of its own with the pool."""
+    """A table of points in the water and one above it, in a separate folder with the pool."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pool.yaml").write_text(POOL)
     (tmp_path / "points.csv").write_text(POINTS)
@@ -525,12 +528,12 @@ def points(files, tmp_path, monkeypatch):
 
 
 def read(text):
-    """Rows of a table in a text."""
+    """Return the rows of a table given as text."""
     return list(csv.DictReader(io.StringIO(text)))
 
 
 def test_points_to_pixels_and_back(points, capsys):
-    """The pixels of `project` back on their own planes are the points, to a micrometre; names are carried along."""
+    """Pixels of `project`, back-projected onto their own planes, give the points to a micrometre; names are kept."""
     assert finssim("project", "points.csv", "--pool", "pool.yaml", "--out", "pixels.csv") == 0
     assert "2 of 3 points have a pixel" in capsys.readouterr().err
     rows = table(points / "pixels.csv")
@@ -546,7 +549,7 @@ def test_points_to_pixels_and_back(points, capsys):
 
 
 def test_project_reads_standard_input_and_the_pool(points, capsys, monkeypatch):
-    """And writes to standard output; another pool gives other pixels."""
+    """`project` reads standard input and writes to standard output; another pool gives other pixels."""
     (points / "other.yaml").write_text(POOL.replace("height: 1.0", "height: 0.8"))
     found = []
     for pool in ("pool.yaml", "other.yaml"):
@@ -559,7 +562,7 @@ def test_project_reads_standard_input_and_the_pool(points, capsys, monkeypatch):
 @pytest.mark.parametrize("out", [True, False])
 @pytest.mark.parametrize("command", ["project", "backproject"])
 def test_points_as_json(points, capsys, command, out):
-    """One object; with the rows in it, if there is no file for them."""
+    """`--json` prints one object, which contains the rows if there is no output file for them."""
     (points / "uv.csv").write_text("u,v\n600,300\n10,10\n")
     words = ["points.csv"] if command == "project" else ["uv.csv", "--z", "0"]
     words += ["--pool", "pool.yaml", "--json", *(["--out", "out.csv"] if out else [])]
@@ -571,7 +574,7 @@ def test_points_as_json(points, capsys, command, out):
 
 
 def test_backproject_on_planes(points, capsys):
-    """--z is the height, --plane any plane: z = 0.2 written either way is the same, a wall is another."""
+    """--z sets the height, --plane any plane: z = 0.2 gives the same in both notations, a wall does not."""
     (points / "uv.csv").write_text("u,v\n600,300\n900,500\n")
     found = {}
     for name, words in {
@@ -590,7 +593,7 @@ def test_backproject_on_planes(points, capsys):
 
 
 def test_backproject_tells_the_error_of_points(points, capsys):
-    """In proportion to the pixel's; none unless asked for."""
+    """The error of points is proportional to the pixel error, and is written only on request."""
     (points / "uv.csv").write_text("u,v\n600,300\n")
     sigma = {}
     for std in ("0.5", "1"):
@@ -629,7 +632,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
     ],
 )  # fmt: skip
 def test_points_that_cannot_be_used_are_refused_in_a_sentence(points, capsys, words, sentence):
-    """And nothing is written, not to standard output either."""
+    """Each request is refused in a sentence, and nothing is written, not even to standard output."""
     (points / "uv.csv").write_text("u,v\n600,300\n")
     (points / "bad.csv").write_text("u,v\n600,300\n600,low\n")
     before = sorted(points.iterdir())
@@ -639,7 +642,7 @@ def test_points_that_cannot_be_used_are_refused_in_a_sentence(points, capsys, wo
 
 @pytest.mark.parametrize("command", ["localize", "fuse"])
 def test_an_interruption_keeps_the_rows_so_far(files, tmp_path, capsys, monkeypatch, command):
-    """Control-C ends with 130 and a sentence; the table holds what was done."""
+    """Control-C ends with 130 and a sentence; the table contains the rows finished so far."""
     from finssim.localization.fusion.estimator import Estimator
     from finssim.localization.localize import Locator
 
@@ -667,7 +670,7 @@ def test_an_interruption_keeps_the_rows_so_far(files, tmp_path, capsys, monkeypa
 
 
 def test_a_pool_file_that_was_written_reads_back(files, tmp_path):
-    """The fixture's pool, by hand and as FinsSim writes it, is the same pool."""
+    """The fixture's pool, written by hand and written by FinsSim, is the same pool."""
     pool = load_pool(files / "pool.yaml")
     write_pool(pool, tmp_path / "pool.yaml")
     assert load_pool(tmp_path / "pool.yaml").sha256 == pool.sha256

@@ -1,4 +1,4 @@
-"""`finssim trials` and `finssim excite`, as a person types them."""
+"""`finssim trials` and `finssim excite`, with words as a user types them."""
 
 import json
 
@@ -21,20 +21,20 @@ def trials(tmp_path_factory):
 
 @pytest.mark.parametrize("group", ["trials", "calibrate", "experiment"])
 def test_a_group_alone_shows_its_commands(capsys, group):
-    """No word after it is no mistake."""
+    """A group without a further word shows its commands and is not an error."""
     assert finssim(group) == 0
     assert "Commands:" in capsys.readouterr().out
 
 
 def test_excite_writes_trials_that_read_back(trials):
-    """Both directions of the level, with the vehicle's name and what was measured."""
+    """Both directions of the level are written, with the vehicle's name and the measured quantities."""
     found = load_trials([trials])
     assert {trial.name for trial in found} == {"surge_plus_9", "surge_minus_9"}
     assert all(trial.has("u", "tau_x", "rpm_H_LF") for trial in found)
 
 
 def test_excite_writes_programmes_for_a_robot(capsys, tmp_path):
-    """Without --simulate: a table per programme; --json names the folders."""
+    """Without --simulate, each programme becomes a table; --json names the folders."""
     words = ["excite", "surge,yaw", "--vehicle", "finsrov", "--levels", "surge=5,10", "--levels", "yaw=1"]
     assert finssim(*words, "--out", tmp_path / "p", "--json") == 0
     folders = json.loads(capsys.readouterr().out)["trials"]
@@ -43,7 +43,7 @@ def test_excite_writes_programmes_for_a_robot(capsys, tmp_path):
 
 
 def test_import_makes_a_trial_of_a_table(capsys, tmp_path):
-    """A table with canonical columns needs no map."""
+    """A table with canonical columns needs no column map."""
     rows = "\n".join(f"{0.1 * i:.1f},{min(i, 10)},{0.01 * i}" for i in range(40))
     (tmp_path / "pool.csv").write_text(f"t,tau_x,u\n{rows}\n", encoding="utf-8")
     assert finssim("trials", "import", tmp_path / "pool.csv", "--out", tmp_path / "out", "--json") == 0
@@ -53,7 +53,7 @@ def test_import_makes_a_trial_of_a_table(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_check_says_what_trials_can_tell(capsys, trials):
-    """As text and as one JSON object, which names every trial."""
+    """The check prints text, or one JSON object that names every trial."""
     assert finssim("trials", "check", trials, "--vehicle", "finsrov") == 0
     assert "surge_plus_9" in capsys.readouterr().out
     assert finssim("trials", "check", trials, "--vehicle", "finsrov", "--json") == 0
@@ -80,13 +80,13 @@ def test_check_says_what_trials_can_tell(capsys, trials):
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, tmp_path, words, sentence):
-    """And nothing is written."""
+    """Each request is refused in a sentence, and nothing is written."""
     assert sentence in refusal(capsys, *words, "--out", tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_vehicle_of_imported_trials_is_found_from_any_directory(capsys, tmp_path, monkeypatch):
-    """Vehicle file beside the logs, by a relative path; then elsewhere; then the whole folder moved."""
+    """A vehicle file beside the logs, given by a relative path, is found from elsewhere and after moving the folder."""
     home, away = tmp_path / "dive", tmp_path / "moved"
     (home / "sub").mkdir(parents=True)
     (home / "own.yaml").write_text("extends: bluerov2\n", encoding="utf-8")
@@ -110,20 +110,20 @@ def test_the_vehicle_of_imported_trials_is_found_from_any_directory(capsys, tmp_
 
 
 def test_check_ends_with_3_if_no_trial_can_be_used(capsys, tmp_path):
-    """A script sees it."""
+    """Status 3 lets a script detect that no trial can be used."""
     (tmp_path / "still.csv").write_text("t,u\n0,0\n0.1,0\n0.2,0\n", encoding="utf-8")
     assert finssim("trials", "check", tmp_path, "--vehicle", "bluerov2") == 3
     assert "refused" in capsys.readouterr().out
 
 
 def test_check_refuses_what_is_no_trial(capsys, tmp_path):
-    """A folder without trials, and a path that is not there."""
+    """A folder without trials and a path that does not exist are refused."""
     assert "contains no trial" in refusal(capsys, "trials", "check", tmp_path)
     assert "no such file" in refusal(capsys, "trials", "check", tmp_path / "nowhere")
 
 
 def test_a_place_that_takes_no_files(capsys):
-    """Refused in a sentence."""
+    """An unwritable output directory is refused in a sentence."""
     assert "write elsewhere" in refusal(
         capsys, "excite", "surge", "--vehicle", "finsrov", "--out", "/proc/x/trials"
     )

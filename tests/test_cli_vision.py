@@ -1,4 +1,4 @@
-"""`finssim calibrate camera`, `pool` and `mounts`, as a person types them: every option, every refusal."""
+"""`finssim calibrate camera`, `pool` and `mounts`, as a user types them: every option, every refusal."""
 
 import json
 import re
@@ -26,21 +26,21 @@ PARAMETER = {"estimate", "ci95", "unit", "identifiable", "note"}
 
 
 def found_by(capsys, *words):
-    """The one JSON object that a command prints."""
+    """Return the one JSON object that a command prints."""
     capsys.readouterr()
     assert finssim(*words, "--json") == 0
     return json.loads(capsys.readouterr().out)
 
 
 def refused(capsys, folder, words, sentence):
-    """A refusal holds the sentence, and nothing is written."""
+    """Check that a command is refused with a sentence and writes nothing."""
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert sentence in refusal(capsys, *words, notes=True)
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
 def width(found, name):
-    """Width of a parameter's interval."""
+    """Return the width of a parameter's interval."""
     low, high = found["parameters"][name]["ci95"]
     return high - low
 
@@ -60,7 +60,8 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="session")
 def charuco(tmp_path_factory):
-    """Pictures of a ChArUco board of 7x5 squares, markers of DICT_4X4_50, by a lens of 600 px."""
+    """Pictures of a ChArUco board of 7x5 squares, markers of DICT_4X4_50, through a lens with 600 px of focal
+    length."""
     cv2 = pytest.importorskip("cv2")
     folder, rng = tmp_path_factory.mktemp("charuco"), np.random.default_rng(1)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
@@ -78,7 +79,7 @@ def charuco(tmp_path_factory):
 
 @pytest.mark.slow
 def test_camera_as_json_and_as_a_file(place, capsys):
-    """One object with the keys of the contract; the file holds the same lens, and beside it stands nothing else."""
+    """`--json` prints one object with the keys of the contract; the only file written contains the same lens."""
     found = found_by(capsys, *CAMERA, "--board", "9x6", "--report", "report")
     assert found.keys() >= {
         *("kind", "parameters", "per_view", "rms_px", "held_out_rms_px", "views", "left_out", "findings"),
@@ -117,8 +118,8 @@ def test_camera_fits_the_lens_that_it_is_told(place, capsys, model):
 
 @pytest.mark.slow
 def test_camera_takes_square_and_seed(place, capsys):
-    """The square goes into the record; the seed decides which pictures are held out together, and no more. The report
-    gives the command that does it again."""
+    """The square is recorded; the seed decides only which pictures are held out together. The report gives the command
+    that repeats the calibration."""
     words = ["calibrate", "camera", *sorted(PHOTOGRAPHS.glob("*.jpg"))]
     words += ["--board", "9x6", "--out", "camera.yaml"]
     plain = found_by(capsys, *words)
@@ -135,7 +136,7 @@ def test_camera_takes_square_and_seed(place, capsys):
 
 @pytest.mark.slow
 def test_camera_reads_a_charuco_board(place, charuco, capsys):
-    """Its size, its squares, its markers and their dictionary are what the options say."""
+    """The options set the board's size, squares, markers and dictionary."""
     words = ["calibrate", "camera", charuco, "--out", "camera.yaml", "--charuco", "7x5", "--square", "0.03"]
     found = found_by(capsys, *words, "--dictionary", "DICT_4X4_50", "--marker", "0.02")
     assert found["views"] == 6
@@ -174,7 +175,7 @@ def test_camera_reads_a_charuco_board(place, charuco, capsys):
     ],
 )  # fmt: skip
 def test_camera_refuses_in_a_sentence(place, capsys, words, sentence):
-    """And nothing is written."""
+    """Each request is refused in a sentence, and nothing is written."""
     refused(capsys, place, words, sentence)
 
 
@@ -182,7 +183,7 @@ def test_camera_refuses_in_a_sentence(place, capsys, words, sentence):
 
 
 def combined(path, seen, names="id,u,v,x,y,z", scale=1.0):
-    """A table of pixels with points."""
+    """Write a table of pixels with points."""
     lines = [names]
     for name, (u, v), point in zip(seen.names, seen.pixels, scale * seen.points, strict=True):
         cells = dict(zip("xyz", point, strict=True)) | {"id": name, "u": u, "v": v}
@@ -192,7 +193,7 @@ def combined(path, seen, names="id,u,v,x,y,z", scale=1.0):
 
 @pytest.fixture(scope="session")
 def pool_files(tmp_path_factory):
-    """A solid survey of 24 points, one of a floor, and a picture of tags on that floor, all below 1 m of water."""
+    """A survey of 24 points in space, one of a floor, and a picture of tags on that floor, all below 1 m of water."""
     folder = tmp_path_factory.mktemp("surveyed")
     write_camera(folder / "camera.yaml", PLUMB_BOB, {})
     water = Interface.water(1.0)
@@ -213,7 +214,7 @@ TAG_EDGE = 0.16
 
 @pytest.fixture(scope="session")
 def tag_files(pool_files):
-    """The floor's tags, with 4 mm of survey error, in one picture drawn through the water."""
+    """The floor's tags, surveyed with 4 mm of error, in one picture rendered through the water."""
     pytest.importorskip("pupil_apriltags")
     rng, tags, rows = np.random.default_rng(5), [], ["tag,x,y,z,yaw_deg"]
     for i, (x, y) in enumerate((x, y) for x in (-1.2, -0.4, 0.5, 1.3) for y in (-0.7, 0.0, 0.6)):
@@ -240,7 +241,7 @@ def tag_files(pool_files):
 
 @pytest.fixture
 def surveyed(pool_files, tmp_path, monkeypatch):
-    """The folder of the surveys to work in; what is written goes to another."""
+    """The folder of the surveys as working directory; outputs go to another."""
     monkeypatch.chdir(pool_files)
     return tmp_path
 
@@ -250,14 +251,14 @@ TAPE = "surface: {height: 1.0}"
 
 
 def surveyed_as(folder, tape=TAPE, **values):
-    """A survey file of the folder: a surface with a tape and two folds, unless given otherwise; its path."""
+    """Write a survey file, with a tape-measured surface and two folds unless given otherwise, and return its path."""
     tree = {"fit": ["pose", "height", "tilt", "index"], "folds": 2, **yaml.safe_load(tape), **values}
     (folder / "survey.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
     return folder / "survey.yaml"
 
 
 def pool_by(capsys, out, *words, tape=TAPE, inputs=("points.csv",), **values):
-    """What `finssim calibrate pool` finds, and the pool that it writes."""
+    """Return the result of `finssim calibrate pool` and the pool that it writes."""
     survey = ["--survey", surveyed_as(out, tape, **values)]
     found = found_by(capsys, "calibrate", "pool", *inputs, *survey, *WITH, "--out", out / "p.yaml", *words)
     return found, load_pool(out / "p.yaml")
@@ -265,7 +266,7 @@ def pool_by(capsys, out, *words, tape=TAPE, inputs=("points.csv",), **values):
 
 @pytest.fixture(scope="session")
 def plain(pool_files, tmp_path_factory):
-    """The same with a tape alone, for comparison."""
+    """The result with a tape alone, for comparison."""
     import contextlib
     import io
 
@@ -280,7 +281,7 @@ def plain(pool_files, tmp_path_factory):
 
 @pytest.mark.slow
 def test_pool_as_json_and_as_a_file(surveyed, plain):
-    """The keys of the contract; near the truth; what was known beforehand is in the file's record."""
+    """The result has the keys of the contract and is near the truth; the file's record contains the prior knowledge."""
     found, pool = plain
     assert found.keys() >= {
         *("kind", "interface", "parameters", "residual", "held_out", "pinhole", "lens_fitted", "outliers"),
@@ -296,8 +297,8 @@ def test_pool_as_json_and_as_a_file(surveyed, plain):
 
 @pytest.mark.slow
 def test_pool_as_a_table_with_a_report(surveyed, capsys):
-    """With the shortest survey file: what was found, where it was written, and a command that does it again, to the
-    byte."""
+    """The shortest survey file gives a table of results, the output path, and a command that repeats it byte
+    for byte."""
     import shlex
 
     (surveyed / "s.yaml").write_text("surface: {}\ncamera: {latency: 0.05}\n")
@@ -321,7 +322,7 @@ def test_pool_as_a_table_with_a_report(surveyed, capsys):
 
 @pytest.mark.slow
 def test_pool_matches_a_survey_with_pixels(surveyed, pool_files, plain, capsys):
-    """Two tables give what one gives; `points` is beside the survey file."""
+    """Two tables give the same result as one; `points` is relative to the survey file."""
     points = str(pool_files / "survey.csv")
     _, pool = pool_by(capsys, surveyed, points=points, inputs=("pixels.csv",))
     assert pool.sha256 == plain[1].sha256
@@ -329,7 +330,7 @@ def test_pool_matches_a_survey_with_pixels(surveyed, pool_files, plain, capsys):
 
 @pytest.mark.slow
 def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
-    """Millimetres that are not named spread over kilometres and are refused; with `unit` they are the same survey."""
+    """Millimetres without `unit` span kilometres and are refused; with `unit` they give the same survey."""
     survey = ["--survey", surveyed_as(surveyed)]
     words = ["calibrate", "pool", "millimetres.csv", *survey, *WITH, "--out", surveyed / "p.yaml"]
     refused(capsys, surveyed, words, "unit: mm into the survey file")
@@ -338,7 +339,7 @@ def test_pool_reads_lengths_in_the_unit(surveyed, plain, capsys):
 
 
 def test_pool_takes_the_height_of_a_floor(surveyed, capsys):
-    """A table without z: refused without `z`; another height of the floor moves the camera with it."""
+    """A table without z is refused without `z`; another height of the floor moves the camera with it."""
     survey = ["--survey", surveyed_as(surveyed, "surface: {}")]
     words = ["calibrate", "pool", "floor.csv", *survey, *WITH, "--out", surveyed / "p.yaml"]
     refused(capsys, surveyed, words, "no column 'z'")
@@ -393,13 +394,13 @@ KEYS = {
     "latency": ({"camera": {"latency": 0.04}}, lambda a, b, p: p.latency == 0.04),
     "folds": ({"folds": 4}, lambda a, b, p: a["held_out"]["folds"] == 4 != b["held_out"]["folds"]),
 }  # fmt: skip
-"""Key of the survey file -> what is given, and what then differs: JSON now, JSON without, pool now."""
+"""Key of the survey file -> values given, and the expected difference: JSON with, JSON without, pool with."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KEYS)
 def test_pool_does_what_each_key_says(surveyed, plain, capsys, name):
-    """The result is otherwise in the way that the key names."""
+    """The key changes the result as its name implies."""
     values, told = KEYS[name]
     found, pool = pool_by(capsys, surveyed, **values)
     assert told(found, plain[0], pool)
@@ -414,7 +415,7 @@ def test_pool_draws_by_its_seed(surveyed, plain, capsys):
 
 @pytest.mark.slow
 def test_pool_finds_the_tags_of_a_picture(surveyed, tag_files, capsys):
-    """Of the given family, with the given edge: camera and water within 1.5 cm."""
+    """Tags of the given family and edge determine camera and water within 1.5 cm."""
     given = {"inputs": ("tags.png",), "points": str(tag_files / "tags.csv")}
     tags = {"family": "tag36h11", "edge": TAG_EDGE}
     found, pool = pool_by(capsys, surveyed, tags=tags, **given)
@@ -460,7 +461,7 @@ POOL_WORDS = ["calibrate", "pool", "points.csv", "--survey", "SURVEY", *WITH, "-
     ],
 )  # fmt: skip
 def test_pool_refuses_in_a_sentence(surveyed, pool_files, capsys, words, sentence):
-    """And nothing is written, neither where the inputs are."""
+    """Each request is refused in a sentence, and nothing is written, nor beside the inputs."""
     files = {"OUT": surveyed / "p.yaml", "SURVEY": surveyed_as(surveyed)}
     given = [files.get(word, word) for word in words]
     before = sorted(pool_files.rglob("*"))
@@ -473,7 +474,7 @@ def test_pool_refuses_in_a_sentence(surveyed, pool_files, capsys, words, sentenc
 
 @pytest.fixture(scope="session")
 def mount_files(tmp_path_factory):
-    """A pool, a FinsROV with its port where it is, and a log."""
+    """A pool, a FinsROV with its port at the true position, and a log."""
     folder = tmp_path_factory.mktemp("mounts")
     write_pool(POOL, folder / "pool.yaml")
     vehicle = load_vehicle("finsrov").replace(
@@ -489,7 +490,7 @@ def mount_files(tmp_path_factory):
 
 @pytest.fixture
 def mounting(mount_files, tmp_path, monkeypatch):
-    """The folder of the logs to work in; what is written goes to another."""
+    """The folder of the logs as working directory; outputs go to another."""
     monkeypatch.chdir(mount_files)
     return tmp_path
 
@@ -499,7 +500,7 @@ MOUNT = ["calibrate", "mounts", "log", "--pool", "pool.yaml", "--vehicle", "vehi
 
 @pytest.mark.slow
 def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
-    """The keys of the contract; the tags' heights and distance as they are, in the vehicle file."""
+    """The result has the keys of the contract; the vehicle file contains the tags' true heights and distance."""
     found = found_by(capsys, *MOUNT, mounting / "v.yaml", "--seed", "9", "--report", mounting / "report")
     assert found.keys() >= {
         *("kind", "method", "vehicle", "parameters", "quality", "correlation", "findings", "trials"),
@@ -532,7 +533,7 @@ def test_mounts_as_json_and_as_a_vehicle(mounting, capsys):
     ],
 )  # fmt: skip
 def test_mounts_refuses_in_a_sentence(mounting, mount_files, capsys, words, sentence):
-    """And nothing is written, neither where the log is."""
+    """Each request is refused in a sentence, and nothing is written, nor beside the log."""
     given = [mounting / "v.yaml" if word == "OUT" else word for word in words]
     before = sorted(mount_files.rglob("*"))
     refused(capsys, mounting, given, sentence)

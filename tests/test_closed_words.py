@@ -1,4 +1,4 @@
-"""Every file that a person writes is of known words alone: an unknown key or word is refused, by its name."""
+"""Every hand-written file has a closed vocabulary: an unknown key or word is refused by name."""
 
 import copy
 from pathlib import Path
@@ -44,9 +44,9 @@ hydrodynamics: calibrated
 seed: 42
 """
 FREE = {"about", "source", "note", "description", "name", "title", "license", "license_url", "camera_name"}
-"""Keys whose values are for people."""
+"""Keys whose values are free text."""
 RECORDS = {"calibration", "calibrations", "training", "provenance"}
-"""Sections in which a program notes how a file came about."""
+"""Sections in which a program records the origin of a file."""
 LATER = {
     "map": {"vehicle", "column", "p", "value"},
     "trial": {"vehicle"},
@@ -55,11 +55,11 @@ LATER = {
     "survey through a window": {"points"},
     "policy": {"task", "unit", "mode", "sha256", "hydrodynamics"},
 }
-"""Words that are names of something outside the file, which whoever uses it compares or looks up."""
+"""Words that name something outside the file and are checked only when used."""
 
 
 def policy(path):
-    """The description of a policy, whose action mode is that of its vehicle."""
+    """Return the description of a policy, whose action mode is that of its vehicle."""
     mode_from_dict(read_description(path.parent).action, load_vehicle("finsrov"))
 
 
@@ -139,7 +139,7 @@ READERS = {
 
 
 def places(tree, path=(), done=None):
-    """Paths of the mappings in a tree that are not a record, one of those with the same keys."""
+    """Return the paths of the mappings in a tree that are not records, one for each set of keys."""
     done = set() if done is None else done
     if isinstance(tree, dict) and frozenset(tree) not in done:
         done.add(frozenset(tree))
@@ -150,7 +150,7 @@ def places(tree, path=(), done=None):
 
 
 def words(tree, path=(), done=None):
-    """Paths of the words that mean something, each once."""
+    """Return the paths of the words that have a meaning, each once."""
     done = set() if done is None else done
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
         if isinstance(value, dict | list) and key not in RECORDS:
@@ -161,7 +161,7 @@ def words(tree, path=(), done=None):
 
 
 def changed(tree, path, key, value):
-    """A copy of the tree with one value set."""
+    """Return a copy of the tree with one value set."""
     tree = copy.deepcopy(tree)
     here = tree
     for step in path:
@@ -199,7 +199,7 @@ def reader(request, tmp_path):
 
 
 def test_an_unknown_key_is_refused_by_name(reader):
-    """A key with a number in any section of any file is known, or named in the refusal."""
+    """A key with a digit appended is known, or named in the refusal, in any section of any file."""
     read, path, tree, _ = reader
     missed = []
     for place in places(tree):
@@ -210,7 +210,7 @@ def test_an_unknown_key_is_refused_by_name(reader):
 
 
 def test_an_unknown_word_is_refused_by_name(reader):
-    """A word that chooses something is known, or named in the refusal."""
+    """A word that selects something is known, or named in the refusal."""
     read, path, tree, later = reader
     missed = []
     for *place, key in words(tree):

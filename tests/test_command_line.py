@@ -1,4 +1,4 @@
-"""A command is a function: its signature is the options, its docstring the help."""
+"""A command is a function: its signature gives the options, its docstring the help."""
 
 import gc
 import inspect
@@ -54,7 +54,7 @@ def work(
 
 @pytest.fixture
 def work(tmp_path, monkeypatch):
-    """A command made of the source above, and what its function was called with."""
+    """A command made from the source above, and the arguments of its function."""
     (tmp_path / "thing.py").write_text(SOURCE)
     monkeypatch.setattr(command_line, "ROOT", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -67,7 +67,7 @@ def work(tmp_path, monkeypatch):
 
 
 def test_a_function_is_called_with_what_was_typed(work):
-    """Positions, numbers, lists and flags reach the function as its types say; what is no option keeps its default."""
+    """Positions, numbers, lists and flags reach the function with their types; other parameters keep their defaults."""
     run, calls = work
     words = [
         "a.csv",
@@ -91,7 +91,7 @@ def test_a_function_is_called_with_what_was_typed(work):
 
 
 def test_defaults_are_those_of_the_function(work):
-    """What is not typed is as a call from Python would have it; a result that is not ok has status 3."""
+    """Omitted options are as in a call from Python; a result that is not ok gives status 3."""
     run, calls = work
     assert run("a.csv") == 3
     assert calls[0]["rate"] == 5.0 and calls[0]["axes"] == ("surge", "yaw") and calls[0]["changes"] == ()
@@ -101,14 +101,14 @@ def test_defaults_are_those_of_the_function(work):
     "words", [["--rate", "10"], ["--rate", "x"], ["--seed", "-1"], ["--quiet"], ["--changes", "x"]]
 )
 def test_what_is_not_of_the_signature_is_refused(work, capsys, words):
-    """A number out of its bounds, a word for a number, and a name that is no option."""
+    """A number out of bounds, a word for a number and an unknown option are refused."""
     run, calls = work
     assert run("a.csv", *words) == 2 and not calls
     assert words[0] in capsys.readouterr().err
 
 
 def test_help_is_the_docstring(work, capsys):
-    """The text, each argument with its unit, its metavar, bounds and default."""
+    """The help contains the text, and each argument with its unit, metavar, bounds and default."""
     run, _ = work
     assert run("--help") == 0
     text = " ".join(capsys.readouterr().out.split())
@@ -121,7 +121,7 @@ def test_help_is_the_docstring(work, capsys):
     ("words", "status"), [(["a.csv", "--deep"], 0), (["a.csv"], 3), ([], 2), (["a.csv", "--rate", "10"], 2)]
 )
 def test_a_script_is_a_command_of_its_own(work, monkeypatch, words, status):
-    """The same words, exit statuses and refusals as a command of `finssim`; words that are missing are refused."""
+    """A script has the words, exit statuses and refusals of a `finssim` command; missing words are refused."""
     _, calls = work
     monkeypatch.setattr(sys, "argv", ["thing.py", *words])
     with pytest.raises(SystemExit) as end:
@@ -144,7 +144,7 @@ def test_what_the_source_says_is_what_python_has(words):
 
 
 def test_every_option_has_help():
-    """No command has an option that its docstring leaves out."""
+    """Every option of every command is described in its docstring."""
 
     def walk(command, words):
         for parameter in command.params:
@@ -161,7 +161,7 @@ def test_every_option_has_help():
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e300", "1e10"])
 def test_a_number_without_bounds_is_a_quantity(capsys, tmp_path, number):
-    """Not infinite, and not larger than any; nothing is written."""
+    """A number that is infinite or too large for any quantity is refused, and nothing is written."""
     words = ["simulate", "--vehicle", "finsrov", "--command", "surge=5", "--out", str(tmp_path / "run.csv")]
     assert boundary.run(app, [*words, "--duration", number]) == 2
     assert f"'--duration': {float(number):g} is not a number from -1e+09 to 1e+09" in capsys.readouterr().err
@@ -169,19 +169,19 @@ def test_a_number_without_bounds_is_a_quantity(capsys, tmp_path, number):
 
 
 SERVING = {"pool", "teleop", "view", "play", "ros2 up", "ros2 node", "ardusub-sitl"}
-"""Commands that serve, or print lines of JSON already."""
+"""Commands that serve, or already print lines of JSON."""
 
 
 @pytest.mark.parametrize("words", [words for words in EVERY if words not in SERVING])
 def test_every_command_with_a_result_prints_json(words, capsys):
-    """--json is an option of all."""
+    """All of them have the option --json."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
     assert "--json" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", EVERY)
 def test_an_option_means_the_same_in_every_command(words, capsys):
-    """--seed is 1 where it has a default; the estimator is never called a mode."""
+    """--seed defaults to 1 wherever it has a default; the estimator is never called a mode."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     seed = re.search(r"--seed (?:<int range>|INTEGER RANGE) (?:(?! --).)*", text)
@@ -190,7 +190,7 @@ def test_an_option_means_the_same_in_every_command(words, capsys):
 
 
 def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
-    """Every command once, below its section, and no line wider than 80 columns."""
+    """Every command is listed once, below its section, and no line is wider than 80 columns."""
     assert boundary.run(app, ["--help"]) == 0
     lines = capsys.readouterr().out.splitlines()
     first = dict.fromkeys(words.partition(" ")[0] for words in EVERY)
@@ -201,7 +201,7 @@ def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
 
 
 def test_garbage_is_searched_again_once_a_command_is_imported():
-    """`main` stops the search until then."""
+    """`main` disables garbage collection until then."""
     gc.disable()
     try:
         assert command_line.loaded("math:sqrt")(4.0) == 2.0 and gc.isenabled()

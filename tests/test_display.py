@@ -1,4 +1,4 @@
-"""Objects that a user meets in a terminal or a notebook: one line each, and a table in HTML."""
+"""Objects that a user displays in a terminal or a notebook: one line each, and a table in HTML."""
 
 from html.parser import HTMLParser
 from importlib.resources import files
@@ -19,7 +19,7 @@ FINSROV = load_vehicle("finsrov")
 
 
 def cells(html):
-    """Texts of the cells of a table, once every tag is closed."""
+    """Return the texts of the cells of a table, after checking that every tag is closed."""
     texts, depth = [], []
 
     class Reader(HTMLParser):
@@ -58,7 +58,7 @@ def fit():
 
 @pytest.mark.parametrize("name", catalogue())
 def test_a_vehicle_is_one_line(name):
-    """With its name, mass, thrusters and hydrodynamic sets; of the catalogue none is longer than two terminal lines."""
+    """The line names mass, thrusters and hydrodynamic sets; for the catalogue it fits two terminal lines."""
     vehicle = load_vehicle(name)
     assert repr(vehicle) == str(vehicle)
     assert (
@@ -67,7 +67,7 @@ def test_a_vehicle_is_one_line(name):
 
 
 def test_every_object_is_one_line():
-    """Without an address and without its arrays."""
+    """The line contains no address and no arrays."""
     simulator = Simulator("finsrov", worlds=3)
     assert repr(simulator) == "<Simulator: 3 worlds of finsrov (calibrated), 0.1 s in 4 substeps, cpu>"
     assert repr(trial()) == "<Trial surge_050: 2.0 s, 21 rows, u depth>"
@@ -79,7 +79,7 @@ def test_every_object_is_one_line():
 
 
 def test_notebooks_show_tables():
-    """Vehicle, trial and fit: well-formed HTML that holds their numbers, escaped."""
+    """Vehicle, trial and fit give well-formed HTML that contains their numbers, escaped."""
     assert "11.2 kg" in cells(FINSROV.replace({"body.mass": 11.2})._repr_html_())
     assert cells(trial()._repr_html_())[5:] == [
         "u",
@@ -100,7 +100,7 @@ def test_notebooks_show_tables():
 
 
 def test_notebooks_show_what_is_simulated_and_drawn():
-    """A simulator with its surroundings and state, a task with what it observes, ranges with their ends."""
+    """A simulator shows its surroundings and state, a task its observations, ranges their ends."""
     simulator = Simulator("finsrov", worlds=3, water=Water(current=(0.1, 0.0, 0.0)))
     simulator.place(position=(1.0, 2.0, -0.5))
     simulator.step()
@@ -123,7 +123,7 @@ def test_notebooks_show_what_is_simulated_and_drawn():
 
 
 def test_a_replay_shows_its_scores():
-    """The tables that `finssim replay` prints."""
+    """A replay shows the tables that `finssim replay` prints."""
     trials = simulate_programme(programmes("yaw", FINSROV, levels=[2.0]), FINSROV, seed=1)
     result = replay(trials[:1], FINSROV)
     assert repr(result) == "<Replay of finsrov (calibrated): 1 trials>"
@@ -131,7 +131,7 @@ def test_a_replay_shows_its_scores():
 
 
 def test_an_evaluation_shows_its_table():
-    """The table that `finssim evaluate` prints."""
+    """An evaluation shows the table that `finssim evaluate` prints."""
     measures = [{"episode": 0, "success": 1.0, "return": 2.0, "time": 3.0, "energy": 4.0}]
     plant = {"name": "nominal", "title": ""}
     shown = evaluation({"name": "pid"}, "docking", FINSROV, plant, measures)
@@ -140,5 +140,5 @@ def test_an_evaluation_shows_its_table():
 
 
 def test_type_checkers_read_the_package():
-    """PEP 561."""
+    """The package contains the marker of PEP 561."""
     assert files("finssim").joinpath("py.typed").is_file()

@@ -1,4 +1,4 @@
-"""What `make check` demands of public docstrings."""
+"""Requirements of `make check` on public docstrings."""
 
 import ast
 import sys
@@ -39,7 +39,7 @@ ALIASES = "finssim.localization.poses"
     ],
 )
 def test_what_a_docstring_lacks_is_named(signature, entry, lacking):
-    """By argument and type: a unit of real numbers, a shape of arrays, a frame of what has a direction."""
+    """A missing unit of real numbers, shape of an array or frame of a direction is named by argument and type."""
     name = signature.split(":")[0]
     text = f'def f({signature}):\n    """Do it.\n\n    Args:\n        {name}: {entry}\n    """\n'
     (function,) = ast.parse(text).body
@@ -58,13 +58,13 @@ def test_what_a_docstring_lacks_is_named(signature, entry, lacking):
     ],
 )
 def test_returned_numbers_have_a_unit(returned, text, lacking):
-    """In the section `Returns:`, or in the text above the arguments where there is none."""
+    """The unit is in the section `Returns:`, or in the text above the arguments where that section is absent."""
     (function,) = ast.parse(f'def f() -> {returned}:\n    """{text}"""\n').body
     assert list(check_docstrings.missing(function, ALIASES)) == ["what it returns: unit"] * lacking
 
 
 def test_fields_have_a_unit_in_their_own_docstring_or_in_that_of_the_class():
-    """Of a field without a docstring that of the class is read, there its own entry if it has one."""
+    """A field without a docstring is looked up in that of the class, in its own entry if it has one."""
     source = '''class C:
     """A thing.{about}"""
     speed: float

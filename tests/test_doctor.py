@@ -1,4 +1,4 @@
-"""The doctor tells the truth about this machine."""
+"""The doctor reports the true state of this machine."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from finssim.cli.doctor import EXTRAS, examine
 
 
 def test_a_working_machine_is_called_healthy():
-    """Tests run where the core is installed; the CPU runs Warp's kernels."""
+    """Tests run where the core is installed, and the CPU runs Warp's kernels."""
     found = examine()
     assert found["healthy"]
     assert found["core"]["numpy"] == metadata.version("numpy")
@@ -21,7 +21,7 @@ def test_a_working_machine_is_called_healthy():
 
 
 def test_a_missing_core_package_is_reported(monkeypatch, capsys):
-    """Without a core package the doctor says which and is not content."""
+    """A missing core package is named, and the result is not healthy."""
     monkeypatch.setattr(doctor, "CORE", (*doctor.CORE, "no-such-distribution"))
     assert doctor.doctor() == 1
     out = capsys.readouterr().out
@@ -29,7 +29,7 @@ def test_a_missing_core_package_is_reported(monkeypatch, capsys):
 
 
 def test_a_missing_extra_is_named_with_what_it_enables(monkeypatch, capsys):
-    """An extra that is not complete shows the package to install and the reason to."""
+    """An incomplete extra shows the package to install and the purpose."""
     monkeypatch.setitem(EXTRAS, "learn", doctor.Extra({"no-such-learner": "nsl"}, "train policies"))
     found = examine()["extras"]["learn"]
     assert found == {
@@ -43,14 +43,14 @@ def test_a_missing_extra_is_named_with_what_it_enables(monkeypatch, capsys):
 
 
 def test_json_is_one_object(capfd):
-    """Standard output of --json is JSON alone, with what text shows."""
+    """--json prints only JSON on standard output, with the same content as the text."""
     assert doctor.doctor(as_json=True) == 0
     keys = {"healthy", "machine", "core", "devices", "extras", "registered", "failures"}
     assert json.loads(capfd.readouterr().out).keys() == keys
 
 
 def test_extras_are_those_of_the_package():
-    """The doctor knows the extras that the package declares, and each one's distributions."""
+    """The doctor's extras, and the distributions of each, are those that the package declares."""
     project = pytest.importorskip("tomllib").loads(
         (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     )["project"]

@@ -1,4 +1,4 @@
-"""Output is whole or absent, and a refusal is one sentence."""
+"""Output is complete or absent, and a refusal is one sentence."""
 
 import json
 import os
@@ -23,12 +23,12 @@ from finssim.core.files import (
 
 
 def entries(directory):
-    """Names in a directory, hidden ones included."""
+    """Return the names in a directory, hidden ones included."""
     return sorted(entry.name for entry in directory.iterdir())
 
 
 def test_a_file_appears_whole_and_alone(tmp_path):
-    """The target holds what was written, parents are made, and no temporary file stays."""
+    """The target contains the written text, parents are created, and no temporary file remains."""
     target = tmp_path / "new" / "report.html"
     with atomic_write(target) as temporary:
         temporary.write_text("first")
@@ -37,7 +37,7 @@ def test_a_file_appears_whole_and_alone(tmp_path):
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
-    """An error inside the block, of any kind, keeps the earlier content and removes the part."""
+    """Any error inside the block keeps the earlier content and removes the partial file."""
     target = tmp_path / "table.csv"
     target.write_text("old")
     for error in (RuntimeError("boom"), KeyboardInterrupt()):
@@ -48,7 +48,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_new_files_follow_the_umask(tmp_path):
-    """A result is as readable as any file the user makes."""
+    """An output is as readable as any other file of the user."""
     (tmp_path / "plain").touch()
     with atomic_write(tmp_path / "ours"):
         pass
@@ -56,7 +56,7 @@ def test_new_files_follow_the_umask(tmp_path):
 
 
 def test_a_symbolic_link_is_followed(tmp_path):
-    """Writing to a link writes the file it names."""
+    """Writing to a link writes the file that it names."""
     (tmp_path / "real").write_text("old")
     (tmp_path / "link").symlink_to("real")
     with atomic_write(tmp_path / "link") as temporary:
@@ -66,7 +66,7 @@ def test_a_symbolic_link_is_followed(tmp_path):
 
 @pytest.mark.parametrize("atomic", [atomic_write, atomic_directory])
 def test_a_file_as_parent_is_refused_on_entry(tmp_path, atomic):
-    """The path through a file is refused before the block runs."""
+    """A path through a file is refused before the block runs."""
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"cannot write .*/file/out: part of that path is a file"):
         with atomic(tmp_path / "file" / "out"):
@@ -75,7 +75,7 @@ def test_a_file_as_parent_is_refused_on_entry(tmp_path, atomic):
 
 @pytest.mark.parametrize("atomic", [atomic_write, atomic_directory])
 def test_a_place_that_takes_no_files_is_refused_on_entry(atomic):
-    """/proc takes no files from anyone, the superuser included."""
+    """/proc refuses files from everyone, the superuser included."""
     with pytest.raises(OutputError, match=r"^cannot write /proc/finssim/out: .* write elsewhere$"):
         with atomic("/proc/finssim/out"):
             pytest.fail("the block ran")
@@ -116,7 +116,7 @@ def test_a_full_disk_leaves_nothing(tmp_path):
 
 
 def test_no_space_left_is_said_so(tmp_path):
-    """ENOSPC, here from the device that is always full, becomes its sentence; the part is removed."""
+    """ENOSPC, here from /dev/full, becomes its sentence; the partial file is removed."""
     with pytest.raises(OutputError, match=r"cannot write .*log.csv: the disk is full: free some space"):
         with atomic_write(tmp_path / "log.csv"), open("/dev/full", "w") as full:
             full.write("x")
@@ -124,13 +124,13 @@ def test_no_space_left_is_said_so(tmp_path):
 
 
 def test_an_unreadable_input_is_not_called_an_output(tmp_path):
-    """An input missing elsewhere keeps its own error."""
+    """An input that is missing keeps its own error."""
     with pytest.raises(FileNotFoundError, match="nowhere"), atomic_write(tmp_path / "out"):
         open("/nowhere/at/all")
 
 
 def test_a_directory_appears_whole(tmp_path):
-    """Until the block ends the name is free; then it holds every file, and no temporary directory stays."""
+    """The name is free until the block ends; then it has every file, and no temporary directory remains."""
     with atomic_directory(tmp_path / "policy") as temporary:
         (temporary / "sub").mkdir()
         (temporary / "sub" / "a.txt").write_text("a")
@@ -139,7 +139,7 @@ def test_a_directory_appears_whole(tmp_path):
 
 
 def test_an_interrupted_directory_leaves_nothing(tmp_path):
-    """Control-C removes the part."""
+    """Control-C removes the partial directory."""
     with pytest.raises(KeyboardInterrupt), atomic_directory(tmp_path / "policy") as temporary:
         (temporary / "half").touch()
         raise KeyboardInterrupt
@@ -147,7 +147,7 @@ def test_an_interrupted_directory_leaves_nothing(tmp_path):
 
 
 def test_only_an_earlier_output_is_replaced(tmp_path):
-    """A directory with the mark of its kind is replaced as a whole; anyone else's files are refused on entry."""
+    """A directory with the marker of its kind is replaced as a whole; other files are refused on entry."""
     policy = tmp_path / "policy"
     for content in ("one", "two"):
         with atomic_directory(policy, replaces="policy.yaml") as temporary:
@@ -164,7 +164,7 @@ def test_only_an_earlier_output_is_replaced(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_run_leaves_no_target(tmp_path):
-    """A process killed while it writes leaves the target's name free."""
+    """A process that is killed while it writes leaves the target's name free."""
     script = (
         "import sys, time; from finssim.core.files import *\n"
         "with atomic_write(sys.argv[1]) as temporary:\n"
@@ -180,7 +180,7 @@ def test_a_killed_run_leaves_no_target(tmp_path):
 
 
 def test_a_place_is_tried_without_leaving_anything(tmp_path):
-    """Before long work: what cannot be written is refused, what can stays as it was."""
+    """Before long work, an unwritable path is refused and a writable one is left as it was."""
     (tmp_path / "old.yaml").write_text("old")
     refuse_unwritable(atomic_write(tmp_path / "old.yaml"))
     refuse_unwritable(atomic_directory(tmp_path / "new"))
@@ -214,7 +214,7 @@ NO_NAMES = {
 
 @pytest.mark.parametrize(("name", "reason"), NO_NAMES.items(), ids=map(ascii, range(len(NO_NAMES))))
 def test_a_name_from_data_is_no_path(name, reason):
-    """On no system: separators and drives of others count too. One sentence says whose, what and what to do."""
+    """Separators and drives of every system are refused; one sentence names the source, the text and the remedy."""
     with pytest.raises(KeyError, match=reason) as refused:
         plain_name(name, "run.mcap: vehicle", KeyError)
     sentence = refused.value.args[0]
@@ -240,14 +240,14 @@ def test_a_name_from_data_is_no_path(name, reason):
     ],
 )
 def test_a_plain_name_is_one_file_of_its_folder(tmp_path, name):
-    """It comes back as it is, and a file of that name lies where it was meant to lie, beside its temporary one."""
+    """The name is returned unchanged, and a file of that name lies in the intended folder, beside its temporary one."""
     with atomic_write(tmp_path / f"{plain_name(name, 'trial', KeyError)}.yaml") as temporary:
         assert temporary.parent == tmp_path
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.yaml"]
 
 
 def test_a_directory_has_one_writer(tmp_path, capsys):
-    """The second is told who writes; afterwards, and after a refused command, nothing stays of the lock."""
+    """The second writer is told of the first; afterwards, and after a refused command, no lock remains."""
     out = tmp_path / "new" / "hold"
     with sole_writer(out), sole_writer(tmp_path / "new" / "other"):
         with pytest.raises(
@@ -264,7 +264,7 @@ def test_a_directory_has_one_writer(tmp_path, capsys):
 
 
 def test_a_lock_of_a_dead_process_is_replaced_and_one_of_another_computer_is_not(tmp_path):
-    """A killed training may be resumed at once."""
+    """A killed training can be resumed at once."""
     lock = tmp_path / ".hold.lock"
     for host, refused in ((socket.gethostname(), False), ("elsewhere", True)):
         lock.write_text(json.dumps({"pid": 2**30, "host": host, "command": "finssim train"}))

@@ -1,4 +1,4 @@
-"""The functions that `finssim` exports: a study in a script or a notebook, with objects and without output."""
+"""The functions that `finssim` exports: a study in a script or notebook, with objects and without printed output."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ EPS = float(np.finfo(np.float32).eps)
 
 @pytest.mark.slow
 def test_importing_the_package_is_cheap_and_every_name_is_there():
-    """`import finssim` imports neither NumPy nor Warp; all its names can be used and are listed."""
+    """`import finssim` imports neither NumPy nor Warp; all exported names are listed and usable."""
     code = "import sys, finssim; print(sorted({'numpy', 'warp', 'torch', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -38,7 +38,7 @@ def test_importing_the_package_is_cheap_and_every_name_is_there():
 def test_acceleration_is_that_of_the_reference(name, model):
     """nu_dot equals that of an independent float64 implementation in random states, to float32 rounding.
 
-    The hull by its matrices; fins and further terms have their own tests.
+    The hull is compared by its matrices; fins and further terms have their own tests.
     """
     vehicle, rng = plain(load(name)), np.random.default_rng(5)
     length = max(vehicle.body.size)
@@ -50,7 +50,7 @@ def test_acceleration_is_that_of_the_reference(name, model):
 
 
 def test_attitude_may_be_angles_and_axes_broadcast():
-    """Roll, pitch and yaw are the same attitude as their quaternion; one state and many wrenches give many rows."""
+    """Roll, pitch and yaw give the same result as their quaternion; one state and many wrenches give many rows."""
     rpy = fs.acceleration("bluerov2", [0, 0, -3, 0.2, -0.1, 1.0], np.zeros(6))
     half = np.array([0.2, -0.1, 1.0]) / 2.0
     (c, s) = np.cos(half), np.sin(half)
@@ -88,7 +88,7 @@ def test_states_that_make_no_sense_are_refused(arguments, said):
 
 
 def test_a_wrench_within_reach_is_met_and_one_beyond_keeps_the_limits():
-    """B f = tau to 1e-4 of it where the thrusters reach it; no thrust is ever beyond its limits."""
+    """B f = tau holds to a relative 1e-4 where the thrusters can reach it; no thrust ever exceeds its limits."""
     vehicle = fs.load_vehicle("bluerov2_heavy")
     six = fs.load_vehicle("bluerov2").replace({"water.gravity": vehicle.water.gravity})
     simulator = fs.Simulator([vehicle, six], worlds=3)
@@ -108,7 +108,7 @@ def test_a_wrench_within_reach_is_met_and_one_beyond_keeps_the_limits():
 
 
 def test_pulses_give_the_thrust_of_the_speed_controller():
-    """A neutral pulse gives nothing, a full one the force of the curve at that speed; voltage counts."""
+    """A neutral pulse gives no thrust, a full one the force of the curve at that speed; the voltage has an effect."""
     vehicle = fs.load_vehicle("bluerov2")
     simulator = fs.Simulator(vehicle, worlds=2)
     simulator.set_pwm(np.full((2, 1, 6), 1500.0) + np.array([0.0, 300.0])[:, None, None])
@@ -131,7 +131,7 @@ def frame():
 
 
 def test_a_trial_is_made_of_a_frame_with_its_units_and_axes():
-    """Columns, units and axes are converted; what is not used is a finding; a mapping is as good as a DataFrame."""
+    """Columns, units and axes are converted; unused columns are a finding; a mapping works like a DataFrame."""
     import pandas as pd
 
     columns = {"v": "speed", "depth": "depth", "force_T1": "force_T1"}
@@ -213,7 +213,7 @@ def test_a_fit_without_trials_and_one_axis_by_name():
 
 @pytest.mark.slow
 def test_a_study_from_trials_to_the_pool(capfd, tmp_path):
-    """Every step takes what the step before returned; nothing is printed on standard output."""
+    """Each step takes the result of the previous step; nothing is printed on standard output."""
     from finssim.identification.programme import programmes
     from finssim.identification.synthetic import simulate_programme
 

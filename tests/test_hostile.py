@@ -1,4 +1,4 @@
-"""A small sample of `benchmarks/hostile.py`: broken files end in a sentence, or are read, and nothing else appears."""
+"""A small sample of `benchmarks/hostile.py`: broken files are refused in a sentence or read, and no output remains."""
 
 import importlib.util
 import random
@@ -21,7 +21,7 @@ CASES = (
     ("pixels.csv", "backproject {} --z 0 --pool SEEDS/pool.yaml"),
     ("parameters.yaml", f"{hostile.PARAMETERS} {{}}"),
 )
-"""Files that need no command to be made, and commands that read them in milliseconds."""
+"""Files that can be made without a command, and commands that read them in milliseconds."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def seeds(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "command"), CASES)
 def test_broken_files_are_read_or_refused(seeds, tmp_path, monkeypatch, capsys, name, command):
-    """Fifteen inputs of each kind: the exit status is 0 or 2, whatever is in the file, and no other file appears."""
+    """For fifteen inputs of each kind, the exit status is 0 or 2 whatever the content, and no other file appears."""
     monkeypatch.chdir(tmp_path)
     file, ends = tmp_path / name, set()
     for i in range(15):

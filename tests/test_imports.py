@@ -1,4 +1,4 @@
-"""Imports follow the arrows between layers, heavy libraries stay where they are needed, and importing is cheap."""
+"""Imports follow the layers, heavy libraries are imported only where needed, and importing is cheap."""
 
 import ast
 import subprocess
@@ -42,10 +42,10 @@ ARROWS = {
     "extensions.viewer": {"extensions.perception", "evaluation"},
     "extensions.ros2": {"extensions.perception", "pool"},
 }
-"""Layer -> the layers right below it. A layer may import everything below; nothing but an extension lies above one."""
+"""Layer -> the layers directly below it. A layer may import everything below; only extensions lie above extensions."""
 
 TOP = {"workflow", "cli", "__main__"}
-"""What may import anything, and what only they import."""
+"""Modules that may import anything, and that only these modules import."""
 
 
 HOMES = {
@@ -153,12 +153,12 @@ HOMES = {
 
 
 def layer_of(parts: Sequence[str]) -> str:
-    """Layer of a module's name below `finssim`; of the extensions each is one."""
+    """Return the layer of a module's name below `finssim`; each extension is a layer."""
     return ".".join(parts[: 2 if parts[:1] == ("extensions",) else 1])
 
 
 def layer(path: Path) -> str:
-    """Name of the package or top module a source file belongs to; "" for the package itself."""
+    """Return the package or top module of a source file; "" for the package itself."""
     parts = path.relative_to(SOURCE).with_suffix("").parts
     return layer_of(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -167,18 +167,18 @@ LAYERS = {layer(path) for path in MODULES}
 
 
 class Parsed(NamedTuple):
-    """What the tests ask of a source file."""
+    """Parsed contents of a source file."""
 
     imports: frozenset[str]
-    """Dotted names of all modules that it imports, inside functions too."""
+    """Dotted names of all imported modules, inside functions too."""
     loaded: frozenset[str]
-    """Modules that are imported when it is."""
+    """Modules that are imported when this one is."""
     classes: tuple[str, ...]
 
 
 @cache
 def parsed(path: Path) -> Parsed:
-    """Read a file once."""
+    """Parse a file, once."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     nodes = list(ast.walk(tree))
     classes = tuple(node.name for node in nodes if isinstance(node, ast.ClassDef))
@@ -186,7 +186,7 @@ def parsed(path: Path) -> Parsed:
 
 
 def names_of(nodes: Iterable[ast.AST], path: Path) -> set[str]:
-    """Dotted names that import statements among nodes name."""
+    """Return the dotted names in the import statements among nodes."""
     names = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -200,7 +200,7 @@ def names_of(nodes: Iterable[ast.AST], path: Path) -> set[str]:
 
 
 def executed(tree: ast.Module) -> Iterator[ast.AST]:
-    """Statements that run when a module is imported."""
+    """Yield the statements that run when a module is imported."""
     nodes = list[ast.AST](tree.body)
     while nodes:
         node = nodes.pop()
@@ -212,33 +212,33 @@ def executed(tree: ast.Module) -> Iterator[ast.AST]:
 
 
 def imported_layers(path: Path) -> set[str]:
-    """Layers of FinsSim that a file imports."""
+    """Return the layers of FinsSim that a file imports."""
     ours = {layer_of(tuple(n.split("."))[1:]) for n in parsed(path).imports if n.split(".")[0] == "finssim"}
     return ours & LAYERS - {"", "extensions"}
 
 
 def below(name: str) -> set[str]:
-    """Every layer that `name` may import: those right below it and theirs."""
+    """Return every layer that `name` may import: those directly below it, and theirs."""
     return set(chain.from_iterable({under} | below(under) for under in ARROWS.get(name, ())))
 
 
 def test_every_module_has_its_place():
-    """Each package and top module stands in the drawing of the layers."""
+    """Each package and top module appears in the diagram of the layers."""
     assert LAYERS - {"", "extensions"} == ARROWS.keys() | TOP
 
 
 def test_a_class_has_a_name_of_its_own():
-    """One meaning for each name: no two classes of the package share theirs."""
+    """No two classes of the package have the same name."""
     names = Counter(name for path in MODULES for name in parsed(path).classes)
     assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_imports_follow_the_arrows():
-    """A module imports its own layer and layers below it; nothing imports the top but the top."""
+    """A module imports its own layer and layers below it; only the top imports the top."""
     against = {}
     for path in MODULES:
         own = layer(path)
-        if own in TOP or path == SOURCE / "__init__.py":  # which imports lazily
+        if own in TOP or path == SOURCE / "__init__.py":  # it imports lazily
             continue
         allowed = {own} | below(own)
         against[path.relative_to(SOURCE).as_posix()] = imported_layers(path) - allowed
@@ -246,27 +246,27 @@ def test_imports_follow_the_arrows():
 
 
 def loaded_with(path: Path) -> set[str]:
-    """Modules of FinsSim that a module imports when it is imported, without the packages that it lies in."""
+    """Return the modules of FinsSim that a module imports when imported, without its parent packages."""
     own = dotted(path)
     parts = chain.from_iterable(accumulate(name.split("."), "{}.{}".format) for name in parsed(path).loaded)
     return {name for name in parts if name != own and not own.startswith(f"{name}.")}
 
 
 def dotted(path: Path) -> str:
-    """Name of the module of a file."""
+    """Return the module name of a file."""
     return ".".join(("finssim", *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__")
 
 
 def test_no_module_imports_one_that_imports_it():
-    """Any module can be imported first: nothing that a module imports imports it in turn, at any distance."""
+    """Any module can be imported first: the imports contain no cycle of any length."""
     graph = {dotted(path): loaded_with(path) for path in MODULES}
     known = {name: imported & graph.keys() for name, imported in graph.items()}
     sorter = TopologicalSorter(known)
-    sorter.prepare()  # raises a CycleError that lists the circle
+    sorter.prepare()  # raises a CycleError that lists the cycle
 
 
 def exporting() -> list[str]:
-    """Packages that import their names when these are first used."""
+    """Return the packages that import their names on first use."""
     return [
         dotted(path)
         for path in MODULES
@@ -277,7 +277,7 @@ def exporting() -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("package", exporting())
 def test_a_package_exports_what_it_says(package):
-    """Its list is that of its imports, each name can be imported, and none is the name of a module of it."""
+    """The export list matches the imports, each name can be imported, and none is the name of a submodule."""
     module = import_module(package)
     folder = Path(str(module.__file__)).parent
     modules = {path.stem for path in folder.glob("*.py")} | {
@@ -295,14 +295,14 @@ def test_a_package_exports_what_it_says(package):
 
 
 def test_the_package_imports_nothing_of_the_checkout():
-    """Studies, benchmarks and tools import the package, which is installed without them."""
+    """The package is installed without studies, benchmarks and tools, so it imports none of them."""
     outside = {"studies", "benchmarks", "tools", "tests"}
     against = {path: parsed(path).imports for path in MODULES}
     assert not [path for path, names in against.items() if outside & {n.partition(".")[0] for n in names}]
 
 
 def test_heavy_libraries_stay_at_home():
-    """A heavy library is imported in the files that need it, and in no other."""
+    """A heavy library is imported in the files that need it, and in no others."""
     importers = {library: set() for library in HOMES}
     for path in MODULES:
         for library in HOMES.keys() & {name.partition(".")[0] for name in parsed(path).imports}:
@@ -311,7 +311,7 @@ def test_heavy_libraries_stay_at_home():
 
 
 def fresh(script: str) -> str:
-    """Standard output of a Python that has imported nothing yet."""
+    """Return the standard output of a fresh Python."""
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     return run.stdout
 
@@ -338,7 +338,7 @@ def test_a_part_costs_only_what_it_needs(module, absent):
 
 @pytest.mark.slow
 def test_importing_finssim_costs_less_than_importing_numpy():
-    """`import finssim` in a fresh Python takes less time than `import numpy`, the best of several of each."""
+    """`import finssim` in a fresh Python takes less time than `import numpy`, each the best of several runs."""
     script = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
     times = {"finssim": [], "numpy": []}
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""`finssim new`: what it writes runs, passes its tests, and is found by every command once it is installed."""
+"""`finssim new` writes packages that run, pass their tests and, once installed, are found by every command."""
 
 import json
 import re
@@ -20,7 +20,7 @@ NAMES = {
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """One of each kind, under a name of its own."""
+    """One package of each kind, each with its own name."""
     place = tmp_path_factory.mktemp("own")
     for kind, name in NAMES.items():
         assert new(kind, name, out=place / name) == place / name
@@ -33,7 +33,7 @@ def test_every_kind_is_tested():
 
 @pytest.mark.parametrize("kind", NAMES)
 def test_nothing_of_the_old_name_is_left(written, kind):
-    """In no form; the file and its test have the new one."""
+    """No form of the old name remains; the file and its test have the new one."""
     old, name = KINDS[kind][0], NAMES[kind]
     files = {path.name: path.read_text(encoding="utf-8") for path in (written / name).iterdir()}
     assert f"test_{name}.py" in files
@@ -46,7 +46,7 @@ def test_nothing_of_the_old_name_is_left(written, kind):
 
 @pytest.mark.slow
 def test_what_it_writes_passes_its_tests(written):
-    """All of them, each from its own directory."""
+    """All written tests pass, each from its own directory."""
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, written.iterdir())]
     run = subprocess.run(words, cwd=written, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout + run.stderr
@@ -54,7 +54,7 @@ def test_what_it_writes_passes_its_tests(written):
 
 @pytest.mark.slow
 def test_an_agent_of_ones_own_is_evaluated_like_ours(written, capsys):
-    """By file and class, beside the trials of a PID."""
+    """A user's agent is evaluated by file and class, beside the trials of a PID."""
     spring = f"{written / 'spring' / 'spring.py'}:Spring"
     assert boundary.run(app, ["evaluate", spring, "--task", "t1", "--trials", "1"]) == 0
     assert "spring" in capsys.readouterr().out
@@ -62,7 +62,7 @@ def test_an_agent_of_ones_own_is_evaluated_like_ours(written, capsys):
 
 @pytest.mark.parametrize("kind", ["task", "term", "sensor", "actuator"])
 def test_once_installed_every_command_finds_it(written, kind, tmp_path, monkeypatch):
-    """By the entry point of its pyproject.toml."""
+    """Commands find the package by the entry point of its pyproject.toml."""
     from finssim.core.registry import FAMILIES
 
     name = NAMES[kind]
@@ -85,7 +85,7 @@ def test_once_installed_every_command_finds_it(written, kind, tmp_path, monkeypa
     ],
 )
 def test_what_cannot_be_made_is_refused(words, sentence, capsys, tmp_path, monkeypatch):
-    """In one sentence, and nothing is written."""
+    """Each request is refused in one sentence, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     assert boundary.run(app, ["new", *words]) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())

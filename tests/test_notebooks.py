@@ -15,27 +15,27 @@ COURSE = sorted((EXAMPLES / "course").glob("*.ipynb"))
 
 
 def cells(path: Path) -> list[dict]:
-    """Code cells of a notebook, in order."""
+    """Return the code cells of a notebook, in order."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     assert notebook["nbformat"] == 4
     return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
 
 
 def code(path: Path) -> str:
-    """Code of a notebook without the directives of IPython."""
+    """Return the code of a notebook without IPython directives."""
     lines = [line for cell in cells(path) for line in [*cell["source"], "\n"]]
     return "".join(line for line in lines if not line.startswith("%"))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_committed_without_outputs(path):
-    """Outputs are made by who runs it; a difference then shows what its author changed."""
+    """Outputs are produced by the reader; a difference then shows only the author's changes."""
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells(path))
 
 
 @pytest.mark.parametrize("path", COURSE, ids=lambda path: path.stem)
 def test_the_course_is_committed_as_it_ran(path):
-    """Learners read it before they install anything: every cell ran once, in order, without a warning on its way."""
+    """Learners read it before they install anything: every cell ran once, in order, without a warning."""
     assert [cell["execution_count"] for cell in cells(path)] == list(range(1, len(cells(path)) + 1))
     outputs = [output for cell in cells(path) for output in cell["outputs"]]
     assert all(o["output_type"] != "error" and o.get("name") != "stderr" for o in outputs)
@@ -47,13 +47,13 @@ SHORT = {
     "05_learning": ("steps=STEPS,", 'steps=50_000, init="pid",'),
     "train_and_look_inside": ("steps=300_000,", "steps=16_384,"),
 }
-"""What makes a notebook's training short: its words, and others; what must hold its goal afterwards begins as a PID."""
+"""Replacements that shorten a notebook's training; an agent that must hold its goal afterwards starts as a PID."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [*NOTEBOOKS, *COURSE], ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path, monkeypatch, capsys):
-    """From its first cell to its last, in a folder of its own; as it stands, but for trainings, which are short."""
+    """Each notebook runs from first to last cell in its own folder, unchanged except for shortened trainings."""
     text = code(path)
     if path.stem in SHORT:
         words, fewer = SHORT[path.stem]

@@ -1,4 +1,4 @@
-"""What the pages show works: their Python runs, their vehicle loads, and the strict build passes."""
+"""The examples on the pages work: their Python runs, their vehicle loads, and the strict build passes."""
 
 import ast
 import json
@@ -31,7 +31,7 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """Fenced code of one language, in the page's order."""
+    """Return the fenced code of one language, in the page's order."""
     text = page.read_text(encoding="utf-8")
     return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
 
@@ -54,7 +54,7 @@ def test_python_on_a_page_runs(page, tmp_path, monkeypatch):
 
 
 def test_the_vehicle_on_the_page_loads(tmp_path):
-    """The example vehicle is a vehicle, and a wrong axis in it gives the error that the page shows."""
+    """The example vehicle loads, and a wrong axis in it gives the error that the page shows."""
     example, actuators = blocks(ROOT / "docs" / "reference" / "vehicle_file.md", "yaml")
     (tmp_path / "minnow.yaml").write_text(example, encoding="utf-8")
     assert load_vehicle(tmp_path / "minnow.yaml").thruster_names == ("left", "right")
@@ -71,7 +71,7 @@ def test_the_vehicle_on_the_page_loads(tmp_path):
 
 
 def test_the_sensing_the_sweep_and_the_plant_on_the_pages_load(tmp_path):
-    """The example files of the learning and evaluation pages are what the commands take."""
+    """The commands accept the example files of the learning and evaluation pages."""
     sensing, sweep = blocks(ROOT / "docs" / "learning.md", "yaml")
     (plant,) = blocks(ROOT / "docs" / "evaluation.md", "yaml")
     for example, load in (
@@ -82,7 +82,7 @@ def test_the_sensing_the_sweep_and_the_plant_on_the_pages_load(tmp_path):
 
 
 def test_the_pools_on_the_page_load(tmp_path):
-    """The full file and the shortest one are what the commands take."""
+    """The commands accept the full pool file and the shortest one."""
     full, shortest = blocks(ROOT / "docs" / "reference" / "pool_file.md", "yaml")
     for example, height in ((full, 0.96), (shortest, 1.0)):
         (tmp_path / "pool.yaml").write_text(example, encoding="utf-8")
@@ -91,7 +91,7 @@ def test_the_pools_on_the_page_load(tmp_path):
 
 @pytest.mark.slow
 def test_the_survey_on_the_page_calibrates_a_pool(tmp_path, monkeypatch):
-    """The survey file of the page, with a survey of the published pool in millimetres: the camera to 15 mm."""
+    """The survey file of the page, with a survey of the published pool in millimetres, locates the camera to 15 mm."""
     from survey.surveyed_pools import FLOOR, PLUMB_BOB, overhead, survey
 
     monkeypatch.chdir(tmp_path)
@@ -112,7 +112,8 @@ def test_the_survey_on_the_page_calibrates_a_pool(tmp_path, monkeypatch):
 
 
 def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch):
-    """The vehicle of the hour loads, its checks pass, its truth extends it, and its map reads its log."""
+    """The vehicle of the one-hour tutorial loads and passes its checks, its truth extends it, and its map
+    reads its log."""
     page = ROOT / "docs" / "own_rov.md"
     monkeypatch.chdir(tmp_path)
     for name, example in zip(("minnow.yaml", "log.yaml", "water.yaml"), blocks(page, "yaml"), strict=True):
@@ -127,14 +128,14 @@ def test_the_rov_on_the_page_is_sound_and_its_log_is_read(tmp_path, monkeypatch)
 
 
 def test_the_world_on_the_page_loads(tmp_path):
-    """The example file is a world, with its mooring and what moves with it."""
+    """The example file is a valid world, with its mooring and moving bodies."""
     example, *_ = blocks(ROOT / "docs" / "worlds.md", "yaml")
     (tmp_path / "buoy.yaml").write_text(example, encoding="utf-8")
     assert load_world(tmp_path / "buoy.yaml").objects["buoy"].frame == "mooring"
 
 
 def test_every_range_of_the_section_on_randomisation_loads(tmp_path):
-    """Whole files, and the schedules line by line, of which a file has one."""
+    """Complete files load; the schedules, of which a file has one, load line by line."""
     path = tmp_path / "ranges.yaml"
     *_, first, tied, schedules = blocks(ROOT / "docs" / "reference" / "ranges.md", "yaml")
     for example in (first, tied, *(f"mass: [0.9, 1.1]\n{line}" for line in schedules.splitlines())):
@@ -144,17 +145,15 @@ def test_every_range_of_the_section_on_randomisation_loads(tmp_path):
 
 @pytest.mark.slow
 def test_pages_build_without_a_warning(tmp_path):
-    """Every link between pages leads to a page and to a heading of it."""
-    mkdocs = (
-        "import gc; gc.disable(); from mkdocs.__main__ import cli; cli()"  # a fifth of the time is the search
-    )
+    """Every link between pages leads to an existing page and heading."""
+    mkdocs = "import gc; gc.disable(); from mkdocs.__main__ import cli; cli()"  # collection takes a fifth of the time
     words = ["build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]
     run = subprocess.run([sys.executable, "-c", mkdocs, *words], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
 
 
 def test_a_page_about_a_package_begins_with_what_to_call_first():
-    """Then comes a few lines that do it, which run with the other Python of the pages."""
+    """A few lines of code follow, which run with the other Python of the pages."""
     pages = {page: page.read_text(encoding="utf-8") for page in PAGES}
     of_packages = {page: text.partition("\n::: ")[0] for page, text in pages.items() if "\n::: " in text}
     assert len(of_packages) > 15
@@ -164,14 +163,14 @@ def test_a_page_about_a_package_begins_with_what_to_call_first():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_files_that_a_page_names_exist(page):
-    """Tests and sources that a page names by their path are there."""
+    """Tests and sources that a page names by path exist."""
     named = re.findall(r"`((?:tests|src|examples|finssim)/[\w./]+)`", page.read_text(encoding="utf-8"))
     missing = [name for name in named if not (ROOT / name).exists() and not (ROOT / "src" / name).exists()]
     assert missing == []
 
 
 def texts() -> dict[Path, str]:
-    """Python code of every page, example and notebook by its file."""
+    """Return the Python code of every page, example and notebook by its file."""
     found = {page: "\n".join(blocks(page, "py(?:thon)?")) for page in [*PAGES, ROOT / "README.md"]}
     found |= {file: file.read_text(encoding="utf-8") for file in (ROOT / "examples").rglob("*.py")}
     for file in (ROOT / "examples").rglob("*.ipynb"):
@@ -182,7 +181,7 @@ def texts() -> dict[Path, str]:
 
 
 def imports_of(text: str) -> set[tuple[str, str]]:
-    """Modules of FinsSim that Python code imports, and what it imports from them; "" for the module itself."""
+    """Return the FinsSim modules that Python code imports, with the imported names; "" for the module itself."""
     names = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
@@ -193,7 +192,7 @@ def imports_of(text: str) -> set[tuple[str, str]]:
 
 
 def test_pages_and_examples_import_from_finssim_or_one_of_its_packages():
-    """Readers see the names that packages export; where these are defined may change."""
+    """Readers use the names that packages export, so that the defining modules may change."""
     deeper, unknown = set(), set()
     for file, text in texts().items():
         for module, name in imports_of(text):

@@ -1,4 +1,4 @@
-"""Long work shows how far it is, by a bar or by lines; a silent command says within two seconds that it starts."""
+"""Long work shows its progress by a bar or by lines; a silent command reports within two seconds that it starts."""
 
 import io
 import sys
@@ -12,7 +12,7 @@ from finssim.core.system import announce
 
 
 def test_a_file_gets_a_line_at_once_and_one_every_ten_seconds(capsys, monkeypatch):
-    """With the share that is done and the time that is left, of a clock that the test moves."""
+    """Each line has the completed share and the remaining time, by a clock that the test advances."""
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with progress_bar("evaluate") as show:
@@ -43,7 +43,7 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_silent_command_counts_until_it_prints(monkeypatch, terminal):
-    """On a terminal the count is one line, erased before the output; elsewhere each is a line."""
+    """On a terminal the count is one line, erased before the output; elsewhere each count is a line."""
     monkeypatch.setattr(system, "COUNT", (0.01, 0.01))
     out, error = io.StringIO(), Terminal(terminal)
     monkeypatch.setattr(sys, "stdout", out)

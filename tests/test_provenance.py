@@ -1,4 +1,4 @@
-"""Where an artefact came from can be read back from it."""
+"""The origin of an artefact can be read back from it."""
 
 import json
 import subprocess
@@ -15,14 +15,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_provenance_survives_json_and_yaml():
-    """It is made of plain values."""
+    """Provenance consists of plain values."""
     origin = provenance()
     assert json.loads(json.dumps(origin)) == origin == yaml.safe_load(yaml.safe_dump(origin))
     assert origin["finssim"] == finssim.__version__ and "numpy" in origin["packages"]
 
 
 def test_the_revision_is_the_checkout_s_commit():
-    """In a checkout it is HEAD, marked where the source differs from it."""
+    """In a checkout the revision is HEAD, marked if the source differs from it."""
     head = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True)
     revision = provenance()["revision"]
     if head.returncode:  # an unpacked archive

@@ -1,4 +1,4 @@
-"""What publishes the project names things that exist."""
+"""The files that publish the project refer to things that exist."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ FILES = sorted((ROOT / ".github").rglob("*.y*ml")) + [ROOT / ".pre-commit-config
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_it_is_yaml(path):
-    """A workflow has jobs of steps, an issue form a body; paths and extras in either are there."""
+    """A workflow has jobs of steps, an issue form a body; paths and extras in either exist."""
     text = path.read_text(encoding="utf-8")
     data = yaml.safe_load(text)
     if path.parent.name == "workflows":
@@ -36,7 +36,7 @@ def test_the_citation_is_of_this_version():
 
 
 def test_a_container_gets_what_its_image_copies():
-    """Docker sees only what .dockerignore lets through."""
+    """.dockerignore lets through every path that the image copies."""
     seen = re.findall(r"^!(.+)", (ROOT / ".dockerignore").read_text(encoding="utf-8"), re.MULTILINE)
     copied = re.findall(r"^COPY (.+) \S+$", (ROOT / "Dockerfile").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(seen) == sorted(" ".join(copied).split())

@@ -1,4 +1,4 @@
-"""What Warp prints, and what a user is told instead."""
+"""Warp's own output, and the messages that replace it."""
 
 import json
 import os
@@ -23,7 +23,7 @@ print(json.dumps(thrusts.tolist()))
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """The same script twice, with a kernel cache that is empty at first."""
+    """Two runs of the same script, with a kernel cache that is empty at first."""
     cache = tmp_path_factory.mktemp("kernels")
     environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
     command = [sys.executable, "-c", SCRIPT]
@@ -33,7 +33,7 @@ def runs(tmp_path_factory):
 
 
 def test_what_is_compiled_is_told_once_and_on_standard_error(runs):
-    """By the name of the module that holds the kernels; with compiled kernels nothing is said."""
+    """The message names the module of the kernels; with compiled kernels there is none."""
     announced, *compiled = runs[0].stderr.splitlines()
     assert "once on this machine" in announced
     assert [line.split(" in ")[0] for line in compiled] == ["compiled the kernels of control.allocation"]
@@ -41,6 +41,6 @@ def test_what_is_compiled_is_told_once_and_on_standard_error(runs):
 
 
 def test_standard_output_holds_what_the_program_prints_alone(runs):
-    """JSON can be read from it, whether kernels were compiled or not, and is the same."""
+    """JSON can be read from it, and is the same whether kernels were compiled or not."""
     first, second = (json.loads(run.stdout) for run in runs)
     assert len(first) == 8 and first == second

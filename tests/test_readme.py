@@ -1,4 +1,4 @@
-"""What the README and the examples tell a newcomer to type works."""
+"""The commands in the README and the examples work for a new user."""
 
 import re
 import runpy
@@ -26,7 +26,7 @@ SMALL = {"train": ["--steps", "4096", "--worlds", "64"], "evaluate": ["--trials"
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 EXAMPLES.append(ROOT / "examples" / "bluerov2" / "loop.py")
-"""What `finssim new` copies is below `examples/own`, with tests of its own."""
+"""Example scripts; the templates of `finssim new` are below `examples/own`, with tests of their own."""
 
 SHORT = {
     "loop.py": ("if status := finssim(line).wait():", "if status := boundary.run(app, line.split()):"),
@@ -36,22 +36,22 @@ SHORT = {
     "learn_with_torchrl.py": ("ROLLOUTS, STEPS, WORLDS, BATCH = 60,", "ROLLOUTS, STEPS, WORLDS, BATCH = 2,"),
     "train_and_evaluate.py": ("600_000", "16_384"),
 }
-"""What makes an example short: words that say how long it is or that start a process, and others."""
+"""Replacements that shorten an example or keep it from starting a process."""
 
 
 def blocks(language: str) -> list[str]:
-    """Fenced code of one language, in the README's order."""
+    """Return the fenced code of one language, in the README's order."""
     return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
 
 
 def commands() -> list[list[str]]:
-    """Command lines of the README's bash blocks, as words."""
+    """Return the command lines of the README's bash blocks, split into words."""
     lines = "\n".join(blocks("bash")).splitlines()
     return [words for words in (shlex.split(line, comments=True) for line in lines) if words]
 
 
 def shortened(line: str) -> list[str]:
-    """Words of a recipe without its third and further plants and trajectories, whose names are known too."""
+    """Return the words of a recipe with at most two plants and trajectories."""
     for option, known in (("--plant", available_plants()), ("--trajectory", TRAJECTORIES)):
         named = re.findall(rf" {option} (\S+)", line)
         assert set(named) <= set(known), line
@@ -61,21 +61,21 @@ def shortened(line: str) -> list[str]:
 
 
 def run(words: list[str], folder: Path) -> str:
-    """Run a command in a folder and return what it printed; a failure shows it."""
+    """Run a command in a folder and return its output; a failure shows the output."""
     answer = subprocess.run(words, cwd=folder, capture_output=True, text=True)
     assert answer.returncode == 0, f"{shlex.join(words)}\n{answer.stdout}\n{answer.stderr}"
     return answer.stdout + answer.stderr
 
 
 def test_every_command_is_of_a_known_kind():
-    """A command that the tests below would not run is noticed."""
+    """A command of a kind that the tests below do not run fails here."""
     kinds = {words[0] for words in commands()}
     assert kinds <= {"make", "pip", ".venv/bin/finssim"}
 
 
 @pytest.mark.slow
 def test_make_targets_exist_and_run_what_the_tests_run():
-    """Each `make` line names a target; the targets are this test run and the demo, tested on their own."""
+    """Each `make` line names a target; the targets are this test run and the demo, which is tested separately."""
     targets = {words[1] for words in commands() if words[0] == "make"}
     dry = run(["make", "--dry-run", "--always-make", *sorted(targets)], ROOT)
     assert targets == {"demo", "test"}
@@ -94,7 +94,7 @@ def test_pip_line_names_what_is_declared():
 
 @pytest.mark.slow
 def test_finssim_lines_run_in_order(tmp_path, monkeypatch, capfd):
-    """A newcomer's session, with trainings and evaluations cut short: each line succeeds and prints something."""
+    """In a new user's session, with shortened trainings and evaluations, each line succeeds and prints something."""
     monkeypatch.chdir(tmp_path)
     for words in commands():
         if words[0] != ".venv/bin/finssim":
@@ -107,7 +107,7 @@ def test_finssim_lines_run_in_order(tmp_path, monkeypatch, capfd):
 
 @pytest.mark.slow
 def test_the_recipes_that_need_no_file_of_the_reader_run_in_order(tmp_path, monkeypatch, capfd):
-    """Trainings and evaluations of the page of recipes, cut short, with its files and a controller of one's own."""
+    """Shortened trainings and evaluations of the recipes page run with its files and a user's controller."""
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "reference" / "recipes.md").read_text(encoding="utf-8")
     water, camera = re.findall(r"^```yaml\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
@@ -126,13 +126,13 @@ def test_the_recipes_that_need_no_file_of_the_reader_run_in_order(tmp_path, monk
 
 @pytest.mark.slow
 def test_the_installed_command_starts(tmp_path):
-    """What the README's lines begin with is there, and is this package."""
+    """The command at the start of the README's lines exists, and belongs to this package."""
     assert run([str(BIN / "finssim"), "--version"], tmp_path) == f"finssim {__version__}\n"
 
 
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_blocks_run(code, tmp_path, monkeypatch, capsys):
-    """The README's Python runs as it stands."""
+    """The README's Python runs unchanged."""
     (tmp_path / "block.py").write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     runpy.run_path("block.py", run_name="__main__")
@@ -142,7 +142,7 @@ def test_python_blocks_run(code, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_examples_run(path, tmp_path, monkeypatch, capsys):
-    """Every example runs from any folder and prints what it found; as it stands, but for what `SHORT` says."""
+    """Every example runs from any folder and prints its results, unchanged except for the replacements in `SHORT`."""
     code = path.read_text(encoding="utf-8")
     if path.name in SHORT:
         words, fewer = SHORT[path.name]
@@ -159,7 +159,7 @@ def test_examples_run(path, tmp_path, monkeypatch, capsys):
 
 
 def test_links_lead_somewhere():
-    """Relative links of the README and the project's other front pages point at files."""
+    """Relative links of the README and the project's other front pages lead to files."""
     for page in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", (ROOT / page).read_text(encoding="utf-8")):
             assert (ROOT / target).exists(), f"{page}: {target}"

@@ -1,4 +1,4 @@
-"""The clock of a session, as slow as the environment asks."""
+"""The clock of a session, slowed by an environment variable."""
 
 import time
 
@@ -11,7 +11,7 @@ from finssim.vehicles import load_vehicle
 
 
 def test_a_slow_clock_runs_and_waits_at_its_rate(monkeypatch):
-    """At a quarter, 20 ms of the session are 80 ms of the machine, and all processes read one clock."""
+    """At a rate of a quarter, 20 ms of the session are 80 ms of the machine, and all processes read the same clock."""
     monkeypatch.setenv(realtime.RATE, "0.25")
     assert realtime.now() == pytest.approx(0.25 * time.monotonic(), abs=0.01)
     before, began = realtime.now(), time.monotonic()
@@ -22,7 +22,7 @@ def test_a_slow_clock_runs_and_waits_at_its_rate(monkeypatch):
 
 @pytest.mark.parametrize("text", ["0", "2", "-1", "nan", "fast", ""])
 def test_a_rate_that_is_none_is_refused(monkeypatch, text):
-    """With the variable, what it is and what was expected."""
+    """The refusal names the variable, its value and the expected values."""
     monkeypatch.setenv(realtime.RATE, text)
     with pytest.raises(
         realtime.ClockRateError, match=f"FINSSIM_CLOCK_RATE={text}: expected a number from 0.01 to 1"
@@ -41,7 +41,7 @@ def test_a_rate_that_is_none_is_refused(monkeypatch, text):
     ],
 )
 def test_a_vehicle_is_never_driven_by_a_slow_clock(monkeypatch, robot):
-    """Its watchdogs keep real time; only a pool on this machine shares the slow clock."""
+    """The vehicle's watchdogs run in real time; only a pool on this machine shares the slow clock."""
     monkeypatch.setenv(realtime.RATE, "0.5")
     with pytest.raises(LinkError, match="unset FINSSIM_CLOCK_RATE"):
         with connected(Wiring(robot=robot), load_vehicle("finsrov"), None):

@@ -1,4 +1,4 @@
-"""One registry for every family: FinsSim's own members, those of installed packages, those of a program."""
+"""One registry for every family: members of FinsSim, of installed packages and of a program."""
 
 import json
 import os
@@ -57,7 +57,7 @@ MEMBERS = {
 
 @pytest.fixture
 def outside(tmp_path, monkeypatch):
-    """A package with a vehicle, a task, a learner and a command."""
+    """An installed package with a vehicle, a task, a learner and a command."""
     install(tmp_path, monkeypatch, "outside", PACKAGE, MEMBERS)
     folder = tmp_path / "site_outside"
     (folder / "mini.yaml").write_text("extends: bluerov2\nbody: {mass: {value: 10.5, origin: guessed}}\n")
@@ -66,7 +66,7 @@ def outside(tmp_path, monkeypatch):
 
 @pytest.fixture
 def broken(tmp_path, monkeypatch):
-    """A package that cannot be imported, with a member of every family."""
+    """An installed package that cannot be imported, with a member of every family."""
     members = {f"{family.noun}s": {"lost": "broken:lost"} for family in FAMILIES}
     install(tmp_path, monkeypatch, "broken", "import no_such_module\n", members)
     return tmp_path / "site_broken"
@@ -85,7 +85,7 @@ def command(*words, path: Path):
 
 
 def test_every_member_of_finssim_can_be_imported():
-    """References are names in text: each leads to an object that its family accepts."""
+    """Each textual reference leads to an object that its family accepts."""
     assert {words.split()[0] for words in EVERY} == {words.split()[0] for words in COMMANDS}
     for family in FAMILIES:
         assert family.failures() == {}
@@ -94,7 +94,7 @@ def test_every_member_of_finssim_can_be_imported():
 
 
 def test_names_of_packages_work_as_those_of_finssim(outside):
-    """A vehicle, a task and a learner by name."""
+    """A vehicle, a task and a learner are found by name."""
     assert "mini" in catalogue() and load_vehicle("mini").body.mass == 10.5
     assert task_named("hover").hold == 3.0
     kind = learner_named("slow")
@@ -103,7 +103,7 @@ def test_names_of_packages_work_as_those_of_finssim(outside):
 
 
 def test_a_broken_package_is_named_and_stops_only_what_needs_it(broken):
-    """One sentence with its name, at its first use; all else is as ever."""
+    """One sentence names it at its first use; everything else is unaffected."""
     sentence = (
         "'lost' of package broken 1.0 cannot be used: broken:lost: ModuleNotFoundError: No module named"
     )
@@ -121,7 +121,7 @@ def test_a_broken_package_is_named_and_stops_only_what_needs_it(broken):
 
 
 def test_an_object_that_is_no_member_is_refused(tmp_path, monkeypatch):
-    """A number as a task, as a vehicle and as a sensor."""
+    """A number is refused as a task, as a vehicle and as a sensor."""
     members = {family: {"odd": "numbered:ODD"} for family in ("tasks", "vehicles", "sensors", "learners")}
     install(tmp_path, monkeypatch, "numbered", "ODD = 7\n", members)
     for family in (TASKS, VEHICLES, SENSORS):
@@ -132,7 +132,8 @@ def test_an_object_that_is_no_member_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_name_belongs_to_one_package(tmp_path, monkeypatch):
-    """Two packages of one name are both named; the name of FinsSim's own member stays its own, which is reported."""
+    """Two packages with the same name are both named; FinsSim's own member keeps its name, and the clash is
+    reported."""
     for name in ("first", "second"):
         members = {"tasks": {"hover": f"{name}:hover", "t1": f"{name}:hover"}}
         install(tmp_path, monkeypatch, name, "def hover(): ...\n", members)
@@ -143,7 +144,7 @@ def test_a_name_belongs_to_one_package(tmp_path, monkeypatch):
 
 
 def test_a_program_adds_and_redefines_its_own_members_only():
-    """A cell of a notebook that is executed again replaces its class; another object of that name is refused."""
+    """A notebook cell that is executed again replaces its class; another object of that name is refused."""
     family = Family("thing", {"ours": "math:pi"})
     first, second, other = (type(name, (), {}) for name in ("Mine", "Mine", "Other"))
     family["mine"] = first
@@ -161,7 +162,7 @@ def test_a_program_adds_and_redefines_its_own_members_only():
 
 @pytest.mark.slow
 def test_commands_of_packages(outside):
-    """It is in the help, its options are those of its function, and it runs."""
+    """A package's command is in the help, has the options of its function, and runs."""
     shown = command("--help", path=outside)
     assert "Extensions" in shown.stdout and "Greet a vehicle." in shown.stdout
     run = command("greet", "mini", "--twice", path=outside)
@@ -171,7 +172,8 @@ def test_commands_of_packages(outside):
 
 @pytest.mark.slow
 def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken, capsys):
-    """By family and package; each broken member with a sentence, and a process that has it begins all the same."""
+    """Members are listed by family and package; a broken member is reported in a sentence and does not
+    prevent the start."""
     assert finssim("doctor", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["registered"]["tasks"]["outside 1.0"] == ["hover"]
@@ -189,7 +191,7 @@ def test_the_doctor_lists_members_and_reports_broken_ones(outside, broken, capsy
 
 
 def test_a_described_world_is_refused_where_no_extension_reads_it(monkeypatch):
-    """In one sentence that names the world."""
+    """The refusal is one sentence that names the world."""
     monkeypatch.setattr(site, "WORLDS", Family("unregistered-world", {}))
     with pytest.raises(site.SurroundingsError, match="world 'dock': no extension reads described worlds"):
         site.described_world("dock")

@@ -1,4 +1,4 @@
-"""`tools/report.py`: tables in pages, requests that are refused, and the pages of this repository."""
+"""`tools/report.py`: tables in pages, refused requests, and the pages of this repository."""
 
 import json
 import shutil
@@ -40,13 +40,13 @@ ANATOMY = {
 
 
 def test_the_pages_that_ship_say_what_the_results_do():
-    """Every figure of their tables comes out of `results/`."""
+    """Every figure in their tables comes from `results/`."""
     assert RESULTS and report(RESULTS, into=PAGES, check=True) == 0
     assert all("<!-- report: " in page.read_text(encoding="utf-8") for page in PAGES)
 
 
 def test_a_block_is_filled_and_the_rest_stays(tmp_path):
-    """All of a table, or the rows and columns that the page names; a second time nothing changes."""
+    """A block gets the whole table, or the rows and columns that the page names; a second run changes nothing."""
     page, result = tmp_path / "page.md", tmp_path / "anatomy.json"
     result.write_text(json.dumps(ANATOMY))
     page.write_text(
@@ -65,7 +65,7 @@ def test_a_block_is_filled_and_the_rest_stays(tmp_path):
 
 
 def test_a_result_in_sentences_is_a_list():
-    """A soak has no table."""
+    """A soak result has no table."""
     soaked = {
         "experiment": "soak",
         "vehicle_h": 20.0,
@@ -98,13 +98,13 @@ def test_a_result_in_sentences_is_a_list():
     ],
 )
 def test_what_there_is_not_is_refused(what, message):
-    """With the page and what it asks for."""
+    """The refusal names the page and its request."""
     with pytest.raises(ReportError, match=f"^page: <!-- report: {what} -->: {message}"):
         filled(f"<!-- report: {what} -->\n<!-- end -->", {"anatomy": ANATOMY}, "page")
 
 
 def test_a_file_that_is_no_result_is_refused(tmp_path):
-    """And what it is instead."""
+    """The refusal says what the file is instead."""
     page = shutil.copy(ROOT / "README.md", tmp_path / "page.md")
     for text, message in (
         ("no", "not the result of"),

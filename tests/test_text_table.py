@@ -1,4 +1,4 @@
-"""One reader of text tables: however a table is written, its cells are the same, and each knows its line."""
+"""One reader of text tables: the cells are the same in every format, and each records its line."""
 
 import math
 
@@ -8,7 +8,7 @@ from finssim.core.text_table import read_text_table, text_table
 
 
 class Refused(ValueError):
-    """Of a layer."""
+    """Error of a layer."""
 
 
 @pytest.mark.parametrize("mark", [",", ";", "\t", " , "])
@@ -45,7 +45,7 @@ def test_what_a_crash_leaves_is_told(tmp_path):
 
 
 def test_old_spreadsheets_and_files_that_are_no_text(tmp_path):
-    """One-byte µ reads; bytes of a program do not become names."""
+    """A one-byte µ is read; binary bytes do not become column names."""
     (tmp_path / "old.csv").write_bytes("pulse (µs)\n1500\n".encode("latin-1"))
     assert read_text_table(tmp_path / "old.csv", Refused).names == ["pulse (µs)"]
     (tmp_path / "binary.csv").write_bytes(b"\xff\x01\x02\x80,\x81\n")

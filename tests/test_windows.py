@@ -1,4 +1,4 @@
-"""The commands without what the Python of Windows lacks: SIGHUP, resource, termios, fork, output in UTF-8."""
+"""The commands without features that Python on Windows lacks: SIGHUP, resource, termios, fork, UTF-8 output."""
 
 import json
 import os
@@ -16,7 +16,7 @@ SHIM = Path(__file__).parent / "reference" / "as_windows.py"
 
 
 def start(words, folder):
-    """A process that runs commands one after the other, its output in code page 1252."""
+    """Start a process that runs commands one after the other, with its output in code page 1252."""
     command = [sys.executable, "-X", "warn_default_encoding", str(SHIM), json.dumps(words)]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}
     return subprocess.Popen(
@@ -25,7 +25,7 @@ def start(words, folder):
 
 
 def statuses(process):
-    """Exit statuses of its commands, and what it wrote to standard error."""
+    """Return the exit statuses of its commands and its standard error."""
     out, err = process.communicate(timeout=600)
     assert process.returncode == 0, err.decode("cp1252")
     return json.loads(out.decode("cp1252").splitlines()[-1]), err.decode("cp1252")
@@ -33,7 +33,7 @@ def statuses(process):
 
 @pytest.mark.slow
 def test_every_command_is_there_and_the_short_ones_run(tmp_path):
-    """The help of each imports what it needs; lists, a simulation, trials, a check and a replay end with 0."""
+    """Every command's help imports its dependencies; lists, a simulation, trials, a check and a replay end with 0."""
     helps = [[*name.split(), "--help"] for name in EVERY]
     runs = [
         ["vehicles"],
@@ -54,7 +54,7 @@ def test_every_command_is_there_and_the_short_ones_run(tmp_path):
 
 @pytest.mark.slow
 def test_a_robot_runs_in_a_pool_in_lockstep(tmp_path):
-    """Two processes without SIGHUP: the robot arms, drives and ends, and the pool with it."""
+    """Two processes without SIGHUP: the robot arms, drives and ends, and so does the pool."""
     from finssim.pool.run import MCU_PORT
 
     port = MCU_PORT + 400
@@ -82,7 +82,7 @@ def test_a_robot_runs_in_a_pool_in_lockstep(tmp_path):
 
 
 def test_keys_of_windows_console_are_those_of_a_terminal(monkeypatch):
-    """Arrows come in two characters, the first 0 or 0xe0; Ctrl-C is a key and interrupts."""
+    """Arrows arrive as two characters, the first 0 or 0xe0; Ctrl-C is a key and interrupts."""
 
     class Console:
         def __init__(self, keys):
@@ -100,7 +100,7 @@ def test_keys_of_windows_console_are_those_of_a_terminal(monkeypatch):
 
 
 def test_a_python_that_reads_no_keys_is_refused_in_a_sentence(monkeypatch):
-    """Neither termios nor msvcrt."""
+    """Keys are refused in a sentence where neither termios nor msvcrt exists."""
     monkeypatch.setitem(sys.modules, "termios", None)
 
     class Terminal:
@@ -116,7 +116,7 @@ def test_a_python_that_reads_no_keys_is_refused_in_a_sentence(monkeypatch):
 
 
 def test_peak_memory_is_in_mebibytes_on_every_system(monkeypatch):
-    """Linux counts kibibytes, macOS bytes, and Windows has no such call."""
+    """Linux counts kibibytes, macOS bytes, and Windows has no such function."""
     import resource
 
     class Usage:
@@ -131,7 +131,7 @@ def test_peak_memory_is_in_mebibytes_on_every_system(monkeypatch):
 
 
 def test_stop_signals_are_those_that_the_system_has(monkeypatch):
-    """Without SIGHUP two remain; Windows' SIGBREAK counts where there is one."""
+    """Without SIGHUP two signals remain; SIGBREAK of Windows counts where it exists."""
     import signal
 
     monkeypatch.delattr(signal, "SIGHUP")

@@ -1,4 +1,4 @@
-"""YAML and JSON from outside: what they say, or one sentence, soon and whatever the text."""
+"""YAML and JSON from outside are read, or refused in one sentence, quickly and whatever the text."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ def read(folder, text):
 
 
 def test_what_is_written_reads_back_as_it_was(tmp_path):
-    """Words that look like numbers to a YAML 1.2 or 1.1 reader, such as digests, and numbers."""
+    """Numbers, and words that look like numbers to a YAML 1.2 or 1.1 reader such as digests, survive a round trip."""
     words = [
         "12e34",
         "1e5",

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 @dataclass
 class State:
-    """A batch of vehicles as a controller measures them."""
+    """A batch of vehicle states as a controller measures them."""
 
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
@@ -18,14 +18,14 @@ class State:
 
 
 def skew(a):
-    """Matrix S with S b = a x b, of vectors (..., 3)."""
+    """Return the matrix S with S b = a x b, of vectors (..., 3)."""
     S = np.zeros((*a.shape, 3))
     S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = np.moveaxis(a, -1, 0)
     return S - np.swapaxes(S, -1, -2)
 
 
 def turn(rotvec):
-    """Rotation matrices of rotation vectors, by Rodrigues' formula."""
+    """Return rotation matrices of rotation vectors, by Rodrigues' formula."""
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]
     S = skew(rotvec)
     return np.eye(3) + np.sinc(angle / np.pi) * S + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * S @ S
@@ -63,13 +63,13 @@ class Pool:
 
     @property
     def measured(self):
-        """Pose and velocity of the body origin."""
+        """Return pose and velocity of the body origin."""
         nu = self.nu.copy()
-        nu[:, :3] += nu[:, 3:] @ skew(self.g).T  # omega x r is -r x omega
+        nu[:, :3] += nu[:, 3:] @ skew(self.g).T  # since omega x r = -r x omega
         return State(self.p - self.R @ self.g, Rotation.from_matrix(self.R).as_quat(canonical=True), nu)
 
     def advance(self, command, period):
-        """Moves on by one control period under commanded thrusts (worlds, n)."""
+        """Advance by one control period under commanded thrusts (worlds, n)."""
         assert (command <= self.upper).all() and (command >= self.lower).all()
         for _ in range(round(period / self.STEP)):
             self.queue.append(command)

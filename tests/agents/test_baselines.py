@@ -1,4 +1,4 @@
-"""Baselines do their tasks from the observation alone, as `Pid` does from the state."""
+"""Baselines solve their tasks from the observation alone, as `Pid` does from the state."""
 
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -29,7 +29,7 @@ HOLONOMIC = [name for name in catalogue() if len(driven_axes(load_vehicle(name))
 
 
 def rollout(task, name, vehicle="finsrov", worlds=16, seed=3, **options):
-    """Metrics of one episode in every world, played by a baseline."""
+    """Return the metrics of one episode in every world, played by a baseline."""
     body = load_vehicle(vehicle)
     env = make(task, worlds=worlds, vehicle=body, hydrodynamics=coefficients_of(body), seed=seed, **options)
     player = baseline(task, name, body)
@@ -46,7 +46,7 @@ def rollout(task, name, vehicle="finsrov", worlds=16, seed=3, **options):
 @pytest.mark.parametrize("observe", ["truth", "estimator"])
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_does_its_task(task, observe):
-    """FinsROV succeeds in at least 15 of 16 episodes, with the truth and with what localization makes of it."""
+    """FinsROV succeeds in at least 15 of 16 episodes, with the true state and with the estimate of localization."""
     measured = rollout(task, next(iter(baselines_of(task))), observe=observe)
     assert measured["success"].sum() >= 15
     assert measured["length"].min() > 100
@@ -56,7 +56,7 @@ def test_a_baseline_does_its_task(task, observe):
 @pytest.mark.parametrize("vehicle", HOLONOMIC)
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_does_its_task_with_every_vehicle_that_can(task, vehicle):
-    """Three directions of thrust are enough for 7 of 8 episodes of the tasks that have their own size by vehicle."""
+    """Three directions of thrust suffice for 7 of 8 episodes of the tasks whose size is scaled to the vehicle."""
     if task in ("t1", "t2") and max(load_vehicle(vehicle).body.size) > 1.0:
         pytest.skip("the paper's pool is too small for it")
     assert rollout(task, next(iter(baselines_of(task))), vehicle, worlds=8)["success"].sum() >= 7
@@ -64,7 +64,7 @@ def test_a_baseline_does_its_task_with_every_vehicle_that_can(task, vehicle):
 
 @pytest.mark.parametrize("task", SINGLE)
 def test_a_baseline_needs_the_observation_alone(task):
-    """Rows are independent: one vehicle is commanded alike, alone or among others, whatever the memory of these."""
+    """Rows are independent: a vehicle gets the same command alone and among others, whatever the others' memory."""
     player = baseline(task, next(iter(baselines_of(task))))
     rows = [make(task, worlds=6, seed=s).arrays.observation.numpy().copy() for s in range(3)]
     memory, lone = player.reset(6), player.reset(1)
@@ -75,7 +75,7 @@ def test_a_baseline_needs_the_observation_alone(task):
 
 
 def test_what_t1_shows_is_enough_for_the_same_command():
-    """The command from the observation is the one from the state, integrals included, turned with the goal."""
+    """The command from the observation equals that from the state, integrals included, rotated with the goal."""
     env = make("t1", worlds=32, seed=1)
     player, pid = baseline("t1", "pid"), Pid.from_vehicle(load_vehicle("finsrov"), period=0.1)
     state, a = env.simulator.state, env.arrays
@@ -86,7 +86,7 @@ def test_what_t1_shows_is_enough_for_the_same_command():
         )
         tau, direct = pid.command(direct, measured, Goal(a.goal_position.numpy(), a.goal_quaternion.numpy()))
         action, memory = player.act(memory, a.observation.numpy())
-        # float32 observations, offsets of metres at some 100 N/m.
+        # Observations are float32, with offsets of metres at some 100 N/m.
         np.testing.assert_allclose(action * pid.wrench_limits, tau, atol=1e-3)
         env.step(action)
 
@@ -110,7 +110,7 @@ def test_t1s_observation_gives_the_pose_in_the_goals_axes():
 
 
 def test_an_attitude_is_read_from_where_up_is():
-    """Roll and pitch from up in the body, the heading as given; and the heading's rate from the body's."""
+    """Up in the body frame gives roll and pitch, with the heading as given; the body's rate gives the heading's."""
     rng = np.random.default_rng(0)
     roll, pitch, yaw = rng.uniform(-1.0, 1.0, (3, 100))
     q = quat_from_euler(roll, pitch, yaw)
@@ -122,14 +122,14 @@ def test_an_attitude_is_read_from_where_up_is():
 
 
 def test_an_acceleration_is_read_from_where_a_reference_will_be():
-    """Exact on cubics, whatever the jerk."""
+    """The acceleration is exact on cubics, whatever the jerk."""
     a, jerk, v = np.array([[0.03, -0.02, 0.01]]), np.array([[0.5, 0.4, -0.3]]), np.array([[0.2, 0.1, -0.05]])
     offsets = [v * t + a * t**2 / 2.0 + jerk * t**3 / 6.0 for t in (0.0, 0.1, 0.2)]
     np.testing.assert_allclose(acceleration_ahead(offsets, v), a, atol=1e-12)
 
 
 def test_memories_start_over_row_by_row():
-    """Rows of the mask are new, the others stay, in tuples; nothing is changed in place."""
+    """Masked rows are reset and the others stay, in tuples too; nothing is changed in place."""
     old = (np.ones(3), PidMemory(np.full((3, 3), 2.0), np.full((3, 3), 3.0)), None)
     fresh = (np.zeros(3), PidMemory(np.zeros((3, 3)), np.zeros((3, 3))), None)
     heading, pid, nothing = restarted(old, fresh, np.array([False, True, False]))
@@ -148,7 +148,7 @@ def test_an_unknown_baseline_is_refused_with_what_there_is():
 
 
 def test_a_subclass_under_another_name_has_the_baselines_alone_that_it_defines():
-    """It may observe something else than the baseline expects."""
+    """A subclass may observe something other than its base's baseline expects."""
 
     @dataclass(frozen=True, kw_only=True)
     class Renamed(StationKeeping):
@@ -165,5 +165,5 @@ def test_a_subclass_under_another_name_has_the_baselines_alone_that_it_defines()
 
 
 def test_every_task_has_a_baseline():
-    """Something honest to beat."""
+    """A learned policy has a baseline to compare with."""
     assert all(baselines_of(task) for task in TASKS.usable())

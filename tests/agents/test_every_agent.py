@@ -1,4 +1,4 @@
-"""Laws that every agent obeys: controllers and baselines of every task, and one from outside the package."""
+"""Requirements on every agent: controllers and baselines of every task, and one from outside the package."""
 
 import json
 
@@ -17,7 +17,7 @@ FINSROV = load_vehicle("finsrov")
 
 
 class Homing:
-    """An agent from outside: thrusts towards the goal, and a third less in every decision."""
+    """External agent that thrusts towards the goal, a third less in every decision."""
 
     name, action, wrench_scale, period = "homing", "wrench6", 1.0, 0.1
 
@@ -48,7 +48,7 @@ def agent(task, name):
 
 
 def inputs(task, n, seed=0):
-    """Readings and goals of n worlds, a row for each agent of each, within what a task shows."""
+    """Return readings and goals of n worlds, with a row for each agent, within the range of a task's observations."""
     rng, the_task = np.random.default_rng(seed), fitted_task(task, FINSROV)
     rows = n * len(the_task.agents)
     turn = rng.normal(size=(rows, 4))
@@ -72,14 +72,14 @@ def inputs(task, n, seed=0):
 
 
 def chosen(reading, goal, rows):
-    """Some of the rows."""
+    """Return some of the rows."""
     pictures = reading.pictures and {name: picture[rows] for name, picture in reading.pictures.items()}
     parts = (reading.observation, reading.position, reading.quaternion, reading.nu)
     return Known(*(part[rows] for part in parts), pictures), Goal(goal.position[rows], goal.quaternion[rows])
 
 
 def played(agent, frames, rows):
-    """Actions in all frames, from the beginning."""
+    """Return the actions in all frames, from the beginning."""
     memory, actions = agent.reset(rows), []
     for reading, goal in frames:
         action, memory = agent.act(memory, reading, goal)
@@ -89,9 +89,9 @@ def played(agent, frames, rows):
 
 @EVERY
 def test_its_actions_are_parts_of_its_limits(agent, task):
-    """Finite for whatever it is shown, a row for each agent; and it describes itself in plain data.
+    """Actions are finite for any input, with a row for each agent; the agent describes itself in plain data.
 
-    In [-1, 1], but for wrenches of controllers, which whoever executes them limits axis by axis.
+    Actions are in [-1, 1], except wrenches of controllers, which are limited axis by axis when executed.
     """
     reading, goal, agents = inputs(task, 6)
     actions = played(agent, [(reading, goal)] * 3, 6)
@@ -102,14 +102,14 @@ def test_its_actions_are_parts_of_its_limits(agent, task):
 
 @EVERY
 def test_it_begins_anew_after_a_reset(agent, task):
-    """Equal inputs from the beginning give equal actions, bit for bit: nothing is kept but its memory."""
+    """Equal inputs from the beginning give bit-identical actions: only the memory keeps state."""
     frames = [inputs(task, 4, seed)[:2] for seed in range(3)]
     np.testing.assert_array_equal(played(agent, frames, 4), played(agent, frames, 4))
 
 
 @EVERY
 def test_a_world_does_not_know_of_the_others(agent, task):
-    """The last two of five worlds alone act as among the five."""
+    """The last two of five worlds get the same actions alone as among the five."""
     frames = [inputs(task, 5, seed)[:2] for seed in range(3)]
     agents = inputs(task, 5)[2]
     rows = slice(3 * agents, 5 * agents)

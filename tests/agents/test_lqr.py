@@ -1,4 +1,4 @@
-"""The LQR's gains are optimal, its observer finds what pushes, and it holds every published setpoint."""
+"""The LQR's gains are optimal, its observer estimates the disturbance, and it holds every published setpoint."""
 
 import math
 
@@ -26,7 +26,7 @@ def lqr(vehicle):
 
 
 def cost_of_an_axis(lqr, axis, gains):
-    """Sum of (e / scale)² + (u / limit)² from e = 1 on, the linear axis integrated in small steps."""
+    """Return the sum of (e / scale)² + (u / limit)² from e = 1 on, with the linear axis integrated in small steps."""
     model, limit = lqr.body.model, lqr.body.wrench_limits[axis]
     m, d, k = (x[axis] for x in (model.inertia, model.linear_damping, model.stiffness))
     scale = 0.25 if axis < 3 else math.radians(25.0)
@@ -44,7 +44,7 @@ def cost_of_an_axis(lqr, axis, gains):
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 5])
 def test_no_other_gains_cost_less(lqr, axis):
-    """Each gain changed by 5 % either way costs more, by an amount of second order."""
+    """Changing any gain by 5 % in either direction costs more, by an amount of second order."""
     best = cost_of_an_axis(lqr, axis, lqr.gains[axis])
     for i in range(lqr.gains.shape[1]):
         for factor in (0.95, 1.05):
@@ -60,7 +60,7 @@ def test_no_other_gains_cost_less(lqr, axis):
     ids=["20 Hz", "10 Hz", "current 0.11 m/s", "2 N heavier"],
 )
 def test_all_eight_setpoints_are_held(vehicle, pool, period, water):
-    """As the PID's: within 0.10 m and 10 degrees, started within 15 s, level; 1 mm and 0.1 degrees after 30 s."""
+    """Within the success limits and level, started within 15 s; within 1 mm and 0.1 degrees after 30 s."""
     log, _ = run(Lqr.from_vehicle(vehicle, period=period), pool(vehicle, 8, **water), T1, 30.0)
     assert (settling_time(log, period) < 15.0).all()
     assert np.abs(log[-1, :, :3]).max() < 1e-3 and np.abs(log[-1, :, 3]).max() < math.radians(0.1)
@@ -69,7 +69,7 @@ def test_all_eight_setpoints_are_held(vehicle, pool, period, water):
 
 @pytest.mark.slow
 def test_the_observer_finds_what_pushes(vehicle, lqr, pool):
-    """In a plant 2 N heavier than its file: 2 N downwards in the world, whatever the heading, within 2 %."""
+    """In a plant 2 N heavier than its file, the estimate is 2 N downwards in the world, at any heading, within 2 %."""
     goal = Goal(np.zeros((2, 3)) + [0.0, 0.0, -0.5], quat_from_yaw(np.array([0.0, 2.0])))
     _, memory = run(lqr, pool(vehicle, 2, load=2.0), goal, 15.0)
     np.testing.assert_allclose(memory.force, [[0.0, 0.0, -2.0]] * 2, atol=0.04)
@@ -77,7 +77,7 @@ def test_the_observer_finds_what_pushes(vehicle, lqr, pool):
 
 @pytest.mark.slow
 def test_a_current_is_observed_in_the_world_frame(vehicle, lqr, pool):
-    """Turned by 90° in a current along x, the force observed stays along x: what damping makes of 0.1 m/s, to 5 %."""
+    """Turned by 90° in a current along x, the estimated force stays along x: the damping of 0.1 m/s, to 5 %."""
     start = Goal(np.array([[0.0, 0.0, -0.5]]), quat_from_yaw(np.array([0.0])))
     plant = pool(vehicle, 1, current=(0.1, 0.0, 0.0))
     _, memory = run(lqr, plant, start, 15.0)
@@ -91,7 +91,8 @@ def test_a_current_is_observed_in_the_world_frame(vehicle, lqr, pool):
 
 @pytest.mark.slow
 def test_it_settles_a_bluerov2_heavy_before_its_pid_does(pool):
-    """Vectored thrusters at once strong and quick: behind the delay, optimal feedback needs half of the PID's time."""
+    """Vectored thrusters are both strong and quick: despite the delay, optimal feedback needs half of the
+    PID's time."""
     heavy = load_vehicle("bluerov2_heavy")
     times = {
         name: settling_time(run(controller(name, heavy), pool(heavy, 8), T1, 30.0)[0], 0.05)
@@ -102,7 +103,7 @@ def test_it_settles_a_bluerov2_heavy_before_its_pid_does(pool):
 
 @pytest.mark.parametrize("name", THRUSTED)
 def test_every_vehicle_has_a_stable_one(name):
-    """Closed loop of every driven axis with the gains of its file: the state dies out within a minute."""
+    """For every driven axis with the gains of the vehicle's file, the closed loop's state decays within a minute."""
     lqr = Lqr.from_vehicle(load_vehicle(name))
     for axis in np.flatnonzero(lqr.body.wrench_limits > 0.0):
         assert np.isfinite(cost_of_an_axis(lqr, axis, lqr.gains[axis]))
@@ -133,7 +134,7 @@ def test_a_period_of_zero_is_refused(vehicle):
 
 
 def test_a_disturbance_is_bounded(lqr):
-    """Half of the wrench limit at most, whatever the velocity jumps by."""
+    """The estimate is at most half of the wrench limit, however far the velocity jumps."""
     memory = lqr.reset()._replace(nu=np.zeros(6))
     for _ in range(200):
         memory = memory._replace(nu=np.zeros(6))

@@ -1,4 +1,4 @@
-"""NMPC predicts as an independent simulation moves, keeps the thrusters' limits, and holds what pushes off its goal."""
+"""NMPC's prediction agrees with an independent simulation, keeps thruster limits, and rejects disturbances."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,8 @@ def setpoint(i):
 
 @pytest.mark.slow
 def test_it_predicts_as_the_independent_simulation_moves(vehicle, nmpc, pool):
-    """A second of random thrusts from a tilted, turning start: 2 mm, 0.4 degrees, 5 mm/s: the midpoint step's error."""
+    """After a second of random thrusts from a tilted, turning start, they agree to the midpoint step's error: 2 mm,
+    0.4 degrees, 5 mm/s."""
     rng = np.random.default_rng(5)
     plant = pool(vehicle, 1)
     plant.delay, plant.queue = 0, []
@@ -56,14 +57,15 @@ def test_it_predicts_as_the_independent_simulation_moves(vehicle, nmpc, pool):
     ids=["still", "current and 1 N heavier"],
 )
 def test_a_setpoint_is_held(vehicle, nmpc, pool, i, water):
-    """Within 0.10 m and 10 degrees for 10 s, started within 8 s; 1 cm at the end though the model has no current."""
+    """Held within 0.10 m and 10 degrees for 10 s, started within 8 s; 1 cm at the end although the model has
+    no current."""
     log, _ = run(nmpc, pool(vehicle, 1, **water), setpoint(i), 18.0)
     assert settling_time(log, nmpc.period)[0] < 8.0
     assert np.abs(log[-1, :, :3]).max() < 0.01
 
 
 def test_a_far_goal_is_approached_with_a_thruster_at_its_limit(vehicle, nmpc):
-    """Not by a wrench limited axis by axis: the thrusts planned are within their own limits, and one is at it."""
+    """The planned thrusts are within their own limits and one is at its limit; no wrench is limited axis by axis."""
     goal = Goal(np.array([6.0, 0.0, -0.5]), quat_from_yaw(0.0))
     _, memory = nmpc.command(nmpc.reset(), at_rest(np.array([0.0, 0.0, -0.5]), quat_from_yaw(0.0)), goal)
     thrusts = np.reshape(memory.plan[:-21], (-1, 29))[:, 21:]
@@ -73,7 +75,7 @@ def test_a_far_goal_is_approached_with_a_thruster_at_its_limit(vehicle, nmpc):
 
 
 def test_the_sign_of_the_quaternion_makes_no_difference(nmpc):
-    """q and -q are one attitude: a filter or a motion capture may change between them at any time."""
+    """q and -q are the same attitude: a filter or a motion capture may switch between them at any time."""
     goal, q = Goal(np.array([0.3, 0.0, -0.5]), quat_from_yaw(0.5)), quat_from_yaw(2.9)
     place = np.array([0.0, 0.0, -0.5])
     _, memory = nmpc.command(nmpc.reset(), at_rest(place, q), goal)
@@ -85,7 +87,7 @@ def test_the_sign_of_the_quaternion_makes_no_difference(nmpc):
 
 
 def test_commands_under_way_are_reckoned_with(pool):
-    """A vehicle whose thrusters hear everything 0.3 s late: three commands under way, and it is held all the same."""
+    """A vehicle whose thrusters act 0.3 s late has three commands pending, and is held all the same."""
     plain = load_vehicle("finsrov")
     late = plain.replace({f"thrusters.{name}.delay": 0.3 for name in plain.thruster_names})
     nmpc = controller("nmpc", late)
@@ -97,7 +99,8 @@ def test_commands_under_way_are_reckoned_with(pool):
 
 
 def test_the_unknown_wrench_is_what_the_prediction_lacks(nmpc):
-    """0.01 m/s more along x than expected in a period: the mass times that, by the observer's share of a period."""
+    """0.01 m/s more along x than predicted in a period gives the mass times that, by the observer's share of
+    a period."""
     rest = at_rest(np.array([0.0, 0.0, -0.5]), quat_from_yaw(0.0))
     goal = Goal(rest.position, rest.quaternion)
     _, memory = nmpc.command(nmpc.reset(), rest, goal)

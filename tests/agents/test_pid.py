@@ -1,4 +1,4 @@
-"""The PID places its poles, holds every published setpoint in water known and unknown, and never winds up."""
+"""The PID places its poles, holds every published setpoint in nominal and disturbed water, and never winds up."""
 
 import math
 from functools import cache
@@ -29,7 +29,7 @@ def vehicle():
 
 @pytest.fixture(scope="module")
 def held(vehicle, pool):
-    """40 s of T1 in a plant: errors and memory of `run`, once for every plant."""
+    """40 s of T1 in a plant: errors and memory of `run`, computed once for every plant."""
 
     @cache
     def run_once(period=0.05, **water):
@@ -45,7 +45,7 @@ def held(vehicle, pool):
     ("m", "d", "k"), [(27.1, 39.1, 0.0), (0.84, 0.3, 0.0), (40.0, 0.5, 0.0), (2.0, 3.0, 1.0)]
 )
 def test_the_closed_loop_has_the_poles_asked_for(m, d, k):
-    """State matrix of axis, lag and controller (x, v, thrust, integral): its eigenvalues are -w, -w, -w/5 and -b."""
+    """The state matrix of axis, lag and controller (x, v, thrust, integral) has the eigenvalues -w, -w, -w/5 and -b."""
     lag = 0.195
     gains = place_poles(AxisModel(*(np.full(6, value) for value in (m, d, 0.0, k))), lag)
     kp, kd, rate = gains.kp[0], gains.kd[0], gains.rate[0]
@@ -59,14 +59,14 @@ def test_the_closed_loop_has_the_poles_asked_for(m, d, k):
     )
     total = 1 / lag + d / m
     w = total / 4
-    # A double pole moves by the square root of rounding.
+    # A double pole varies by the square root of rounding.
     np.testing.assert_allclose(
         np.sort_complex(np.linalg.eigvals(A)), [-(total - 2.2 * w), -w, -w, -w / 5], atol=1e-5, rtol=1e-5
     )
 
 
 def test_an_axis_that_water_holds_stiffly_is_left_to_it(vehicle):
-    """The vehicle rights itself at 1.2 Hz, beyond its thrusters' 0.17 s: no proportional or derivative moment."""
+    """The vehicle rights itself at 1.2 Hz, faster than its thrusters' 0.17 s: no proportional or derivative moment."""
     pid = Pid.from_vehicle(vehicle)
     np.testing.assert_array_equal(pid.gains.kp[3:5], 0.0)
     np.testing.assert_array_equal(pid.gains.kd[3:5], 0.0)
@@ -89,7 +89,7 @@ def test_an_axis_that_water_holds_stiffly_is_left_to_it(vehicle):
     ids=["20 Hz", "10 Hz", "current 0.11 m/s", "2 N heavier", "2 N lighter"],
 )
 def test_all_eight_setpoints_are_held(held, period, water):
-    """Within 0.10 m and 10 degrees for 10 s, started within 15 s, and level all along; 1 cm and 1 degree at the end."""
+    """Within 0.10 m and 10 degrees for 10 s, started within 15 s, and always level; 1 cm and 1 degree at the end."""
     log, _ = held(period=period, **water)
     assert (settling_time(log, period) < 15.0).all()
     assert np.abs(log[-1, :, :3]).max() < 0.01 and np.abs(log[-1, :, 3]).max() < math.radians(1.0)
@@ -98,7 +98,7 @@ def test_all_eight_setpoints_are_held(held, period, water):
 
 @pytest.mark.slow
 def test_setpoints_are_reached_without_overshoot(held):
-    """In the water it knows, no axis passes its goal by more than 5 cm."""
+    """In nominal water, no axis passes its goal by more than 5 cm."""
     log, _ = held(period=0.05)
     passed = -log[..., :3] * np.sign(log[0, :, :3])
     far = np.abs(log[0, :, :3]) > 0.05
@@ -123,7 +123,7 @@ def test_all_eight_setpoints_are_held_when_the_model_is_wrong(vehicle, pool, cha
 
 @pytest.mark.slow
 def test_all_eight_setpoints_are_held_with_noisy_measurements(vehicle, pool):
-    """2 cm, 2 degrees, 2 cm/s and 2 degrees/s of white noise on every sample."""
+    """Every sample has white noise of 2 cm, 2 degrees, 2 cm/s and 2 degrees/s."""
     rng = np.random.default_rng(0)
 
     def noise(state):
@@ -147,7 +147,7 @@ def holds_a_pose(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in catalogue() if holds_a_pose(name)])
 def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
-    """Two body lengths away and turned by a radian or two: in place within 30 s."""
+    """From two body lengths away and turned by a radian or two, it holds the pose within 30 s."""
     craft = load_vehicle(name)
     away = 2.0 * craft.body.size[0] * np.array([[1.0, 0.5, -0.2], [-1.0, 0.3, 0.2]])
     start = np.array([0.0, 0.0, -10.0])
@@ -161,14 +161,14 @@ def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
 
 @pytest.mark.slow
 def test_the_integral_becomes_the_load_it_carries(held):
-    """With 2 N added to the weight, the upward integral ends at 2 N: nothing else is left in it."""
+    """With 2 N added to the weight, the upward integral ends at 2 N and contains nothing else."""
     _, memory = held(period=0.05, load=2.0)
     np.testing.assert_allclose(memory.force, np.tile([0.0, 0.0, 2.0], (8, 1)), atol=0.02)
 
 
 @pytest.mark.slow
 def test_a_long_way_at_full_thrust_does_not_wind_up(vehicle, pool):
-    """Ten metres, 24 s of travel: the integral stays below a tenth of full thrust and the goal is not overrun."""
+    """Over ten metres, 24 s of travel, the integral stays below a tenth of full thrust and the goal is not overshot."""
     pid = Pid.from_vehicle(vehicle)
     goal = Goal(np.array([[10.0, 0.0, -0.5]]), quat_from_yaw([0.0]))
     log, memory = run(pid, pool(vehicle, 1), goal, 60.0)
@@ -177,7 +177,7 @@ def test_a_long_way_at_full_thrust_does_not_wind_up(vehicle, pool):
 
 
 def test_a_vehicle_that_cannot_move_does_not_wind_up(vehicle):
-    """Held fast away from its goal for two minutes, the integral stays at its bound and the command at the limit."""
+    """Held fast away from its goal for two minutes, its integral stays at the bound and its command at the limit."""
     pid = Pid.from_vehicle(vehicle)
     memory, held = pid.reset(), at_rest(np.zeros(3), quat_from_yaw(0.0))
     for _ in range(2400):
@@ -187,7 +187,7 @@ def test_a_vehicle_that_cannot_move_does_not_wind_up(vehicle):
 
 
 def test_the_holding_wrench_balances_weight_and_buoyancy(vehicle):
-    """At rest at a tilted goal, the command and the hydrostatic load cancel, force and moment."""
+    """At rest at a tilted goal, the command cancels the hydrostatic load, in force and moment."""
     heavy = vehicle.replace({"body.mass": 12.6, "body.center_of_buoyancy": [0.01, -0.004, 0.03]})
     pid = Pid.from_vehicle(heavy)
     q = quat_from_euler(0.1, -0.2, 2.0)
@@ -200,7 +200,7 @@ def test_the_holding_wrench_balances_weight_and_buoyancy(vehicle):
 
 
 def test_the_command_does_not_depend_on_where_north_is(vehicle):
-    """Turning the whole world about the vertical leaves the body-frame command unchanged, integral included."""
+    """Rotating the whole world about the vertical leaves the body-frame command unchanged, integral included."""
     pid = Pid.from_vehicle(vehicle)
     q, away, goal = quat_from_euler(0.05, 0.1, 0.3), np.array([0.3, -0.2, 0.1]), quat_from_yaw(1.0)
     commands = []
@@ -227,7 +227,7 @@ def test_a_batch_of_n_equals_n_single_controllers(vehicle):
 
 
 def test_half_a_turn_to_make_leaves_the_tilt_error_alone(vehicle):
-    """Rolled 0.1 rad and facing backwards: the tilt error is 0.1 rad about the roll axis, the heading error pi."""
+    """Rolled by 0.1 rad and facing backwards, the tilt error is 0.1 rad about the roll axis, the heading error pi."""
     goal = Goal(np.zeros(3), quat_from_yaw(np.pi - 1e-9))
     error = tracking_error(at_rest(np.zeros(3), quat_from_euler(0.1, 0.0, 0.0)), goal, np.zeros(3)).pose
     np.testing.assert_allclose(error[3:5], [-0.1, 0.0], atol=1e-9)
@@ -235,7 +235,7 @@ def test_half_a_turn_to_make_leaves_the_tilt_error_alone(vehicle):
 
 
 def test_axes_without_authority_are_not_commanded():
-    """A torpedo with one propeller is asked for surge and nothing else, however far off its attitude is."""
+    """A torpedo with one propeller gets only a surge command, however wrong its attitude is."""
     torpedo = load_vehicle("remus100")
     pid = Pid.from_vehicle(torpedo)
     measured = at_rest(np.zeros(3), quat_from_euler(0.3, 0.2, 1.0), 0.1 * np.ones(6))

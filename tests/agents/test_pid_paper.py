@@ -30,7 +30,7 @@ def test_runs_at_sixty_hertz(pid):
 
 @pytest.mark.parametrize(("axis", "gain", "divisor"), [(0, 8.0, 20.0), (1, 8.0, 20.0), (2, 4.0, 10.0)])
 def test_pushes_towards_the_goal_with_gain_over_axis_range(pid, axis, gain, divisor):
-    """Half a metre ahead, to the left or above: effort kp e / range of the 7 N unit, on that axis only."""
+    """Half a metre ahead, to the left or above, the effort is kp e / range of the 7 N unit, on that axis only."""
     tau = first_command(pid, 0.5 * np.eye(3)[axis])
     np.testing.assert_allclose(
         tau, np.eye(6)[axis] * 7.0 * gain * 0.5 / divisor, rtol=1e-4
@@ -38,20 +38,20 @@ def test_pushes_towards_the_goal_with_gain_over_axis_range(pid, axis, gain, divi
 
 
 def test_position_errors_are_taken_in_the_bodys_axes(pid):
-    """Facing left, a goal ahead of the world's x axis lies to starboard."""
+    """With the vehicle facing left, a goal ahead along the world's x axis lies to starboard."""
     tau = first_command(pid, (0.5, 0.0, 0.0), math.pi / 2, quat_from_yaw(math.pi / 2))
     assert tau[1] < 0.0 and abs(tau[0]) < 1e-12
 
 
 def test_heading_gain_is_per_degree_and_turns_the_short_way(pid):
-    """60 degrees to the left ask for 0.0006 * 60 / 5 of the unit, to the left; and as much the other way."""
+    """60 degrees to the left give 0.0006 * 60 / 5 of the unit to the left; to the right, as much to the right."""
     expected = 7.0 * 0.0006 * 60.0 / 5.0
     assert first_command(pid, goal_yaw=math.radians(60.0))[5] == pytest.approx(expected)
     assert first_command(pid, goal_yaw=math.radians(300.0))[5] == pytest.approx(-expected)
 
 
 def test_heading_output_is_bounded_and_dead_within_five_degrees(pid):
-    """180 degrees ask for 0.108, bounded to 0.10; 4.9 degrees ask for nothing."""
+    """180 degrees give 0.108, bounded to 0.10; 4.9 degrees give nothing."""
     assert abs(first_command(pid, goal_yaw=math.pi)[5]) == pytest.approx(7.0 * 0.10 / 5.0)
     assert first_command(pid, goal_yaw=math.radians(4.9))[5] == 0.0
 

@@ -1,4 +1,4 @@
-"""Step logs of an invented motor: first order plus dead time with a dead zone, by its closed form."""
+"""Synthetic step logs of a motor: first order plus dead time with a dead zone, in closed form."""
 
 import math
 
@@ -9,17 +9,17 @@ from finssim.trials.trial import Trial
 
 RPM = math.pi / 30.0
 FINE = 2000.0
-"""Steps per second of the exact solution, of which the log takes every so many."""
+"""Steps per second of the exact solution, from which the log is subsampled."""
 
 
 def held(levels, hold):
-    """Times and values of a command that holds each level for `hold` seconds."""
+    """Return times and values of a command that holds each level for `hold` seconds."""
     t = np.arange(0.0, len(levels) * hold, 1.0 / FINE)
     return t, np.asarray(levels, float)[np.minimum((t / hold).astype(int), len(levels) - 1)]
 
 
 def lagged(target, delay, tau):
-    """First order plus dead time of a held target, exact."""
+    """Return the exact response, first order plus dead time, to a held target."""
     d = round(delay * FINE)
     late = np.concatenate([np.full(d, target[0]), target])[: len(target)]
     a = math.exp(-1.0 / (FINE * tau))
@@ -46,7 +46,7 @@ def step_log(
     asked="command",
     seed=0,
 ):
-    """A trial with `command_NAME` [N] or `rpm_command_NAME`, and `rpm_NAME`; the lag acts on thrust or on speed."""
+    """Return a trial with `command_NAME` [N] or `rpm_command_NAME`, and `rpm_NAME`; the lag is of thrust or speed."""
     rng = np.random.default_rng(seed)
     t, rpm = held(rpm_levels, hold)
     turning = np.where(np.abs(rpm) < dead_rpm, 0.0, rpm) * RPM

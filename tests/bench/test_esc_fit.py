@@ -1,4 +1,4 @@
-"""The law of a speed controller from tables: recovered where it is exact, bounded and honest where it is not."""
+"""The law of a speed controller from tables: recovered where it is exact, with valid intervals where it is not."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ TRUTHS = {
 
 
 def table(truth, volts, *, step=8.0, noise=0.0, seed=0):
-    """Pulses, speeds and voltages that the truth gives, every `step` µs."""
+    """Return pulses, speeds and voltages of a given law, every `step` µs."""
     pulse = np.tile(np.arange(1100.0, 1900.1, step), len(volts))
     voltage = np.repeat(volts, len(pulse) // len(volts))
     speed = truth.shaft_speed(pulse, voltage)
@@ -29,7 +29,7 @@ def table(truth, volts, *, step=8.0, noise=0.0, seed=0):
 @pytest.mark.parametrize("volts", [[14.8], [12.0, 14.8, 16.8]], ids=["one voltage", "three"])
 @pytest.mark.parametrize("truth", TRUTHS.values(), ids=TRUTHS)
 def test_an_exact_law_is_recovered(truth, volts):
-    """Speeds to 0.1 %, and the dead band at every voltage to the step of the pulses."""
+    """Speeds are recovered to 0.1 %, and the dead band at every voltage to the step of the pulses."""
     fit = fit_esc(*table(truth, volts), pulse_range=RANGE, at=14.8)
     pulses = np.arange(1105.0, 1900.0, 10.0)
     for voltage in (12.0, 16.8):
@@ -41,7 +41,7 @@ def test_an_exact_law_is_recovered(truth, volts):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth():
-    """60 noisy tables: every number of the law lies in its 95 % interval in at least 85 % of them."""
+    """In 60 noisy tables, every parameter lies in its 95 % interval in at least 85 % of them."""
     truth = TRUTHS["asymmetric"]
     hits = {"emf_plus": 0, "load_plus": 0, "zero_plus": 0, "emf_minus": 0, "load_minus": 0, "zero_minus": 0}
     for seed in range(60):

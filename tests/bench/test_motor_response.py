@@ -1,4 +1,4 @@
-"""Motors: dead time and lag from step logs, recovered with intervals that cover, in the vehicle file's domain."""
+"""Dead time and lag of motors from step logs, with intervals that cover, in the vehicle file's domain."""
 
 import numpy as np
 import pytest
@@ -15,13 +15,13 @@ from finssim.vehicles import load_vehicle
 FINSROV = load_vehicle("finsrov")
 H_LF = FINSROV.thrusters["H_LF"]
 PULSES = (0, 1500, 0, -1500, 0, 2200, 0, -2200, 0)
-"""The published procedure's pulses of both signs [rpm]."""
+"""Pulses of both signs in the published procedure [rpm]."""
 
 
 def log(
     delay, tau, *, rate=50.0, noise=0.02, seed=0, lost=0.0, pulses=(0, 0.5, 0, -0.5, 0, 1, 0, -1, 0), hold=2.5
 ):
-    """Command and response of a unit motor: times, values, times, values."""
+    """Return command and response of a unit motor: times, values, times, values."""
     rng = np.random.default_rng(seed)
     t, u = held(pulses, hold)
     y, rows = lagged(u, delay, tau), sampled(t, rate)
@@ -45,7 +45,7 @@ CASES = [  # delay [s], time constant [s], sampling [Hz]
 
 @pytest.mark.parametrize(("delay", "tau", "rate"), CASES)
 def test_dead_time_and_lag_are_recovered(delay, tau, rate):
-    """Noise of 2 % of the larger pulse, a fifth of the samples lost; a lag near one sample is told less well."""
+    """Noise is 2 % of the larger pulse and a fifth of the samples is lost; a lag near one sample is less accurate."""
     found = response(*log(delay, tau, rate=rate, lost=0.2))
     assert found.delay == pytest.approx(delay, abs=0.2 / rate + 0.002)
     assert found.time_constant == pytest.approx(tau, rel=0.05 if tau * rate > 2.0 else 0.1)
@@ -55,7 +55,7 @@ def test_dead_time_and_lag_are_recovered(delay, tau, rate):
 @pytest.mark.slow
 @pytest.mark.parametrize(("delay", "tau", "rate"), [CASES[0], CASES[3]])
 def test_intervals_cover_the_truth(delay, tau, rate):
-    """25 repetitions: the 95 % intervals hold the truth in at least 84 %, and are narrower than the numbers."""
+    """In 25 repetitions, the 95 % intervals contain the truth in at least 84 %, and are narrower than the values."""
     hits = np.zeros(2)
     for seed in range(25):
         found = response(*log(delay, tau, rate=rate, seed=seed, lost=0.1))
@@ -74,7 +74,7 @@ def test_without_noise_the_answer_is_that_of_the_closed_form():
 
 
 def test_an_overshooting_motor_is_not_accepted():
-    """A second order of damping ratio 0.3 overshoots by exp(-π 0.3 / √(1 - 0.09)) = 37 %."""
+    """A second-order motor of damping ratio 0.3, which overshoots by exp(-π 0.3 / √(1 - 0.09)) = 37 %, is refused."""
     t, u = held((0, 1, 0, -1, 0), 2.5)
     w, z, h = 20.0, 0.3, 1.0 / 2000.0
     y, v, ys = 0.0, 0.0, []
@@ -99,7 +99,7 @@ def test_steps_are_found_in_what_is_held():
 @pytest.mark.parametrize("domain", ["force", "speed"])
 @pytest.mark.parametrize("asked", ["command", "rpm_command"])
 def test_the_vehicle_files_domain_is_respected(domain, asked):
-    """The lag is recovered where the vehicle file lets it act, from thrusts or speeds that were asked for."""
+    """The lag is recovered in the vehicle file's domain, from commanded thrusts or speeds."""
     vehicle = FINSROV.replace({"thrusters.*.domain": domain})
     trial = step_log(vehicle.thrusters["H_LF"], "H_LF", PULSES, domain=domain, asked=asked)
     fit = fit_motor([trial], vehicle)
@@ -132,7 +132,8 @@ def test_the_dead_zone_lies_between_the_commands_that_show_it():
 
 
 def test_what_sampling_hides_is_said():
-    """12 ms of delay at 50 Hz are within one sample; a lag of 2 ms cannot be told from none."""
+    """A delay of 12 ms at 50 Hz is within one sample; a lag of 2 ms is not distinguishable from none. Both
+    are reported."""
     fit = fit_motor([step_log(H_LF, "H_LF", PULSES, delay=0.012)], FINSROV)
     assert "is below one sample of 0.02 s" in fit.estimates["H_LF.delay"].note
     low, high = fit.estimates["H_LF.delay"].ci95
@@ -150,7 +151,7 @@ def test_a_motor_that_does_not_follow_keeps_its_numbers():
 
 
 def test_several_trials_and_thrusters_are_fitted_together():
-    """Thrusters without steps get their group's mean; another group keeps its number, and both are said."""
+    """Thrusters without steps get their group's mean; another group keeps its values, and both are reported."""
     trials = [step_log(H_LF, "H_LF", PULSES, seed=seed, tau=0.15) for seed in range(4)]
     fit = fit_motor(trials, FINSROV)
     fitted = FINSROV.replace(fit.changes)
@@ -162,7 +163,7 @@ def test_several_trials_and_thrusters_are_fitted_together():
 
 
 def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
-    """What a vehicle with hobby speed controllers logs: pulses at 50 Hz, speeds at 20 Hz without sign, some lost."""
+    """A vehicle with hobby speed controllers logs pulses at 50 Hz and unsigned speeds at 20 Hz, some of them lost."""
     vehicle = load_vehicle("bluerov2")
     thruster = vehicle.thrusters["T2"]
     rng = np.random.default_rng(3)
@@ -171,7 +172,7 @@ def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
     rows = sampled(t, 100.0)
     rpm = np.abs(speed[rows]) / RPM + 5.0 * rng.standard_normal(len(rows))
     rpm[np.arange(len(rows)) % 5 != 0] = np.nan  # 20 Hz
-    rpm[[300, 1000, 1500]] = 0.0  # lost telegrams
+    rpm[[300, 1000, 1500]] = 0.0  # lost packets
     pwm = pulse[rows].copy()
     pwm[np.arange(len(rows)) % 2 == 1] = np.nan
     trial = Trial(
@@ -188,7 +189,7 @@ def test_pulses_and_unsigned_speeds_with_lost_samples_and_spikes():
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "asked"), [("finsrov", "command"), ("bluerov2", "pwm")])
 def test_the_simulators_motors_are_recovered_from_trials_of_the_whole_vehicle(name, asked):
-    """The engine solves delay and lag by itself; its logs give back the vehicle file's numbers, here without noise."""
+    """The engine solves delay and lag independently; its noise-free logs give back the vehicle file's values."""
     vehicle = load_vehicle(name)
     trials = simulate_programme(programmes(["yaw"], vehicle), vehicle, inputs=(asked, "rpm"))
     fit = fit_motor(trials[:2], vehicle)

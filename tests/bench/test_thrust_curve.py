@@ -1,4 +1,4 @@
-"""Thrust curves: tables as benches and manufacturers write them, c± with honest intervals, the vehicle they make."""
+"""Thrust curves: tables of benches and manufacturers, c± with valid intervals, and the resulting vehicle."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ RPM = math.pi / 30.0
 
 
 def made(c_plus=1.1e-4, c_minus=0.9e-4, fastest=2600.0, slowest=300.0, rows=40, noise=0.05, seed=0):
-    """Speeds [rpm] and thrusts [N] of an invented thruster, both directions and standstill."""
+    """Return speeds [rpm] and thrusts [N] of a synthetic thruster, in both directions and at standstill."""
     rng = np.random.default_rng(seed)
     speeds = np.linspace(slowest, fastest, rows)
     rpm = np.concatenate([-speeds[::-1], [0.0, 0.0, 0.0], speeds])
@@ -85,7 +85,7 @@ def test_an_empty_pulse_leaves_the_sign_to_the_force(tmp_path):
 
 @pytest.mark.parametrize("path", [AT_16_V, ALL_VOLTAGES], ids=lambda path: path.stem)
 def test_the_published_t200_tables_are_read_with_signs(path):
-    """The manufacturer prints speeds without sign; forward pulses push forward."""
+    """The manufacturer prints speeds without sign; forward pulses give forward thrust."""
     table = read_table(path)
     turning = table.speed != 0.0
     np.testing.assert_array_equal(np.sign(table.speed[turning]), np.sign(table.pulse[turning] - 1500.0))
@@ -94,7 +94,7 @@ def test_the_published_t200_tables_are_read_with_signs(path):
 
 @pytest.mark.parametrize("unsigned", ["speed", "force", "both"])
 def test_signs_come_from_what_has_them(tmp_path, unsigned):
-    """Speeds without sign follow the forces, forces without sign the speeds, both the pulse."""
+    """Speeds without sign follow the forces, forces without sign the speeds, and both together the pulse."""
     rpm, force = made(noise=0.0)
     pulse = 1500.0 + rpm / 8.0
     shown = {
@@ -152,7 +152,8 @@ def test_decimal_commas_and_a_line_of_units_are_understood(tmp_path, separator):
 
 
 def test_a_log_of_held_levels_gives_its_settled_parts(tmp_path):
-    """Levels of 5 s (facts §19: the last 2 s count), a load cell with an offset, a motor that needs 0.3 s."""
+    """Levels last 5 s (facts §19: the last 2 s count), with a load cell that has an offset and a motor that
+    needs 0.3 s."""
     rng = np.random.default_rng(1)
     levels = np.repeat([0, 800, 1400, 2000, 2600, 0, -800, -1400, -2000, -2600, 0], 100).astype(float)
     rpm = np.zeros_like(levels)
@@ -208,7 +209,7 @@ def test_an_exact_curve_is_recovered_exactly(c, slowest, rows):
 
 @pytest.mark.parametrize(("alike", "least"), [(0.0, 0.92), (0.9, 0.85)], ids=["white", "neighbours alike"])
 def test_the_interval_covers_the_truth(alike, least):
-    """95 % intervals, 300 tables of 80 rows; residuals that neighbours share must not make them narrow."""
+    """95 % intervals cover the truth in 300 tables of 80 rows, even where neighbouring residuals are correlated."""
     rng, omega, hits = np.random.default_rng(3), np.linspace(30.0, 280.0, 80), 0
     for _ in range(300):
         error = rng.standard_normal(80)
@@ -220,7 +221,7 @@ def test_the_interval_covers_the_truth(alike, least):
 
 
 def test_tables_that_disagree_widen_the_interval():
-    """Four thrusters of one group, alike within themselves and 5 % apart from each other."""
+    """The four thrusters of the group are consistent within themselves and 5 % apart from each other."""
     rng, omega = np.random.default_rng(4), np.linspace(30.0, 280.0, 60)
     tables = [
         (omega, c * omega**2 + 0.02 * rng.standard_normal(60))
@@ -232,7 +233,8 @@ def test_tables_that_disagree_widen_the_interval():
 
 
 def test_a_handful_of_rows_is_a_table():
-    """Three rows with 2 % of noise: an interval of a fifth or so, by t of two degrees of freedom; one row has none."""
+    """Three rows with 2 % of noise give an interval of about a fifth, by t of two degrees of freedom; one row
+    gives none."""
     omega = np.array([50.0, 100.0, 150.0])
     side = fit_side([(omega, 1.1e-4 * omega**2 * np.array([1.02, 0.98, 1.01]))])
     assert abs(side.c - 1.1e-4) < side.half_width < 0.5 * 1.1e-4
@@ -248,7 +250,7 @@ def test_a_stray_row_is_left_out():
 
 
 def test_a_dead_zone_shows_only_where_the_table_goes_there():
-    """A gap between standstill and the slowest speed is a dead zone if speeds above it are much closer together."""
+    """A gap between standstill and the slowest speed is a dead zone if the speeds above it are much closer together."""
     above = np.linspace(32.0, 280.0, 80)
     seen = dead_zone(np.r_[0.0, 0.0, above])
     assert seen.measured and seen.speed == 32.0 and seen.interval[0] < 32.0
@@ -274,7 +276,8 @@ def test_the_published_t200_table_is_described_by_two_numbers():
 
 
 def test_the_fit_at_16_v_predicts_the_other_voltages_with_the_error_it_states():
-    """Thrust from speed: within 1.7 % of the largest. Speed from pulse and voltage: 3.3 % to 16 V, 6 % to 20 V."""
+    """Thrust from speed is within 1.7 % of the largest; speed from pulse and voltage within 3.3 % to 16 V, 6
+    % to 20 V."""
     fit = fit_thruster([ALL_VOLTAGES], BLUEROV2, voltage=16.0)
     for volts, speed_error in ((10, 0.033), (12, 0.026), (14, 0.014), (16, 0.005), (18, 0.029), (20, 0.060)):
         figures = fit.quality[f"T200 at {volts} V"]
@@ -291,7 +294,7 @@ def test_the_fit_at_16_v_predicts_the_other_voltages_with_the_error_it_states():
 
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "finsrov"])
 def test_the_fitted_vehicle_passes_its_checks(name):
-    """Force limits follow the curve; the changes load; every thruster of the group has them."""
+    """Force limits follow the curve; the changes load and apply to every thruster of the group."""
     vehicle = load_vehicle(name)
     fitted = vehicle.replace(fit_thruster([AT_16_V], vehicle).changes)
     failed = {f.name for f in check_vehicle(fitted) if not f.passed} - {
@@ -304,7 +307,7 @@ def test_the_fitted_vehicle_passes_its_checks(name):
 
 
 def test_groups_and_thrusters_are_told_by_file_names(tmp_path):
-    """Two propeller groups of one vehicle get their own curves."""
+    """Two propeller groups of one vehicle get separate curves."""
     paths = [
         write(
             tmp_path / f"run1_{name}.csv",
@@ -340,7 +343,7 @@ def test_tables_that_name_no_group_warn_on_a_vehicle_with_several():
 
 
 def test_force_and_pulse_without_speed_fit_the_speed_controller_alone(tmp_path):
-    """Speeds then are those of the vehicle file's curve; pulse -> thrust is right whatever their scale."""
+    """Speeds are those of the vehicle file's curve; pulse -> thrust is right whatever their scale."""
     table = read_table(AT_16_V)
     path = write(
         tmp_path / "a.csv", "PWM (µs),Thrust (N),Voltage (V)", table.pulse, table.force, table.voltage
@@ -355,7 +358,7 @@ def test_force_and_pulse_without_speed_fit_the_speed_controller_alone(tmp_path):
 
 @pytest.mark.parametrize("times", [2.0, 0.5])
 def test_pulses_of_another_thruster_invent_no_shaft_speeds(tmp_path, times):
-    """Twice and half the forces at the same pulses: the thrust comes back, and no speed counts as determined."""
+    """With twice and half the forces at the same pulses, the thrust is recovered and no speed counts as determined."""
     table = read_table(AT_16_V)
     header = "PWM (µs),Thrust (N),Voltage (V)"
     fit = fit_thruster(
@@ -371,7 +374,7 @@ def test_pulses_of_another_thruster_invent_no_shaft_speeds(tmp_path, times):
 
 
 def test_a_limit_of_the_vehicle_file_stays_where_the_table_does_not_reach_it(tmp_path):
-    """Speeds up to half the limit say nothing about the limit; the force there follows the new curve."""
+    """Speeds up to half the limit do not determine the limit; the force there follows the new curve."""
     path = write(tmp_path / "a.csv", "RPM,Thrust (N)", *made(fastest=1300.0))
     fit = fit_thruster([path], FINSROV, group="CCW")
     assert not fit.estimates["CCW.rpm_max"].identifiable

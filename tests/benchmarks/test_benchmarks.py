@@ -1,4 +1,4 @@
-"""Benchmarks load with what they import and explain themselves, so that a refactoring that breaks one is noticed."""
+"""Every benchmark can be imported and prints its help, so that a refactoring that breaks one is noticed."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ for path in sys.argv[1:]:
 
 @pytest.mark.slow
 def test_every_benchmark_loads_and_answers_help():
-    """In one process, since most of the time goes into imports that they share."""
+    """All run in one process, since most of the time is spent on shared imports."""
     paths = sorted(map(str, BENCHMARKS.glob("*.py")))
     assert len(paths) > 20
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""The benchmark of cameras measures every figure; the figures are not judged here."""
+"""The benchmark of cameras measures every figure; the values are not checked here."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from benchmarks import cameras
 
 @pytest.mark.slow
 def test_the_object_has_rates_by_size_and_the_bare_sensor_beside(monkeypatch):
-    """Frames per second by picture size, the bare rays of the same run, their ratio, pings and memory."""
+    """The object has frames per second by picture size, those of bare rays, their ratio, pings and memory."""
     for name, value in (("SIZES", (8, 16)), ("WORLDS", 4), ("ROUNDS", 2), ("MEMORY_WORLDS", 4)):
         monkeypatch.setattr(cameras, name, value)
     out = cameras.bench_cameras()

@@ -1,4 +1,4 @@
-"""The benchmark of the engine measures every figure; the figures are not judged here."""
+"""The benchmark of the engine measures every figure; the values are not checked here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from benchmarks import engine
 
 @pytest.mark.slow
 def test_the_object_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rates keyed by model or action and world count, triangles, memory, the ratio to MuJoCo and the machine."""
+    """The object has rates by model or action and world count, triangles, memory, the ratio to MuJoCo and the
+    machine."""
     monkeypatch.setattr(engine, "SECONDS", 0.01)
     monkeypatch.setattr(engine, "WORLDS", (1, 64))
     monkeypatch.setattr(engine, "MEMORY_WORLDS", 64)
@@ -22,6 +23,6 @@ def test_the_object_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:
-    """Before anything is measured."""
+    """A missing device is refused before anything is measured."""
     with pytest.raises(ValueError, match="device 'tpu' is not available"):
         engine.bench(device="tpu")

@@ -1,4 +1,4 @@
-"""The benchmark of a GPU runs on a processor, names what it leaves out, and judges differences."""
+"""The GPU benchmark also runs on a CPU, names the parts that it skips, and evaluates differences."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks import gpu
 def test_a_small_run_on_the_processor_has_every_figure(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Physics, a task, a learner, a camera and a sonar have rates; a learner that is not there is named."""
+    """Physics, a task, a learner, a camera and a sonar have rates; a missing learner is named."""
     monkeypatch.syspath_prepend(str(Path(gpu.__file__).parent))
     monkeypatch.setattr(gpu, "numeric_tasks", lambda: ["t1", "path"])
     monkeypatch.setattr(gpu, "LEARNERS", {"ppo": "t1", "nobody": "t1"})
@@ -33,7 +33,7 @@ def test_a_small_run_on_the_processor_has_every_figure(
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    """Before anything is measured or written."""
+    """A missing device is refused before anything is measured or written."""
     with pytest.raises(ValueError, match="device 'tpu' is not available"):
         gpu.gpu(out=tmp_path / "gpu", device="tpu")
     assert not (tmp_path / "gpu").exists()

@@ -19,7 +19,7 @@ FINSROV = load_vehicle("finsrov")
 
 @pytest.fixture(scope="module")
 def responses() -> dict[str, dict]:
-    """The calibrated model's responses by name."""
+    """Responses of the calibrated model by name."""
     return {r["name"]: r for r in simulate_responses(FINSROV)["responses"]}
 
 
@@ -39,7 +39,8 @@ def test_simulated_speeds_solve_the_published_drag(responses: dict[str, dict], n
 
 
 def test_what_agrees_and_what_does_not(responses: dict[str, dict]) -> None:
-    """Surge ahead, sway and fast yaw agree with the pool within 15 %; heave is several times too fast, and says why."""
+    """Forward surge, sway and fast yaw agree with the pool within 15 %; heave is several times too fast, with
+    a reason."""
     agreeing = {name for name, r in responses.items() if r["agrees"]}
     assert agreeing == {"surge +18 N", "sway 18 N", "yaw 8 N m"}
     heave = responses["heave -12 N"]
@@ -47,7 +48,7 @@ def test_what_agrees_and_what_does_not(responses: dict[str, dict]) -> None:
 
 
 def test_applied_is_what_the_thrusters_give(responses: dict[str, dict]) -> None:
-    """8 N m of yaw is beyond the weaker direction's 6.95 N m (published capability), 18 N of surge is not beyond."""
+    """8 N m of yaw exceeds the weaker direction's 6.95 N m (published capability); 18 N of surge is within reach."""
     assert responses["yaw 8 N m"]["applied"] == pytest.approx(6.9477, abs=2e-3)
     assert responses["surge +18 N"]["applied"] == pytest.approx(18.0, rel=1e-3)
 
@@ -60,14 +61,14 @@ def test_another_model_gives_other_speeds(responses: dict[str, dict]) -> None:
 
 
 def script(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run the script in a process of its own."""
+    """Run the script in a separate process."""
     command = [sys.executable, "benchmarks/published_responses.py", *words]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
 @pytest.mark.slow
 def test_the_script_prints_one_object() -> None:
-    """--json is one JSON object with every response, its verdict and the vehicle's hash."""
+    """--json prints one JSON object with every response, its verdict and the vehicle's hash."""
     out = json.loads(script("--json").stdout)
     assert out["vehicle"]["sha256"] == FINSROV.sha256
     assert len(out["responses"]) == 6 and all(np.isfinite(r["simulated"]) for r in out["responses"])
@@ -84,7 +85,7 @@ def test_the_script_prints_one_object() -> None:
     ],
 )
 def test_the_script_refuses_in_a_sentence(words: tuple[str, ...], sentence: str) -> None:
-    """Exit status 2, and one line on standard error."""
+    """A refusal has exit status 2 and one line on standard error."""
     done = script(*words)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
@@ -92,6 +93,6 @@ def test_the_script_refuses_in_a_sentence(words: tuple[str, ...], sentence: str)
 
 
 def test_a_vehicle_without_published_responses_is_refused() -> None:
-    """The sentence names the vehicles that have some."""
+    """The sentence names the vehicles with published responses."""
     with pytest.raises(ValidationError, match="no published responses of 'lauv'.*finsrov"):
         validate("lauv")

@@ -24,7 +24,7 @@ class Layout:
 
 
 def matrix(positions, axes) -> NDArray[np.float64]:
-    """Columns (axis, position x axis) of thrusters placed about the commanded point."""
+    """Return the columns (axis, position x axis) of thrusters positioned about the commanded point."""
     axes = np.array(axes, float)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     return np.vstack([axes.T, np.cross(np.array(positions, float), axes).T])

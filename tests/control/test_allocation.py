@@ -41,16 +41,16 @@ def stacked(layout, regularisation=1e-4):
 
 
 def objective(layout, f, tau, regularisation=1e-4):
-    """||W (B f - tau)||^2 + lambda ||f||^2 in float64."""
+    """Return ||W (B f - tau)||^2 + lambda ||f||^2 in float64."""
     weight = regularisation_weight(layout.B, layout.weights, regularisation)
     return (((f @ layout.B.T - tau) * layout.weights) ** 2).sum(-1) + weight * (f**2).sum(-1)
 
 
 def optimality_gap(layout, f, tau, regularisation=1e-4):
-    """Upper bound of the objective's distance from its minimum, in float64.
+    """Return an upper bound of the objective's distance from its minimum, in float64.
 
-    With g = H (f - f0), every feasible x has q(x) >= q(f) + g'(x - f) + (x - f)'H(x - f)/2. Thrusters at a limit
-    that g presses them against only add to it, so with g zeroed there the objective is at most g' H^-1 g too high.
+    With g = H (f - f0), every feasible x has q(x) >= q(f) + g'(x - f) + (x - f)'H(x - f)/2. Thrusters that g presses
+    against a limit can only increase q, so with g zeroed there the objective is at most g' H^-1 g too high.
     """
     M = stacked(layout, regularisation)
     H = M.T @ M
@@ -71,7 +71,7 @@ def test_a_hundred_thousand_allocations_carry_a_certificate_of_optimality(layout
     assert (optimality_gap(layout, f, tau) <= 1e-5 * objective(layout, f, tau)).all()
     assert (f >= layout.lower).all() and (f <= layout.upper).all()
     saturated = (np.abs(f - layout.lower) < 1e-5) | (np.abs(f - layout.upper) < 1e-5)
-    assert 0.2 < saturated.any(1).mean() < 0.95  # both branches are in the sample
+    assert 0.2 < saturated.any(1).mean() < 0.95  # the sample contains both branches
 
 
 @pytest.mark.parametrize("name", THRUSTED)
@@ -99,12 +99,12 @@ def test_objective_equals_that_of_lsq_linear(layout):
 
 @pytest.mark.parametrize("regularisation", [1e-6, 1e-3, 1e-1])
 def test_objective_equals_that_of_lsq_linear_for_any_regularisation(finsrov, regularisation):
-    """Small lambda makes the problem ill-conditioned (1e6 here), and float32 still solves it."""
+    """A small lambda makes the problem ill-conditioned (1e6 here), and float32 still solves it."""
     assert_as_good_as_lsq_linear(finsrov, wrenches(finsrov, 500, seed=3), regularisation)
 
 
 def test_full_surge_matches_the_published_thrusts(finsrov):
-    """Full forward thrust of the published vehicle: 1.65 N on the verticals, 7 and 6.81 N on the horizontals."""
+    """Full forward thrust of the published vehicle gives 1.65 N on the verticals, 7 and 6.81 N on the horizontals."""
     f = allocator(finsrov).allocate([finsrov.wrench_limits[0], 0, 0, 0, 0, 0])
     np.testing.assert_allclose(f, [1.65, -1.65, -1.65, 1.65, 7.0, 7.0, -6.81, -6.81], atol=0.01)
 
@@ -119,7 +119,7 @@ def test_pure_axis_limits_are_reached(finsrov, axis):
 
 
 def test_attainable_wrenches_are_met_to_the_regularisation(finsrov):
-    """Unsaturated, the wrench falls short by lambda/(sigma^2 + lambda), about 1e-4 of itself."""
+    """Without saturation, the wrench falls short by lambda/(sigma^2 + lambda), about 1e-4 of itself."""
     tau = 0.2 * wrenches(finsrov, 1000) / 5.0
     exact = allocator(finsrov)
     achieved = exact.achieved(exact.allocate(tau))
@@ -144,7 +144,7 @@ def measured_allocator():
 
 
 def test_random_layouts_are_solved(finsrov):
-    """Nothing rests on a symmetric vehicle: the certificate holds for random matrices of 5 to 8 thrusters."""
+    """The certificate holds for random matrices of 5 to 8 thrusters, without the symmetry of a vehicle."""
     rng = np.random.default_rng(4)
     for n in (5, 6, 7, 8) * 3:
         lower, upper = -rng.uniform(0.1, 10.0, n), rng.uniform(0.1, 10.0, n)
@@ -166,7 +166,7 @@ def test_a_dead_thruster_gives_nothing_and_the_others_make_up(finsrov):
 
 
 def test_one_wrench_gives_bitwise_what_a_batch_gives(layout):
-    """The robot's N = 1 and the training batch are the same code."""
+    """The robot's N = 1 and the training batch run the same code."""
     shared = allocator(layout)
     tau = wrenches(layout, 64)
     batch = shared.allocate(tau.reshape(4, 16, 6))
@@ -184,7 +184,7 @@ def allocate_of_types(
 
 
 def test_vehicle_types_of_one_batch_use_their_own_tables(finsrov):
-    """Two types in one launch give what each gives alone; a type with fewer thrusters leaves the rest at zero."""
+    """Two types in one launch give the results of each alone; a type with fewer thrusters leaves the rest at zero."""
     five = Allocator(finsrov.B[:, :5], finsrov.lower[:5], finsrov.upper[:5], finsrov.weights)
     eight = allocator(finsrov)
     data = allocation_data(
@@ -237,7 +237,7 @@ def test_bad_wrenches_are_refused(finsrov, tau):
 
 
 def test_a_first_allocation_waits_for_no_compiler(monkeypatch):
-    """Kernels are loaded where an allocator or an action mode is made: a robot's first decision only launches them."""
+    """Kernels are loaded when an allocator or action mode is created: a robot's first decision only launches them."""
     vehicle = load_vehicle("finsrov")
     made, mode = Allocator.from_vehicle(vehicle), action_mode("wrench6", vehicle)
     monkeypatch.setattr(wp, "launch", None)

@@ -1,4 +1,4 @@
-"""ArduSub's mixer: the published tables, its limits, the catalogue's thrusters, and the way back from thrusts."""
+"""ArduSub's mixer: the published tables, its limits, the catalogue's thrusters, and the inverse from thrusts."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ def demand(**parts):
 
 
 def asked(vehicle, part):
-    """Demand that an axis of an action makes: on from where the motors begin to turn up to the gain."""
+    """Return the demand for a part of an axis: from the dead band, where motors begin to turn, up to the gain."""
     dead = dead_band(vehicle)
     return dead + (vehicle.autopilot.gain - dead) * (part - QUIET) / (1.0 - QUIET)
 
 
 def test_the_vectored_frame_gives_way_to_the_throttle():
-    """The pair that is the rear in the direction of travel has no more forward demand than 1 - |throttle|."""
+    """The pair at the rear in the direction of travel has a forward demand of at most 1 - |throttle|."""
     mixer = Mixer.of_frame("VECTORED")
     out = mixer.outputs(demand(forward=1.0, throttle=0.75))
     np.testing.assert_allclose(out[:4], [-1.0, -1.0, 0.25, 0.25])
@@ -42,13 +42,13 @@ def test_the_vectored_frame_gives_way_to_the_throttle():
 
 
 def test_the_frame_of_six_axes_keeps_directions():
-    """Horizontals and verticals are scaled down apart, so that full ahead and full right is still diagonal."""
+    """Horizontals and verticals are scaled down separately, so that full ahead and full right is still diagonal."""
     out = Mixer.of_frame("VECTORED_6DOF").outputs(demand(forward=1.0, lateral=1.0, throttle=0.3))
     np.testing.assert_allclose(out, [0.0, -1.0, 1.0, 0.0, -0.3, -0.3, -0.3, -0.3], rtol=1e-6)
 
 
 def test_full_ahead_and_full_up_are_the_published_pulses():
-    """1100 µs on motors 1, 2 and 1900 on 3, 4 ahead, 1100 on the verticals up; directions turn a motor's pulses."""
+    """Ahead: 1100 µs on motors 1, 2 and 1900 on 3, 4; up: 1100 on the verticals; directions invert a motor's pulses."""
     mixer = Mixer.of_frame("VECTORED_6DOF")
     np.testing.assert_allclose(
         mixer.pulses(demand(forward=1.0)), [1100, 1100, 1900, 1900, 1500, 1500, 1500, 1500]
@@ -61,7 +61,7 @@ def test_full_ahead_and_full_up_are_the_published_pulses():
 @pytest.mark.parametrize("vehicle", [HEAVY, ROV], ids=lambda v: v.name)
 @pytest.mark.parametrize("name", PUSHES)
 def test_each_demand_pushes_its_way(vehicle, name):
-    """Through the mode, the mixer, the ESC and the thrusters of the catalogue: the axis named, and no other force."""
+    """Mode, mixer, ESC and thrusters of the catalogue give a force along the named axis and no other."""
     if (vehicle, name) == (ROV, "pitch"):
         pytest.skip("six thrusters do not pitch")
     axis, sign = PUSHES[name]
@@ -74,7 +74,7 @@ def test_each_demand_pushes_its_way(vehicle, name):
 
 
 def test_thrusts_are_those_of_the_speed_controller():
-    """An action's thrusts are c ω² at the pulses that the mixer gives, by the ESC's own law; at another voltage too."""
+    """Thrusts of an action are c ω² at the mixer's pulses by the ESC's law, also at another voltage."""
     for voltage in (None, 12.0):
         vehicle = HEAVY if voltage is None else HEAVY.replace({"autopilot.voltage": voltage})
         action = np.array([0.7, -0.2, 0.4, 0.05, -0.1, 0.3])
@@ -95,12 +95,12 @@ def test_thrusts_are_those_of_the_speed_controller():
         ]
         np.testing.assert_allclose(
             f, expected, atol=0.02
-        )  # a table every µs between which thrust is taken as straight
+        )  # thrust is interpolated linearly in a table with 1 µs spacing
 
 
 @pytest.mark.parametrize("vehicle", [HEAVY, ROV], ids=lambda v: v.name)
 def test_demands_of_thrusts_give_these_thrusts_again(vehicle):
-    """What the mixer gave comes back from it, with motors in the dead band and groups that saturate."""
+    """The inverse recovers the mixer's thrusts, with motors in the dead band and groups that saturate."""
     mode, mixer = action_mode("pilot6", vehicle), Mixer.of(vehicle)
     random, off = np.random.default_rng(0), []
     for _ in range(200):
@@ -108,13 +108,13 @@ def test_demands_of_thrusts_give_these_thrusts_again(vehicle):
         again = before_dead_band(mixer.demands(f) / vehicle.autopilot.gain, axis_dead_band(vehicle))
         body = np.array([again[4], -again[5], again[3], again[0], -again[1], -again[2]])
         off.append(np.abs(mode.to_thrusters(body) - f).max())
-    # Where the vectored frame clips single motors with all axes near full, the demand is not always reached.
+    # Where the vectored frame clips single motors with all axes near full, the demand is not always met.
     assert np.percentile(off, 90.0) < 0.1
     np.testing.assert_array_equal(mixer.demands(np.zeros(len(f))), 0.0)
 
 
 def test_a_motor_wired_and_declared_the_other_way_gives_the_same_push():
-    """MOT_3_DIRECTION -1 beside a propeller that pushes the other way: pulses differ, thrust direction does not."""
+    """With MOT_3_DIRECTION -1 and a propeller of the other hand, pulses differ and the thrust direction does not."""
     turned = HEAVY.replace(
         {"thrusters.T3.axis": (-HEAVY.thrusters["T3"].axis).tolist(), "autopilot.directions": [1, 1, -1]}
     )
@@ -126,7 +126,7 @@ def test_a_motor_wired_and_declared_the_other_way_gives_the_same_push():
 
 
 def test_a_frame_may_be_a_table():
-    """The factors written out are the frame of that name, but clipped one by one."""
+    """A frame given by its factors equals the named frame, except that each motor is clipped separately."""
     rows = HEAVY.autopilot.factors.tolist()
     own = HEAVY.replace({"autopilot.frame": rows})
     small = demand(forward=0.2, yaw=0.1, throttle=-0.3)
@@ -162,7 +162,7 @@ def test_a_vehicle_without_an_autopilot_has_no_axes():
 
 @pytest.mark.parametrize("gain", [0.25, 0.5, 1.0])
 def test_motors_turn_from_one_percent_of_an_axis_at_any_gain(gain):
-    """Just below `QUIET` nothing turns, just above it something does, and action 1 is the gain's full output."""
+    """Just below `QUIET` no motor turns, just above it one does, and action 1 is the gain's full output."""
     vehicle = HEAVY.replace({"autopilot.gain": gain})
     mode = action_mode("pilot6", vehicle)
     for axis in range(6):
@@ -184,7 +184,8 @@ def test_a_gain_that_turns_no_motor_is_refused():
 
 
 def test_the_way_back_past_the_dead_band_is_the_way_there():
-    """Also where an axis is scaled, and where it is switched off."""
+    """`before_dead_band` inverts the mapping, also where an axis is scaled; an axis that is switched off is
+    excluded."""
     scale = (1.0, 0.5, 0.3, 1.0, 0.0, 0.8)
     band = axis_dead_band(HEAVY, scale)
     assert band[0] == pytest.approx(dead_band(HEAVY) / HEAVY.autopilot.gain)

@@ -1,4 +1,4 @@
-"""An action means a part of a limit, is refused when it cannot be one, and its definition travels as plain data."""
+"""An action is a fraction of a limit, is refused if invalid, and its definition is plain data."""
 
 import json
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ def craft(layout):
 
 
 OWN = [name for name in MODES if not MODES[name].pilot and not MODES[name].course]
-"""Modes of every vehicle; ArduSub's is tested in test_ardusub.py, the autopilot of course in sim/test_course.py."""
+"""Modes of every vehicle; ArduSub's is tested in test_ardusub.py, the course autopilot in sim/test_course.py."""
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -104,7 +104,7 @@ def thrusts_of_worlds(action: wp.array2d(dtype=vec8), data: ModeData, force: wp.
 
 @pytest.mark.parametrize("name", OWN)
 def test_a_batch_of_vehicles_and_the_robot_give_the_same_bits(name):
-    """Every vehicle of the catalogue that has the same number of thrusters, each with a scale of its own."""
+    """The batch has every catalogue vehicle with the same number of thrusters, each with its own scale."""
     vehicles = [one for one in map(load_vehicle, catalogue()) if len(one.thruster_names) == 8]
     assert len(vehicles) > 3
     scales = [1.0 / (1 + v) for v in range(len(vehicles))]
@@ -119,7 +119,8 @@ def test_a_batch_of_vehicles_and_the_robot_give_the_same_bits(name):
 
 
 def test_another_mode_is_one_entry(craft, monkeypatch):
-    """Two components that each drive half of the thrusters, the second of them backwards; more than all is all."""
+    """Two components each drive half of the thrusters, the second one backwards; values beyond the limits are
+    clipped."""
     n = len(craft.thruster_names)
     half = np.stack([np.arange(n) < n // 2, -1.0 * (np.arange(n) >= n // 2)])
     monkeypatch.setitem(
@@ -171,7 +172,8 @@ def test_unknown_modes_and_impossible_scales_are_refused(craft):
 
 
 def test_surfaces_are_all_channels_in_their_own_units():
-    """A propeller in newtons, then four fins in radians, each in parts of its limits either way."""
+    """The channels are a propeller in newtons and four fins in radians, as fractions of their limits in each
+    direction."""
     vehicle = tailed("x")
     mode = action_mode("surfaces", vehicle)
     assert mode.labels == ("propeller", "fin_0", "fin_1", "fin_2", "fin_3")

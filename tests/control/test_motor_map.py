@@ -1,4 +1,4 @@
-"""Motor map: order, sign and curve; thrusts too small to hold are right on average, through an independent motor."""
+"""Motor map: order, sign and curve; thrusts too small to hold are correct on average, by an independent motor."""
 
 from types import SimpleNamespace
 
@@ -27,7 +27,7 @@ FINSROV = VEHICLES["finsrov"]
 
 
 def commands(motors, requests):
-    """Canonical shaft speeds [rpm] that requests (steps, n) [N] become, (steps, n)."""
+    """Return canonical shaft speeds [rpm], (steps, n), for requests [N], (steps, n)."""
     memory, told = motors.reset(), []
     for request in requests:
         normalised, _, memory = motors.normalised(request, memory, DT)
@@ -37,7 +37,7 @@ def commands(motors, requests):
 
 
 def delivered(vehicle, rpm):
-    """Thrust [N] of motors with a dead zone, a first-order lag of the shaft and T = c ω|ω|, (steps*FINE, n)."""
+    """Return the thrust [N], (steps*FINE, n), of motors with a dead zone, a first-order shaft lag and T = c ω|ω|."""
     thrusts = []
     for t, column in zip(vehicle.thrusters.values(), rpm.T, strict=True):
         turning = np.where((column > t.dead_rpm_minus) & (column < t.dead_rpm_plus), 0.0, column) * RPM
@@ -48,7 +48,7 @@ def delivered(vehicle, rpm):
 
 
 def pulse_impulse(motors):
-    """Impulse of one pulse per direction and thruster [N s], (2, n)."""
+    """Return the impulse of one pulse per direction and thruster [N s], (2, n)."""
     return np.array([[2.0 * side.half for side in (m.minus, m.plus)] for m in motors._motors]).T
 
 
@@ -56,7 +56,8 @@ def pulse_impulse(motors):
 @pytest.mark.parametrize("name", VEHICLES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_mean_thrust_is_what_was_asked(name, sign):
-    """mean T = f within 3 % and what one unfinished pulse can hide, for requests from 0.02 to 1 N either way."""
+    """Mean T = f within 3 % plus the share of one unfinished pulse, for requests from 0.02 to 1 N in both
+    directions."""
     vehicle, duration = VEHICLES[name], 60.0
     motors = MotorMap.from_vehicle(vehicle)
     n = motors.thrusters
@@ -65,14 +66,14 @@ def test_the_mean_thrust_is_what_was_asked(name, sign):
         request = sign * np.array([SMALL[(start + k) % len(SMALL)] for k in range(n)])
         thrust = delivered(vehicle, commands(motors, np.tile(request, (round(duration / DT), 1))))
         mean = thrust.sum(axis=0) * DT / FINE / duration
-        # Any motor is late by its lag once: at most 1.5 time constants of a shaft that starts from rest.
+        # Each motor lags once: by at most 1.5 time constants of a shaft that starts from rest.
         hidden = pulse_impulse(motors)[int(sign > 0.0)] + 1.5 * lag * np.abs(request)
         np.testing.assert_array_less(np.abs(mean - request), 0.03 * np.abs(request) + hidden / duration)
 
 
 @pytest.mark.parametrize("name", WITH_DEAD_ZONE)
 def test_a_small_request_never_falls_into_the_dead_zone(name):
-    """Every commanded speed either is zero or turns the shaft, and both happen."""
+    """Every commanded speed is either zero or turns the shaft, and both occur."""
     vehicle = VEHICLES[name]
     rpm = commands(MotorMap.from_vehicle(vehicle), np.full((600, len(vehicle.thrusters)), 0.05))
     for t, column in zip(vehicle.thrusters.values(), rpm.T, strict=True):
@@ -81,7 +82,7 @@ def test_a_small_request_never_falls_into_the_dead_zone(name):
 
 
 def test_pulses_and_gaps_are_never_shorter_than_the_motor_needs():
-    """A constant request turns the motor on and off for at least its time constant each."""
+    """A constant request turns the motor on and off for at least its time constant each time."""
     for request in (0.05, 0.2, 0.5):
         rpm = commands(MotorMap.from_vehicle(FINSROV), np.full((3600, 8), request))
         for t, column in zip(FINSROV.thrusters.values(), rpm.T, strict=True):
@@ -90,7 +91,7 @@ def test_pulses_and_gaps_are_never_shorter_than_the_motor_needs():
 
 
 def test_no_request_is_no_thrust_at_once_and_leaves_nothing():
-    """Zero commands exactly zero, in the middle of a pulse too, and the pulses begin anew after it."""
+    """Zero commands exactly zero, even during a pulse, and the pulses start afresh after it."""
     motors = MotorMap.from_vehicle(FINSROV)
     memory = motors.reset()
     for _ in range(37):
@@ -102,7 +103,7 @@ def test_no_request_is_no_thrust_at_once_and_leaves_nothing():
 
 
 def test_a_changed_sign_ends_the_pulse_and_leaves_no_residue():
-    """No pulse runs against the request, and the impulse after a reversal is the new request's within one pulse."""
+    """No pulse opposes the request, and the impulse after a reversal is the new request's within one pulse."""
     motors = MotorMap.from_vehicle(FINSROV)
     requests = np.repeat([[0.1] * 8, [-0.05] * 8], [413, 3600], axis=0)
     rpm = commands(motors, requests)
@@ -113,13 +114,13 @@ def test_a_changed_sign_ends_the_pulse_and_leaves_no_residue():
 
 @pytest.mark.parametrize("amplitude", [0.02, 0.1, 0.11])
 def test_jitter_around_zero_starts_no_motor(amplitude):
-    """A policy that asks for ±0.1 N in turn at 10 Hz asks for nothing on average, and gets nothing."""
+    """A policy that alternates between ±0.1 N at 10 Hz requests zero on average, and gets zero."""
     signs = np.repeat(np.tile([1.0, -1.0], 300), 6)
     assert not commands(MotorMap.from_vehicle(FINSROV), amplitude * np.tile(signs, (8, 1)).T).any()
 
 
 def test_jitter_around_a_small_request_gives_its_mean():
-    """0.06 N with ±0.1 N of 10 Hz on top is 0.06 N on average: what is owed survives the changes of sign."""
+    """0.06 N plus ±0.1 N of 10 Hz is 0.06 N on average: the remainder survives the changes of sign."""
     motors = MotorMap.from_vehicle(FINSROV)
     request = 0.06 + 0.1 * np.repeat(np.tile([1.0, -1.0], 600), 6)
     mean = delivered(FINSROV, commands(motors, np.tile(request, (8, 1)).T)).mean(axis=0)
@@ -130,7 +131,7 @@ def test_jitter_around_a_small_request_gives_its_mean():
 @pytest.mark.parametrize("name", VEHICLES)
 @given(share=st.floats(-3.0, 3.0, allow_subnormal=False), dt=st.floats(0.0, 1.0))
 def test_a_held_thrust_comes_out_as_its_speed(name, share, dt):
-    """T(rpm told) = the request within the limits, unless it is too small to be held; never beyond full scale."""
+    """T(commanded rpm) = the request within the limits, unless it is too small to be held; never beyond full scale."""
     motors = MotorMap.from_vehicle(VEHICLES[name])
     told, mean, _ = motors.normalised(share * motors.upper, motors.reset(), dt)
     np.testing.assert_array_equal(mean, np.clip(share * motors.upper, motors.lower, motors.upper))
@@ -141,7 +142,7 @@ def test_a_held_thrust_comes_out_as_its_speed(name, share, dt):
 
 
 def test_each_output_drives_its_thruster_with_its_sign():
-    """FinsROV's published table of outputs M1 to M8: thruster and sign."""
+    """Thruster and sign agree with FinsROV's published table of outputs M1 to M8."""
     table = ["-H_LF", "-H_LB", "-V_LF", "+V_LB", "-V_RB", "+H_RF", "-H_RB", "-V_RF"]
     motors = MotorMap.from_vehicle(FINSROV)
     for output, (sign, name) in enumerate((word[0], word[1:]) for word in table):
@@ -151,7 +152,8 @@ def test_each_output_drives_its_thruster_with_its_sign():
 
 
 def test_full_thrust_is_the_fastest_speed_of_the_file():
-    """c± at the published rpm limits is the published force limit, so full thrust commands that speed of 3000 rpm."""
+    """c± at the published rpm limits gives the published force limit, so full thrust commands that speed of
+    3000 rpm."""
     motors = MotorMap.from_vehicle(FINSROV)
     rpm = motors.canonical_rpm(motors.normalised(motors.upper, motors.reset(), DT)[0]) * 3000.0
     expected = [t.rpm_max for t in FINSROV.thrusters.values()]
@@ -159,7 +161,7 @@ def test_full_thrust_is_the_fastest_speed_of_the_file():
 
 
 def test_outputs_that_cannot_be_are_refused():
-    """An output used twice or beyond the controller's, and an mcu without a motor_index, are named."""
+    """An output used twice or beyond the controller's range, and an mcu without a motor_index, are named."""
     with pytest.raises(ControlError, match="correct motor_index"):
         MotorMap.from_vehicle(FINSROV.replace({"thrusters.H_LF.motor_index": 3}))
     with pytest.raises(ControlError, match="lie in 0 to 7"):

@@ -11,7 +11,7 @@ from finssim.control.trajectories import TRAJECTORIES
 
 
 def test_errors_beside_a_sloping_leg_in_closed_form():
-    """A leg along (3, 4, -5)/sqrt(50): across is level and to the left, above is perpendicular to it."""
+    """For a leg along (3, 4, -5)/sqrt(50), across is level and to the left, above is perpendicular to the leg."""
     path = Waypoints([[1.0, 2.0, -3.0], [31.0, 42.0, -53.0]])
     e = np.array([3.0, 4.0, -5.0]) / math.sqrt(50.0)
     left = np.array([-0.8, 0.6, 0.0])
@@ -55,7 +55,8 @@ def test_paths_that_are_none_are_refused(points, radius, words):
 
 
 def followed(gain: float, seconds: float) -> np.ndarray:
-    """Cross-track and vertical error [m] of points that hold HEADING and pitch in a current, at 1.5 m/s."""
+    """Return the final cross-track and vertical error [m] of points that follow aimed angles in a current at
+    1.5 m/s."""
     path, guide, h = Waypoints([[0, 0, -10], [2000, 0, -10]]), LineOfSight(6.0, gain), 0.1
     x, current = np.array([[0.0, 8.0, -13.0]]), np.array([0.1, -0.4, 0.15])
     leg, memory = path.reset(), guide.reset()
@@ -71,7 +72,7 @@ def followed(gain: float, seconds: float) -> np.ndarray:
 
 
 def test_the_integral_takes_a_current_out():
-    """Without it the point ahead is aimed at with the heading, and the current leaves D tan(drift angle)."""
+    """Without the integral the heading points at the look-ahead point, and the current leaves D tan(drift angle)."""
     drift = np.array([math.asin(0.4 / 1.5), math.asin(0.15 / 1.5)])
     assert np.abs(followed(0.0, 200.0)) == pytest.approx(6.0 * np.tan(drift), rel=0.02)
     assert np.abs(followed(0.2, 200.0)).max() < 0.01
@@ -85,7 +86,7 @@ def test_the_greatest_slope_is_kept():
 
 
 def test_a_sloping_seabed_is_followed_without_lag():
-    """Depth of the seabed 20 m + 0.3 m/s: the wanted depth is the altitude above it one second ahead."""
+    """With a seabed depth of 20 m + 0.3 m/s, the reference depth is the altitude above the seabed one second ahead."""
     follower, h = SeabedFollower(altitude=3.0), 0.1
     memory = follower.reset(2)
     for k in range(400):

@@ -1,4 +1,4 @@
-"""A policy directory runs only with what it was trained for, and says in one sentence what differs."""
+"""A policy directory runs only with the setup it was trained for, and reports any difference in one sentence."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TROUT = SimpleNamespace(name="trout", sha256="cd" * 32)
 
 
 def network(inputs: int = 3) -> bytes:
-    """clip(GAIN x, -1, 1), as an ONNX file."""
+    """Return clip(GAIN x, -1, 1) as an ONNX file."""
     weights = [numpy_helper.from_array(GAIN[:, :inputs], "gain")]
     weights += [numpy_helper.from_array(np.float32(v), n) for v, n in ((-1, "low"), (1, "high"))]
     nodes = [helper.make_node("Gemm", ["observation", "gain"], ["x"], transB=1)]
@@ -81,7 +81,7 @@ def folder(tmp_path):
 
 
 def test_the_action_is_the_network_of_the_observation(folder):
-    """clip(GAIN x): by hand for one vehicle, and row by row for many."""
+    """The action is clip(GAIN x): by hand for one vehicle, and row by row for many."""
     policy = Policy.load(folder, vehicle=MINNOW, task=TASK, mode=MODE)
     np.testing.assert_allclose(policy.act([1.0, 2.0, 0.25]), [0.5, -0.25], atol=1e-7)
     np.testing.assert_allclose(policy.act([8.0, 0.0, -3.0]), [1.0, -1.0], atol=0)
@@ -207,7 +207,7 @@ def test_a_bad_observation_is_refused_by_name(folder):
 
 
 def test_one_action_takes_microseconds(folder):
-    """A robot calls it with N = 1; processor time, since others may work on the machine."""
+    """A robot calls it with N = 1; processor time is measured, since the machine may be shared."""
     policy, observation = Policy.load(folder), np.zeros(3, dtype=np.float32)
     durations = []
     for _ in range(500):
@@ -228,14 +228,14 @@ def test_running_a_policy_needs_no_torch(folder):
 
 
 def test_a_network_with_other_names_is_refused(folder):
-    """An input that is called otherwise would fail at the first action."""
+    """An input with another name would fail at the first action."""
     write(folder, network().replace(b"observation", b"observatlon"))
     with pytest.raises(PolicyError, match="maps observatlon to action, expected observation to action"):
         Policy.load(folder)
 
 
 def test_a_network_that_takes_too_much_memory_is_refused(folder):
-    """Two weights of 400 kB whose product has 10^10 numbers."""
+    """The product of two weights of 400 kB has 10^10 elements."""
     wide = numpy_helper.from_array(np.ones((100_000, 1), np.float32), "wide")
     nodes = [helper.make_node("MatMul", ["observation", "gain"], ["x"])]
     nodes += [

@@ -1,4 +1,4 @@
-"""The published trajectories keep to what is published of them, and every velocity is the derivative it claims."""
+"""The published trajectories have their published properties, and each velocity is the derivative of the position."""
 
 from dataclasses import replace
 
@@ -29,12 +29,12 @@ PUBLISHED = {
 }
 """Duration [s] and greatest speed [m/s]."""
 FASTEST_CHANGE = 0.08
-"""Largest acceleration that is published [m/s²]."""
+"""Largest published acceleration [m/s²]."""
 
 
 @EVERY
 def test_the_velocity_is_the_derivative_of_the_position(name):
-    """Central differences over 2 ms: their error is h² x''' / 6, and at a corner h x'' / 2."""
+    """Central differences over 2 ms have an error of h² x''' / 6, and of h x'' / 2 at a corner."""
     trajectory, h = TRAJECTORIES[name], 1e-3
     t = np.linspace(h, trajectory.duration - h, 5001)
     slope = (trajectory.at(t + h).position - trajectory.at(t - h).position) / (2.0 * h)
@@ -54,7 +54,7 @@ def test_the_published_durations_and_peaks_are_met(name, duration, peak):
 
 @EVERY
 def test_every_trajectory_keeps_to_the_published_limits_and_suits_the_vehicle(name):
-    """0.15 m/s, 0.08 m/s² and 1.2 m x 0.7 m around the middle, from 0.9 m down to 0.25 m above the surface."""
+    """Limits are 0.15 m/s, 0.08 m/s² and 1.2 m x 0.7 m around the middle, from 0.9 m to 0.25 m below the surface."""
     t = np.linspace(0.0, TRAJECTORIES[name].duration, 10001)
     reference = TRAJECTORIES[name].at(t)
     assert np.linalg.norm(reference.velocity, axis=-1).max() <= 0.15
@@ -64,7 +64,7 @@ def test_every_trajectory_keeps_to_the_published_limits_and_suits_the_vehicle(na
 
 
 def test_the_published_plane_is_ours_with_its_z_as_our_y():
-    """The controller frame's (x, y up, z left) is our (x, z left as y, y up as z)."""
+    """The controller frame's (x, y up, z left) is our (x, y = its z left, z = its y up)."""
     np.testing.assert_allclose(TRAJECTORIES["straight"].at(0.0).position, [-1.0, -0.4, -0.5])
     corners = TRAJECTORIES["broken"].at(np.array([0.0, 32.0, 45.0, 77.0, 90.0])).position
     expected = [(-1, -0.4), (1, 0.4), (1, -0.4), (-1, 0.4), (-1, -0.4)]
@@ -93,7 +93,8 @@ def test_many_times_at_once_are_those_one_by_one(name):
 
 
 def test_the_heading_is_kept_or_looks_along_the_way():
-    """Fixed: the angle given. Tangent: that of the velocity, known at the rests of a straight line too."""
+    """A fixed heading is the given angle; a tangent one is that of the velocity, also at the rests of a
+    straight line."""
     assert np.all(load_trajectory("circle", yaw=0.7).at(np.linspace(0.0, 99.0, 9)).yaw == pytest.approx(0.7))
     tangent = load_trajectory("circle", heading="tangent")
     v = tangent.at(10.0).velocity
@@ -103,7 +104,7 @@ def test_the_heading_is_kept_or_looks_along_the_way():
 
 
 def test_a_trajectory_guides_a_pose_controller():
-    """`goal_at` gives place, velocity and a level attitude of the wanted heading."""
+    """`goal_at` gives position, velocity and a level attitude with the required heading."""
     trajectory = load_trajectory("lemniscate", yaw=0.3)
     goal, reference = goal_at(trajectory, 4.0), trajectory.at(4.0)
     np.testing.assert_array_equal(goal.position, reference.position)
@@ -116,7 +117,7 @@ def test_the_published_name_of_the_broken_line_is_known():
 
 
 def test_a_vehicle_refuses_what_it_cannot_follow():
-    """FinsROV goes 0.345 m/s sideways, and its pool ends at y = 1 m."""
+    """FinsROV reaches 0.345 m/s sideways, and its pool ends at y = 1 m."""
 
     def line(y, duration):
         _, motion = polyline([(0.0, 0.0, -0.5), (0.0, y, -0.5)], [duration])
@@ -125,7 +126,7 @@ def test_a_vehicle_refuses_what_it_cannot_follow():
     check_vehicle(line(0.8, 4.0), FINSROV)
     with pytest.raises(ControlError, match=r"sway of .* goes 0\.34"):
         check_vehicle(line(0.8, 3.0), FINSROV)
-    check_vehicle(replace(line(0.8, 3.0), heading="tangent"), FINSROV)  # forwards it is fast enough
+    check_vehicle(replace(line(0.8, 3.0), heading="tangent"), FINSROV)  # it is fast enough forwards
     with pytest.raises(ControlError, match="y is 1"):
         check_vehicle(line(1.2, 20.0), FINSROV)
 
@@ -142,7 +143,7 @@ def test_what_is_no_trajectory_is_refused():
 
 @EVERY
 def test_a_published_trajectory_grows_with_the_vehicle(name):
-    """Its way and its speed, not its time; FinsROV's is the published one."""
+    """Its path and its speed are scaled, not its duration; FinsROV's is the published one."""
     published, own = TRAJECTORIES[name], load_trajectory(name, vehicle=load_vehicle("rexrov"))
     t = np.linspace(0.0, published.duration, 50)
     for part in ("position", "velocity"):

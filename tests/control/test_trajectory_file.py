@@ -1,4 +1,4 @@
-"""Trajectories from files: what they say is followed, and what is wrong is told in one sentence."""
+"""Trajectories from files are followed as written, and an invalid file is refused in one sentence."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from finssim.control.trajectories import TRAJECTORIES, load_trajectory, read_tra
 
 
 def test_a_table_of_samples_follows_the_motion_they_were_taken_from(tmp_path):
-    """A circle sampled at 10 Hz comes back within a tenth of a millimetre and 2 mm/s, after its start from rest."""
+    """A circle sampled at 10 Hz is recovered within a tenth of a millimetre and 2 mm/s, after its start from rest."""
     circle = TRAJECTORIES["circle"]
     t = np.arange(0.0, 60.0, 0.1)
     rows = np.column_stack([t, circle.at(t).position])

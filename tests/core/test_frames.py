@@ -1,4 +1,4 @@
-"""Every change of convention comes back, and known motions look as that convention says they must."""
+"""Every change of convention is invertible, and known motions have the signs of each convention."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ Q = Rotation.random(5, random_state=0).as_quat()
 R = Rotation.random(5, random_state=0).as_matrix()
 
 NOSE_UP = -Y
-"""Angular velocity of a nose-up pitch in our axes: the right hand about left lowers the nose."""
+"""Angular velocity of a nose-up pitch in our axes: right-handed rotation about left lowers the nose."""
 LEFT_TURN = Z
 RISING = Z
 
@@ -70,18 +70,19 @@ class TestEveryChange:
 
 
 def test_fossen_sees_known_motions_as_his_book_does():
-    """Nose up: theta and q grow. Left turn: r and the heading fall. Rising: w and the world z (depth) fall."""
+    """Nose up: theta and q increase. Left turn: r and the heading decrease. Rising: w and the world z (depth)
+    decrease."""
     np.testing.assert_array_equal(TO_FOSSEN.axial(NOSE_UP), Y)
     np.testing.assert_array_equal(TO_FOSSEN.axial(LEFT_TURN), -Z)
     np.testing.assert_array_equal(TO_FOSSEN.vector(RISING), -Z)
     assert TO_FOSSEN.yaw(0.5) == -0.5
     nose_up = TO_FOSSEN.quaternion(quat_from_euler(0.0, -0.2, 0.0))
     np.testing.assert_allclose(nose_up, quat_from_euler(0.0, 0.2, 0.0))
-    assert quat_rotate(nose_up, X)[2] < 0.0  # the bow points up, against his z
+    assert quat_rotate(nose_up, X)[2] < 0.0  # the bow points up, against Fossen's z
 
 
 def test_the_controller_sees_known_motions_in_left_handed_axes():
-    """y is up and z left, so rising is +y; turning left is -y and nose up is +z, against the right hand."""
+    """y is up and z left, so rising is +y; turning left is -y and nose up is +z, since the axes are left-handed."""
     np.testing.assert_array_equal(TO_CONTROLLER.vector(RISING), Y)
     np.testing.assert_array_equal(TO_CONTROLLER.vector(Y), Z)
     np.testing.assert_array_equal(TO_CONTROLLER.axial(LEFT_TURN), -Y)
@@ -98,14 +99,14 @@ def test_the_controller_map_is_the_published_one():
 
 
 def test_a_left_vertical_thruster_rolls_as_published():
-    """Pushing up on the left is +roll in ours and the published -0.133 N m/N in the controller frame, y up, z left."""
+    """Pushing up on the left is +roll in our frame and the published -0.133 N m/N in the controller's, y up, z left."""
     lever, force = np.array([0.08312216, 0.13304673, 0.04907]), Z
     wrench = TO_CONTROLLER.twist(np.concatenate([force, np.cross(lever, force)]))
     np.testing.assert_allclose(wrench, [0, 1, 0, -0.133047, 0, 0.083122], atol=1e-6)
 
 
 def test_a_camera_looks_along_its_optical_z():
-    """Forward, right and down of the camera are optical z, x and y."""
+    """Forward, right and down of the camera are its optical z, x and y."""
     np.testing.assert_array_equal(TO_OPTICAL.vector([X, -Y, -Z]), [Z, X, Y])
     attitude = quat_from_euler(0.1, np.pi / 2, 0.4)  # x forward points straight down into the water
     optical = optical_from_camera(attitude)

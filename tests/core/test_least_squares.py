@@ -1,4 +1,4 @@
-"""Levenberg and Marquardt's method: it finds minima from afar, keeps to possible states and reports what it did."""
+"""Levenberg-Marquardt finds minima from distant starts, returns only valid states and reports its course."""
 
 import math
 
@@ -9,7 +9,7 @@ from finssim.core.least_squares import STEADIEST, descend
 
 
 def problem(residual, jacobian, possible=lambda x: True):
-    """Cost and linearisation of a sum of squares of a vector of parameters."""
+    """Return cost and linearisation of a sum of squares of a vector of parameters."""
 
     def linearise(x):
         r, J = residual(x), jacobian(x)
@@ -25,7 +25,7 @@ def problem(residual, jacobian, possible=lambda x: True):
 
 
 def valley(x):
-    """Rosenbrock's residuals, whose minimum is (1, 1), at the end of a curved valley."""
+    """Return Rosenbrock's residuals, whose minimum is (1, 1), at the end of a curved valley."""
     return np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
 
 
@@ -35,7 +35,7 @@ def valley_slopes(x):
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (3.0, -4.0), (0.0, 0.0)])
 def test_the_end_of_a_curved_valley_is_found(start):
-    """Rosenbrock's minimum from three starts, with a cost that no step raised."""
+    """Rosenbrock's minimum is found from three starts, and no step raises the cost."""
     cost, linearise = problem(valley, valley_slopes)
     costs = []
 
@@ -49,7 +49,7 @@ def test_the_end_of_a_curved_valley_is_found(start):
 
 
 def test_a_linear_problem_takes_a_step_and_its_confirmation():
-    """Hardly damped, the first step of a straight-line fit reaches the closed form; the next promises nothing."""
+    """With little damping, the first step of a straight-line fit reaches the closed form; the next predicts no gain."""
     t = np.linspace(0.0, 1.0, 20)
     A, y = np.column_stack([t, np.ones(20)]), np.sin(t)
     cost, linearise = problem(lambda x: A @ x - y, lambda x: A)
@@ -66,7 +66,7 @@ def test_an_impossible_state_is_never_returned():
 
 
 def test_a_search_without_any_step_gives_up():
-    """States that no step leaves raise the damping to its limit: about nine steps, since its growth doubles."""
+    """If no step succeeds, damping reaches its limit in about nine steps, since its growth factor doubles."""
     end = descend(3.0, lambda x: 1.0, lambda x: lambda damping: (None, 1.0), steps=1000)
     assert end.state == 3.0 and not end.converged
     assert end.steps == next(n for n in range(100) if 1e-3 * 2.0 ** (n * (n + 1) / 2) >= STEADIEST)

@@ -1,4 +1,4 @@
-"""Closed meshes: integrals against closed forms, what a hull must satisfy, and what is refused."""
+"""Closed meshes: integrals against closed forms, properties of hulls, and refusals."""
 
 import numpy as np
 import pytest
@@ -21,12 +21,12 @@ FINSROV = parametric_hull((0.56, 0.42, 0.25), 0.0118)
 
 
 def box(size, center=(0.0, 0.0, 0.0)):
-    """A box: the hull whose volume is that of its envelope."""
+    """Return a box: the hull whose volume is that of its envelope."""
     return parametric_hull(size, float(np.prod(size)), center)
 
 
 def test_box_has_volume_and_centroid_of_a_box():
-    """V = abc, and the centre is where it was put."""
+    """V = abc, and the centre is at the given position."""
     a, b, c = 0.5, 0.4, 0.3
     vertices, faces = box((a, b, c), center=(1.0, -2.0, 3.0))
     assert mesh_volume(vertices, faces) == pytest.approx(a * b * c, rel=1e-12)
@@ -50,7 +50,7 @@ def test_tetrahedron_volume_and_centroid_wherever_it_lies(offset):
     center=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
 )
 def test_hull_has_the_envelope_the_volume_and_the_center_asked_for(size, fill, center):
-    """Whatever share of its envelope the hull fills, it is closed and has exactly the numbers asked for."""
+    """Whatever fraction of its envelope the hull fills, it is closed and has exactly the requested properties."""
     volume = fill * np.prod(size)
     vertices, faces = parametric_hull(size, volume, center)
     check_closed(vertices, faces)
@@ -63,7 +63,7 @@ def test_hull_has_the_envelope_the_volume_and_the_center_asked_for(size, fill, c
 
 @pytest.mark.parametrize("fill", [0.2, 0.6, 0.9])
 def test_hull_mirrors_on_its_three_planes(fill):
-    """Mirrored, the set of triangles is the same: no plane of symmetry is lost to the choice of diagonals."""
+    """Mirroring leaves the set of triangles unchanged: the choice of diagonals breaks no plane of symmetry."""
     vertices, faces = parametric_hull((1.0, 0.8, 0.6), fill * 0.48)
     normal, area, centroid = face_geometry(vertices, faces)
     table = np.column_stack([centroid, normal, area])
@@ -75,7 +75,7 @@ def test_hull_mirrors_on_its_three_planes(fill):
 
 
 def test_slender_hull_is_round_across():
-    """A tube's section is a circle: every vertex lies where |x|^n + r^n = 1, so r depends on |x| alone."""
+    """A tube's section is a circle: every vertex satisfies |x|^n + r^n = 1, so r depends on |x| alone."""
     vertices, _ = parametric_hull((1.6, 0.19, 0.19), 0.0306)
     middle = np.isclose(vertices[:, 0], 0.0)
     assert np.linalg.norm(vertices[middle, 1:], axis=1) == pytest.approx(0.095, rel=1e-9)
@@ -103,7 +103,7 @@ def test_impossible_hull_is_refused(size, volume, message):
 
 
 def test_binary_stl_round_trip(tmp_path):
-    """What was written is read back to float32, with the shared vertices merged."""
+    """A written file reads back to float32, with the shared vertices merged."""
     write_stl(tmp_path / "hull.stl", *FINSROV)
     vertices, faces = load_stl(tmp_path / "hull.stl")
     check_closed(vertices, faces)
@@ -113,7 +113,7 @@ def test_binary_stl_round_trip(tmp_path):
 
 
 def test_ascii_and_binary_stl_agree(tmp_path):
-    """Either form gives the same triangles, also where a binary header begins with the word "solid"."""
+    """Both forms give the same triangles, also where a binary header begins with the word "solid"."""
     vertices, faces = box((1.0, 2.0, 3.0))
     lines = ["solid box"]
     for corners in vertices[faces]:
@@ -130,7 +130,7 @@ def test_ascii_and_binary_stl_agree(tmp_path):
 
 
 def test_unreadable_stl_is_refused(tmp_path):
-    """A file cut short, of another kind, without triangles or with a broken number is named."""
+    """A file that is truncated, of another kind, without triangles or with an invalid number is named."""
     write_stl(tmp_path / "hull.stl", *FINSROV)
     whole = (tmp_path / "hull.stl").read_bytes()
     for content, message in [
@@ -168,7 +168,7 @@ def test_open_turned_and_flat_surfaces_are_refused():
 
 
 def test_one_inverted_part_is_found_and_turned():
-    """A second body exported inside out would subtract from the volume; turned, both add up."""
+    """A second body exported inside out would subtract from the volume; inverted, both add up."""
     near, faces = box((1.0, 1.0, 1.0))
     vertices = np.concatenate([near, near * 0.5 + [2.0, 0.0, 0.0]])
     both = np.concatenate([faces, faces[:, ::-1] + len(near)])

@@ -1,4 +1,4 @@
-"""Rotations agree with SciPy, undo themselves, and turn the way the conventions say."""
+"""Rotations agree with SciPy, invert exactly, and have the signs of the conventions."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_products_and_matrices_agree_with_scipy():
 
 
 def test_cross_is_numpys_to_the_last_digit():
-    """For one pair, for many, and for shapes that are broadcast."""
+    """This holds for one pair, for many, and for shapes that broadcast."""
     other = np.roll(VECTORS, 1, axis=0)
     assert np.array_equal(cross(VECTORS, other), np.cross(VECTORS, other))
     assert np.array_equal(cross(X, VECTORS[:5, None]), np.cross(X, VECTORS[:5, None]))
@@ -59,7 +59,7 @@ def test_euler_angles_agree_with_scipy():
 
 
 def test_matrices_come_back_as_the_same_quaternion():
-    """Including half turns, where w = 0 and a formula that divides by it fails."""
+    """This includes half turns, where w = 0 and a formula that divides by it fails."""
     half_turns = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0.6, 0.8, 0, 0], [0, 0, 0, 1.0]])
     np.testing.assert_allclose(matrix_to_quat(quat_to_matrix(half_turns)), half_turns, atol=1e-15)
     np.testing.assert_allclose(matrix_to_quat(RANDOM.as_matrix()), up_to_sign(Q), atol=1e-14)
@@ -87,8 +87,8 @@ def test_a_quaternion_times_its_conjugate_is_no_rotation():
 
 
 def test_positive_yaw_turns_left_and_positive_pitch_lowers_the_nose():
-    """x forward, y left, z up: the right-hand rule about up is a left turn, about left is nose down, about forward is
-    left side up."""
+    """With x forward, y left and z up, positive rotation about up turns left, about left lowers the nose, and about
+    forward raises the left side."""
     quarter = np.pi / 2
     np.testing.assert_allclose(quat_rotate(quat_from_yaw(quarter), X), Y, atol=1e-15)
     np.testing.assert_allclose(quat_rotate(quat_from_euler(0, quarter, 0), X), -Z, atol=1e-15)
@@ -117,7 +117,7 @@ def test_batches_of_any_shape_equal_single_calls():
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 6.0])
 def test_one_is_as_one_of_many(scale):
-    """Plain numbers of a single rotation and columns of a batch: the same formulas, so the same to rounding."""
+    """Plain numbers of one rotation and columns of a batch use the same formulas, so they agree to rounding."""
     v, w = scale * np.random.default_rng(11).standard_normal((2, 7, 3))
     q, r = quat_from_rotvec(v), quat_from_rotvec(w)
     for function, arguments in (

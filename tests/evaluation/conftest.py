@@ -1,4 +1,4 @@
-"""Experiments of tests are small: they stay in one process, since another takes seconds to start."""
+"""Small experiments for the tests: they run in one process, since another takes seconds to start."""
 
 import os
 from dataclasses import replace
@@ -16,7 +16,7 @@ BRIEF_STEPS = (("rest", 0.5), ("baseline", 1.0), ("excitation", 4.0), ("coast", 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_processor():
-    """What asks for as many processes as there are processors gets one; who names a number gets that."""
+    """A machine with one processor: a default number of processes is one; an explicit number is kept."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "cpu_count", lambda: 1)
         yield
@@ -24,8 +24,7 @@ def one_processor():
 
 @pytest.fixture(scope="module")
 def brief_t1():
-    """Trials of T1 last 16 s in place of 60, with the late errors from the last six: where only what is made of a
-    trial is tested."""
+    """Trials of T1 of 16 s instead of 60, with late errors from the last six, for tests of trials' outputs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics, "EVALUATION_WINDOW", (10.0, 16.0))
         for function in (RobotJob.__init__, read_record):
@@ -35,7 +34,7 @@ def brief_t1():
 
 @pytest.fixture(scope="module")
 def brief_steps():
-    """Steps of force last 4 s in place of 9: where the fits that they are made for are not tested."""
+    """Steps of force of 4 s instead of 9, for tests that do not check the fits."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(programme.PLANS, "step", BRIEF_STEPS)
         yield
@@ -43,7 +42,7 @@ def brief_steps():
 
 @pytest.fixture
 def brief_straight(monkeypatch):
-    """The straight trajectory ends after the first third of its way, at the speed that it has."""
+    """The straight trajectory, ending after the first third of its path, at unchanged speed."""
     whole = TRAJECTORIES["straight"]
     first, last = (whole.at(t).position for t in (0.0, whole.duration))
     time, motion = polyline([first, first + (last - first) / 3.0], [whole.duration / 3.0])

@@ -1,4 +1,4 @@
-"""A campaign plays each trial once, keeps what is finished, and returns results in the order of its jobs."""
+"""A campaign plays each trial once, keeps finished results, and returns results in the order of its jobs."""
 
 import json
 import math
@@ -24,13 +24,13 @@ JOBS = [RobotJob(row="pid", controller="pid", target=target) for target in ("P01
 
 
 def marks(folder):
-    """Targets that were played, sorted."""
+    """Return the targets that were played, sorted."""
     return sorted((folder / "played.txt").read_text().split())
 
 
 @pytest.mark.slow
 def test_results_come_in_the_order_of_the_jobs(tmp_path):
-    """Whatever process ended first."""
+    """The order does not depend on which process ended first."""
     results = run_jobs(JOBS, tmp_path, played.known, processes=2)
     assert [r["job"]["target"] for r in results] == ["P01", "P02", "P03"]
     assert [r["success"] for r in results] == [True, False, True]
@@ -38,7 +38,7 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path):
 
 @pytest.mark.slow
 def test_what_is_finished_is_not_played_again(tmp_path):
-    """A second call plays only what is new."""
+    """A second call plays only new jobs."""
     run_jobs(JOBS[:2], tmp_path, played.known, processes=1)
     told, shown = [], []
     run_jobs(
@@ -54,7 +54,7 @@ def test_what_is_finished_is_not_played_again(tmp_path):
 
 
 def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
-    """It reads as it was written, numbers of 70 bits too; a digit, a key or a half of it missing is refused."""
+    """A result reads back exactly, numbers of 70 bits included; a changed digit, a missing key or half is refused."""
     path, result = tmp_path / "P01.json", {"e_p": 0.1 + 0.2, "seed": 2**70, "target": ["P01", None]}
     keep_result(path, result)
     assert load_result(path) == result
@@ -72,7 +72,7 @@ def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
 
 @pytest.mark.slow
 def test_a_trial_that_breaks_loses_no_other(tmp_path):
-    """Its error is raised; the results so far stay, whole."""
+    """Its error is raised; the earlier results stay complete."""
     with pytest.raises(RuntimeError, match="P02 broke"):
         run_jobs(JOBS, tmp_path, played.failing, processes=1)
     kept = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]
@@ -80,7 +80,7 @@ def test_a_trial_that_breaks_loses_no_other(tmp_path):
 
 
 def gone(pid):
-    """Whether a process has ended."""
+    """Return whether a process has ended."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -91,7 +91,7 @@ def gone(pid):
 @pytest.mark.slow
 @pytest.mark.parametrize("signal", [SIGTERM, SIGKILL, SIGINT], ids=lambda signal: signal.name)
 def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
-    """However it ends: nobody is left playing trials that nobody waits for."""
+    """However the campaign ends, no worker continues to play its trials."""
     program = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from pathlib import Path\nfrom reference import played\n"
@@ -113,7 +113,7 @@ def test_workers_do_not_outlive_a_campaign(tmp_path, signal):
 
 
 def wait_until(true):
-    """Wait for something that comes soon, or fail."""
+    """Wait for a condition that becomes true soon, or fail."""
     for _ in range(1200):
         if true():
             return
@@ -155,7 +155,7 @@ def test_a_result_with_nan_is_refused_and_nothing_is_written(tmp_path):
     "says, reason", [(b"", "timed out"), (b"SSH-2.0-OpenSSH_9.6\r\n", "another program")]
 )
 def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, reason):
-    """One that is silent is given up after the time for an answer, one that greets otherwise at once."""
+    """A silent server is refused after the time for an answer, one with another greeting at once."""
     monkeypatch.setattr(campaign, "PATIENCE", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         address = f"127.0.0.1:{listener.getsockname()[1]}"
@@ -164,7 +164,7 @@ def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, 
             guest = listener.accept()[0]
             with suppress(ConnectionResetError):
                 guest.sendall(says)
-                while guest.recv(1 << 10):  # until the other end has gone
+                while guest.recv(1 << 10):  # until the other end has closed
                     pass
             guest.close()
 
@@ -178,7 +178,7 @@ def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, 
 
 @pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_further_jobs_are_prepared_while_others_are_played(tmp_path, processes):
-    """Their results follow, and a second call plays none of either."""
+    """Their results follow, and a second call plays none of them again."""
     shown = []
 
     def more():

@@ -1,4 +1,4 @@
-"""`finssim demo`: the whole loop at a small size, and a report that stands alone."""
+"""`finssim demo`: the whole loop at a small size, and a self-contained report."""
 
 import contextlib
 import io
@@ -50,14 +50,14 @@ SMALL = Scope(
 
 @pytest.fixture(scope="module")
 def made(brief_steps, tmp_path_factory):
-    """The command, with a policy that had no time to learn: its folder, what was identified, and what it told."""
+    """Folder, identification and messages of the command, with a policy that had no time to learn."""
     out, found, told = tmp_path_factory.mktemp("demo") / "demo", [], io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(told):
         patch.setattr(demo_module, "identify", lambda *a, **k: found.append(identify(*a, **k)) or found[0])
         patch.setattr(demo_module, "FULL", SMALL)
         patch.setattr(
             demo_module, "running", lambda *_: contextlib.nullcontext()
-        )  # compiles what is compiled
+        )  # compile the kernels first
         assert boundary.run(app, ["demo", "--steps", "8192", "--seed", "1", "--out", str(out)]) == 0
     return out, found[0], told.getvalue()
 
@@ -68,7 +68,7 @@ def folder(made):
 
 
 def test_policy_results_and_report_are_there(folder):
-    """And the training was as long as the command was told."""
+    """The files exist, and the training has the requested length."""
     assert Policy.load(folder / "policy").description.training["steps"] == 8192
     assert [path.name for path in folder.parent.iterdir()] == ["demo"]
     assert {p.name for p in folder.iterdir()} == {
@@ -90,7 +90,7 @@ def test_policy_results_and_report_are_there(folder):
 
 
 def test_the_identified_vehicle_is_as_fast_as_the_plant_and_the_policy_is_for_it(made):
-    """Surge reaches in the identified vehicle what it reached in the pool's trials, within 10 %; trials by role."""
+    """Surge of the identified vehicle reaches the speed of the pool's trials, within 10 %; trials are filed by role."""
     folder, _, told = made
     vehicle = load_vehicle(folder / "finsrov_identified.yaml")
     assert Policy.load(folder / "policy", vehicle=vehicle).description.vehicle.sha256 == vehicle.sha256
@@ -104,7 +104,7 @@ def test_the_identified_vehicle_is_as_fast_as_the_plant_and_the_policy_is_for_it
 
 
 def test_each_trial_is_told_as_soon_as_it_is_over(made):
-    """First the speeds that trials reached, then what was identified, then who held what."""
+    """The order is: the speeds reached in trials, the identification, the controllers' results."""
     lines = made[2].splitlines()
     at = [next(i for i, line in enumerate(lines) if line.startswith(s)) for s in ("identified", "training")]
     assert sum(": up to " in line for line in lines[: at[0]]) == 4 and at[0] < at[1]
@@ -113,7 +113,7 @@ def test_each_trial_is_told_as_soon_as_it_is_over(made):
 
 
 def test_controllers_met_the_plant_that_the_trials_came_from_through_the_whole_stack(folder):
-    """Every trial begins at the published start, in the pool of pool.yaml, and localization was at work in it."""
+    """Every trial begins at the published start, in the pool of pool.yaml, and uses localization."""
     assert load_plant_spec(folder / "pool.yaml").seed == 1
     result = json.loads((folder / "t1" / "t1.json").read_text(encoding="utf-8"))
     rows = {trial["job"]["row"]: trial for trial in result["trials"]}
@@ -138,7 +138,7 @@ def test_the_full_demonstration_tries_all_setpoints_and_axes():
 
 
 def test_the_report_loads_nothing(folder):
-    """It begins with a picture; pictures are inside; no script, no style sheet, no address."""
+    """It begins with a picture; pictures are embedded; there is no script, style sheet or address."""
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert html.index("<figure>") < html.index('<p class="lead">') < html.index("<details")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
@@ -164,7 +164,7 @@ def test_the_report_has_every_controller_and_the_provenance(folder):
 
 
 def test_an_interrupted_demonstration_goes_on(tmp_path, monkeypatch, made):
-    """Ctrl-C in the second rollout: the same call identifies, trains and deploys; other settings are refused."""
+    """After Ctrl-C in the second rollout, the same call identifies, trains and deploys; other settings are refused."""
 
     def identified(folder, *_, **__):
         write_vehicle(made[1].vehicle, folder / "finsrov_identified.yaml")
@@ -208,12 +208,12 @@ class CoreFinder(PathFinder):
 sys.meta_path[sys.meta_path.index(PathFinder)] = CoreFinder
 os.cpu_count = lambda: 1
 """
-"""Hides the packages of every extra from a process, and all processors but one: see `one_processor` of conftest.py."""
+"""Hides the packages of every extra from a process, and all processors but one (see `one_processor` of conftest.py)."""
 
 
 @pytest.fixture
 def installed(tmp_path):
-    """The environment of a process in which the wheel of this source is installed, without any extra."""
+    """Environment of a process in which the wheel of this source is installed, without any extra."""
     words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist")]
     subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = (tmp_path / "dist").glob("finssim-*.whl")
@@ -226,9 +226,9 @@ def installed(tmp_path):
 
 
 def test_a_wheel_demonstrates_itself_without_any_extra(installed, folder, tmp_path):
-    """`pip install .` is enough, without torch, OpenCV and TensorBoard, and what is left out is said.
+    """`pip install .` suffices, without torch, OpenCV and TensorBoard, and omissions are reported.
 
-    The trials that are fitted are those of the earlier demonstration; the others are recorded.
+    The fitted trials are those of the earlier demonstration; the others are recorded.
     """
     shutil.copytree(folder / "trials" / "fit", tmp_path / "demo" / "trials" / "fit")
     shutil.copy(folder / "demo.yaml", tmp_path / "demo")
@@ -256,7 +256,7 @@ def test_somebodys_files_are_not_replaced(tmp_path):
 
 
 def test_a_training_curve_leaves_out_rows_without_a_number():
-    """Success and return of the evaluations come first; before the first episode ended a row has no return."""
+    """Success and return of the evaluations come first; rows before the end of the first episode have no return."""
     kinds = [("steps", float), ("mean_return", float), ("held", float), ("evaluation_return", float)]
     rows = [(100.0, np.nan, 0.1, np.nan), (200.0, 2.0, 0.2, np.nan), (300.0, 3.0, 0.3, np.nan)]
     figure = demo_module._training(np.array(rows, dtype=kinds))

@@ -1,4 +1,4 @@
-"""The whole loop on a robot: trials, vehicle, policy and report in one folder that an interrupted call goes on with."""
+"""The whole loop on a robot: trials, vehicle, policy and report in one folder, resumable after an interruption."""
 
 import json
 from contextlib import nullcontext
@@ -31,11 +31,11 @@ QUIET = Console(quiet=True)
 
 
 def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(brief_steps, tmp_path, monkeypatch):
-    """q after the first of four programmes; then the rest, a training, two controllers, and what they did.
+    """After q at the first of four programmes, the rest follows: a training, two controllers, and their results.
 
-    The trials tell how fast the plant is, which is the catalogue's, within 5 %.
+    The speed of the plant that the trials give is the catalogue's, within 5 %.
     """
-    monkeypatch.setattr(demo_module, "running", lambda *_: nullcontext())  # compiles what is compiled
+    monkeypatch.setattr(demo_module, "running", lambda *_: nullcontext())  # compile the kernels first
     out, file = tmp_path / "demo", tmp_path / "pool.yaml"
     options = {"settings": DemoSettings(steps=8192, scope=SMALL), "console": QUIET}
     with lockstep_pool(FINSROV, file) as wiring, pytest.raises(KeyboardInterrupt):
@@ -64,7 +64,7 @@ def test_the_loop_goes_on_where_it_was_interrupted_and_ends_in_a_report(brief_st
 
 
 def test_somebodys_folder_is_refused(tmp_path):
-    """Before a robot is opened."""
+    """A folder with other files is refused before a robot is opened."""
     (tmp_path / "thesis.tex").write_text("years")
     robot = OnRobot(
         wiring=Wiring(robot="127.0.0.1:1", lockstep=True), pool_file=tmp_path / "p.yaml", arm=True

@@ -1,4 +1,4 @@
-"""The error envelope is the quartiles of the errors, and the figure shows them against the success limits."""
+"""The error envelope consists of the quartiles of the errors, and the figure shows them with the success limits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = np.arange(601) / 10.0
 
 
 def at_distance(distance, turn=0.0, t=T):
-    """A trial that stays `distance` below the goal, turned by `turn`."""
+    """Return a trial that stays `distance` below the goal, turned by `turn`."""
     position = np.tile(GOAL[:3], (len(t), 1)) - np.outer(np.broadcast_to(distance, t.shape), [0.0, 0.0, 1.0])
     quaternion = quat_from_yaw(np.full(len(t), GOAL[3] - 2 * math.pi) + turn)
     guide = Station(tuple(GOAL[:3]), GOAL[3])
@@ -28,7 +28,7 @@ def at_distance(distance, turn=0.0, t=T):
 
 
 def test_five_constant_errors_have_their_own_quartiles():
-    """Of 1, 2, 3, 4, 5 the quartiles are 2, 3, 4: in centimetres of distance and in degrees of either sign."""
+    """The quartiles of 1, 2, 3, 4, 5 are 2, 3, 4: in centimetres of distance and in degrees of either sign."""
     t, position, yaw = error_envelope(
         [at_distance(k / 100, math.radians(k) * (-1) ** k) for k in (5, 1, 4, 2, 3)]
     )
@@ -39,7 +39,7 @@ def test_five_constant_errors_have_their_own_quartiles():
 
 
 def test_a_trial_that_ends_early_leaves_the_quartiles_to_the_others():
-    """One of three ends at 10 s; where two of three end, nothing is drawn."""
+    """If one of three ends at 10 s, two remain; where two of three have ended, nothing is drawn."""
     short = at_distance(0.9, t=T[:101])
     _, two_left, _ = error_envelope([at_distance(0.1), at_distance(0.3), short])
     np.testing.assert_allclose(two_left[1, [100, 101, 600]], [0.3, 0.2, 0.2])

@@ -1,4 +1,4 @@
-"""Episodes of any task: measured by the task, each world's first to its end, means with intervals."""
+"""Episodes of any task: measured by the task, the first of each world to its end, means with intervals."""
 
 import json
 
@@ -21,7 +21,7 @@ FINSROV, NOMINAL = load_vehicle("finsrov"), load_plant("nominal")
 
 
 class Still:
-    """Does nothing, for any task."""
+    """Agent that does nothing, for any task."""
 
     wrench_scale = 1.0
 
@@ -42,16 +42,16 @@ class Still:
 
 @pytest.mark.parametrize("name", NUMERIC)
 def test_every_task_can_be_played_to_its_end(name):
-    """By a controller that does nothing: whatever the task measures is there for each of three short episodes."""
+    """With a controller that does nothing, each of three short episodes has all measures of the task."""
     task = task_named(name, time_limit=1.0)
     found = run_episodes(Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=3))
     assert [row["trial"] for row in found] == [0, 1, 2]
-    assert all(row["return"] is not None for row in found)  # a time that is never reached is none
+    assert all(row["return"] is not None for row in found)  # a time that is never reached is None
     assert all(row["length"] <= 10.0 + 1e-6 for row in found)
 
 
 def test_each_world_counts_its_first_episode():
-    """T1 in 1 s episodes: a return that is the sum of the rewards of ten steps, as the environment gives them alone."""
+    """In 1 s episodes of T1, the return is the sum of the ten rewards that the environment gives."""
     task = task_named("t1", time_limit=1.0)
     found = run_episodes(Still(task), task, FINSROV, NOMINAL, TrialSettings(trials=2, seed=5))
     from finssim.tasks import make
@@ -62,7 +62,7 @@ def test_each_world_counts_its_first_episode():
 
 
 def test_a_world_that_breaks_has_no_measures(monkeypatch, tmp_path):
-    """Neither its last return nor that of the episode that begins in its place; the others go on."""
+    """Neither its last return nor that of its next episode counts; the other worlds continue."""
     step = Environment.step
 
     def breaking(self, action):
@@ -110,7 +110,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["t3", "team-pursuit"])
 def test_baselines_are_evaluated_by_name(name, tmp_path, capsys):
-    """Table, JSON and figure; a row for each plant where there are two."""
+    """They give a table, JSON and a figure, with a row for each plant where there are two."""
     who = next(iter(baselines_of(name)))
     assert agent_for(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
     words = ["evaluate", who, "--task", name, "--plant", "nominal", "--plant", "noise", "--trials", "2"]

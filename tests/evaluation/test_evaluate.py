@@ -1,4 +1,4 @@
-"""`finssim evaluate`: trials as published, in every plant, for policies and PIDs, as table, JSON and files."""
+"""`finssim evaluate`: published trials in every plant, for policies and PIDs, as table, JSON and files."""
 
 import json
 import math
@@ -33,14 +33,14 @@ NOMINAL = load_plant("nominal")
 
 
 def proportional(folder, vehicle=FINSROV, action="wrench6"):
-    """A policy that needs no training: thrust towards the goal and against velocity, written by hand as one layer."""
+    """Write a policy without training: thrust towards the goal and against velocity, as one layer."""
     layer = nn.Linear(16, 6)
     with torch.no_grad():
         layer.weight.zero_()
         layer.bias.zero_()
         for axis in range(3):
             layer.weight[axis, axis], layer.weight[axis, 9 + axis] = 6.0, -3.0
-        # Index 4 is the sine of the yaw to turn; index 14 the yaw rate.
+        # Index 4 is the sine of the yaw error; index 14 the yaw rate.
         layer.weight[5, 4], layer.weight[5, 14] = 0.3, -0.3
     task = StationKeeping()
     description = PolicyDescription(
@@ -68,7 +68,7 @@ def test_the_tuned_pid_holds_all_setpoints_in_the_nominal_plant():
 
 
 def test_a_policy_directory_is_flown(policy):
-    """A hand-written feedback holds the setpoints that ask for no half turn."""
+    """A hand-written feedback holds the setpoints that need no half turn."""
     result = evaluate_controller(policy, NOMINAL).result
     held = {trial["setpoint"]: trial["success"] for trial in result["per_trial"]}
     assert held["P01"] and held["P05"] and held["P06"]
@@ -76,7 +76,8 @@ def test_a_policy_directory_is_flown(policy):
 
 
 def test_trials_are_those_of_the_protocol():
-    """60 s from the published start, level and at rest, the eight setpoints in turn, at the controller's rate."""
+    """Trials last 60 s from the published start, level and at rest, over the eight setpoints in turn, at the
+    controller's rate."""
     player = PidAgent("pid", FINSROV)
     done = run_trials(player, StationKeeping(), FINSROV, NOMINAL, TrialSettings(trials=10))
     assert [trial.name for trial in done] == [*T1_SETPOINTS, "P01", "P02"]
@@ -86,12 +87,12 @@ def test_trials_are_those_of_the_protocol():
         np.testing.assert_allclose(motion.yaw[0], 0.0, atol=1e-6)
         assert motion.t[-1] == pytest.approx(60.0) and motion.t[1] == player.period
     np.testing.assert_allclose(done[3].goal, T1_SETPOINTS["P04"])
-    # Equal goals in an undisturbed plant are equal trials.
+    # In an undisturbed plant, trials with equal goals are equal.
     np.testing.assert_array_equal(motions[0].position, motions[8].position)
 
 
 PLANTS = [name for name in available_plants() if not load_plant(name).held_out]
-"""Those of tasks that see nothing."""
+"""Plants of tasks without a camera."""
 
 
 @pytest.mark.slow
@@ -99,7 +100,7 @@ PLANTS = [name for name in available_plants() if not load_plant(name).held_out]
     ("controller", "name"), [*(("pid", name) for name in PLANTS), ("pid-paper", "nominal")]
 )
 def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
-    """Numbers are finite in every plant that ships (short trials)."""
+    """Results are finite in every plant that ships (short trials)."""
     monkeypatch.setattr(trials_module, "DURATION", 2.0)
     result = evaluate_controller(controller, load_plant(name), TrialSettings(trials=3)).result
     assert (result["controller"]["name"], result["plant"]["name"]) == (controller, name)
@@ -108,14 +109,14 @@ def test_every_plant_can_be_flown_in(name, controller, monkeypatch):
 
 
 def positions(plant, **options):
-    """Of all trials of the tuned PID, (T, n, 3)."""
+    """Return the positions of all trials of the tuned PID, (T, n, 3)."""
     played = evaluate_controller("pid", plant, TrialSettings(**options)).trials
     return np.stack([trial.motion.position for trial in played], axis=1)
 
 
 @pytest.mark.slow
 def test_plants_make_a_difference(monkeypatch):
-    """A current pushes, noise shakes, lag delays: each path differs from the nominal one."""
+    """With a current, noise or lag, each path differs from the nominal one."""
     monkeypatch.setattr(trials_module, "DURATION", 5.0)
     nominal = positions(NOMINAL, trials=2)
     for name in set(PLANTS) - {"nominal"}:
@@ -124,7 +125,7 @@ def test_plants_make_a_difference(monkeypatch):
 
 
 def test_seeds_decide_what_is_drawn(monkeypatch):
-    """Equal seeds are equal trials, others are not, and a trial does not depend on how many there are."""
+    """Equal seeds give equal trials, other seeds others, and a trial does not depend on the number of trials."""
     monkeypatch.setattr(trials_module, "DURATION", 3.0)
     plant = load_plant("randomised")
     one, again, other, many = (
@@ -136,7 +137,7 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
 
 
 def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
-    """Nothing else is on standard output, and every trial has its setpoint and measures."""
+    """Standard output contains nothing else, and every trial has its setpoint and measures."""
     assert boundary.run(app, ["evaluate", str(policy), "--trials", "9", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed.keys() >= KEYS | {"provenance", "vehicle", "plant", "seed"}
@@ -156,7 +157,7 @@ def test_the_table_has_a_row_per_setpoint_all_and_the_papers(capsys):
 
 @pytest.mark.slow
 def test_a_directory_holds_result_figure_and_trajectories(tmp_path, monkeypatch):
-    """All open, agree with each other, and may be replaced by the next evaluation."""
+    """All files open, agree with each other, and may be replaced by the next evaluation."""
     monkeypatch.setattr(trials_module, "DURATION", 5.0)
     for _ in range(2):
         result = evaluate("pid", out=tmp_path / "e")
@@ -172,7 +173,7 @@ def test_a_directory_holds_result_figure_and_trajectories(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, capsys, monkeypatch):
-    """A row for each plant; under `plants` the object that each gives alone; trajectories in folders of their names."""
+    """Each plant has a row, its own object under `plants`, and a folder of trajectories with its name."""
     plants = ["nominal", "simplified"]
     words = ["evaluate", "pid", *(word for name in plants for word in ("--plant", name))]
     assert boundary.run(app, [*words, "--out", str(tmp_path / "e")]) == 0
@@ -192,7 +193,7 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
 
 
 def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
-    """From then on it has no numbers, and no success; the other trials are as if nothing had been."""
+    """From then on it has no numbers and no success; the other trials are unaffected."""
     step, calls = Environment.step, []
 
     def breaking(self, action):
@@ -221,7 +222,7 @@ def test_a_policy_for_another_vehicle_is_refused(tmp_path):
 
 
 def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
-    """That is what plants are for: the policy is checked against the vehicle's file."""
+    """This is the purpose of plants: the policy is checked against the vehicle's file."""
     monkeypatch.setattr(trials_module, "DURATION", 1.0)
     heavy = PlantChanges(name="heavy", vehicle={"body.mass": 12.5})
     assert evaluate_controller(policy, heavy, TrialSettings(trials=1)).result["plant"]["vehicle"] == {
@@ -255,7 +256,7 @@ def test_what_cannot_be_evaluated_gets_its_sentence(controller, options, error, 
 
 
 def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
-    """Its trajectories would be written elsewhere."""
+    """Its trajectories would be written outside the output folder."""
     for name in ("../x", "..", "", "/tmp/x", "a\\b", "c:", "a" * 300):
         (tmp_path / "plant.yaml").write_text(f"name: '{name}'\n", encoding="utf-8")
         with pytest.raises(EvaluationError, match="^plant '.*expected the plain name of a file or folder"):
@@ -264,7 +265,7 @@ def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
 
 
 def test_the_help_names_every_plant_and_every_trajectory():
-    """As they are in the catalogue; `run` names the trajectories too."""
+    """The names are those of the catalogue; `run` names the trajectories too."""
     pages = {
         "evaluation.evaluate:evaluate": [*available_plants(), *TRAJECTORIES],
         "robot.run:run": TRAJECTORIES,
@@ -281,19 +282,19 @@ def test_an_unknown_controller_is_refused_with_those_there_are():
 
 
 def test_somebodys_files_are_not_replaced(policy):
-    """Not even a policy's: an evaluation needs a directory of its own."""
+    """Even a policy's directory is refused: an evaluation needs its own."""
     with pytest.raises(OutputError, match="already holds files"):
         evaluate(policy, out=policy)
 
 
 def test_the_papers_rows_are_the_published_table():
-    """Table of T1: eight trials each, the best at 7 of 8."""
+    """The table of T1 has eight trials each, the best at 7 of 8."""
     assert {row[4] for row in PAPER_T1.values()} == {8} and max(row[3] for row in PAPER_T1.values()) == 7
     assert PAPER_T1["calibrated + DR"][:3] == [0.092, 0.043, 5.42]
 
 
 def test_a_policys_own_task_and_vehicle_are_the_defaults(tmp_path, monkeypatch):
-    """Trained for a BlueROV2, it flies one; trained for a file of one's own, it asks for the file."""
+    """A policy trained for a BlueROV2 flies a BlueROV2; one trained for a user's file requires that file."""
     monkeypatch.setattr(trials_module, "DURATION", 1.0)
     bluerov2 = load_vehicle("bluerov2_heavy")
     policy = proportional(tmp_path / "policy", bluerov2)

@@ -1,4 +1,4 @@
-"""Programmes in the virtual pool, through the robot's whole software: trials that tell of the plant."""
+"""Programmes in the virtual pool, with the robot's whole software: trials that identify the plant."""
 
 import json
 
@@ -40,7 +40,7 @@ def run_of(programme, **settings):
 
 @pytest.fixture(scope="module")
 def surge(tmp_path_factory):
-    """One step of 12 N in a pool without secrets: its trial."""
+    """The trial of one step of 12 N in a nominal pool."""
     folder = tmp_path_factory.mktemp("surge")
     run = run_of(step(12.0))
     assert play_programme(run, folder)["fault"] == ""
@@ -59,12 +59,12 @@ def test_a_record_becomes_a_trial_with_phases_axis_and_role(surge):
 
 def test_the_way_stays_in_the_pool_and_the_other_axes_where_they_were(surge):
     x, y, yaw = (surge.channels[name] for name in ("x", "y", "qz"))
-    assert np.nanmax(np.abs(x)) < 1.72  # the envelope's half length from the wall
+    assert np.nanmax(np.abs(x)) < 1.72  # half the envelope's length from the wall
     assert np.nanmax(np.abs(y)) < 0.1 and np.nanmax(np.abs(yaw)) < 0.1
 
 
 def test_the_trial_tells_damping_and_mass_of_the_plant(surge):
-    """Nominal: the file's 27.1 kg with added mass and 39.1 N s/m. One trial, 5 %."""
+    """In the nominal plant, one trial gives the file's 27.1 kg with added mass and 39.1 N s/m, within 5 %."""
     fit = fit_by_simulation([surge], FINSROV, axes=["surge"], damping="linear")
     assert fit.estimates["surge.d1"].estimate == pytest.approx(39.07, rel=0.05)
     assert fit.estimates["surge.m_eff"].estimate == pytest.approx(27.14, rel=0.1)
@@ -83,9 +83,9 @@ def test_equal_runs_have_equal_keys_and_every_setting_counts():
 
 
 def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
-    """Rolled hard and left so: the tilt watchdog ends it. What was finished beside it is kept; alone it is refused.
+    """A persistent hard roll is ended by the tilt watchdog. Finished trials beside it are kept; alone it is refused.
 
-    So is what was finished before Ctrl-C.
+    Trials that were finished before Ctrl-C are kept too.
     """
     n = 300
     tau = np.zeros((n, 6))
@@ -123,7 +123,7 @@ def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
 
 
 def test_thrusters_carry_what_a_vehicle_is_too_light():
-    """All the time, and nothing where it is ballasted or not controlled in heave."""
+    """They carry it all the time, and nothing if the vehicle is ballasted or not controlled in heave."""
     programme = step(6.0)
     light = FINSROV.replace({"body.displaced_volume": FINSROV.body.displaced_volume + 2e-4})
     carried = trimmed(programme, light).tau_desired - programme.tau_desired
@@ -133,7 +133,7 @@ def test_thrusters_carry_what_a_vehicle_is_too_light():
 
 
 def test_excite_in_a_pool_by_command(tmp_path):
-    """Trials, records and what they are; the pool, its vehicle and its severity are those of the options."""
+    """It writes trials, records and their description; pool, vehicle and severity are those of the options."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--levels", "1.0", "--out", str(tmp_path / "t")]
     pool = ["--pool", "3", "--severity", "nominal", "--pool-vehicle", "finsrov_sim7", "--json"]
     done = CliRunner().invoke(app, [*command, *pool])
@@ -150,7 +150,7 @@ def test_excite_in_a_pool_by_command(tmp_path):
 
 
 def test_excite_plays_the_dive_that_a_report_recommends(tmp_path, capsys):
-    """By command; other kinds and levels are refused beside it."""
+    """The command plays it; other kinds and levels beside it are refused."""
     legs = [{"axis": "yaw", "level": 2.0, "hold": 1.5, "times": 2}]
     (tmp_path / "fit.json").write_text(json.dumps({"next_dive": {"legs": legs}}))
     command = ["excite", "all", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--from", str(tmp_path)]
@@ -167,7 +167,7 @@ def test_a_pool_goes_with_no_other_simulation(tmp_path):
 
 @pytest.mark.parametrize("option", [["--severity", "hard"], ["--pool-vehicle", "bluerov2"]])
 def test_what_tells_of_a_pool_needs_one(tmp_path, option, capsys):
-    """Refused, not left unheeded."""
+    """Such options are refused, not ignored."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *option]
     assert boundary.run(app, command) == 2 and not (tmp_path / "t").exists()
     assert "--pool SEED" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Starts of programmes in a pool: inside its workspace, with room for the way."""
+"""Starts of programmes in a pool: inside its workspace, with room for the motion."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ PLAN = programmes("all", VEHICLE)
 
 @pytest.mark.parametrize("programme", PLAN, ids=lambda p: p.name)
 def test_way_and_stop_stay_in_the_water_and_the_workspace(programme):
-    """From the start over the room and the stopping way, the envelope keeps off walls, floor and surface, and the
-    body origin inside the bridge's inner box."""
+    """Over the room and the stopping distance, the envelope stays off walls, floor and surface, and the body origin
+    inside the bridge's inner box."""
     place = start_of(programme, VEHICLE, box_of(BASIN))
     axis = programme.axes[0]
     column = programme.tau_desired[:, AXES.index(axis)]

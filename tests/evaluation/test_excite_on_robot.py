@@ -1,4 +1,4 @@
-"""Programmes on a robot that stays where it is between trials: brought to each start, stopped, gone on with."""
+"""Programmes on a robot that keeps its position between trials: driven to each start, stopped and resumed."""
 
 import json
 
@@ -24,7 +24,7 @@ QUIET = Console(quiet=True)
 
 @pytest.fixture
 def robot(tmp_path):
-    """A vehicle 0.7 m from its start, on a port; how trials are made on it."""
+    """A vehicle 0.7 m from its start, on a port, and the settings for trials on it."""
 
     def opened(wiring, **how):
         return OnRobot(wiring=wiring, pool_file=tmp_path / "pool.yaml", arm=True, **how)
@@ -38,7 +38,7 @@ def excite(out, robot, axes="roll", level=1.0):
 
 
 def test_trials_are_made_one_after_the_other_and_an_interrupted_session_goes_on(tmp_path, robot):
-    """The PID brings the vehicle to each start; q ends after the first; the same command plays only the second."""
+    """The PID drives the vehicle to each start; q ends after the first; the same command plays only the second."""
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with (
         lockstep_pool(FINSROV, file, position=(0.6, 0.3, -0.4), yaw=0.6) as wiring,
@@ -60,14 +60,14 @@ def test_trials_are_made_one_after_the_other_and_an_interrupted_session_goes_on(
         assert abs(2.0 * np.arcsin(qz[np.isfinite(qz)][0])) < TURNED
         assert tuple(trial.header.axis) == ("roll",) and trial.phase[0] == "baseline"
         assert (trial.phase == "excitation").sum() > 5
-    with open_record(out / "records" / "roll_minus_1.mcap") as record:  # the way to the start is not in it
+    with open_record(out / "records" / "roll_minus_1.mcap") as record:  # the drive to the start is not in it
         starts = [e.message.data for e in record.messages(("events",)) if "trial_start" in e.message.data]
     assert len(starts) == 1 and "roll_minus_1" in starts[0]
     assert yaml.safe_load((out / "programmes.yaml").read_text())["robot"] is True
 
 
 def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
-    """Surge steps of both directions tell the damping of the plant, 39.1 N s/m, within 5 %."""
+    """Surge steps in both directions give the damping of the plant, 39.1 N s/m, within 5 %."""
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
         excite(out, robot(wiring, unattended=True), "surge", level=12.0)
@@ -78,7 +78,7 @@ def test_a_robot_trial_is_taken_by_the_calibration_as_it_is(tmp_path, robot):
 
 
 def test_a_robot_that_no_camera_sees_is_excited_by_its_position_fixes(tmp_path):
-    """In open water, with log and compass aboard: rates are the IMU's, and no pool file is in the record."""
+    """In open water, with Doppler log and compass, rates are the IMU's, and the record contains no pool file."""
     heavy, out = load_vehicle("bluerov2_heavy"), tmp_path / "trials"
     how = {"site": "open-water", "positioning": "motion-capture", "position": (0.0, 0.0, -0.75)}
     with lockstep_pool(heavy, None, **how) as wiring:
@@ -96,7 +96,7 @@ def test_a_robot_that_no_camera_sees_is_excited_by_its_position_fixes(tmp_path):
 
 
 def test_the_operator_stops_a_trial_which_is_put_away_and_played_again_or_skipped(tmp_path, robot):
-    """x turns the thrusters off within the trial; its record is kept apart; s leaves the other out."""
+    """x turns the thrusters off during the trial, whose record is kept separately; s skips the other."""
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file) as wiring:
         person = Person(("enter:", "\r"), ("3 s of", "x"), ("enter:", "\r"), ("5 s of", ""), ("enter:", "s"))
@@ -109,7 +109,7 @@ def test_the_operator_stops_a_trial_which_is_put_away_and_played_again_or_skippe
 
 
 def test_by_hand_nothing_is_armed_before_the_vehicle_is_at_its_start(tmp_path, robot):
-    """Enter does nothing 0.6 m away: only s goes on."""
+    """0.6 m away, Enter does nothing: only s continues."""
     out, file = tmp_path / "trials", tmp_path / "pool.yaml"
     with lockstep_pool(FINSROV, file, position=(0.6, 0.0, -0.5)) as wiring:
         person = Person(*[("bring it to its start", key) for key in ("\r", "s")] * 2)
@@ -119,7 +119,7 @@ def test_by_hand_nothing_is_armed_before_the_vehicle_is_at_its_start(tmp_path, r
 
 
 def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
-    """Not armed, by hand with nobody there, another plan's folder, no workspace, a start outside it."""
+    """Refused: not armed, by hand without an operator, another plan's folder, no workspace, a start outside it."""
     from finssim.identification.vehicle_file import write_vehicle
     from finssim.robot.wiring import Wiring
     from finssim.trials.findings import CalibrationError
@@ -154,7 +154,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
     ],
 )
 def test_options_that_do_not_go_together(tmp_path, words, sentence, capsys):
-    """In one sentence each."""
+    """Each combination is refused in one sentence."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *words]
     assert boundary.run(app, command) == 2
     assert sentence in capsys.readouterr().err

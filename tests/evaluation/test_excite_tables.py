@@ -1,4 +1,4 @@
-"""`excite` writes programmes that a robot can run, and trials that open again."""
+"""`excite` writes programmes that a robot can run, and trials that read back."""
 
 import csv
 
@@ -51,7 +51,7 @@ def test_simulated_trials_open_as_they_were_made(tmp_path):
 
 
 def test_an_earlier_output_is_replaced_and_a_foreign_folder_is_not(tmp_path):
-    """Running again replaces the programmes; a folder with anything else in it is refused."""
+    """A second run replaces the programmes; a folder with anything else in it is refused."""
     excite("surge", vehicle="bluerov2", out=tmp_path / "plan", plan=PlanSettings(levels=["5,6"]))
     excite("surge", vehicle="bluerov2", out=tmp_path / "plan", plan=PlanSettings(levels=["5"]))
     assert len(list((tmp_path / "plan").iterdir())) == 2 + 1

@@ -1,4 +1,4 @@
-"""The published protocol on a robot: from the published start, one trial after the other, marked as hardware."""
+"""The published protocol on a robot: from the published start, one trial after the other, labelled as hardware."""
 
 import json
 
@@ -37,7 +37,7 @@ def experiment(spec, out, wiring, targets, person=None):
 
 @pytest.fixture(scope="module")
 def held(brief_t1, tmp_path_factory):
-    """Two setpoints of T1, ended by the operator after the first and gone on with; folder, result, truth."""
+    """Two setpoints of T1, ended by the operator after the first and resumed: folder, result, truth."""
     folder = tmp_path_factory.mktemp("t1")
     out, truth = folder / "out", folder / "truth"
     with lockstep_pool(
@@ -53,7 +53,7 @@ def held(brief_t1, tmp_path_factory):
 
 
 def test_rows_are_scored_as_virtual_ones_and_marked(held):
-    """Both setpoints held; the first was not played again; table, JSON and figure say hardware."""
+    """Both setpoints are held; the first is not played again; table, JSON and figure say hardware."""
     out, result, _, first = held
     row = result["rows"]["pid"]
     assert (row["success"], row["trials"], row["stopped"]) == (2, 2, 0) and row["e_p_m"]["value"] < 0.05
@@ -66,7 +66,7 @@ def test_rows_are_scored_as_virtual_ones_and_marked(held):
 
 
 def test_a_record_of_the_experiment_is_measured_again_by_evaluate_and_by_a_truth(held, capsys):
-    """The same figures from the record, and near ones from what truly happened on the same clock."""
+    """The record gives the same figures, and the true motion on the same clock similar ones."""
     out, result, truth, _ = held
     (trial,) = (t for t in result["trials"] if t["job"]["target"] == "P02")
     record = out / "trials" / trial["record"]
@@ -82,7 +82,7 @@ def test_a_record_of_the_experiment_is_measured_again_by_evaluate_and_by_a_truth
 
 
 def test_when_all_is_played_the_robot_is_not_opened(held):
-    """Nobody answers at that address."""
+    """No robot answers at that address."""
     from finssim.robot.wiring import Wiring
 
     out, result, _, _ = held
@@ -91,7 +91,7 @@ def test_when_all_is_played_the_robot_is_not_opened(held):
 
 
 def test_a_trajectory_is_followed_from_its_first_pose(brief_straight, tmp_path):
-    """T2 straight by the tuned PID: the whole way, and an error of centimetres."""
+    """The tuned PID follows the whole straight path of T2 with an error of centimetres."""
     with lockstep_pool(FINSROV, tmp_path / "pool.yaml") as wiring:
         result = experiment(T2, tmp_path / "out", wiring, ("straight",))
     row = result["rows"]["pid"]
@@ -100,9 +100,9 @@ def test_a_trajectory_is_followed_from_its_first_pose(brief_straight, tmp_path):
 
 
 def test_dead_reckoning_is_carried_from_trial_to_trial(tmp_path):
-    """Let in once in open water, the vehicle begins the second trial a metre away by the reckoning of the first.
+    """Initialised once in open water, the vehicle begins the second trial a metre away by the estimate of the first.
 
-    By the truth it is there to 0.15 m: the compass errs by 1°, the log by 1 %, where it was let in by 5 cm.
+    Its true position is within 0.15 m: the compass errs by 1°, the log by 1 %, the initial position by 5 cm.
     """
     heavy = load_vehicle("bluerov2_heavy")
     places = (0.4, -0.3, -0.6), (1.2, 0.1, -0.8)
@@ -129,7 +129,8 @@ def test_dead_reckoning_is_carried_from_trial_to_trial(tmp_path):
 
 
 def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp_path):
-    """The link breaks off after 12 s: fault, a result without success, and nothing is armed after it."""
+    """When the link breaks after 12 s, there is a fault and a result without success, and nothing is armed
+    afterwards."""
     with (
         lockstep_pool(FINSROV, tmp_path / "pool.yaml", silent_from=12.0) as wiring,
         pytest.raises(RobotError, match=r"pid, P02: stopped (the trial counts): no fresh telemetry"),
@@ -158,6 +159,6 @@ def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp
     ],
 )
 def test_options_that_do_not_go_together(tmp_path, words, sentence, capsys):
-    """In one sentence each."""
+    """Each combination is refused in one sentence."""
     assert boundary.run(app, ["experiment", "t1", "--out", str(tmp_path / "o"), *words]) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,4 @@
-"""The drawn test: repeatable, with errors of the size that it states, and a calibration that cannot cheat."""
+"""The simulated campaign: repeatable, with errors of the stated size, and a calibration isolated from the truth."""
 
 import dataclasses
 from dataclasses import replace
@@ -25,7 +25,7 @@ SMALL = {"locations": (6, 4), "images": 48}
 
 
 def plain(thing):
-    """A campaign as nested lists, which compare equal number by number."""
+    """Return a campaign as nested lists, which compare equal number by number."""
     if dataclasses.is_dataclass(thing):
         return {f.name: plain(getattr(thing, f.name)) for f in dataclasses.fields(thing)}
     if isinstance(thing, (tuple, list)):
@@ -35,14 +35,14 @@ def plain(thing):
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_equal_seeds_give_equal_campaigns(name):
-    """Number by number; another seed gives another one."""
+    """They are equal number by number; another seed gives another campaign."""
     one, same, other = (draw_campaign(CONDITIONS[name], seed, **SMALL) for seed in (4, 4, 5))
     assert plain(one) == plain(same)
     assert plain(one)["calibrates"] != plain(other)["calibrates"]
 
 
 def test_the_campaign_is_the_published_one():
-    """170 places over the pool's middle, 720 pictures shared evenly, and 85 places that calibrate."""
+    """It has 170 places over the pool's middle, 720 pictures shared evenly, and 85 calibration places."""
     campaign = draw_campaign(CONDITIONS["published"], 1)
     places = np.array([visit.nominal for visit in campaign.visits])
     assert len(places) == LOCATIONS[0] * LOCATIONS[1] == 170
@@ -54,7 +54,7 @@ def test_the_campaign_is_the_published_one():
 
 
 def test_the_camera_is_the_published_one():
-    """Every digit of its lens, and its height above the water."""
+    """Every digit of its lens and its height above the water agree."""
     camera = published_pool().camera
     assert (camera.lens.fx, camera.lens.fy) == (540.9305, 540.9305)
     assert (camera.lens.cx, camera.lens.cy) == (682.2341, 348.6136)
@@ -63,7 +63,7 @@ def test_the_camera_is_the_published_one():
 
 
 def errors_of(campaign):
-    """What went wrong at each visit: survey (3), heading, roll and pitch as it lies, depth, roll and pitch as read."""
+    """Return the errors of each visit: survey (3), heading, true roll and pitch, depth, measured roll and pitch."""
     rows = []
     for visit in campaign.visits:
         roll, pitch, yaw = quat_to_euler(matrix_to_quat(visit.R_pb))
@@ -76,7 +76,7 @@ def errors_of(campaign):
 
 
 def test_errors_of_visits_have_the_stated_spread():
-    """Within four standard errors of a standard deviation, their means within four of a mean; none is repeated."""
+    """Standard deviations and means are within four of their standard errors; no error is repeated."""
     c = CONDITIONS["published"]
     errors = np.concatenate([errors_of(draw_campaign(c, seed)) for seed in range(6)])
     stated = np.array([c.survey] * 3 + [c.heading, c.tilt, c.tilt, c.depth, c.tilt, c.tilt])
@@ -88,7 +88,7 @@ def test_errors_of_visits_have_the_stated_spread():
 
 
 def test_errors_of_a_campaign_have_the_stated_spread():
-    """Lens, tape and level are drawn once a campaign."""
+    """Lens, tape and level are drawn once per campaign."""
     c, true = CONDITIONS["published"], published_pool()
     drawn = [draw_campaign(c, seed, locations=(2, 2), images=4) for seed in range(400)]
     lens = true.camera.lens
@@ -108,16 +108,18 @@ def test_errors_of_a_campaign_have_the_stated_spread():
     assert np.abs(errors.std(axis=0) / stated - 1.0).max() < 4.0 / np.sqrt(2 * len(drawn))
     assert (np.abs(errors.mean(axis=0)) / stated).max() < 4.0 / np.sqrt(len(drawn))
     assert all(one.lens.fx == one.lens.fy + (lens.fx - lens.fy) for one in drawn)
-    assert all(one.truth.camera.lens == lens for one in drawn)  # the camera is what it is; its file is wrong
+    assert all(
+        one.truth.camera.lens == lens for one in drawn
+    )  # the camera is as given; its file has the error
 
 
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(Conditions)])
 def test_each_condition_alone_does_what_it_says(name):
-    """With all others zero, only its own error is there."""
+    """With all others zero, only its own error is present."""
     none = {field.name: 0.0 for field in dataclasses.fields(Conditions)}
     campaign = draw_campaign(Conditions(**{**none, name: 0.01}), 3, **SMALL)
     true = published_pool()
-    # The tilt is drawn twice: as the tag lies and as it is read.
+    # The tilt is drawn twice: the tag's own and the measured one.
     wrong = set(np.flatnonzero(np.abs(errors_of(campaign)).max(axis=0) > 1e-9))
     expected = {"survey": {0, 1, 2}, "heading": {3}, "tilt": {4, 5, 7, 8}, "depth": {6}}
     assert wrong == expected.get(name, set())
@@ -128,13 +130,13 @@ def test_each_condition_alone_does_what_it_says(name):
 
 
 def test_quiet_conditions_have_no_error_but_that_of_the_pictures():
-    """Every standard deviation is zero; the flat ones differ from the published ones in ripples alone."""
+    """Every standard deviation is zero; the flat conditions differ from the published ones in ripples alone."""
     assert not any(vars(CONDITIONS["quiet"]).values())
     assert replace(CONDITIONS["flat"], ripples=CONDITIONS["published"].ripples) == CONDITIONS["published"]
 
 
 def test_lifting_moves_reading_and_truth_alike():
-    """The held-out visits alone, with every error as it was."""
+    """Only held-out visits are lifted, with every error unchanged."""
     campaign = draw_campaign(CONDITIONS["published"], 2, **SMALL)
     higher = lifted(campaign, 0.4)
     before = [v for v, c in zip(campaign.visits, campaign.calibrates, strict=True) if not c]
@@ -153,14 +155,14 @@ def test_lifting_moves_reading_and_truth_alike():
 
 @pytest.fixture(scope="module")
 def calibrated():
-    """A campaign by geometry, its pictures and its calibration."""
+    """A campaign with geometric pictures, the pictures and the calibration."""
     campaign = draw_campaign(CONDITIONS["published"], 1, **SMALL)
     seen = list(pictures(campaign, "geometry"))
     return campaign, seen, calibrate(campaign, seen)
 
 
 def test_calibration_uses_its_own_half_alone(calibrated):
-    """Frames and survey name pictures of calibrating visits, each once, and all of them."""
+    """Frames and survey contain each picture of the calibration visits once, and no others."""
     campaign, seen, found = calibrated
     of_half = {p.name for p in seen if campaign.calibrates[p.visit]}
     assert {frame.image for frame in found.frames} == of_half == {row["image"] for row in found.survey}
@@ -170,8 +172,7 @@ def test_calibration_uses_its_own_half_alone(calibrated):
 
 
 def test_calibration_looks_neither_at_the_truth_nor_at_held_out_visits(calibrated):
-    """Were the truth another, or every held-out visit elsewhere and seen elsewhere, the pools were the same bit by
-    bit."""
+    """With another truth, or with every held-out visit and its picture moved, the pools are bit-identical."""
     campaign, seen, found = calibrated
     rng = np.random.default_rng(0)
     visits = []
@@ -199,7 +200,7 @@ def test_calibration_looks_neither_at_the_truth_nor_at_held_out_visits(calibrate
 
 
 def test_calibration_is_near_the_truth_which_it_does_not_know(calibrated):
-    """Camera within 2 cm, its height over the water within 1 cm, water within half a degree."""
+    """Camera within 2 cm, its height above the water within 1 cm, water tilt within half a degree."""
     campaign, _, found = calibrated
     true, ours = campaign.truth, found.refractive
     assert np.linalg.norm(ours.camera.position - true.camera.position) < 0.02
@@ -209,4 +210,4 @@ def test_calibration_is_near_the_truth_which_it_does_not_know(calibrated):
     straight = found.pinhole.interface
     assert straight.index_near == straight.index_far  # straight lines, above the same water
     assert straight.height(0.0, 0.0) == pytest.approx(campaign.water_read)
-    assert found.pinhole.camera.position[2] < z - 0.1  # which see the floor raised
+    assert found.pinhole.camera.position[2] < z - 0.1  # for which the floor appears raised

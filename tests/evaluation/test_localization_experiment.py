@@ -1,4 +1,4 @@
-"""The whole experiment, small: its folder, what a user can do again with it, and what an interruption leaves."""
+"""The whole experiment at a small size: its folder, the steps a user can repeat, and interruptions."""
 
 import json
 import re
@@ -43,7 +43,7 @@ def quick():
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """One seed of 20 places and 40 pictures, with our renderer; its progress."""
+    """Result and progress of one seed with 20 places and 40 pictures of our renderer."""
     out, said = tmp_path_factory.mktemp("experiment") / "localization", []
     result = localization_experiment(
         out=out, seeds=1, seed=1, locations=(5, 4), images=40, progress=lambda *what: said.append(what)
@@ -52,7 +52,7 @@ def done(tmp_path_factory):
 
 
 def test_the_folder_holds_what_is_returned(done):
-    """The JSON file is the result; every other file is there, and no half-written one."""
+    """The JSON file equals the result; every other file exists, and none is incomplete."""
     out, result, _ = done
     assert json.loads((out / "localization.json").read_text()) == json.loads(json.dumps(result))
     assert {path.name for path in out.iterdir()} == FILES
@@ -61,7 +61,7 @@ def test_the_folder_holds_what_is_returned(done):
 
 
 def test_the_result_has_its_documented_parts(done):
-    """Every method under every condition, with intervals around figures; the paper's figures are the paper's."""
+    """Every method has figures with intervals under every condition; the paper's figures are as published."""
     _, result, _ = done
     assert result["experiment"] == "localization" and result["renderer"] == "own"
     assert result["seeds"] == [1]
@@ -78,7 +78,7 @@ def test_the_result_has_its_documented_parts(done):
 
 
 def test_refraction_wins_where_it_should(done):
-    """Below 1 cm under every condition and at another depth; straight lines with depth fail there altogether."""
+    """Its error is below 1 cm under every condition and at another depth, where straight lines with depth fail."""
     _, result, _ = done
     for name, methods in result["results"].items():
         assert methods["refractive"]["rmse_cm"] < 1.0, name
@@ -90,7 +90,7 @@ def test_refraction_wins_where_it_should(done):
 
 
 def test_the_page_shows_the_same_figures(done):
-    """Every RMSE of the result stands in the page beside the paper's, with the seed and the map of errors."""
+    """The page contains every RMSE of the result beside the paper's, with the seed and the map of errors."""
     out, result, _ = done
     page = (out / "localization.html").read_text(encoding="utf-8")
     for methods in [*result["results"].values(), result["paper"]]:
@@ -103,7 +103,7 @@ def test_the_page_shows_the_same_figures(done):
 
 
 def test_progress_rises(done):
-    """From zero, by seed and by condition."""
+    """It rises from zero, by seed and by condition."""
     _, _, said = done
     parts = [part for part, _ in said]
     assert parts == sorted(parts) and parts[0] == 0.0 and parts[-1] < 1.0
@@ -122,7 +122,7 @@ def test_a_user_can_calibrate_the_same_pool_again(done, tmp_path, capsys):
 
 
 def test_a_user_can_locate_the_tag_again(done):
-    """The written detections, back-projected through the written pool, lie on the surveyed places to a centimetre."""
+    """Written detections, back-projected through the written pool, lie on the surveyed places to a centimetre."""
     from finssim.core.optics import back_project
 
     out, _, _ = done
@@ -142,12 +142,12 @@ def test_a_user_can_locate_the_tag_again(done):
 
 @pytest.fixture
 def published_alone(monkeypatch):
-    """The published conditions in place of all three."""
+    """The published conditions instead of all three."""
     monkeypatch.setattr(module, "CONDITIONS", {"published": CONDITIONS["published"]})
 
 
 def interrupting(words):
-    """Progress that is Ctrl-C at its first mention of something."""
+    """Return a progress function that raises Ctrl-C at its first mention of some words."""
 
     def progress(part, what):
         if what == words:
@@ -165,7 +165,7 @@ def test_an_interruption_leaves_nothing(tmp_path):
 
 
 def test_a_method_that_locates_nothing_is_no_error(published_alone, tmp_path, monkeypatch):
-    """Tags that are never found at the other depth: no figure, the count says so, and the folder is written."""
+    """If no tag is found at the other depth, there is no figure, the count is zero, and the folder is written."""
     draw = module.pictures
 
     def blind(campaign, renderer):
@@ -202,7 +202,7 @@ def test_somebodys_folder_is_refused_before_the_work(tmp_path):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """The command, on a few places."""
+    """The command, limited to a few places."""
     monkeypatch.setattr(module, "localization_experiment", partial(localization_experiment, **TINY))
 
 
@@ -210,7 +210,7 @@ COMMAND = ["experiment", "localization", "--renderer", "geometry"]
 
 
 def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, published_alone, tmp_path, capfd):
-    """A table, where it was written, and one JSON object with --json; standard error has lines of progress alone.
+    """It prints a table and the output path, or one JSON object with --json; standard error has only progress.
 
     Equal seeds give the function's results, number by number, and its pool; other seeds give others.
     """
@@ -233,7 +233,7 @@ def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, publ
 
 
 def test_the_command_draws_three_times_with_our_renderer_unless_told_otherwise(monkeypatch, tmp_path):
-    """The defaults of the help."""
+    """These defaults are those of the help."""
     given = {}
 
     def asked(**options):
@@ -257,7 +257,7 @@ def test_the_command_draws_three_times_with_our_renderer_unless_told_otherwise(m
     ],
 )
 def test_the_command_refuses_in_a_sentence(capsys, tmp_path, monkeypatch, words, sentence):
-    """Before the work; nothing is written."""
+    """Each request is refused before any work begins, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     assert finssim("experiment", "localization", *words) == 2
     (line,) = filter(None, capsys.readouterr().err.splitlines())

@@ -1,4 +1,4 @@
-"""What looks at a campaign: exact corners, our camera, and Mitsuba, which show the same tag at the same place."""
+"""Renderers of a campaign: exact corners, our camera, and Mitsuba show the same tag at the same place."""
 
 from dataclasses import replace
 
@@ -21,19 +21,19 @@ SMALL = {"locations": (5, 4), "images": 20}
 
 
 def exact(campaign, visit):
-    """Pixels of the tag's corners through the water, (4, 2)."""
+    """Return the pixels of the tag's corners through the water, (4, 2)."""
     points = visit.position + corners(TAG.edge) @ visit.R_pb.T
     return project(campaign.truth.camera, campaign.truth.interface, points).pixels
 
 
 def some(campaign, count):
-    """A campaign of its first visits, one picture each."""
+    """Return a campaign of the first visits, with one picture each."""
     visits = tuple(replace(visit, images=1) for visit in campaign.visits[:count])
     return replace(campaign, visits=visits, calibrates=np.zeros(count, bool))
 
 
 def errors(campaign, seen):
-    """Corners as detected minus exact ones, (n, 4, 2) [px]."""
+    """Return detected minus exact corners, (n, 4, 2) [px]."""
     return np.array([p.detection.corners - exact(campaign, campaign.visits[p.visit]) for p in seen])
 
 
@@ -48,7 +48,7 @@ def test_every_visit_has_its_pictures_with_names_of_their_own():
 
 
 def test_corners_by_geometry_have_white_noise_alone():
-    """Of the stated spread, without shared part; without noise they are exact."""
+    """The noise has the stated standard deviation and no common part; without noise the corners are exact."""
     campaign = draw_campaign(CONDITIONS["published"], 1, locations=(5, 4), images=600)
     e = errors(campaign, pictures(campaign, "geometry"))
     assert e.std() == pytest.approx(module.CORNER_NOISE, rel=4.0 / np.sqrt(2 * e.size))
@@ -75,7 +75,7 @@ def test_what_lies_outside_the_picture_is_not_detected():
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["own", "geometry"])
 def test_equal_seeds_give_equal_pictures(renderer):
-    """Bit by bit, whatever came before; another campaign's noise is another."""
+    """They are bit-identical, whatever was drawn before; another campaign has other noise."""
     campaign = some(draw_campaign(CONDITIONS["published"], 1, **SMALL), 3)
     one, same = (np.array([p.detection.corners for p in pictures(campaign, renderer)]) for _ in range(2))
     np.testing.assert_array_equal(one, same)
@@ -86,7 +86,7 @@ def test_equal_seeds_give_equal_pictures(renderer):
 
 @pytest.mark.slow
 def test_our_camera_shows_the_tag_where_it_is():
-    """In still water corners are detected within 0.3 px of their projection, 0.1 px rms; ripples move them further."""
+    """In still water corners are within 0.3 px of their projection, 0.1 px rms; ripples increase the error."""
     flat = draw_campaign(CONDITIONS["flat"], 1, **SMALL)
     still = errors(flat, pictures(flat, "own"))
     assert still.shape == (20, 4, 2)

@@ -1,4 +1,4 @@
-"""How errors are counted: against the survey and the truth, by visit, with intervals; and what each wrong does."""
+"""Error statistics against the survey and the truth, by visit, with intervals; and the effect of each error source."""
 
 import json
 import math
@@ -17,20 +17,20 @@ SMALL = {"locations": (6, 4), "images": 48}
 
 
 def seen_by_geometry(name, seed=1):
-    """A campaign and its pictures."""
+    """Return a campaign and its geometric pictures."""
     campaign = draw_campaign(CONDITIONS[name], seed, **SMALL)
     return campaign, list(pictures(campaign, "geometry"))
 
 
 @pytest.fixture(scope="module")
 def published():
-    """Every error."""
+    """The campaign with every error."""
     return seen_by_geometry("published")
 
 
 @pytest.fixture(scope="module")
 def exact():
-    """No error at all."""
+    """The campaign without any error."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(localization_experiment, "CORNER_NOISE", 0.0)
         return seen_by_geometry("quiet")
@@ -38,7 +38,7 @@ def exact():
 
 @pytest.mark.parametrize("method", ["refractive", "refractive-6dof"])
 def test_without_errors_refraction_is_exact(exact, method):
-    """Exact corners and the true pool: every place within 0.1 mm."""
+    """With exact corners and the true pool, every position is within 0.1 mm."""
     campaign, seen = exact
     scores = locate(campaign, seen, campaign.truth, method)
     assert scores.located == scores.pictures == 24 and not scores.reasons
@@ -46,14 +46,14 @@ def test_without_errors_refraction_is_exact(exact, method):
 
 
 def test_straight_lines_with_depth_are_centimetres_off_even_then(exact):
-    """With the true camera pose, but as if there were no water."""
+    """They use the true camera pose and ignore the water."""
     campaign, seen = exact
     dry = replace(campaign.truth, interface=replace(campaign.truth.interface, index_far=1.0003))
     assert locate(campaign, seen, dry, "pinhole-depth").rmse > 0.02
 
 
 def test_refraction_beats_straight_lines_with_depth(published):
-    """With every error and the true camera, tenfold and more."""
+    """With every error and the true camera, refraction is at least ten times better."""
     campaign, seen = published
     rmse = {m: locate(campaign, seen, campaign.truth, m).rmse for m in ("refractive", "pinhole-depth")}
     assert 10.0 * rmse["refractive"] < rmse["pinhole-depth"]
@@ -61,7 +61,8 @@ def test_refraction_beats_straight_lines_with_depth(published):
 
 
 def test_refraction_with_depth_is_less_noisy_than_what_finds_the_depth_itself():
-    """Noise of the pictures alone, which a tag's apparent size turns into distance; exact corners would do for both."""
+    """Only pictures have noise, which a tag's apparent size amplifies into distance; with exact corners both
+    are exact."""
     campaign, seen = seen_by_geometry("quiet")
     rmse = {m: locate(campaign, seen, campaign.truth, m).rmse for m in ("refractive", "pinhole")}
     assert 1.5 * rmse["refractive"] < rmse["pinhole"]
@@ -79,7 +80,7 @@ def test_held_out_visits_alone_are_scored_each_once(published):
 
 
 def test_pictures_of_a_visit_are_averaged(published):
-    """Half of the pictures give the same visits with larger errors of the pictures."""
+    """Half of the pictures give the same visits with larger errors."""
     campaign, seen = published
     one_each = list({p.visit: p for p in seen}.values())
     several, single = (
@@ -93,7 +94,7 @@ def test_pictures_of_a_visit_are_averaged(published):
 
 
 def test_refused_pictures_are_counted_by_their_reason(published):
-    """A tag that was not seen, and one whose corners no pose explains."""
+    """Examples are an undetected tag and one whose corners fit no pose."""
     campaign, seen = published
     held_out = [p for p in seen if not campaign.calibrates[p.visit]]
     lost, broken, *rest = held_out
@@ -105,14 +106,14 @@ def test_refused_pictures_are_counted_by_their_reason(published):
 
 
 def score(errors, **more):
-    """Scores of these errors [m]."""
+    """Return the scores of given errors [m]."""
     e = np.array(errors, float).reshape(-1, 2)
     given = {"pictures": len(e), "located": len(e), "reasons": {}, **more}
     return Scores(np.arange(len(e)), e, e / 2.0, **given)
 
 
 def test_figures_are_pooled_over_visits():
-    """3-4-5 triangles: centimetres, root mean square and 95th percentile, counts and reasons added up."""
+    """3-4-5 triangles check centimetres, root mean square, 95th percentile, and sums of counts and reasons."""
     one = score([[0.03, 0.04], [0.0, 0.05]], reasons={"tag not detected": 1}, pictures=3)
     two = score([[0.06, 0.08]], reasons={"tag not detected": 2, "no": 1}, pictures=4)
     figures = pooled([one, two])
@@ -127,7 +128,7 @@ def test_figures_are_pooled_over_visits():
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [1, 3, 10])
 def test_intervals_contain_the_estimate_and_are_repeatable(seeds):
-    """And shrink with more visits of the same errors."""
+    """They also shrink with more visits of the same errors."""
     rng = np.random.default_rng(seeds)
     drawn = [rng.normal(0.0, 0.01, (20, 2)) for _ in range(seeds)]
     few, many = [score(e) for e in drawn], [score(np.tile(e, (16, 1))) for e in drawn]
@@ -143,7 +144,7 @@ def test_intervals_contain_the_estimate_and_are_repeatable(seeds):
 
 
 def test_seeds_that_disagree_widen_the_interval():
-    """The same errors, shared out evenly between seeds or by size."""
+    """The same errors are divided between seeds evenly or by size."""
     small, large = np.full((50, 2), 0.001), np.full((50, 2), 0.01)
     mixed = [score(np.vstack([small[::2], large[::2]])) for _ in range(2)]
     apart = [score(small), score(large)]
@@ -155,7 +156,7 @@ def test_seeds_that_disagree_widen_the_interval():
     "empty", [[score([])], [score([]), score([[0.03, 0.04]])]], ids=["all", "one of two"]
 )
 def test_where_nothing_was_located_there_is_no_figure(empty):
-    """No error of a number that is none; JSON takes it."""
+    """The empty case raises no error and gives valid JSON."""
     figures = pooled(empty)
     json.dumps(figures, allow_nan=False)
     if len(empty) == 1:
@@ -166,7 +167,7 @@ def test_where_nothing_was_located_there_is_no_figure(empty):
 
 @pytest.mark.parametrize(("offset", "sign"), [(0.05, 1.0), (-0.05, -1.0)])
 def test_a_depth_read_too_deep_puts_the_tag_too_far_out(exact, offset, sign):
-    """Along the ray in the water: by tan of its angle there, outwards from the point below the camera."""
+    """The shift is along the ray in the water: tan of its angle there, outwards from the point below the camera."""
     campaign, seen = exact
     visits = tuple(replace(visit, depth_read=visit.depth_read + offset) for visit in campaign.visits)
     scores = locate(replace(campaign, visits=visits), seen, campaign.truth, "refractive")

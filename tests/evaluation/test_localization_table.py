@@ -1,4 +1,4 @@
-"""The table beside the paper's: what a person reads, in the width of a terminal and on a page."""
+"""The table beside the paper's, as printed in the width of a terminal and on a page."""
 
 import io
 
@@ -15,7 +15,7 @@ from finssim.studies.localization import (
 
 
 def figures(rmse, located=10):
-    """Of one method."""
+    """Return figures of one method."""
     return {
         "rmse_cm": rmse,
         "rmse_ci95_cm": [rmse - 0.125, rmse + 0.125],
@@ -38,7 +38,7 @@ NOTHING = {
 
 @pytest.fixture
 def result():
-    """Made-up figures, each method's other than the next one's."""
+    """Made-up figures, different for each method."""
     methods = {method: figures(1.0 + k) for k, method in enumerate(METHOD_TITLES)}
     return {
         "seeds": [1, 2],
@@ -63,14 +63,14 @@ def result():
 
 
 def printed(result, width=100):
-    """What is printed in a terminal of a width."""
+    """Return the output in a terminal of a given width."""
     text = io.StringIO()
     print_tables(tables_of(result), Console(file=text, width=width))
     return text.getvalue()
 
 
 def test_every_figure_of_every_method_is_shown(result):
-    """Under its conditions, with its interval and how many pictures were located; and on the page as well."""
+    """Each appears under its conditions, with its interval and number of located pictures, and on the page."""
     text, page = printed(result), markdown_of(tables_of(result))
     for k in range(len(METHOD_TITLES)):
         for cell in (f"{1 + k:.2f}", f"[{0.875 + k:.2f}, {1.125 + k:.2f}]", f"{2 + 2 * k:.2f}"):
@@ -81,7 +81,7 @@ def test_every_figure_of_every_method_is_shown(result):
 
 
 def test_the_paper_stands_beside_ours_as_another_experiment(result):
-    """Its figures, and that the two are not the same."""
+    """The table contains the paper's figures and the remark that the two experiments differ."""
     for text in (printed(result), markdown_of(tables_of(result))):
         words = " ".join(text.split())
         for rmse, p95 in PAPER_TABLE_2.values():
@@ -91,7 +91,7 @@ def test_the_paper_stands_beside_ours_as_another_experiment(result):
 
 
 def test_the_gain_is_against_what_it_names(result):
-    """Of 1 against the rival's figure, in percent, for both rivals."""
+    """The gain is 1 minus the ratio to the rival's figure, in percent, for both rivals."""
     words = " ".join(printed(result).split())
     for rival in ("pinhole", "pinhole, refractive pose"):
         other = result["results"]["published"][rival]["rmse_cm"]
@@ -99,14 +99,14 @@ def test_the_gain_is_against_what_it_names(result):
 
 
 def test_the_table_fits_a_terminal(result):
-    """Of 80 columns, figures whole."""
+    """In 80 columns, no figure is cut."""
     lines = printed(result, width=80).splitlines()
     assert max(map(len, lines)) <= 80
     assert any("[0.88, 1.12]" in line or "[0.88, 1.13]" in line for line in lines)
 
 
 def test_where_nothing_was_located_the_table_says_so(result):
-    """In place of a figure; and no gain is claimed over it."""
+    """A text replaces the figure, and no gain over it is claimed."""
     result["results"]["published"] = {**result["results"]["published"], "pinhole": NOTHING}
     for text in (printed(result), markdown_of(tables_of(result))):
         assert "–" in text and "0/12" in text
@@ -114,7 +114,7 @@ def test_where_nothing_was_located_the_table_says_so(result):
 
 
 def test_errors_of_the_calibrations_are_on_the_page(result):
-    """One row a seed, with units, and where it all comes from."""
+    """Each seed has a row, with units and the origin of the numbers."""
     page = markdown_of(tables_of(result))
     assert "| 1 | 1.23 | -5.68 | 6.91 | 0.046 | +0.0012 |" in page
     assert "camera height [mm]" in page and "FinsSim 0.1, revision abc, seeds [1, 2]" in page

@@ -1,4 +1,4 @@
-"""Measures of synthetic trials whose answers are known in closed form."""
+"""Measures of synthetic trials with known results in closed form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ GOAL = np.array([1.0, -0.3, -0.5, math.pi])
 
 
 def trial(offset, yaw_offset, period=0.1, duration=60.0):
-    """Samples every `period`, at GOAL + offset(t) and its yaw + yaw_offset(t), yaw wrapped as sensors give it."""
+    """Return samples every `period`, at GOAL + offset(t) and its yaw + yaw_offset(t), with yaw wrapped as by
+    sensors."""
     t = np.arange(round(duration / period) + 1) * period
     position = GOAL[:3] + np.stack([np.broadcast_to(component, t.shape) for component in offset(t)], axis=-1)
     yaw = (GOAL[3] + yaw_offset(t) + math.pi) % (2 * math.pi) - math.pi
@@ -28,7 +29,7 @@ def nowhere(t):
 
 
 def test_constant_errors_are_their_own_rms():
-    """e = (0.03, 0.04, 0.12): e_p = 0.13; e_y is the vertical part; 12 cm below is no success."""
+    """For e = (0.03, 0.04, 0.12), e_p = 0.13 and e_y is the vertical part; 12 cm below is no success."""
     measures = measure_trial(*trial(lambda t: (0.03, 0.04, -0.12), lambda t: np.full_like(t, -0.05)), GOAL)
     assert measures["e_p_m"] == pytest.approx(0.13)
     assert measures["e_y_m"] == pytest.approx(0.12)
@@ -38,14 +39,14 @@ def test_constant_errors_are_their_own_rms():
 
 
 def test_errors_before_the_window_do_not_count():
-    """5 m away until 39.9 s, at the goal from 40 s on."""
+    """The vehicle is 5 m away until 39.9 s, and at the goal from 40 s on."""
     measures = measure_trial(*trial(lambda t: (np.where(t < 39.95, 5.0, 0.0), 0.0, 0.0), np.zeros_like), GOAL)
     assert measures["e_p_m"] == pytest.approx(0.0, abs=1e-12)
     assert measures["t_s_s"] == pytest.approx(40.0)
 
 
 def test_an_oscillation_has_the_rms_of_a_sine():
-    """A sin over whole periods: RMS = A / sqrt(2), as error and as jitter, on a goal at the wrap of yaw."""
+    """For A sin over whole periods, RMS = A / sqrt(2), as error and as jitter, with a goal at the wrap of yaw."""
     A, B = 0.06, math.radians(8.0)
     offset = lambda t: (A * np.sin(2 * np.pi * 0.5 * t), 0.0, 0.02)  # noqa: E731
     measures = measure_trial(*trial(offset, lambda t: B * np.sin(2 * np.pi * 0.3 * t)), GOAL)
@@ -55,7 +56,7 @@ def test_an_oscillation_has_the_rms_of_a_sine():
     assert measures["success"] and measures["t_s_s"] == 0.0
     assert measures["J_p_m"] == pytest.approx(
         A / math.sqrt(2), rel=2 * late
-    )  # the constant 2 cm are no jitter
+    )  # the constant 2 cm do not count as jitter
     assert measures["J_psi_deg"] == pytest.approx(8.0 / math.sqrt(2), rel=2 * late)
 
 
@@ -66,7 +67,7 @@ def test_settling_time_of_an_exponential_approach():
 
 
 def test_success_needs_ten_seconds_without_a_break():
-    """Out for one instant every 9 s never succeeds; one 10 s stretch does, and t_s is its start."""
+    """Outside for one instant every 9 s never succeeds; one segment of 10 s does, and t_s is its start."""
     never = measure_trial(*trial(nowhere, lambda t: np.where(np.round(t % 9.0, 6) == 0.0, 1.0, 0.0)), GOAL)
     assert not never["success"]
     once = measure_trial(*trial(nowhere, lambda t: np.where((t > 19.95) & (t < 30.05), 0.0, 0.2)), GOAL)
@@ -77,7 +78,7 @@ def test_success_needs_ten_seconds_without_a_break():
 
 @pytest.mark.parametrize("axis", range(3))
 def test_each_axis_has_its_own_tolerance(axis):
-    """0.09 m on all three axes succeeds though it is 0.156 m away; 0.11 m on one does not."""
+    """0.09 m on all three axes succeeds although the distance is 0.156 m; 0.11 m on one does not."""
     every = measure_trial(*trial(lambda t: (0.09, -0.09, 0.09), np.zeros_like), GOAL)
     one = measure_trial(*trial(lambda t: np.eye(3)[axis] * 0.11, np.zeros_like), GOAL)
     assert every["success"] and not one["success"]
@@ -85,7 +86,7 @@ def test_each_axis_has_its_own_tolerance(axis):
 
 @given(st.floats(0.01, 0.2), st.floats(-0.05, 0.05), st.floats(0.0, 0.1))
 def test_measures_do_not_depend_on_the_sampling_rate(period, drift, turn):
-    """A straight line is interpolated exactly, whatever the rate of its samples, up to the gap limit."""
+    """A straight line is interpolated exactly at any sampling rate, up to the gap limit."""
     line = lambda t: (drift * t / 60.0, 0.0, 0.0)  # noqa: E731
     coarse = measure_trial(*trial(line, lambda t: turn * t / 60.0, period, 62.0), GOAL)
     fine = measure_trial(*trial(line, lambda t: turn * t / 60.0, 0.1, 62.0), GOAL)
@@ -95,7 +96,7 @@ def test_measures_do_not_depend_on_the_sampling_rate(period, drift, turn):
 
 
 def test_a_gap_in_the_samples_breaks_the_hold():
-    """Nothing is known for 0.4 s in every 8 s: no 10 s of evidence, but errors late in the trial are known."""
+    """Samples are missing for 0.4 s in every 8 s: there is no hold of 10 s, but late errors are known."""
     t, position, yaw = trial(nowhere, np.zeros_like)
     kept = (t % 8.0 > 0.35) | (t % 8.0 < 0.05)
     measures = measure_trial(t[kept], position[kept], yaw[kept], GOAL)
@@ -105,7 +106,7 @@ def test_a_gap_in_the_samples_breaks_the_hold():
 
 
 def test_a_trial_that_ends_early_has_no_late_errors():
-    """It may have held for 10 s before; with no samples at all there is nothing to say."""
+    """It may have held for 10 s before; without samples there is no measure at all."""
     measures = measure_trial(*trial(nowhere, np.zeros_like, duration=30.0), GOAL)
     assert measures["success"] and measures["e_p_m"] is None and measures["valid"] == 0.0
     empty = measure_trial(np.empty(0), np.empty((0, 3)), np.empty(0), GOAL)
@@ -140,7 +141,7 @@ def test_malformed_samples_are_refused(t, position, yaw, sentence):
 
 
 def test_the_table_row_averages_errors_and_takes_the_median_settling_time():
-    """Trials at 1, 2, 3 cm settling at 10, 12, 50 s, one that fails at 24 cm and one that ended after 5 s."""
+    """Trials at 1, 2, 3 cm settle at 10, 12, 50 s; one fails at 24 cm and one ended after 5 s."""
     trials = []
     for error, settled in ((0.01, 10.0), (0.02, 12.0), (0.03, 50.0), (0.24, 0.0)):
         path = lambda t, e=error: (0.0, e, 0.0)  # noqa: E731

@@ -1,4 +1,4 @@
-"""Where a trial of a robot may begin: at rest at its start, or, if that need not be exact, roughly there."""
+"""Conditions for the start of a robot trial: at rest at its start, or roughly there if it need not be exact."""
 
 import math
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ START = Station((0.5, -0.2, -0.5), 0.3)
 
 
 def waited(attendant):
-    """How the wait for a vehicle ends that says nothing for two minutes, and when [s]."""
+    """Return how and when [s] the wait ends for a vehicle that sends nothing for two minutes."""
     pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
     trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
 
@@ -43,14 +43,14 @@ def waited(attendant):
 
 
 def test_nobody_waits_for_ever_for_a_vehicle_that_says_nothing():
-    """With nobody beside it the trial ends after a minute and says why; somebody at the keys may wait."""
+    """Without an attendant the trial ends after a minute with a reason; an attendant may wait."""
     assert waited(None) == ("not there", "its state is unknown after 60 s: no telemetry yet", 61.0)
     beside = SimpleNamespace(keys=lambda: (), line=lambda text: None)
     assert waited(beside) == ("interrupted", "not finished", 119.0)
 
 
 def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
-    """When a vehicle that circles its start, so far off and so fast, may begin [s]; None within 20 s."""
+    """Return when [s] a vehicle that circles its start at a distance and speed may begin; None if not within 20 s."""
     pilot = WrenchPilot(lambda: np.zeros(6), FINSROV, name="idle")
     trial = RobotTrial(name="x", pilot=pilot, guide=START, duration=1.0, over=lambda runtime: False)
     stages = TrialStages(trial, FINSROV, START, start_bounds(site, exact))
@@ -69,24 +69,25 @@ def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_a_vehicle_at_rest_at_its_start_begins_after_two_seconds(exact):
-    """Within 10 cm and 10°, slower than 5 cm/s and 5°/s."""
+    """At rest means within 10 cm and 10°, slower than 5 cm/s and 5°/s."""
     assert begins(exact, 0.05, 5.0, 0.02, 2.0) == pytest.approx(2.0)
 
 
 def test_one_that_circles_its_start_begins_where_it_need_not_be_exact():
-    """12° off at 17°/s, as a PID tuned from guesses does: after 10 s, and never where the start must be exact."""
+    """12° off at 17°/s, as with a PID tuned from guesses, it begins after 10 s, and never if the start must
+    be exact."""
     assert begins(False, 0.05, 12.0, 0.02, 17.0) == pytest.approx(10.0)
     assert begins(True, 0.05, 12.0, 0.02, 17.0) is None
 
 
 @pytest.mark.parametrize("far", [(0.2, 0.0, 0.0, 0.0), (0.0, 25.0, 0.0, 0.0), (0.0, 0.0, 0.15, 0.0)])
 def test_one_that_is_farther_off_never_begins(far):
-    """Beyond 15 cm, 20° or 10 cm/s."""
+    """The limits are 15 cm, 20° and 10 cm/s."""
     assert begins(False, *far) is None
 
 
 def test_in_waves_nothing_is_at_rest():
-    """In open water 30 cm, 20° and 0.4 m/s are near enough, at whatever rate; farther off they are not."""
+    """In open water 30 cm, 20° and 0.4 m/s are near enough, at any rate; farther off they are not."""
     assert begins(True, 0.25, 15.0, 0.3, 30.0, site="open-water") == pytest.approx(2.0)
     assert begins(True, 0.35, 15.0, 0.3, 30.0, site="open-water") is None
     assert begins(True, 0.25, 15.0, 0.3, 30.0, site="tank") is None

@@ -1,4 +1,4 @@
-"""Plants: those that ship mean what they say, a file's mistakes get their sentence."""
+"""Plants: shipped ones have their documented content, and mistakes in a file are refused in a sentence."""
 
 import math
 
@@ -18,11 +18,12 @@ from finssim.vehicles import VehicleError, load_vehicle
 
 FINSROV = load_vehicle("finsrov")
 OPEN_LOOP = [name for name, kind in MODES.items() if not kind.pilot and not kind.course]
-"""Modes of any vehicle whose commands do not depend on how it moves."""
+"""Modes of any vehicle whose commands do not depend on its motion."""
 
 
 def test_the_plants_of_the_protocol_ship():
-    """Nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the other two models."""
+    """They are nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the other two
+    models."""
     expected = [
         "beyond_cruise",
         "current",
@@ -42,7 +43,7 @@ def test_the_plants_of_the_protocol_ship():
 
 
 def test_a_plant_is_seen_with_what_is_asked_for():
-    """In place of its noise; the environment has the sensors, and the result says so."""
+    """Sensors replace the plant's noise; the environment contains them, and the result says so."""
     assert load_plant("sensors").environment_arguments()["noise"] == Sensing()
     seen = load_plant("noise").with_view("sensors")
     assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; observation: sensors")
@@ -63,7 +64,7 @@ def test_nominal_changes_nothing():
 
 
 def test_the_noise_is_the_papers():
-    """5 cm per axis and 10° of yaw."""
+    """The noise is 5 cm per axis and 10° of yaw."""
     noise = load_plant("noise").environment_arguments()["noise"]
     assert noise.position_std == 0.05 and noise.yaw_std == pytest.approx(math.radians(10.0))
 
@@ -122,7 +123,7 @@ def test_a_wrong_plant_gets_its_sentence(tmp_path, text, sentence):
 
 @pytest.mark.parametrize("load", [load_plant, load_ranges])
 def test_a_name_is_of_those_that_ship(load, tmp_path, monkeypatch):
-    """Plants and sweeps name ranges and plants: a name without a file is looked up, and never put into a path."""
+    """Plants and sweeps name ranges and plants: a name is looked up, and never becomes part of a path."""
     (tmp_path / "mine.yaml").write_text("mass: [0.9, 1.1]\n", encoding="utf-8")
     for module in ("finssim.evaluation.plants", "finssim.sim.ranges_file"):
         monkeypatch.setattr(f"{module}.SHIPPED", tmp_path / "shipped")
@@ -137,7 +138,7 @@ def test_an_unknown_plant_is_told_the_nearest():
 
 
 def thruster_limits(factor):
-    """A plant whose thrusters reach a multiple of what the vehicle file says."""
+    """Return a plant whose thruster limits are a multiple of the vehicle file's."""
     changes = {
         f"thrusters.{name}.{key}": factor * getattr(t, key)
         for name, t in FINSROV.thrusters.items()
@@ -147,7 +148,7 @@ def thruster_limits(factor):
 
 
 def commands_and_thrusts(run, plant, folder):
-    """What every thruster was commanded and delivered [N], (rows, thrusters), of a recorded evaluation."""
+    """Return commanded and delivered thrust [N] of every thruster, (rows, thrusters), of a recorded evaluation."""
     run(plant, folder)
     table = read_run(folder)
     return tuple(
@@ -182,7 +183,7 @@ def episodes(name, action=None):
 
 
 class Restless:
-    """Asks for parts of every limit, another in every step, up to the whole."""
+    """Agent that requests another fraction of every limit in every step, up to the whole."""
 
     wrench_scale = 1.0
 
@@ -211,7 +212,7 @@ EVERY_EVALUATION = {
 def test_stronger_thrusters_deliver_what_is_asked_of_the_vehicle_that_the_controller_knows(
     name, tmp_path, monkeypatch
 ):
-    """Bit for bit: no command is beyond the limits of the file, so twice of them change nothing at all."""
+    """No command is beyond the limits of the file, so doubled limits give bit-identical results."""
     monkeypatch.setattr(trials_module, "DURATION", 10.0)
     run = EVERY_EVALUATION[name]
     known = commands_and_thrusts(run, load_plant("nominal"), tmp_path / "nominal")
@@ -222,8 +223,8 @@ def test_stronger_thrusters_deliver_what_is_asked_of_the_vehicle_that_the_contro
 
 
 def commanded_and_delivered(mode, plant):
-    """Thruster forces [N], (worlds, thrusters), 3 s after random actions that are equal for every plant, which is long
-    after every lag: what is commanded, and what is delivered."""
+    """Return thruster forces [N], commanded and delivered, (worlds, thrusters), 3 s after random actions that are equal
+    for every plant, which is long after every lag."""
     arguments = plant.environment_arguments()
     environment = Environment(
         task_named("t1"),
@@ -244,7 +245,7 @@ def commanded_and_delivered(mode, plant):
 
 @pytest.mark.parametrize("mode", OPEN_LOOP)
 def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
-    """Half the limits: the commands are those of the nominal plant bit for bit, what is delivered is cut."""
+    """With half the limits, commands are bit-identical to the nominal plant's, and delivered thrusts are clipped."""
     plant = thruster_limits(0.5)
     asked, _ = commanded_and_delivered(mode, load_plant("nominal"))
     commanded, delivered = commanded_and_delivered(mode, plant)
@@ -257,7 +258,7 @@ def test_weak_thrusters_deliver_what_is_asked_up_to_their_own_limits(mode):
 
 @pytest.mark.parametrize("mode", OPEN_LOOP)
 def test_what_is_drawn_of_thrusters_does_not_change_what_is_asked(mode):
-    """Ranges scale the thrust that comes of a command; nothing they draw is a limit by which actions are scaled."""
+    """Ranges scale the thrust that a command produces, never the limits that scale actions."""
     asked, nominal = commanded_and_delivered(mode, load_plant("nominal"))
     commanded, delivered = commanded_and_delivered(mode, load_plant("randomised"))
     np.testing.assert_array_equal(commanded, asked)

@@ -1,4 +1,4 @@
-"""`finssim play`: records go on to be printed, policies are filmed; and the onlooker's pictures."""
+"""`finssim play`: records are printed, policies are filmed; and the pictures of the onlooker's camera."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
 
 
 def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():
-    """FinsROV's orange float is in the middle of the picture, in T1's basin and before the dock."""
+    """FinsROV's orange float is in the middle of the picture, in T1's basin and in front of the dock."""
     for task in (replace(StationKeeping(), time_limit=1.0), make("camera-docking").task):
         env = Environment(task, worlds=2, seed=3)
         onlooker = described_world("pool").onlooker(env, 1, width=320)

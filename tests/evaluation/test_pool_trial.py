@@ -1,4 +1,4 @@
-"""A job plays the robot's whole software in the virtual pool; what it says of itself is what it does."""
+"""A job plays the robot's whole software in the virtual pool, and each of its fields has an effect."""
 
 import dataclasses
 
@@ -32,7 +32,7 @@ def played(tmp_path_factory):
 
 
 def test_a_trial_starts_at_the_published_pose_and_goes_to_its_setpoint(played):
-    """And its estimate is the truth but for centimetres."""
+    """The estimate is within centimetres of the truth."""
     result, series = played()
     assert result["fault"] == "" and result["missed_decisions"] == 0
     np.testing.assert_allclose(series.position[0], T1_START[:3], atol=0.06)
@@ -42,7 +42,7 @@ def test_a_trial_starts_at_the_published_pose_and_goes_to_its_setpoint(played):
 
 
 def test_equal_jobs_give_equal_results(played, tmp_path):
-    """To the last digit, in another call."""
+    """They are equal to the last digit in another call."""
     again = play(SHORT, tmp_path / "again")
     told = ("localization", "success", "t_s_s", "valid")
     assert {key: again[key] for key in told} == {key: played()[0][key] for key in told}
@@ -64,19 +64,19 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
     ids=lambda change: next(iter(change)),
 )
 def test_every_field_of_a_job_changes_the_motion(played, change):
-    """None of them is only written down."""
+    """No field is merely recorded."""
     assert not np.array_equal(played(duration=2.0, **change)[1].position, played(duration=2.0)[1].position)
 
 
 def test_noise_on_the_input_does_not_reach_the_estimate(played):
-    """The paper adds it to what the controller sees, and to nothing else."""
+    """As in the paper, the noise is added only to the controller's input."""
     noisy = played(position_noise=0.05)[0]["localization"]["horizontal_m"]
     assert noisy < 2.0 * played()[0]["localization"]["horizontal_m"] + 0.005
 
 
 @pytest.mark.slow
 def test_pictures_and_corners_tell_nearly_the_same(played):
-    """The quick camera stands for the slow one: the same plant, within a few centimetres of each other."""
+    """The fast camera can replace the slow one: in the same plant they agree within a few centimetres."""
     pictures = played(camera="pictures", duration=3.0)
     corners = played(duration=3.0)
     n = min(len(pictures[1].t), len(corners[1].t))
@@ -87,7 +87,7 @@ def test_pictures_and_corners_tell_nearly_the_same(played):
 
 @pytest.mark.slow
 def test_a_trajectory_is_followed_from_its_own_start(brief_straight, played):
-    """T2 begins where the way begins, and ends with it."""
+    """T2 begins and ends with the path."""
     _, series = played(target="straight", duration=60.0)
     assert np.linalg.norm(series.position[0][:2] - [-1.0, -0.4]) < 0.06
     assert series.t[-1] == pytest.approx(10.0, abs=0.11)
@@ -96,7 +96,7 @@ def test_a_trajectory_is_followed_from_its_own_start(brief_straight, played):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bluerov2_heavy", "rexrov"])
 def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
-    """Defaults of tags, mcu and safety, a pool and a place as large as the vehicle, and a PID made for it: 5 cm."""
+    """With default tags, mcu and safety, a pool scaled to the vehicle, and a PID designed for it, the error is 5 cm."""
     vehicle = load_vehicle(name)
     result, series = played(vehicle=name, pool_vehicle=name, target="P01", duration=20.0)
     goal = in_room(T1_SETPOINTS["P01"], vehicle)[:3]
@@ -106,7 +106,7 @@ def test_other_vehicles_hold_a_setpoint_of_their_own_pool(played, name):
 
 
 def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
-    """Setpoints three times as far lie outside the workspace of the vehicle's file, inside that of the site."""
+    """Setpoints three times as far lie outside the workspace of the vehicle's file and inside that of the site."""
     job = RobotJob(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", plant=0, severity="hardware",
               camera="hardware", site="tank", firmware="ardusub")  # fmt: skip
     there = OnRobot(wiring=Wiring(robot="mavlink", lockstep=True), pool_file=None, site="tank")
@@ -118,7 +118,7 @@ def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
 
 @pytest.mark.slow
 def test_an_autopilot_that_locates_itself_holds_its_setpoint(tmp_path, monkeypatch):
-    """No log on the robot's wire: within 8 cm of the truth from 20 to 30 s."""
+    """Without a Doppler log on the robot's link, it is within 8 cm of the truth from 20 to 30 s."""
     monkeypatch.setattr(metrics, "EVALUATION_WINDOW", (20.0, 30.0))
     job = RobotJob(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", pool_vehicle="bluerov2_heavy",
               plant=2, severity="realistic", seed=1, site="tank", firmware="ardusub-own", duration=30.0)  # fmt: skip

@@ -19,7 +19,7 @@ WORDS = ["baseline"] * 10 + ["excitation"] * 50 + ["coast"] * 30 + ["rest"] * 10
 
 
 def surge(phase=WORDS, **ascent):
-    """6 N of surge in rows 10 to 60 of 50 Hz."""
+    """Return 6 N of surge in rows 10 to 60 at 50 Hz."""
     tau = np.zeros((100, 6))
     tau[10:60, 0] = 6.0
     phases = np.array(phase)
@@ -40,7 +40,7 @@ def wrench(pilot, t, **state):
 
 
 def test_the_excited_axis_gets_the_programme_and_nothing_else():
-    """6 N of surge from row 10 of 50 Hz on, wherever the vehicle has gone along it."""
+    """6 N of surge act from row 10 at 50 Hz on, however far the vehicle has moved along surge."""
     pilot = ProgrammePilot(surge(), VEHICLE)
     assert abs(wrench(pilot, 0.1, x=0.3)[0]) < 0.02 and pilot.phase == "baseline"
     assert wrench(pilot, 0.5, x=0.3)[0] == pytest.approx(6.0, abs=0.05) and pilot.phase == "excitation"
@@ -48,7 +48,7 @@ def test_the_excited_axis_gets_the_programme_and_nothing_else():
 
 
 def test_other_axes_are_pushed_back_to_where_they_were_or_left_alone():
-    """0.1 m to the left of its station, it is pushed to the right; without a PID it is not."""
+    """0.1 m to the left of its station, the vehicle is pushed to the right; without a PID it is not."""
     held = ProgrammePilot(surge(), VEHICLE)
     alone = ProgrammePilot(surge(), VEHICLE, hold=None)
     assert wrench(held, 0.5, y=0.1)[1] < -1.0
@@ -56,7 +56,7 @@ def test_other_axes_are_pushed_back_to_where_they_were_or_left_alone():
 
 
 def test_an_excitation_ends_where_its_room_does():
-    """0.5 m of room: at 0.51 m from where it began, the coast begins, and the rows after it follow."""
+    """With 0.5 m of room, the coast begins at 0.51 m from the start, and the rows after it follow."""
     pilot = ProgrammePilot(surge(), VEHICLE, room=0.5)
     wrench(pilot, 0.0)
     assert wrench(pilot, 0.4, x=0.49)[0] > 5.0
@@ -69,7 +69,7 @@ def test_an_excitation_ends_where_its_room_does():
 
 
 def test_a_coast_ends_after_a_steady_rise():
-    """0.02 m/s upwards for 0.2 s, asked for 0.01 m/s and 0.2 s; a rise that breaks off begins again."""
+    """A rise of 0.02 m/s for 0.2 s ends it, at thresholds of 0.01 m/s and 0.2 s; an interrupted rise counts anew."""
     pilot = ProgrammePilot(surge(ascent_speed=0.01, ascent_time=0.2), VEHICLE, hold=None)
     for t, w, phase in (
         (1.2, 0.02, "coast"),

@@ -13,7 +13,7 @@ from reference.cases import THRUSTED
 
 @pytest.mark.parametrize("name", THRUSTED)
 def test_a_vehicle_is_driven_as_fast_as_finsrov_or_as_fast_as_it_stays_upright(name):
-    """In its own lengths, on the axes that it controls, within its limits; yaw at FinsROV's rate."""
+    """Levels scale with its length, on the axes that it controls, within its limits; yaw has FinsROV's rate."""
     vehicle, finsrov = load_vehicle(name), load_vehicle("finsrov")
     ours, theirs, levels = axis_model(vehicle), axis_model(finsrov), matched(FULL.levels, vehicle)
     assert set(levels) == set(vehicle.controlled_axes)
@@ -33,12 +33,12 @@ def test_a_vehicle_is_driven_as_fast_as_finsrov_or_as_fast_as_it_stays_upright(n
 
 
 def test_finsrov_has_its_own_levels():
-    """To the last digit."""
+    """The levels agree to the last digit."""
     assert matched(FULL.levels, load_vehicle("finsrov")) == FULL.levels
 
 
 def test_roll_and_pitch_tilt_a_vehicle_as_far_as_they_tilt_finsrov():
-    """The angle at rest is level over stiffness."""
+    """The angle at rest is level divided by stiffness."""
     for name in ("bluerov2_heavy", "rexrov"):
         tilts = [
             np.array(matched({"roll": [1.0]}, load_vehicle(v))["roll"])

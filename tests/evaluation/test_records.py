@@ -1,4 +1,4 @@
-"""Which part of a record is learnt from, and which record is refused: records made decision by decision."""
+"""Selection of record segments for learning, and refusals, with records made decision by decision."""
 
 import json
 
@@ -33,14 +33,14 @@ ALLOCATOR = Allocator.from_vehicle(FINSROV)
 
 
 def surge(newtons):
-    """Thrusts of a pure surge."""
+    """Return the thrusts of a pure surge."""
     return ALLOCATOR.allocate([newtons, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def written(path, seconds=2.0, *, meta=None, period=1, vehicle=FINSROV, events=(), **at):
-    """A record in which the vehicle moves along x at 0.1 m/s.
+    """Write a record in which the vehicle moves along x at 0.1 m/s.
 
-    `at` has functions of time: state, ready, goal (position and yaw), force; `period` is in steps of the loop.
+    `at` contains functions of time: state, ready, goal (position and yaw), force; `period` is in steps of the loop.
     """
     state, ready = at.get("state", lambda t: "armed"), at.get("ready", lambda t: True)
     goal, force = at.get("goal", lambda t: ((1.0, 0.0, -0.5), 0.3)), at.get("force", lambda t: surge(5.0))
@@ -63,7 +63,7 @@ def written(path, seconds=2.0, *, meta=None, period=1, vehicle=FINSROV, events=(
 
 
 def spans(path, split_goals=True):
-    """First and last time of each stretch, and its number of decisions."""
+    """Return first and last time of each segment, and its number of decisions."""
     drive = read_drive(path, FINSROV)
     return [
         (round(float(drive.time[i[0]]), 3), round(float(drive.time[i[-1]]), 3), len(i))
@@ -72,7 +72,7 @@ def spans(path, split_goals=True):
 
 
 def test_a_drive_is_sampled_at_the_tasks_period(tmp_path):
-    """Sixty decisions a second become ten, the first among them; observation and action by hand."""
+    """Sixty decisions a second become ten, including the first; observation and action agree with hand calculations."""
     path = written(tmp_path / "a.mcap", force=lambda t: surge(5.0 + t))
     assert spans(path) == [(0.0, 1.9, 20)]
     (episode,) = episodes_of(read_drive(path, FINSROV), Observer("t1", FINSROV), WRENCH6, FINSROV)
@@ -86,7 +86,7 @@ def test_a_drive_is_sampled_at_the_tasks_period(tmp_path):
 
 
 def test_only_what_the_operator_did_with_an_armed_and_located_vehicle_counts(tmp_path):
-    """Disarmed in the middle, no estimate, the controller's turn: each ends a stretch."""
+    """Disarming, a missing estimate and a change to the controller each end a segment."""
     armed = written(tmp_path / "a.mcap", state=lambda t: "hold" if 0.95 < t < 1.2 else "armed")
     assert spans(armed) == [(0.0, 0.9, 10), (1.2, 1.9, 8)]
     located = written(tmp_path / "b.mcap", ready=lambda t: t > 0.52)
@@ -96,7 +96,7 @@ def test_only_what_the_operator_did_with_an_armed_and_located_vehicle_counts(tmp
 
 
 def test_a_blink_between_two_decisions_ends_a_stretch(tmp_path):
-    """One turn of the loop in hold, at which nobody decided."""
+    """One step of the loop in hold, without a decision, suffices."""
     path = written(
         tmp_path / "a.mcap", period=6, state=lambda t: "hold" if abs(t - 0.95) < 0.5 * STEP else "armed"
     )
@@ -112,7 +112,7 @@ def test_another_goal_begins_another_episode_of_a_station_task(tmp_path):
 
 
 def test_a_drive_to_no_goal_needs_one(tmp_path):
-    """A place, or where each stretch ended, at which the last offset is zero."""
+    """The goal is a given position, or the end of each segment, where the last offset is zero."""
     path = written(tmp_path / "a.mcap", 0.5, goal=lambda t: ((0.0, 0.0, 0.0), 0.0))
     with pytest.raises(DriveError, match="was driven by hand without a goal: give --goal"):
         collect_records([path], "t1", out=tmp_path / "set")
@@ -123,7 +123,7 @@ def test_a_drive_to_no_goal_needs_one(tmp_path):
 
 
 def test_every_mode_says_what_was_commanded(tmp_path):
-    """Thrusts of random actions, turned into actions, give the same wrench again; one that cannot is refused."""
+    """Random thrusts, converted to actions and back, give the same wrench; a mode that cannot do so is refused."""
     rng = np.random.default_rng(3)
     heavy = load_vehicle("bluerov2_heavy")
     for name in ("thruster8", "wrench6", "wrench4", "pilot6"):
@@ -140,7 +140,7 @@ def test_every_mode_says_what_was_commanded(tmp_path):
 
 
 def test_records_that_do_not_fit_are_refused(tmp_path):
-    """Another vehicle, a driver slower than the task, nothing to learn from, no estimate, another task."""
+    """Refused: another vehicle, a driver slower than the task, no usable segment, no estimate, another task."""
     other = written(
         tmp_path / "other.mcap", 0.3, vehicle=load_vehicle("bluerov2_heavy"), force=lambda t: np.zeros(8)
     )
@@ -161,7 +161,7 @@ def test_records_that_do_not_fit_are_refused(tmp_path):
 
 
 def test_a_record_that_was_cut_is_taken_up_to_the_cut(tmp_path):
-    """Half of the file: fewer steps, the same ones."""
+    """Half of the file gives fewer steps, with the same values."""
     path = written(tmp_path / "a.mcap", 2.5)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -175,7 +175,7 @@ def load_steps(path, out):
 
 
 def test_the_command_takes_several_records(tmp_path, capsys):
-    """What came of each; with an expert's options it is refused."""
+    """The yield of each is reported; options of an expert are refused."""
     paths = [str(written(tmp_path / f"{name}.mcap", 0.6)) for name in ("a", "b")]
     words = ["collect", *paths, "--task", "t1", "--out", str(tmp_path / "set")]
     assert boundary.run(app, [*words, "--json"]) == 0
@@ -195,7 +195,7 @@ def test_the_command_takes_several_records(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["{}/theirs.csv", "theirs.csv", "theirs", "/theirs"])
 def test_the_trajectory_that_a_record_names_is_no_file(tmp_path, monkeypatch, name):
-    """Only who collects names files, by --goal."""
+    """Only the user names files, by --goal."""
     (tmp_path / "theirs.csv").write_text("t,x,y,z\n0,0,0,-0.5\n9,1,0,-0.5\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     told = name.format(tmp_path)

@@ -1,4 +1,4 @@
-"""A lock-step run of the tuned PID in the virtual pool, learnt from: what it saw, what it said, where a clone goes."""
+"""A lock-step run of the tuned PID in the virtual pool as training data: observations, actions, and a clone."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ SECONDS = 6.0
 
 
 class Watched(AgentPilot):
-    """Keeps what it saw, as the task's observation, and what it did, in parts of its limits."""
+    """Pilot that stores its task observations and its actions as fractions of its limits."""
 
     def __init__(self):
         super().__init__(PidAgent("pid", FINSROV), FINSROV)
@@ -46,7 +46,7 @@ class Watched(AgentPilot):
 
 
 def driven(path, station, seed):
-    """A recorded run from the middle of the pool to a station."""
+    """Return a recorded run from the middle of the pool to a station."""
     true_site, known_site, settings = camera_of(FINSROV, 0, "nominal")
     pilot = Watched()
     pool = VirtualPool(
@@ -78,7 +78,7 @@ def shown(tmp_path_factory):
 
 
 def test_what_the_pilot_saw_and_said_is_what_is_shown(shown):
-    """Every second decision of a pilot that decides twice as often as the task acts: as recorded."""
+    """Every second decision of a pilot at twice the task's rate agrees with the record."""
     pilots, told, place = shown
     found = load(place)
     assert told["episodes"] == 2 and told["expert"] == "pid" and told["steps"] > 2 * 40
@@ -89,13 +89,13 @@ def test_what_the_pilot_saw_and_said_is_what_is_shown(shown):
         np.testing.assert_allclose(found.observation[rows], np.array(pilot.seen[: 2 * n : 2]), atol=1e-6)
         np.testing.assert_allclose(found.following[rows], np.array(pilot.seen[2 : 2 * n + 1 : 2]), atol=1e-6)
         off = np.abs(found.action[rows] - np.array(pilot.said[: 2 * n : 2])).max(axis=1)
-        # What all thrusters together cannot give, as in the first rush, is less than what was wanted.
+        # Wrenches beyond the thrusters' reach, as in the initial rush, are delivered smaller than requested.
         assert np.median(off) < 1e-3 and np.mean(off < 0.02) > 0.8
         first += n
 
 
 def test_a_clone_of_the_run_goes_the_same_way(shown):
-    """At rest, half a metre from its goal and level with it: pushed towards it along surge, sway and heave."""
+    """At rest and level, half a metre from its goal, it pushes towards the goal along surge, sway and heave."""
     _, _, place = shown
     kind = learner_named("bc")
     environment = make("t1", worlds=4, seed=1)

@@ -1,4 +1,4 @@
-"""Records measured: the same measures of the same motion, from the robot's estimate, from a truth, on any clock."""
+"""Measures from records: equal for the same motion, from the robot's estimate or from a truth, on any clock."""
 
 import json
 from pathlib import Path
@@ -38,7 +38,7 @@ X, Y, Z, YAW = T1_SETPOINTS["P03"]
 
 
 def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FINSROV):
-    """A recorded run of the tuned PID on the pool's clock, and its truth, as long as `brief_t1` has it."""
+    """Return a recorded run of the tuned PID on the pool's clock and its truth, of the length in `brief_t1`."""
     true_site, known_site, settings = camera_of(vehicle, 1, "realistic")
     truth, record = folder / "truth", folder / "run.mcap"
     camera = PoolCamera(vehicle, true_site, mode="corners", settings=settings, seed=1)
@@ -62,13 +62,13 @@ def driven(folder, guide, seconds, task="t1", start=(0.0, 0.0, -0.5), vehicle=FI
 
 @pytest.fixture(scope="module")
 def held(brief_t1, tmp_path_factory):
-    """P03, from nearby and held for 16 s."""
+    """A record of P03, started nearby and held for 16 s."""
     guide = Station((X, Y, Z), YAW, name="P03")
     return driven(tmp_path_factory.mktemp("held"), guide, 30.0, start=(X + 0.3, Y + 0.1, Z))
 
 
 def captured(path, truth, late):
-    """A table of motion capture on a clock of its own, at 50 Hz, with a gap."""
+    """Write a motion-capture table on its own clock, at 50 Hz, with a gap."""
     found = read_truth(truth)
     rows = np.arange(0, len(found.time), 2)
     rows = rows[(rows < 400) | (rows > 410)]
@@ -78,7 +78,7 @@ def captured(path, truth, late):
 
 
 def test_the_truth_gives_the_measures_of_the_true_motion(held):
-    """Those that the truth has when its clock is known; the found offset is within a step of the search."""
+    """They equal those with the known clock; the estimated offset is within a step of the search."""
     record, truth, started = held
     trial = read_record(record, "t1", FINSROV, truth=truth)
     measures, found = trial.scores("t1", FINSROV), read_truth(truth)
@@ -93,7 +93,7 @@ def test_the_truth_gives_the_measures_of_the_true_motion(held):
 
 
 def test_the_estimate_is_off_by_what_localization_is(held):
-    """Both are measured alike; they differ by no more than the error of the estimate."""
+    """Measures of estimate and truth differ by no more than the error of the estimate."""
     record, truth, _ = held
     known = read_record(record, "t1", FINSROV).scores("t1", FINSROV)
     true = read_record(record, "t1", FINSROV, truth=truth).scores("t1", FINSROV)
@@ -102,7 +102,7 @@ def test_the_estimate_is_off_by_what_localization_is(held):
 
 
 def test_a_table_on_another_clock_is_laid_over_the_record(held, tmp_path):
-    """3 minutes behind, with a yaw: the offset comes out, and the measures are the same."""
+    """For a table 3 minutes behind, with yaw, the offset is found and the measures are the same."""
     record, truth, _ = held
     known = read_record(record, "t1", FINSROV, truth=truth)
     trial = read_record(record, "t1", FINSROV, truth=captured(tmp_path / "m.csv", truth, -180.0))
@@ -112,7 +112,7 @@ def test_a_table_on_another_clock_is_laid_over_the_record(held, tmp_path):
 
 
 def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held, tmp_path, capsys):
-    """Setpoint by its published name, the paper's row beneath, one JSON object, the figure."""
+    """It prints the setpoint by its published name, the paper's row beneath, one JSON object, and the figure."""
     record, truth, _ = held
     words = ["evaluate", str(record), "--task", "t1", "--truth", str(truth)]
     assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0
@@ -127,7 +127,7 @@ def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held,
 
 
 def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys):
-    """Three seconds: no 10 s of success in them either; t2 would need a trajectory, and the command says how."""
+    """Three seconds contain no success of 10 s; t2 needs a trajectory, and the command says how to give it."""
     record, _, _ = driven(tmp_path, Station((X, Y, Z), YAW), 5.0)
     (trial,) = evaluate([record], task="t1")["per_trial"]
     assert not trial["success"] and trial["e_p_m"] is None and trial["fault"] == "ended early"
@@ -140,7 +140,7 @@ def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys
 def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps(
     tmp_path, capsys, monkeypatch
 ):
-    """Without --vehicle, from another directory, after the file is gone; one that the record lacks is named."""
+    """This works without --vehicle, from another directory and without the file; a missing vehicle is named."""
     own = tmp_path / "minnow.yaml"
     own.write_text("extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 13.0}\n")
     minnow = load_vehicle(own)
@@ -155,7 +155,7 @@ def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps
 
 
 def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_path, capsys):
-    """The way is whole, the errors are a PID's; a truth of another run, t1 and a task of several are refused."""
+    """The path is complete with a PID's errors; a truth of another run, t1 and a multi-agent task are refused."""
     guide = load_trajectory("straight")
     first = tuple(guide.at(0.0).position.tolist())
     record, truth, _ = driven(tmp_path, guide, guide.duration + 5.0, "t2", first)
@@ -181,9 +181,9 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_
 
 @pytest.mark.parametrize("task", ["t3", "own/task/keep_depth"])
 def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys, monkeypatch):
-    """By the same referee, of the truth that the site wrote: the live score, but for the clock that is found again.
+    """The same referee on the site's truth gives the live score, except for the clock, which is estimated again.
 
-    The truth's clock is found to 10 ms, and at 0.5 m/s that is 5 mm; the return is a mean over hundreds of steps.
+    The truth's clock is found to 10 ms, which is 5 mm at 0.5 m/s; the return is a mean over hundreds of steps.
     """
     if task.startswith("own"):
         task, brief = f"{EXAMPLES / task}.py:KeepDepth", {"hold": 2.0, "time_limit": 10.0}
@@ -196,7 +196,7 @@ def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys, monkeypat
         monkeypatch.setitem(type(task_named(task)).__init__.__kwdefaults__, name, value)
     live = site_of(task, who, [FINSROV], seed=3, record=tmp_path / "episode").run()
     record, truth = (tmp_path / "episode" / f"vehicle.{kind}" for kind in ("mcap", "truth"))
-    capsys.readouterr()  # Warp's banner, where it starts here
+    capsys.readouterr()  # Warp's banner, if it starts here
     assert boundary.run(app, ["evaluate", str(record), "--task", task, "--truth", str(truth), "--json"]) == 0
     (scored,) = json.loads(capsys.readouterr().out)["per_trial"]
     assert scored["fault"] == "" and scored["success"] == live["success"] == 1.0
@@ -208,7 +208,7 @@ def test_a_record_is_scored_as_the_episode_was(task, tmp_path, capsys, monkeypat
 
 
 def test_an_episode_that_was_cut_short_counts_without_success(tmp_path, capsys):
-    """5 of 40 s of docking: the table says so beneath, and no return is told."""
+    """For 5 of 40 s of docking, a note beneath the table says so, and no return is printed."""
     site_of("docking", "align-insert", [FINSROV], seed=3, record=tmp_path).run(duration=5.0)
     assert boundary.run(app, ["evaluate", str(tmp_path / "vehicle.mcap"), "--task", "docking"]) == 0
     assert "vehicle.mcap: ended early" in capsys.readouterr().out
@@ -218,7 +218,7 @@ def test_an_episode_that_was_cut_short_counts_without_success(tmp_path, capsys):
 
 
 def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
-    """A task in torch that remembers where it began is refused by name."""
+    """A torch task that remembers its start is refused by name."""
     text = (EXAMPLES / "own/task/keep_depth.py").read_text().split("if __name__")[0]
     text = text.replace("class KeepDepth(TorchTask):", "class Go(TorchTask):\n    memory = {'last': 3}\n")
     start = "memory={'last': w.uniform(low, high)}, position="
@@ -226,11 +226,11 @@ def test_a_memory_that_was_drawn_is_not_in_a_record(held, tmp_path):
     task = f"{tmp_path / 'go.py'}:Go"
     with pytest.raises(ControlError, match="begins with a memory that its reset draws"):
         read_record(held[0], task, FINSROV).scores(task, FINSROV)
-    assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # where it is played, it is scored
+    assert Referee(task, [FINSROV], seed=1).metrics()["success"] == 0.0  # a live episode is scored
 
 
 def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held):
-    """The pipe keeps its bends, at the goal's pose; corners that are drawn with a net's world are in no record."""
+    """The pipe keeps its bends at the goal's pose; the corners drawn for a net's world are in no record."""
     record = read_record(held[0], "pipeline", FINSROV)
     referee = Referee("pipeline", [FINSROV], guide=record.guide, start=record.motion.at(0.0))
     pipe = referee.arrays.reference.position.numpy()[0]
@@ -249,6 +249,6 @@ def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held)
     ],
 )
 def test_what_does_not_go_together_is_refused(words, sentence, capsys):
-    """In one sentence."""
+    """Each combination is refused in one sentence."""
     assert boundary.run(app, ["evaluate", *words]) == 2
     assert sentence in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The replay experiment scores three models on trials that the fit has not seen, and writes what it found."""
+"""The replay experiment scores three models on held-out trials and writes the results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def small(tmp_path_factory):
 
 
 def test_the_calibrated_model_is_the_best_and_within_the_target(small):
-    """Sway 0.014 and yaw 0.020; an offset of the gyroscope in each segment took up errors of the yaw's drag: 0.047."""
+    """Scores are 0.014 in sway and 0.020 in yaw; a gyroscope offset per segment absorbed errors of yaw drag (0.047)."""
     result, _ = small
     for levels in ("same_levels", "other_levels"):
         models = result[levels]["models"]
@@ -102,7 +102,7 @@ def test_pooling_takes_the_median_over_all_trials_and_the_mean_of_the_axes():
 
 
 def test_seeds_that_disagree_widen_the_interval():
-    """The same eight numbers, shared out evenly or by size: only between seeds is there anything to see."""
+    """The same eight numbers, divided evenly or by size, differ only between seeds."""
     low, high = np.linspace(0.10, 0.13, 4), np.linspace(0.30, 0.33, 4)
 
     def width(*groups):

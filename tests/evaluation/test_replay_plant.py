@@ -1,4 +1,4 @@
-"""The hidden plant of the replay experiment is physical, near the published numbers and unlike each model."""
+"""The hidden plant of the replay experiment is physical, near the published values and unlike each model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLANT = ReplayPlant()
 
 
 def test_the_plant_couples_axes_that_every_model_of_the_file_keeps_apart():
-    """Sway with roll, surge with heave and pitch."""
+    """Sway couples with roll, and surge with heave and pitch."""
     for matrix in (PLANT.added_mass.matrix(), PLANT.linear_damping.matrix()):
         scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
         relative = np.abs(matrix / scale)
@@ -26,7 +26,7 @@ def test_the_plant_couples_axes_that_every_model_of_the_file_keeps_apart():
 
 
 def forces_at(nu, thrust):
-    """The plant's extra wrench and gains for one state."""
+    """Return the plant's extra wrench and gains for one state."""
     sim = Simulator(FINSROV, hydrodynamics="mesh", control_step=0.005, substeps=1)
     sim.place(position=(0.0, 0.0, -5.0), velocity=nu)
     sim.numpy("actuator")[0, 0] = thrust
@@ -47,7 +47,7 @@ def test_a_lone_propeller_at_rest_gives_its_bollard_thrust():
 
 
 def test_propellers_take_thrust_from_their_neighbours_and_from_their_own_motion():
-    """All horizontals for surge: each loses some; moving ahead they lose more, backwards less."""
+    """With all horizontals on surge, each loses thrust; moving ahead they lose more, backwards less."""
     thrust = [0, 0, 0, 0, 4.0, 4.0, -4.0, -4.0]
     still, ahead, astern = (forces_at([u, 0, 0, 0, 0, 0], thrust)[1][4:] for u in (0.0, 0.4, -0.4))
     assert ((0.85 < still) & (still < 0.99)).all()
@@ -57,7 +57,7 @@ def test_propellers_take_thrust_from_their_neighbours_and_from_their_own_motion(
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis", "level"), [("surge", 12.0), ("sway", 9.0), ("heave", 9.0), ("yaw", 1.2)])
 def test_the_total_drag_is_within_a_quarter_of_the_published(axis, level):
-    """Steady speed at the middle published level, against that of d1 v + d2 v² = level."""
+    """The steady speed at the middle published level is compared with that of d1 v + d2 v² = level."""
     plan = programmes(axis, FINSROV, levels=[level])[:1]
     recording = PLANT.record(plan, FINSROV, seed=1)
     k = ("surge", "sway", "heave", "roll", "pitch", "yaw").index(axis)
@@ -69,7 +69,7 @@ def test_the_total_drag_is_within_a_quarter_of_the_published(axis, level):
 
 
 def test_telemetry_hides_what_the_propellers_lose():
-    """Logged speeds give the nominal thrust, level over the axis, though less acts."""
+    """Logged speeds give the nominal thrust, level over the axis, although less acts."""
     trial = PLANT.trials(programmes("surge", FINSROV, levels=[12.0])[:1], FINSROV, seed=1)[0]
     steady = (trial.t > 8.0) & (trial.t < 10.5)
     logged = 0.0

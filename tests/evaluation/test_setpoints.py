@@ -1,4 +1,4 @@
-"""The published setpoints mean the same places and headings in our frames."""
+"""The published setpoints are the same positions and headings in our frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_every_setpoint_lies_under_water_inside_the_pool():
 
 @pytest.mark.parametrize("name", T1_PUBLISHED)
 def test_heading_is_the_same_direction_in_both_frames(name):
-    """A positive yaw about the left-handed frame's y turns x towards -z: forward is (cos, 0, -sin) there."""
+    """A positive yaw about y of the left-handed frame turns x towards -z: forward is (cos, 0, -sin) there."""
     published = math.radians(T1_PUBLISHED[name][3])
     yaw = T1_SETPOINTS[name][3]
     forward = np.array([math.cos(yaw), math.sin(yaw), 0.0])
@@ -36,7 +36,7 @@ def test_heading_is_the_same_direction_in_both_frames(name):
 
 
 def test_a_right_turn_is_positive_there_and_negative_here():
-    """omega_c = det(B) B omega: 90 deg to the left is +pi/2 about our z and -90 about the controller's y."""
+    """Since omega_c = det(B) B omega, 90 deg to the left is +pi/2 about our z and -90 about the controller's y."""
     omega = np.array([0.0, 0.0, math.pi / 2])
     omega_c = np.linalg.det(EXCHANGE_Y_Z) * EXCHANGE_Y_Z @ omega
     np.testing.assert_allclose(from_published((0.0, 0.0, 0.0, math.degrees(omega_c[1])))[3], omega[2])

@@ -14,7 +14,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 
 
 def run(out, **changes):
-    """The command's call, with some arguments changed."""
+    """Call the command with some arguments changed."""
     arguments = {
         "vehicle": "finsrov",
         "command": "surge=10",
@@ -28,28 +28,28 @@ def run(out, **changes):
 
 
 def test_the_recorded_speed_is_the_terminal_one(tmp_path):
-    """Surge tends to tau / d1: after 12 s, seventeen time constants, to what rounding and thruster arms leave."""
+    """Surge tends to tau / d1 after 12 s, seventeen time constants, within rounding and thruster arms."""
     table = run(tmp_path / "run.csv", duration=12.0)
     d1 = load_vehicle("finsrov").hydrodynamic_set("calibrated").linear_damping[0, 0]
     assert table["u"].iloc[-1] == pytest.approx(10.0 / d1, rel=5e-3)
 
 
 def test_the_table_is_complete(tmp_path):
-    """One row per control step from rest, with units of SI, a unit quaternion and every thruster by name."""
+    """It has one row per control step from rest, with SI units, a unit quaternion and every thruster by name."""
     table = run(tmp_path / "run.csv")
     vehicle = load_vehicle("finsrov")
     np.testing.assert_allclose(table["t"], np.arange(21) * 0.1)
     assert list(table.columns[-8:]) == [f"thrust_{name}" for name in vehicle.thruster_names]
     assert table.iloc[0][["x", "y", "z", "u", "r"]].tolist() == [0.0, 0.0, -5.0, 0.0, 0.0]
     np.testing.assert_allclose(np.linalg.norm(table[["qx", "qy", "qz", "qw"]], axis=1), 1.0, atol=1e-6)
-    # Velocity is the derivative of position: while it does not turn, x grows by the mean of u, to the step's square.
+    # Velocity is the derivative of position: without rotation, x grows by the mean of u, to the square of the step.
     np.testing.assert_allclose(
         np.diff(table["x"]), 0.1 * (table["u"][:-1].values + table["u"][1:].values) / 2, atol=2e-3
     )
 
 
 def test_the_run_says_where_it_comes_from(tmp_path):
-    """Beside the table stand the vehicle's hash, the command and the versions."""
+    """The file beside the table contains the vehicle's hash, the command and the versions."""
     run(tmp_path / "run.csv", command="yaw=1")
     about = json.loads((tmp_path / "run.csv.json").read_text())
     assert about["vehicle"] == {"name": "finsrov", "sha256": load_vehicle("finsrov").sha256}
@@ -86,7 +86,7 @@ def test_every_model_moves_forward(tmp_path, model):
     ],
 )
 def test_what_cannot_be_simulated_is_refused(tmp_path, changes, error, sentence):
-    """One sentence, and no file."""
+    """One sentence refuses it, and no file is written."""
     out = changes.get("out", tmp_path / "run.csv")
     with pytest.raises(error, match=sentence):
         run(out, **{name: value for name, value in changes.items() if name != "out"})

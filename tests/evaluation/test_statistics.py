@@ -1,4 +1,4 @@
-"""Intervals hold what they should as often as they say, and pairs cancel what both rows share."""
+"""Intervals cover at their nominal rate, and pairs cancel the effects that both rows share."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from finssim.evaluation.statistics import paired_difference, with_interval
 
 
 def test_the_value_is_the_statistic_of_all_values():
-    """Clusters decide the interval, not the value."""
+    """Clusters affect the interval, not the value."""
     values = {"a": [1.0, 2.0], "b": [9.0]}
     assert with_interval(values)["value"] == pytest.approx(4.0)
     assert with_interval(values, np.median)["value"] == pytest.approx(2.0)
@@ -15,7 +15,7 @@ def test_the_value_is_the_statistic_of_all_values():
 
 
 def test_shared_errors_widen_the_interval():
-    """Eight trials that share their plant are worth little more than one."""
+    """Eight trials that share their plant contain little more information than one."""
     random = np.random.default_rng(1)
     clustered = {k: list(np.full(8, shared)) for k, shared in enumerate(random.normal(0.0, 1.0, 9))}
     alone = {k: [x] for k, x in enumerate(random.normal(0.0, 1.0, 72))}
@@ -25,7 +25,7 @@ def test_shared_errors_widen_the_interval():
 
 @pytest.mark.slow
 def test_an_interval_holds_the_mean_about_as_often_as_it_says():
-    """Nine clusters: a percentile bootstrap covers somewhat less than 95 %, never less than 80 %."""
+    """With nine clusters, a percentile bootstrap covers somewhat less than 95 %, never less than 80 %."""
     random = np.random.default_rng(2)
     inside = 0
     for _ in range(60):
@@ -36,7 +36,7 @@ def test_an_interval_holds_the_mean_about_as_often_as_it_says():
 
 
 def test_pairs_cancel_what_a_plant_does_to_both():
-    """A difference of 0.01 shows although plants differ by 1."""
+    """A difference of 0.01 is significant although plants differ by 1."""
     random = np.random.default_rng(3)
     plants = random.normal(0.0, 1.0, 9)
     pairs = [(p, s, t) for p in range(9) for s in (1,) for t in ("P01", "P02")]

@@ -1,4 +1,4 @@
-"""`finssim sweep`: results of every job, from one machine or from two of which one is lost."""
+"""`finssim sweep`: results of every job, from one machine or from two of which one fails."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,7 @@ ray = pytest.importorskip("ray")
 
 @pytest.fixture(scope="module", autouse=True)
 def nothing_left():
-    """No process of Ray outlives the tests."""
+    """No Ray process outlives the tests."""
     before = ray_processes()
     yield
     left = ray_processes() - before
@@ -41,7 +41,7 @@ def nothing_left():
 
 
 def ray_processes():
-    """Numbers of the processes of Ray on this machine, whoever started them."""
+    """Return the ids of the Ray processes on this machine, whoever started them."""
     found = set()
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):  # it ended meanwhile
@@ -53,7 +53,7 @@ def ray_processes():
 
 @pytest.fixture
 def sweep_file(tmp_path):
-    """Two action modes, each trained for one short update."""
+    """A sweep file with two action modes, each trained for one short update."""
     path = tmp_path / "sweep.yaml"
     plan = {
         "task": "t1",
@@ -67,7 +67,7 @@ def sweep_file(tmp_path):
 
 
 def changed(file, **changes):
-    """The same file with other values."""
+    """Return the same file with other values."""
     plan = yaml.safe_load(file.read_text(encoding="utf-8"))
     file.write_text(yaml.safe_dump({**plan, **changes}), encoding="utf-8")
 
@@ -80,7 +80,7 @@ def swept(capsys, *words):
 
 @pytest.mark.slow
 def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, capsys):
-    """A policy and a row for every training; only a missing one is repeated; one that fails is in the table."""
+    """Every training has a policy and a row; only a missing one is repeated; a failed one is in the table."""
     out = tmp_path / "out"
     status, result = swept(capsys, sweep_file, "--out", out, "--processes", 2)
     assert status == 0 and result["ok"] and len(result["rows"]) == 2
@@ -105,19 +105,19 @@ def test_a_sweep_is_done_once_and_goes_on_where_it_was(tmp_path, sweep_file, cap
     assert {path for path in kept if now[path] != kept[path]} == {gone / "policy.onnx"}
     assert {row["run"] for row in result["rows"]} <= {row["run"] for row in again["rows"]}
     evaluated = {path: path.stat().st_mtime_ns for path in (out / "evaluations").iterdir()}
-    assert evaluations.items() < evaluated.items() and len(evaluated) == 3  # one of the repeated training
+    assert evaluations.items() < evaluated.items() and len(evaluated) == 3  # one row of the repeated training
 
 
 @pytest.fixture(scope="module")
 def two_machines():
-    """Two Ray nodes of one processor each, on the loopback interface; the second one is killed by the last test."""
+    """Two Ray nodes with one processor each, on the loopback interface; the last test kills the second one."""
     from ray._private import ray_constants
     from ray.cluster_utils import Cluster
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_worker_niceness", "0")  # 15 by default, with which they wait for the other tests
-        # Otherwise Ray takes 127.0.0.1 for this machine's address on the network, where these nodes do not listen.
+        # Otherwise Ray uses 127.0.0.1 as this machine's network address, where these nodes do not listen.
         patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
         node = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "include_dashboard": False}
         cluster = Cluster(initialize_head=True, head_node_args=node)
@@ -129,7 +129,7 @@ def two_machines():
 
 
 def test_a_table_without_a_policy_shows_the_errors():
-    """Where every training failed."""
+    """In this case every training failed."""
     row = {"name": "run", "seed": 1, "run": "run-seed1", "options": {}, "error": "TrainingError: no"}
     (table,) = command.tables_of({"rows": [row]})
     assert table.rows == [["run", "1", "–", "–", "TrainingError: no"]] and len(table.heads) == 5
@@ -137,7 +137,7 @@ def test_a_table_without_a_policy_shows_the_errors():
 
 @pytest.mark.slow
 def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, monkeypatch):
-    """Policies, results and motions come back: nothing is left to do here, and the table is that of one machine."""
+    """Policies, results and motions return to this machine, where nothing remains to do; the table is the same."""
     cluster, _ = two_machines
     here = transfer.TransferSettings(rows=["calibrated", "pid"], plants=1, seeds=1, steps=4096, processes=1)
     there = replace(here, processes=None, address=cluster.address)
@@ -164,7 +164,7 @@ def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, mon
     [("127.0.0.1:9", "no Ray cluster answers at 127.0.0.1:9"), ("here", "expected HOST:PORT or auto")],
 )
 def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
-    """One sentence at once, and nothing is written."""
+    """It is refused at once in one sentence, and nothing is written."""
     with pytest.raises(ClusterError, match=sentence):
         command.sweep(sweep_file, out=tmp_path / "out", address=address)
     assert not (tmp_path / "out").exists()
@@ -174,7 +174,7 @@ def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
 def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
     tmp_path, sweep_file, two_machines, monkeypatch
 ):
-    """One of two nodes is killed when both have sent a checkpoint: every training ends, one resumed."""
+    """One of two nodes is killed after both have sent a checkpoint: every training ends, one of them resumed."""
     changed(sweep_file, train={"steps": 8 * 4096, "worlds": 16})
     cluster, second = two_machines
     ended = threading.Event()
@@ -183,7 +183,7 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
         async def store(self, number, files):
             super().store(number, files)
             (tmp_path / str(number)).touch()
-            while not (tmp_path / "killed").exists():  # neither ends before the other has begun
+            while not (tmp_path / "killed").exists():  # so that neither ends before the other has begun
                 await asyncio.sleep(0.05)
 
     monkeypatch.setattr(campaign, "Checkpoints", WatchedCheckpoints)
@@ -210,7 +210,7 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
 
 
 def test_an_interrupted_training_of_several_processes_begins_anew(tmp_path, monkeypatch):
-    """Its checkpoints hold the state of the first process alone, and `train` refuses to resume it."""
+    """Its checkpoints contain only the state of the first process, and `train` refuses to resume from them."""
     called = []
     monkeypatch.setattr(transfer, "train", lambda *_, resume=False, **__: called.append(resume))
     (tmp_path / "run-training").mkdir()
@@ -221,7 +221,7 @@ def test_an_interrupted_training_of_several_processes_begins_anew(tmp_path, monk
 
 @pytest.mark.slow
 def test_an_interrupted_training_resumes_from_its_checkpoint(tmp_path):
-    """On this machine: its checkpoints are beside the policy, and are gone with the end."""
+    """On this machine, its checkpoints are beside the policy and are removed at the end."""
     policy, settings = tmp_path / "run", TrainingSettings(worlds=16, steps=4 * 4096)
 
     def interrupt(checkpoint):

@@ -1,4 +1,4 @@
-"""Sweep files: every combination with every seed, and one sentence for a file that cannot be used."""
+"""Sweep files: every combination with every seed, and one sentence for an unusable file."""
 
 import math
 
@@ -18,7 +18,7 @@ def written(folder, **changes):
 
 
 def test_grid_times_seeds(tmp_path):
-    """Seeds outermost, so that every combination has a result early; the grid overrides options of every training."""
+    """Seeds vary slowest, so that every combination has an early result; the grid overrides the common options."""
     file = written(
         tmp_path,
         seeds=[5, 7],
@@ -46,7 +46,7 @@ def test_a_number_of_seeds_counts_from_one(tmp_path):
 
 
 def test_files_are_relative_to_the_sweep(tmp_path):
-    """Vehicle, ranges and plants; workers receive their full paths."""
+    """This holds for vehicle, ranges and plants; workers receive the full paths."""
     for name in ("mine.yaml", "water.yaml"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
     changes = {
@@ -61,7 +61,7 @@ def test_files_are_relative_to_the_sweep(tmp_path):
 
 @pytest.mark.parametrize("key", ["vehicle", "randomize"])
 def test_a_changed_file_is_another_training(tmp_path, key):
-    """The content of a vehicle or of ranges decides the policy, so it is in the name of its directory."""
+    """The content of vehicle and ranges files affects the policy, so it is part of the directory's name."""
     runs = []
     for name in ("finsrov", "bluerov2"):
         (tmp_path / "mine.yaml").write_text(f"extends: {name}\n", encoding="utf-8")
@@ -104,6 +104,6 @@ def test_a_file_that_is_not_there(tmp_path):
 
 @pytest.mark.parametrize("value", ["../../mine\\x", "a\\b", "a" * 300], ids=range(3))
 def test_a_combination_names_a_directory_of_the_sweep(tmp_path, value):
-    """Each training has one, whose name begins with the options of the grid."""
+    """Each training has a directory whose name begins with the options of the grid."""
     with pytest.raises(SweepError, match="^setting '.*expected the plain name of a file or folder"):
         load_sweep(written(tmp_path, grid={"action": [value]})).trainings()

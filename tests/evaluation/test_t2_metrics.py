@@ -1,4 +1,4 @@
-"""Measures of tracking, on runs whose errors are known."""
+"""Measures of tracking, on runs with known errors."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ def times(trajectory, rate=20.0):
 
 @pytest.mark.parametrize("name", TRAJECTORIES)
 def test_a_perfect_run_has_no_error_and_is_complete(name):
-    """Cross-track errors are then those of a reference sampled at 50 Hz: half a sample's way."""
+    """Cross-track errors are those of a reference sampled at 50 Hz: half the distance between samples."""
     trajectory = TRAJECTORIES[name]
     t = times(trajectory)
     m = measure_tracking(t, trajectory.at(t).position, trajectory)
@@ -29,7 +29,7 @@ def test_a_perfect_run_has_no_error_and_is_complete(name):
 
 
 def test_a_constant_shift_is_its_own_error():
-    """Horizontal 0.03 and 0.04 give 0.05 m; with 0.12 below the distance is 0.13 m."""
+    """Horizontal 0.03 and 0.04 give 0.05 m; with 0.12 below, the distance is 0.13 m."""
     t = times(ELLIPSE)
     m = measure_tracking(t, ELLIPSE.at(t).position + [0.03, 0.04, -0.12], ELLIPSE)
     errors = [m[key] for key in ("horizontal_rmse_m", "vertical_rmse_m", "p95_m")]
@@ -37,7 +37,7 @@ def test_a_constant_shift_is_its_own_error():
 
 
 def test_being_late_is_an_error_in_time_and_none_across_the_way():
-    """One second late on the ellipse: v · 1 s off in time, on the way all the same, and not quite there at the end."""
+    """One second late on the ellipse, the error is v · 1 s in time and zero across the path; the end is not reached."""
     t = times(ELLIPSE)
     m = measure_tracking(t, ELLIPSE.at(t - 1.0).position, ELLIPSE)
     speed = np.linalg.norm(ELLIPSE.at(t).velocity, axis=-1)
@@ -45,11 +45,11 @@ def test_being_late_is_an_error_in_time_and_none_across_the_way():
     assert m["cross_track_p95_m"] < 0.002
     assert 0.98 < m["completion"] < 1.0
     short = measure_tracking(t, ELLIPSE.at(t).position + [0.0, -0.02, 0.0], ELLIPSE)
-    assert short["complete"]  # two centimetres short of the end, where the reference creeps
+    assert short["complete"]  # two centimetres short of the end, where the reference is slow
 
 
 def test_projections_never_go_back_nor_take_the_other_branch_of_a_crossing():
-    """The eight's middle is passed twice: the projection stays near the sample's own time, and monotone."""
+    """The eight's middle is passed twice: the projection stays near the sample's own time, and is monotone."""
     t = times(EIGHT)
     rng = np.random.default_rng(0)
     found = projected_times(t, EIGHT.at(t).position + rng.normal(0.0, 0.03, (len(t), 3)), EIGHT)
@@ -73,7 +73,7 @@ def test_only_the_duration_counts():
 
 
 def test_efforts_follow_their_formulas():
-    """Two thrusters of ±4 N, one steady at 4 N, one switching between ±1 N at 20 Hz."""
+    """Two thrusters of ±4 N: one is steady at 4 N, the other switches between ±1 N at 20 Hz."""
     t = times(EIGHT)
     thrust = np.column_stack([np.full(len(t), 4.0), np.where(np.arange(len(t)) % 2, 1.0, -1.0)])
     limits = (np.full(2, -4.0), np.full(2, 4.0))
@@ -110,7 +110,7 @@ def test_what_is_no_series_is_refused():
 
 
 def test_a_constant_offset_at_a_corner_that_the_way_rests_at_is_no_end_of_it():
-    """Dead reckoning 5 cm off all along the broken line: it is followed to its end, and 5 cm off at most."""
+    """Dead reckoning 5 cm off along the whole broken line is measured to its end, with an error of at most 5 cm."""
     guide = TRAJECTORIES["broken"]
     t = np.arange(0.0, guide.duration + 0.05, 0.1)
     measures = measure_tracking(t, guide.at(t).position + np.array([-0.045, 0.02, 0.0]), guide)

@@ -44,7 +44,7 @@ def nominal(tmp_path_factory):
 
 
 def test_the_pid_follows_the_published_trajectories_within_a_centimetre(nominal):
-    """In the nominal plant; the eight begins with a jump in velocity from rest, which costs most."""
+    """This is in the nominal plant; the eight, which begins with a velocity jump from rest, has the largest error."""
     _, result = nominal
     for row in result["per_trial"]:
         name = row["trajectory"]
@@ -74,12 +74,12 @@ def test_the_table_has_a_row_per_trajectory_and_the_papers(nominal, capsys):
 
 
 def horizontal(trials):
-    """Of the first of them [m]."""
+    """Return the horizontal error of the first trials [m]."""
     return trials[0].measures("t2", FINSROV.force_limits)["horizontal_rmse_m"]
 
 
 def test_a_current_and_the_number_of_trials_are_heard():
-    """Still water differs from a current, and the trajectories are taken in turn."""
+    """Still water differs from a current, and the trajectories are used in turn."""
     guides = [TRAJECTORIES["straight"]]
     player = agent_for("pid", FINSROV, TASK)
     still, current = (
@@ -92,7 +92,7 @@ def test_a_current_and_the_number_of_trials_are_heard():
 
 
 def test_a_feed_forward_of_acceleration_halves_the_error():
-    """The straight line within 1 mm; without the goal's acceleration it was 2.6 mm."""
+    """The straight line is followed within 1 mm; without the goal's acceleration it was 2.6 mm."""
     player = agent_for("pid", FINSROV, TASK)
     trials = run_trials(
         player, TASK, FINSROV, NOMINAL, TrialSettings(trials=1), guides=[TRAJECTORIES["straight"]]
@@ -101,7 +101,7 @@ def test_a_feed_forward_of_acceleration_halves_the_error():
 
 
 def test_the_published_baseline_has_a_profile_for_trajectories():
-    """As published: other gains for T2; its errors are those of centimetres to decimetres that the paper reports."""
+    """As published, T2 has other gains; its errors are the centimetres to decimetres that the paper reports."""
     assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
     assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
     player = agent_for("pid-paper", FINSROV, TASK)
@@ -121,7 +121,7 @@ def test_the_figure_has_a_row_for_each_trajectory():
 
 
 def test_the_papers_table_is_transcribed_whole():
-    """Three controllers on four trajectories; the best horizontal error of each is that of + DR."""
+    """It has three controllers on four trajectories; the best horizontal error on each is that of + DR."""
     assert set(PAPER_T2) == {"calibrated + DR", "calibrated", "PID"}
     for name in T2_TRAJECTORIES:
         best = min(PAPER_T2[kind][name][0] for kind in PAPER_T2)
@@ -149,7 +149,7 @@ def test_the_result_says_who_was_tried_where():
 
 
 def test_ones_own_trajectory_is_followed(tmp_path):
-    """A file beside a name, in turn; T1 follows none, and a way out of the pool is refused."""
+    """A file and a name are used in turn; T1 follows none, and a path that leaves the pool is refused."""
     own = tmp_path / "own.csv"
     own.write_text("t,x,y,z\n0,0,0,-0.5\n10,0.3,0,-0.5\n20,0.3,0.3,-0.6\n")
     rows = evaluate_controller("pid", NOMINAL, task="t2", trajectories=[own, "straight"]).result["per_trial"]
@@ -163,7 +163,7 @@ def test_ones_own_trajectory_is_followed(tmp_path):
 
 
 def stiff_policy(folder, errors):
-    """A policy written by hand as one layer: thrust towards the reference and against velocity."""
+    """Write a policy as one layer: thrust towards the reference and against velocity."""
     weight = np.zeros((30, 6))
     for axis in range(3):
         weight[axis, axis], weight[12 + axis, axis], weight[15 + axis, axis] = 6.0, 4.0, -2.0
@@ -182,7 +182,7 @@ def stiff_policy(folder, errors):
 
 
 def test_an_integral_takes_out_what_a_current_leaves(tmp_path):
-    """In 0.10 m/s a policy without memory is pushed away by centimetres; one that integrates its error is not."""
+    """At 0.10 m/s a policy without memory is displaced by centimetres; one that integrates its error is not."""
     options = {"settings": TrialSettings(trials=2), "task": "t2", "trajectories": ["broken"]}
     plain, integrating = (
         evaluate_controller(

@@ -1,4 +1,4 @@
-"""`finssim tasks`: every task in a line; one in full, with the numbers that its environment has."""
+"""`finssim tasks`: each task in a line, or one in full with the numbers of its environment."""
 
 import json
 import re
@@ -24,7 +24,7 @@ def finssim(*words):
 
 
 def test_every_task_is_listed(capsys):
-    """By name, with what is to be done and its baseline."""
+    """Each is listed by name, with its goal and its baseline."""
     assert finssim("tasks") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in TASKS.usable())
@@ -44,7 +44,7 @@ def test_rewards_ends_and_totals_are_told_in_words(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NUMERIC)
 def test_what_is_told_is_what_the_environment_has(name):
-    """Sizes, agents, others, limits of the action, times; no part of the observation missing."""
+    """Sizes, agents, others, action limits and times agree; no part of the observation is missing."""
     told, env = describe_task(name), make(name)
     assert told["observation"]["size"] == env.observation_size
     assert sum(part["size"] for part in told["observation"]["parts"]) == env.observation_size
@@ -61,7 +61,7 @@ def test_what_is_told_is_what_the_environment_has(name):
 
 
 def test_a_task_is_shown_for_a_vehicle(capsys):
-    """Units in brackets, the vehicle's own numbers; and as data."""
+    """The text has units in brackets and the vehicle's own numbers; the data has the same content."""
     pytest.importorskip("finssim.extensions.teams")
     assert finssim("tasks", "show", "team-pursuit", "--vehicle", "bluerov2_heavy") == 0
     out = capsys.readouterr().out
@@ -79,14 +79,14 @@ def test_a_task_is_shown_for_a_vehicle(capsys):
 
 
 def test_a_task_of_ones_own_is_shown(capsys):
-    """By file and class; its own words in place of weights."""
+    """It is given by file and class; its own words replace the weights."""
     assert finssim("tasks", "show", f"{EXAMPLE}:KeepDepth") == 0
     out = capsys.readouterr().out
     assert "keep-depth: Come to a depth" in out and "baselines: none" in out and "cheap thrusts" in out
 
 
 def test_what_there_is_not_is_refused(capsys):
-    """In one sentence."""
+    """An unknown task is refused in one sentence."""
     assert finssim("tasks", "show", "t9") == 2
     assert "unknown task 't9'; available: t1" in capsys.readouterr().err
     assert finssim("tasks", "show", "t1", "--vehicle", "finrov") == 2
@@ -94,6 +94,6 @@ def test_what_there_is_not_is_refused(capsys):
 
 
 def test_sentences_under_fields_are_read_from_the_source():
-    """Those of the bases too."""
+    """The sentences of base classes are read too."""
     docs = attribute_docs(StationKeeping)
     assert docs["time_limit"] == "Length of an episode in training [s]." and docs["hold"].endswith("[s].")

@@ -1,4 +1,4 @@
-"""The experiments run from their command to their table, go on where they were, and refuse what they do not know."""
+"""The experiments run from command to table, resume after an interruption, and refuse unknown names."""
 
 import json
 from pathlib import Path
@@ -30,13 +30,13 @@ def experiment(out, targets=("P01",), **changes):
 
 @pytest.fixture(scope="module")
 def small(brief_t1, tmp_path_factory):
-    """One trial of the tuned PID, as long as `brief_t1` has it: its folder and result."""
+    """Folder and result of one trial of the tuned PID, of the length in `brief_t1`."""
     out = tmp_path_factory.mktemp("t1")
     return out, experiment(out)
 
 
 def test_the_tuned_pid_holds_a_setpoint_of_the_pool(small):
-    """And the row says so with an interval of the one cluster there is."""
+    """The row shows it with an interval of its single cluster."""
     out, result = small
     row = result["rows"]["pid"]
     assert (row["success"], row["trials"], row["stopped"], row["worst_success"]) == (1, 1, 0, 1)
@@ -47,7 +47,7 @@ def test_the_tuned_pid_holds_a_setpoint_of_the_pool(small):
 
 
 def test_a_second_call_plays_nothing_again(small):
-    """What lies in the folder is taken; a new target is added."""
+    """Results in the folder are reused; a new target is added."""
     out, result = small
     before = {path: path.stat().st_mtime_ns for path in (out / "trials").iterdir()}
     again = experiment(out)
@@ -56,7 +56,7 @@ def test_a_second_call_plays_nothing_again(small):
 
 
 def test_the_table_stands_beside_the_papers(small):
-    """Theirs is marked, in every form, and the figure is on the page."""
+    """The paper's rows are marked in every form, and the page contains the figure."""
     out, result = small
     (table,) = T1.tables({**result, "rows": {"pid-paper": result["rows"]["pid"]}})
     assert [row[0] for row in table.rows][1:] == ["  paper: PID"]
@@ -77,14 +77,14 @@ def test_the_table_stands_beside_the_papers(small):
     ],
 )
 def test_what_is_unknown_is_refused_before_anything_is_trained(tmp_path, wrong, words):
-    """In one sentence that names what there is."""
+    """One sentence refuses it and lists the known names."""
     with pytest.raises(ValueError, match=words):
         experiment(tmp_path, **wrong)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_finished_policy_is_not_trained_again(tmp_path):
-    """An unfinished one is."""
+    """An unfinished policy is."""
     rows = {name: T1.rows[name] for name in ("pid", "calibrated-pool")}
     controllers = controllers_of("t1", rows, [5], tmp_path, TrainingSettings(steps=4096))
     network = Path(controllers["calibrated-pool", 5]) / "policy.onnx"
@@ -99,7 +99,7 @@ def test_a_finished_policy_is_not_trained_again(tmp_path):
 
 @pytest.mark.parametrize("spec", [T1, T2], ids=lambda spec: spec.name)
 def test_every_row_can_be_played(spec):
-    """It names a PID or a training that there is, and its paper row exists."""
+    """It names an existing PID or training, and its paper row exists."""
     for row in spec.rows.values():
         assert bool(row.controller) != (row.training is not None)
         if row.paper is not None:
@@ -109,21 +109,21 @@ def test_every_row_can_be_played(spec):
 
 
 def made(row, plant, success, error):
-    """A result as `play` leaves it."""
+    """Return a result in the form that `play` writes."""
     job = {"row": row, "plant": plant, "seed": 1, "target": "P01"}
     figures = dict.fromkeys(("e_y_m", "e_psi_deg", "t_s_s", "J_p_m", "J_psi_deg"), 1.0)
     return {"job": job, "success": success, "fault": "" if success else "tilt", "e_p_m": error, **figures}
 
 
 def test_figures_count_stops_and_the_worst_pool():
-    """A trial that was stopped has no error and still counts."""
+    """A stopped trial has no error and still counts."""
     row = row_figures([made("x", 1, True, 0.02), made("x", 2, False, None)], T1.figures)
     assert (row["success"], row["trials"], row["stopped"], row["worst_success"]) == (1, 2, 1, 0)
     assert row["e_p_m"]["value"] == 0.02 and row["e_p_m"]["count"] == 1
 
 
 def test_differences_are_means_over_pairs():
-    """Of trials with the same plant, seed and target."""
+    """Pairs are trials with the same plant, seed and target."""
     by_row = {
         name: [made(name, plant, True, error + 0.001 * plant) for plant in range(3)]
         for name, error in (("calibrated", 0.02), ("mesh", 0.05), ("pid", 0.01))
@@ -135,7 +135,7 @@ def test_differences_are_means_over_pairs():
 
 
 def test_the_differences_say_which_way_each_row_moves(small):
-    """With the paper's difference beside, where it has one."""
+    """The paper's difference is shown beside, where it has one."""
     _, result = small
     d = {"value": 0.03, "ci95": [0.02, 0.04], "count": 9}
     differences = {"calibrated": {"no-fusion": {"success_rate": None, "e_p_m": d, "e_psi_deg": d}}}

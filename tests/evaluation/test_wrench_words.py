@@ -1,4 +1,4 @@
-"""A wrench in words means what it says, or is refused with a sentence."""
+"""A wrench in words is read as written, or is refused in a sentence."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 @given(st.dictionaries(st.sampled_from(AXES), numbers, min_size=1), st.sampled_from([" ", ", ", "  "]))
 def test_words_give_the_wrench_they_say(wanted, separator):
-    """Any axes in any order and form come back as numbers; the rest is zero."""
+    """Any axes in any order and form are read as numbers; the others are zero."""
     text = separator.join(f"{axis}={value!r}" for axis, value in wanted.items())
     np.testing.assert_array_equal(parse_wrench(text), [wanted.get(axis, 0.0) for axis in AXES])
 
@@ -35,7 +35,7 @@ def test_words_give_the_wrench_they_say(wanted, separator):
     ],
 )
 def test_what_is_no_wrench_is_refused(text, sentence):
-    """The sentence names the word, and what was expected."""
+    """The sentence names the word and the expected form."""
     with pytest.raises(CommandError) as refused:
         parse_wrench(text)
     assert str(refused.value) == sentence

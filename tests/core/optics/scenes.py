@@ -1,4 +1,4 @@
-"""Lenses, interfaces and points that the tests of optics share: each test runs over every member."""
+"""Lenses, interfaces and points shared by the tests of optics: each test runs over every member."""
 
 import numpy as np
 
@@ -15,13 +15,13 @@ LENSES = {
     "fisheye": Lens(**SIZE, model="fisheye", distortion=(-0.02, 0.005, -0.003, 0.0005)),
     "wide": Lens(1280, 720, 300.0, 300.0, 640.0, 360.0, "fisheye", (0.03, -0.004, 0.0, 0.0)),
 }
-"""The second one is FinsROV's overhead camera; the last one sees 120 degrees to each side."""
+"""Lenses by name; the second is FinsROV's overhead camera, the last sees 120 degrees to each side."""
 
 SMALL_TURN = quat_from_rotvec([0.08, -0.05, 0.3])
 
 
 def camera(lens: Lens, interface: Interface, height: float = 1.2) -> Camera:
-    """A camera at a distance [m] from an interface that it faces, but for a small turn."""
+    """Return a camera at a distance [m] from an interface that it faces, except for a small rotation."""
     e1, e2 = interface.tangents()
     R_pc = np.stack([e1, -e2, -interface.normal], axis=-1)
     position = interface.normal * (height - interface.offset) + 0.03 * e1 - 0.17 * e2
@@ -29,7 +29,7 @@ def camera(lens: Lens, interface: Interface, height: float = 1.2) -> Camera:
 
 
 def points(interface: Interface, count: int = 200, spread: float = 0.8, seed: int = 0) -> np.ndarray:
-    """Points on the far side, up to `spread` m sideways and 2 m deep behind the far face."""
+    """Return points on the far side, up to `spread` m sideways and 2 m behind the far face."""
     rng = np.random.default_rng(seed)
     e1, e2 = interface.tangents()
     x, y = rng.uniform(-spread, spread, (2, count, 1))

@@ -1,4 +1,4 @@
-"""Interfaces and cameras: planes as they are given, refusals."""
+"""Interfaces and cameras: definition of planes, and refusals."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from finssim.core.optics import Camera, Interface, Layer, OpticsError
 
 
 def test_water_leans_where_it_is_told():
-    """tilt_x leans the normal towards +x, so that the surface falls along +x; the height holds at the origin."""
+    """tilt_x tilts the normal towards +x, so that the surface falls along +x; the height applies at the origin."""
     water = Interface.water(0.96, tilt_x=0.1, tilt_y=-0.05)
     assert np.arccos(water.normal[2]) == pytest.approx(np.hypot(0.1, 0.05))
     assert water.normal[0] > 0 > water.normal[1]
@@ -22,7 +22,7 @@ def test_water_leans_where_it_is_told():
 
 @pytest.mark.parametrize("interface", INTERFACES.values(), ids=INTERFACES.keys())
 def test_tangents_span_the_plane(interface):
-    """e1, e2 and n are a right-handed set of unit vectors, which hardly turns when the plane tilts a little."""
+    """e1, e2 and n are right-handed unit vectors, and rotate only slightly when the plane tilts slightly."""
     e1, e2 = interface.tangents()
     np.testing.assert_allclose(np.linalg.det([e1, e2, interface.normal]), 1.0, atol=1e-12)
     np.testing.assert_allclose(np.cross(e1, e2), interface.normal, atol=1e-12)
@@ -38,13 +38,13 @@ def test_level_water_has_the_axes_of_the_pool():
 
 
 def test_a_wall_has_no_height():
-    """Asking a vertical plane for its height is refused."""
+    """The height of a vertical plane is refused."""
     with pytest.raises(OpticsError, match="vertical"):
         INTERFACES["wall"].height(0.0, 0.0)
 
 
 def test_thickness_adds_up():
-    """The far face lies behind the near one by all layers."""
+    """The far face lies behind the near one by the sum of all layers."""
     assert INTERFACES["two layers"].thickness == pytest.approx(0.03)
     assert INTERFACES["surface"].thickness == 0.0
 
@@ -67,14 +67,14 @@ def test_thickness_adds_up():
     ],
 )
 def test_impossible_planes_and_poses_are_refused(make, words):
-    """One sentence says what was expected."""
+    """One sentence states the expected values."""
     with pytest.raises(OpticsError) as refused:
         make()
     assert words in str(refused.value)
 
 
 def test_a_camera_cannot_be_changed_behind_its_back():
-    """Neither its own arrays nor the caller's change what a camera or an interface is."""
+    """Changes to its arrays or to the caller's do not change a camera or an interface."""
     position = np.zeros(3)
     eye = Camera(LENSES["pinhole"], position, (0, 0, 0, 1))
     position[0] = 1.0

@@ -21,25 +21,25 @@ every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES.keys())
 every_interface = pytest.mark.parametrize("interface", INTERFACES.values(), ids=INTERFACES.keys())
 
 STEP = 1e-5
-# A central difference errs by STEP² third derivatives/6 (pixels per m³, below 1e5 here) and 1e-13 px/STEP.
+# A central difference errs by STEP² third derivatives/6 (pixels per m³, below 1e5 here) plus 1e-13 px/STEP.
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-5}
 
 
 def differences(pixels, count):
-    """d pixels(x)/dx at 0 for x of `count` numbers, (..., 2, count)."""
+    """Return d pixels(x)/dx at 0 for x of `count` numbers, (..., 2, count)."""
     steps = STEP * np.eye(count)
     return np.stack([(pixels(d) - pixels(-d)) / (2.0 * STEP) for d in steps], axis=-1)
 
 
 def inner_points(interface):
-    """Points at least 5 cm behind the far face, where differences have room."""
+    """Return points at least 5 cm behind the far face, so that differences stay behind it."""
     return points(interface, 40) - 0.05 * interface.normal
 
 
 @every_interface
 @every_lens
 def test_derivatives_of_a_pixel(lens, interface):
-    """With respect to the point, the camera's pose, the plane, the index and the lens."""
+    """Derivatives by the point, the camera's pose, the plane, the index and the lens equal central differences."""
     eye, there = camera(lens, interface), inner_points(interface)
     found = projection_jacobians(eye, interface, there)
 
@@ -71,7 +71,7 @@ def test_derivatives_of_a_pixel(lens, interface):
 
 @every_interface
 def test_derivatives_on_a_plane_of_any_orientation(interface):
-    """How a point on a slanting plane moves with the pixel and with a shift of the plane along its normal."""
+    """Derivatives by the pixel and by a shift of the plane along its normal hold on a slanting plane."""
     eye, there = camera(LENSES["plumb_bob"], interface), inner_points(interface)
     normal = np.array([0.3, -0.2, 0.1]) + 2.0 * interface.normal
     unit = normal / np.linalg.norm(normal)
@@ -94,7 +94,7 @@ def test_derivatives_on_a_plane_of_any_orientation(interface):
 @every_interface
 @every_lens
 def test_straight_below_the_camera_nothing_is_singular(lens, interface):
-    """At rho = 0 all derivatives are finite and those beside it tend to them; so they do 1 nm below the face."""
+    """At rho = 0 all derivatives are finite and continuous, also 1 nm below the face."""
     eye = camera(lens, interface)
     e1, _ = interface.tangents()
     for depth in (0.5, 1e-9):
@@ -109,7 +109,7 @@ def test_straight_below_the_camera_nothing_is_singular(lens, interface):
 
 
 def test_straight_down_the_derivative_is_that_of_the_apparent_depth():
-    """Under a camera that looks straight down, du/dx = f/(h + d n_air/n_water), the paraxial limit."""
+    """Below a camera that looks straight down, du/dx = f/(h + d n_air/n_water), the paraxial limit."""
     interface = Interface.water(0.0)
     eye = Camera(LENSES["pinhole"], (0.0, 0.0, 1.2), (1.0, 0.0, 0.0, 0.0))
     jacobian = projection_jacobians(eye, interface, (0.0, 0.0, -0.8)).point
@@ -118,7 +118,7 @@ def test_straight_down_the_derivative_is_that_of_the_apparent_depth():
 
 
 def test_moving_everything_together_moves_nothing():
-    """Shift point, camera and plane alike: the derivatives of the pixel cancel."""
+    """When point, camera and plane shift alike, the derivatives of the pixel cancel."""
     interface = INTERFACES["tilted 20 degrees"]
     eye, there = camera(LENSES["plumb_bob"], interface), inner_points(interface)
     found = projection_jacobians(eye, interface, there)
@@ -128,7 +128,7 @@ def test_moving_everything_together_moves_nothing():
 
 
 def test_a_point_that_is_not_seen_has_no_derivative():
-    """Above the surface, the derivatives of back-projection are NaN, not numbers."""
+    """Above the surface, the derivatives of back-projection are NaN."""
     interface = INTERFACES["surface"]
     eye = camera(LENSES["pinhole"], interface)
     there, _ = back_project(eye, interface, [640.0, 360.0]).at_z(2.0)
@@ -137,7 +137,7 @@ def test_a_point_that_is_not_seen_has_no_derivative():
 
 @pytest.mark.parametrize("name", ["surface", "from the water", "window"])
 def test_derivatives_on_the_far_face_are_those_just_behind_it(name):
-    """For points on the face itself, the derivative inwards equals a one-sided difference of second order."""
+    """For points on the face itself, the inward derivative equals a one-sided difference of second order."""
     interface = INTERFACES[name]
     eye, there = camera(LENSES["plumb_bob"], interface), points(interface, 20, spread=0.6)
     there = there - (interface.distance(there) + interface.thickness)[:, None] * interface.normal
@@ -149,7 +149,7 @@ def test_derivatives_on_the_far_face_are_those_just_behind_it(name):
 
 @pytest.mark.parametrize("height", [1e-3, 1e-6, 1e-9, 1e-12, 0.0])
 def test_derivatives_of_a_camera_that_touches_the_water(height):
-    """Inside and outside of Snell's window, down to no height at all."""
+    """Derivatives hold inside and outside of Snell's window, down to zero height."""
     interface = Interface.water(0.0)
     eye = camera(LENSES["wide"], interface, height)
     there = eye.position + np.array([[0.3, 0.0, -0.5], [3.0, 0.0, -1.0], [0.0, 0.0, -1.0]])

@@ -1,4 +1,4 @@
-"""Lenses: agreement with OpenCV, the way back, the fold of a distortion, derivatives, refusals."""
+"""Lenses: agreement with OpenCV, the inverse, the fold of a distortion, derivatives, refusals."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES.keys())
 
 
 def front(count: int = 500, widest: float = 60.0) -> np.ndarray:
-    """Points in front of a camera, up to `widest` degrees from its axis, at all distances."""
+    """Return points in front of a camera, up to `widest` degrees from its axis, at all distances."""
     rng = np.random.default_rng(1)
     angle, turn = np.radians(rng.uniform(0.0, widest, count)), rng.uniform(-np.pi, np.pi, count)
     ray = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=-1)
@@ -22,7 +22,7 @@ def front(count: int = 500, widest: float = 60.0) -> np.ndarray:
 
 @every_lens
 def test_projects_as_opencv(lens):
-    """Pixels are those of cv2.projectPoints and cv2.fisheye.projectPoints: same models, same pixel centres."""
+    """Pixels equal cv2.projectPoints and cv2.fisheye.projectPoints: same models, same pixel centres."""
     points, zero = front(), np.zeros(3)
     if lens.model == "fisheye":
         theirs, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, lens.K, np.array(lens.distortion))
@@ -36,7 +36,7 @@ def test_projects_as_opencv(lens):
 
 @every_lens
 def test_a_pixel_looks_where_it_sees(lens):
-    """Rays of the pixels of points meet the points again: the inverse of the distortion, to rounding."""
+    """Rays of the pixels of points pass through the points: the distortion is inverted to rounding."""
     points = front()
     pixels, _ = lens.project(points)
     rays, ok = lens.rays(pixels)
@@ -46,7 +46,7 @@ def test_a_pixel_looks_where_it_sees(lens):
 
 @every_lens
 def test_every_pixel_of_the_image_has_its_own_ray(lens):
-    """Over the whole image, corners included, the rays project back to their pixels."""
+    """Over the whole image, corners included, each pixel's ray projects back to that pixel."""
     u, v = np.meshgrid(np.linspace(-0.5, 1279.5, 41), np.linspace(-0.5, 719.5, 23))
     pixels = np.stack([u, v], axis=-1)
     rays, ok = lens.rays(pixels)
@@ -73,14 +73,14 @@ def test_derivatives(lens):
 
 
 def replace_values(lens: Lens, values: np.ndarray) -> Lens:
-    """The lens with other fx, fy, cx, cy and coefficients."""
+    """Return the lens with other fx, fy, cx, cy and coefficients."""
     fx, fy, cx, cy, *distortion = values.tolist()
     return replace(lens, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
 
 @every_lens
 def test_the_axis_is_as_smooth_as_the_rest(lens):
-    """On the optical axis and a hair beside it, values and derivatives are finite and agree."""
+    """On the optical axis and close to it, values and derivatives are finite and agree."""
     at, beside = np.array([0.0, 0.0, 2.0]), np.array([1e-9, -2e-9, 2.0])
     np.testing.assert_allclose(lens.project(at)[0], [lens.cx, lens.cy], atol=1e-12)
     np.testing.assert_allclose(lens.rays([lens.cx, lens.cy])[0], [0.0, 0.0, 1.0], atol=1e-12)
@@ -97,13 +97,13 @@ def test_the_fisheye_series_near_the_axis_meets_the_closed_form():
 
 
 def test_a_barrel_refuses_what_lies_beyond_its_fold():
-    """r (1 - 0.4 r²) turns back at r = sqrt(1/1.2): points beyond and pixels outside of the image of it are refused."""
+    """r (1 - 0.4 r²) turns back at r = sqrt(1/1.2): points beyond and pixels outside of its image are refused."""
     lens = Lens(**SIZE, distortion=(-0.4, 0.0, 0.0, 0.0))
     fold = np.sqrt(1.0 / 1.2)
     assert lens.field_of_view == pytest.approx(np.arctan(fold), rel=1e-8)
     r = fold * np.array(
         [0.5, 0.99, 0.999999, 1.000001, 1.2, 1.58, 2.0]
-    )  # the last but one appears near the axis again
+    )  # the last but one reappears near the axis
     points = np.stack([r, 0 * r, 1 + 0 * r], axis=-1)
     pixels, ok = lens.project(points)
     assert ok.tolist() == [True] * 3 + [False] * 4
@@ -117,7 +117,7 @@ def test_a_barrel_refuses_what_lies_beyond_its_fold():
 
 @pytest.mark.parametrize("tangential", [0.0, 0.004, 0.02])
 def test_within_the_fold_the_distortion_keeps_its_orientation(tangential):
-    """Everywhere inside the fold of a folding lens the Jacobian is positive; just beyond, somewhere it is not."""
+    """Everywhere inside the fold of a folding lens the Jacobian is positive; just beyond, it is negative somewhere."""
     lens = Lens(**SIZE, distortion=(-0.4, 0.03, tangential, -0.5 * tangential))
     turn = np.linspace(-np.pi, np.pi, 721)
     least = []
@@ -168,7 +168,7 @@ def test_batches_of_any_shape():
 
 
 def test_the_image_reaches_half_a_pixel_past_its_outer_centres():
-    """(0, 0) is the centre of the first pixel: the image spans -0.5 to 1279.5."""
+    """(0, 0) is the centre of the first pixel, so the image spans -0.5 to 1279.5."""
     lens = LENSES["pinhole"]
     inside = lens.inside(
         [[-0.49, 0.0], [-0.51, 0.0], [1279.49, 719.49], [1279.51, 0.0], [0.0, 719.51], [np.nan, 0.0]]
@@ -195,7 +195,7 @@ def test_the_image_reaches_half_a_pixel_past_its_outer_centres():
     ],
 )
 def test_an_impossible_lens_is_refused(change, words):
-    """One sentence says what was expected."""
+    """One sentence states the expected values."""
     with pytest.raises(OpticsError) as refused:
         Lens(**{**SIZE, **change})
     assert words in str(refused.value)

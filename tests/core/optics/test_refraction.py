@@ -27,14 +27,15 @@ SEEN = (Status.OK, Status.OUTSIDE_IMAGE)
 @every_interface
 @every_lens
 def test_there_and_back_is_the_identity(lens, interface):
-    """Points that are projected and traced back onto their planes are where they were; so are the pixels, to 1e-9."""
+    """Points that are projected and traced back onto their planes return to the same place, and so do pixels,
+    to 1e-9."""
     eye, there = camera(lens, interface), points(interface)
     seen = project(eye, interface, there)
     assert np.isin(seen.status, SEEN).all()
     rays = back_project(eye, interface, seen.pixels)
     assert (rays.status == Status.OK).all()
     assert np.allclose(np.linalg.norm(rays.direction, axis=-1), 1.0, atol=1e-14)
-    for axis in np.eye(3):  # planes along z, for one, and along x and y
+    for axis in np.eye(3):  # planes along z, and along x and y
         if np.abs(rays.direction @ axis).min() < 0.01:
             continue
         met, status = rays.at_plane(axis, -(there @ axis))
@@ -42,7 +43,7 @@ def test_there_and_back_is_the_identity(lens, interface):
         np.testing.assert_allclose(met, there, atol=1e-9)
         again = project(eye, interface, met)
         np.testing.assert_allclose(again.pixels, seen.pixels, atol=1e-9)
-    # Off the ray by nothing, for any plane: the moment about the origin of the ray is zero.
+    # The point lies on the ray for any plane: the moment about the ray's origin is zero.
     off = np.cross(there - rays.origin, rays.direction)
     np.testing.assert_allclose(off, 0.0, atol=1e-9)
 
@@ -50,7 +51,7 @@ def test_there_and_back_is_the_identity(lens, interface):
 @every_lens
 @pytest.mark.parametrize("window", [(), (Layer(0.02, 1.333),)])
 def test_equal_indices_leave_the_ray_straight(lens, window):
-    """With one index throughout, window included, this is the pinhole camera, to 1e-12 of the scale."""
+    """With one index throughout, window included, the result is the pinhole camera, to 1e-12 of the scale."""
     interface = Interface.through(
         (0.1, 0.0, 0.4), (0.2, -0.1, 1.0), index_near=1.333, index_far=1.333, window=window
     )
@@ -64,7 +65,7 @@ def test_equal_indices_leave_the_ray_straight(lens, window):
 
 @every_interface
 def test_a_thin_window_is_no_window(interface):
-    """Layers of a picometre change a pixel by no more than their part of the path."""
+    """Layers of a picometre change a pixel by no more than their share of the path."""
     bare = replace(interface, window=())
     thin = replace(interface, window=(Layer(1e-12, 1.49), Layer(1e-12, 1.6)))
     eye, there = camera(LENSES["plumb_bob"], bare), points(bare)
@@ -72,7 +73,7 @@ def test_a_thin_window_is_no_window(interface):
 
 
 def test_a_window_of_water_is_deeper_water():
-    """A layer with the index behind it changes nothing at all."""
+    """A layer with the index of the medium behind it changes nothing at all."""
     bare = Interface.water(0.96)
     with_layer = replace(bare, window=(Layer(0.1, bare.index_far),))
     eye, there = camera(LENSES["plumb_bob"], bare), points(with_layer)
@@ -84,7 +85,7 @@ def test_a_window_of_water_is_deeper_water():
 @every_interface
 @every_lens
 def test_the_choice_of_frame_changes_no_pixel(lens, interface):
-    """All in a frame turned upside down and shifted: the same pixels, and the points there are the same points."""
+    """In a frame that is turned upside down and shifted, pixels and back-projected points are the same."""
     turn, shift = quat_from_rotvec([np.pi * 0.6, np.pi * 0.8, 0.0]), np.array([3.0, -2.0, 7.0])
     eye, there = camera(lens, interface), points(interface, 50)
     normal = quat_rotate(turn, interface.normal)
@@ -99,7 +100,7 @@ def test_the_choice_of_frame_changes_no_pixel(lens, interface):
 
 @every_interface
 def test_the_surface_point_obeys_snell(interface):
-    """Where the ray crosses the near face, the sine before and the sine in the first medium behind keep n sin equal."""
+    """Where the ray crosses the near face, n sin is equal before it and in the first medium behind it."""
     eye, there = camera(LENSES["pinhole"], interface), points(interface)
     seen = project(eye, interface, there)
     before = eye.lens.rays(seen.pixels)[0] @ eye.R_pc.T
@@ -122,7 +123,7 @@ def test_the_surface_point_obeys_snell(interface):
 
 @pytest.mark.parametrize("name", ["surface", "wall", "z down", "from the water"])
 def test_on_the_face_itself_points_are_where_they_are(name):
-    """Toward the interface the pixel tends to that of the straight line to the point on it, and meets it there."""
+    """Towards the interface the pixel tends to that of the straight line to the point on it, and equals it there."""
     interface = INTERFACES[name]
     eye = camera(LENSES["plumb_bob"], interface)
     there = points(interface, 20, spread=0.6)
@@ -143,7 +144,7 @@ def test_on_the_face_itself_points_are_where_they_are(name):
 @every_interface
 @every_lens
 def test_straight_below_the_camera(lens, interface):
-    """On the camera's own normal the ray goes straight, and all around it the pixel is continuous."""
+    """On the interface's normal through the camera the ray is straight, and around it the pixel is continuous."""
     eye = camera(lens, interface)
     below = eye.position - (interface.distance(eye.position) + interface.thickness + 0.7) * interface.normal
     straight, _ = lens.project((below - eye.position) @ eye.R_pc)
@@ -158,7 +159,8 @@ def test_straight_below_the_camera(lens, interface):
 
 @pytest.mark.parametrize("height", [1.0, 1e-3, 1e-6, 1e-9, 1e-12])
 def test_a_camera_close_to_the_water(height):
-    """Down to a picometre above the surface: inside Snell's window the ray comes in at its angle, outside it grazes."""
+    """Down to a picometre above the surface, rays inside Snell's window enter at their angle, those outside
+    graze it."""
     interface = Interface.water(0.0)
     eye = camera(LENSES["wide"], interface, height)
     there = eye.position + np.array([[0.3, 0.0, -0.5], [0.0, 0.9, -1.0], [3.0, 0.0, -1.0], [0.0, 50.0, -0.1]])
@@ -178,7 +180,7 @@ def test_a_camera_close_to_the_water(height):
 
 
 def test_five_metres_of_water_at_a_grazing_view():
-    """5 m deep and 40 m away, seen from 0.3 m above: found, and traced back to a micrometre."""
+    """A point 5 m deep and 40 m away, seen from 0.3 m above, is projected and traced back to a micrometre."""
     interface = Interface.water(0.0)
     eye = camera(LENSES["wide"], interface, 0.3)
     there = np.array([[40.0, 0.0, -5.0], [0.0, -40.0, -5.0]])
@@ -188,7 +190,7 @@ def test_five_metres_of_water_at_a_grazing_view():
 
 
 def test_every_refusal_says_why():
-    """Each reason occurs where its physics is, gives NaN, and is counted under its name."""
+    """Each reason occurs where its physics applies, gives NaN, and is counted by name."""
     water, dry = Interface.water(0.0), INTERFACES["from the water"]
     eye, diver = camera(LENSES["wide"], water), camera(LENSES["wide"], dry)
     assert back_project(eye, water, [1e5, 0.0]).status == Status.NO_RAY  # past the field of view
@@ -223,7 +225,7 @@ def test_every_refusal_says_why():
 
 
 def test_a_drowned_camera_is_told_so():
-    """A camera on the far side of its own interface sees nothing, rather than something wrong."""
+    """A camera on the far side of its own interface gets no pixel rather than a wrong one."""
     water = Interface.water(0.96)
     eye = camera(LENSES["pinhole"], water, -0.2)
     assert back_project(eye, water, [640.0, 360.0]).status == Status.AWAY
@@ -231,7 +233,7 @@ def test_a_drowned_camera_is_told_so():
 
 
 def test_planes_that_a_ray_does_not_meet():
-    """Above the surface: AWAY; along the ray: PARALLEL; a plane without a direction is refused."""
+    """A plane above the surface gives AWAY, one along the ray PARALLEL; a plane without a direction is refused."""
     water = Interface.water(0.96)
     eye = camera(LENSES["pinhole"], water)
     rays = back_project(eye, water, [[600.0, 300.0], [700.0, 400.0]])
@@ -240,14 +242,14 @@ def test_planes_that_a_ray_does_not_meet():
     assert np.isnan(points_[0]).all() and points_[1, 2] == 0.2
     along = np.cross(rays.direction[0], [1.0, 0.0, 0.0])
     assert rays.at_plane(along, -1.0)[1][0] == Status.PARALLEL
-    level, _ = rays.at_plane([0.0, 0.0, -2.0], 0.4)  # of any length: z = 0.2
+    level, _ = rays.at_plane([0.0, 0.0, -2.0], 0.4)  # a normal of any length: z = 0.2
     np.testing.assert_allclose(level, rays.at_z(0.2)[0], atol=1e-12)
     with pytest.raises(OpticsError, match="expected a direction"):
         rays.at_plane([0.0, 0.0, 0.0], 1.0)
 
 
 def test_batches_of_any_shape():
-    """A batch equals single calls; one pixel on many heights broadcasts; the empty batch is empty."""
+    """A batch equals single calls; one pixel with many heights broadcasts; the empty batch is empty."""
     interface = INTERFACES["window"]
     eye = camera(LENSES["plumb_bob"], interface)
     there = points(interface, 12).reshape(2, 3, 2, 3)

@@ -1,4 +1,4 @@
-"""The ray through a stack of layers: Fermat's principle, Snell's law, the slab, and starts from anywhere."""
+"""The ray through a stack of layers: Fermat's principle, Snell's law, the slab, and the range of geometries."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ every_stack = pytest.mark.parametrize("index", STACKS.values(), ids=STACKS.keys(
 
 
 def moves(r, thickness, index):
-    """Sideways moves t_i tan(theta_i) of the ray that was found, and n_i sin(theta_i), of every layer."""
+    """Return the sideways distances t_i tan(theta_i) of the solved ray, and n_i sin(theta_i), of every layer."""
     r2 = np.asarray(r, float) ** 2
     found = solve_stack(r2, thickness, index)
     u = found.g * np.sqrt(r2)
@@ -31,7 +31,7 @@ def moves(r, thickness, index):
 
 @every_stack
 def test_no_path_is_shorter(index):
-    """Fermat: of all broken lines between the two points, the ray that was found has the least optical path."""
+    """By Fermat's principle, the solved ray has the least optical path of all broken lines between the two points."""
     rng = np.random.default_rng(3)
     for _ in range(5):
         thickness = list(rng.uniform(0.05, 2.0, len(index)))
@@ -54,7 +54,7 @@ def test_no_path_is_shorter(index):
         assert path(ours[:-1]) <= least + 1e-14
         np.testing.assert_allclose(
             ours[:-1], brute, atol=3e-7
-        )  # a minimum is flat: root of the rounding of the path
+        )  # a minimum is flat: the root of the rounding error of the path
         shifted = [path(ours[:-1] + d) - path(ours[:-1]) for d in (1e-4, -1e-4)]
         assert min(shifted) > 0.0
 
@@ -63,9 +63,9 @@ def test_no_path_is_shorter(index):
 @pytest.mark.parametrize("near", [0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
 @pytest.mark.parametrize("far", [0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
 def test_finds_the_ray_from_anywhere(index, near, far):
-    """From straight down to a thousand times wider than deep, and on either face: the moves add up to r."""
+    """From straight down to a thousand times wider than deep, and on either face, the sideways distances sum to r."""
     if near == far == 0.0:
-        return  # both points lie in the plane: nothing to cross
+        return  # both points lie in the plane, so there is nothing to cross
     r = np.concatenate([[0.0], np.logspace(-12, 3, 200)])
     thickness = [near, *[0.01] * (len(index) - 2), far]
     moved, _ = moves(r, thickness, index)
@@ -73,7 +73,7 @@ def test_finds_the_ray_from_anywhere(index, near, far):
 
 
 def test_small_angles_give_the_apparent_depth():
-    """To first order in the angle, water of depth d seen from above looks d n_air/n_water deep."""
+    """To first order in the angle, water of depth d seen from above appears d n_air/n_water deep."""
     r = np.array([1e-3, 1e-4, 1e-5])
     found = solve_stack(r * r, [1.2, np.full(3, 0.8)], [1.0, 1.333])
     apparent = 1.0 / found.near_slope - 1.2
@@ -82,13 +82,13 @@ def test_small_angles_give_the_apparent_depth():
 
 
 def test_a_slab_shifts_a_ray_parallel_to_itself():
-    """Glass in air: the ray leaves at its angle a, shifted by t sin(a) (1 - cos(a)/sqrt(n² - sin²(a)))."""
+    """For glass in air, the ray leaves at its angle a, shifted by t sin(a) (1 - cos(a)/sqrt(n² - sin²(a)))."""
     t, n, a = 0.05, 1.49, np.radians([1.0, 20.0, 45.0, 70.0, 85.0])
     inside = np.arcsin(np.sin(a) / n)
     r = 1.5 * np.tan(a) + t * np.tan(inside)  # 0.8 m before, 0.7 m behind the glass
     moved, sine = moves(r, [0.8, t, np.full(5, 0.7)], [1.0, n, 1.0])
     np.testing.assert_allclose(sine, np.sin(a), rtol=1e-12)
     np.testing.assert_allclose(moved[2] / 0.7, np.tan(a), rtol=1e-12)
-    sideways = t * np.tan(a) - moved[1]  # against the ray as if there were no glass
+    sideways = t * np.tan(a) - moved[1]  # relative to the ray without glass
     expected = t * np.sin(a) * (1 - np.cos(a) / np.sqrt(n**2 - np.sin(a) ** 2))
     np.testing.assert_allclose(sideways * np.cos(a), expected, rtol=1e-12)
