@@ -8,6 +8,7 @@ from finssim.localization.fusion.attitude import (
     Tilt,
     TiltGains,
     follow,
+    height_above_origin,
     in_body_axes,
     roll_pitch,
     tilt_from,
@@ -30,6 +31,14 @@ def test_gravity_tells_roll_and_pitch(roll, pitch):
     found = roll_pitch(tilt_from(at_rest(roll, pitch)).up)
     assert found == pytest.approx((roll, pitch))
     np.testing.assert_allclose(up_of(roll, pitch) * GRAVITY, at_rest(roll, pitch), atol=1e-12)
+
+
+def test_a_point_ahead_sinks_with_the_nose():
+    """The height of a point of the body is its component along "up"; nose down, a point ahead is below the origin."""
+    rng = np.random.default_rng(1)
+    for roll, pitch, *point in rng.uniform(-1.5, 1.5, (20, 5)):
+        assert height_above_origin(point, roll, pitch) == pytest.approx(up_of(roll, pitch) @ point)
+    assert height_above_origin((1.0, 0.0, 0.0), 0.0, 0.2) == pytest.approx(-np.sin(0.2))
 
 
 def test_nose_down_is_positive_and_lifts_the_force_off_the_nose():
