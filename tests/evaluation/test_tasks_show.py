@@ -82,7 +82,7 @@ def test_a_task_of_ones_own_is_shown(capsys):
     """It is given by file and class; its own words replace the weights."""
     assert finssim("tasks", "show", f"{EXAMPLE}:KeepDepth") == 0
     out = capsys.readouterr().out
-    assert "keep-depth: Come to a depth" in out and "baselines: none" in out and "cheap thrusts" in out
+    assert "keep-depth: Reach a depth" in out and "baselines: none" in out and "a slope near the depth" in out
 
 
 def test_what_there_is_not_is_refused(capsys):
