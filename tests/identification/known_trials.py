@@ -1,4 +1,4 @@
-"""Synthetic trials of catalogue vehicles, simulated once, and what a fit of them should find."""
+"""Synthetic trials of catalogue vehicles, simulated once, and the expected results of a fit."""
 
 from functools import cache
 
@@ -12,20 +12,20 @@ NOISE = NoiseProfile(velocity_std=0.01, gyro_std=0.005, attitude_std=0.004)
 
 @cache
 def recorded(name, axes, kind="published", levels=()):
-    """Vehicle, programmes and true motion; measuring it again with another seed costs little."""
+    """Return vehicle, programmes and true motion, cached: measuring it again with another seed is cheap."""
     vehicle = load_vehicle(name)
     chosen = programmes(list(axes), vehicle, kind=kind, levels=dict(levels))
     return vehicle, chosen, record(chosen, vehicle, seed=0)
 
 
 def trials(name, *axes, noise=NOISE, seed=0, rate=50.0, kind="published", levels=(), **columns):
-    """Vehicle and synthetic trials of it; `levels` are pairs of an axis and its magnitudes."""
+    """Return a vehicle and synthetic trials of it; `levels` are pairs of an axis and its magnitudes."""
     vehicle, chosen, recording = recorded(name, axes, kind, levels)
     return vehicle, trials_of(recording, chosen, vehicle, noise=noise, seed=seed, rate=rate, **columns)
 
 
 def truth(vehicle):
-    """Name of an estimate -> the number of the vehicle file, about the reference point of its coefficients."""
+    """Return the vehicle file's value of each estimate, about the reference point of its coefficients."""
     plant = matrices(vehicle)
     out = {"buoyancy_excess": plant.excess}
     for i, axis in enumerate(AXES):

@@ -1,4 +1,4 @@
-"""A fit made by hand, with every kind of outcome: written, unidentifiable, without a place in the file."""
+"""A hand-made fit with every kind of outcome: written, unidentifiable, without a key in the vehicle file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SET = "hydrodynamics.calibrated"
 
 
 def made_fit(vehicle: Vehicle | None = None, **changes: Any) -> Fit:
-    """Surge told, yaw's quadratic term not, thrust without a place of its own, one lag for every thruster."""
+    """Return a fit with surge identified, yaw's quadratic term not, thrust without a key, one lag for all thrusters."""
     t = np.linspace(0.0, 10.0, 60)
     estimates = [
         ("surge.m_eff", 30.1, (29.0, 31.2), "kg", True, "", None),

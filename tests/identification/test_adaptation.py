@@ -1,4 +1,4 @@
-"""Changes of a vehicle while it is driven: payload, weak thruster and drag, in simulated driving with known truth."""
+"""Changes of a vehicle during a drive: payload, weak thruster and drag, in simulated driving with known truth."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,8 @@ def fouled():
 
 @cache
 def driven(plant=dict, seed=1):
-    """A trial of all axes with the noise of the vehicle's sensors; `plant` gives where the vehicle differs."""
+    """Return a trial of all axes with the noise of the vehicle's sensors; `plant` gives its differences from
+    the file."""
     programme = multisine(PLAY, VEHICLE, seed=seed, duration=28.0, band=(0.1, 1.0))
     columns = ("u", "v", "w", "p", "q", "r", "roll", "pitch", "yaw", "x", "y", "z")
     options = {"inputs": ("command",), "columns": columns, "noise": "sensors"}
@@ -59,7 +60,7 @@ def driven(plant=dict, seed=1):
 
 @pytest.mark.slow
 def test_motors_that_stand_still_below_their_slowest_speed_are_not_weak():
-    """Vertical motors that small commands do not turn: nothing has changed."""
+    """If small commands do not turn the vertical motors, no change is reported."""
     vertical = [name.startswith("V") for name in VEHICLE.thruster_names]
 
     def stand_still(simulator):
@@ -84,7 +85,7 @@ def test_motors_that_stand_still_below_their_slowest_speed_are_not_weak():
 
 @pytest.mark.parametrize("end", (4.999999999999998, 5.0, 5.05))
 def test_times_that_are_rounded_are_thinned(end):
-    """The last of every tenth of a second may lie a rounding error behind the last sample."""
+    """The last multiple of a tenth of a second may lie a rounding error after the last sample."""
     segment = next(windows_of(driven(), VEHICLE))[0]
     t = np.linspace(0.0, end, 101)
     (thin, values) = _thinned(replace(segment, measured={"u": (t, t)})).measured["u"]
@@ -114,7 +115,7 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_what_changed_is_found_and_nothing_else(case):
-    """Within 30 s of driving: the interval holds the truth and not the file's number; no other estimate differs."""
+    """Within 30 s, the interval contains the truth and excludes the file's value; no other estimate differs."""
     plant, truth = CASES[case]
     adaptation = followed(driven(plant))
     assert differing(adaptation) == set(truth)
@@ -125,7 +126,7 @@ def test_what_changed_is_found_and_nothing_else(case):
 
 @pytest.mark.slow
 def test_a_sudden_change_is_followed_at_once():
-    """After 60 s as the file says, the first window with a payload renews the estimate, and holds the new weight."""
+    """After 60 s without change, the first window with a payload renews the estimate, which contains the new weight."""
     adaptation = followed(driven(), driven(seed=2))
     assert differing(adaptation) == set() and adaptation.renewed == []
     adaptation.update(next(windows_of(driven(payload, seed=3), VEHICLE)))
@@ -136,7 +137,7 @@ def test_a_sudden_change_is_followed_at_once():
 
 @pytest.mark.slow
 def test_the_adapted_vehicle_moves_as_the_changed_one():
-    """Its forces are those of the changed plant: volume and centre, thrust, drag; everything else keeps its number."""
+    """Its forces are those of the changed plant: volume and centre, thrust, drag; all other values are unchanged."""
     adapted = followed(driven(payload), driven(payload, seed=2)).adapted
     weight = (VEHICLE.body.displaced_volume - adapted.body.displaced_volume) * GRAVITY
     assert weight == pytest.approx(6.0, abs=0.6)
@@ -149,7 +150,7 @@ def test_the_adapted_vehicle_moves_as_the_changed_one():
 
 @pytest.mark.slow
 def test_a_follower_of_live_states_finds_what_the_log_shows():
-    """The same states one by one, of which a gap begins a new window; windows are fitted in order."""
+    """The same states arrive one by one; a gap begins a new window, and windows are fitted in order."""
     trial = driven(weak_thruster)
     follower = Follower(VEHICLE)
     channels = trial.channels
@@ -167,7 +168,7 @@ def test_a_follower_of_live_states_finds_what_the_log_shows():
 
 @pytest.mark.slow
 def test_the_command_writes_the_vehicle_as_it_is_now(tmp_path, capsys):
-    """`calibrate changes`: JSON with the estimates, and a file that loads."""
+    """`calibrate changes` writes JSON with the estimates, and a file that loads."""
     write_trial(driven(fouled), tmp_path / "dive")
     out = tmp_path / "now.yaml"
     calibrate_changes([tmp_path / "dive"], vehicle="finsrov", out=out, as_json=True)
@@ -191,7 +192,7 @@ def test_a_trial_without_motion_and_a_vehicle_without_coefficients_are_refused(t
 
 
 def test_what_a_window_does_not_show_moves_nothing_and_is_no_contradiction():
-    """A direction whose information is rounding, of either sign, keeps the state however large the quotient is."""
+    """A direction whose information is rounding, of either sign, keeps its state, however large the quotient."""
     J, right = np.diag([4.0, 1e-12, -1e-12]), np.array([8.0, 1e-3, 1e-3])
     size, along, y = _whitened(np.eye(3), J, right)
     moved = along @ (y * size / (1.0 + size))

@@ -1,4 +1,4 @@
-"""From a fit to a vehicle: what the data determine is written, with interval and trials, and nothing else."""
+"""From a fit to a vehicle: only parameters that the data determine are written, with interval and trials."""
 
 import dataclasses
 import io
@@ -24,7 +24,7 @@ from identification.made_fits import SET, made_fit
 
 
 def test_only_what_the_data_determine_is_written():
-    """Numbers and origins of everything else stay, those that could not be identified included."""
+    """All other values and origins are kept, including those that could not be identified."""
     fit = made_fit()
     before, after = fit.before, calibrated(fit)
     assert after.hydrodynamic_set("calibrated").linear_damping[0, 0] == 39.1
@@ -49,7 +49,7 @@ def test_only_what_the_data_determine_is_written():
 
 
 def test_a_matrix_given_whole_marks_the_entries_that_moved():
-    """A fit may hand over a full matrix: entries that it left alone keep their origin."""
+    """A fit may return a full matrix: entries that it did not change keep their origin."""
     D1 = np.array(load_vehicle("finsrov").hydrodynamic_set("calibrated").linear_damping)
     D1[0, 0], D1[1, 5], D1[5, 1] = 39.1, 0.5, 0.25
     after = calibrated(made_fit(changes={f"{SET}.linear_damping": D1}))
@@ -60,7 +60,7 @@ def test_a_matrix_given_whole_marks_the_entries_that_moved():
 
 
 def test_groups_may_name_their_thrusters():
-    """An estimate for a propeller group is the note of each of its thrusters, and of no other."""
+    """An estimate for a propeller group appears in the note of each of its thrusters, and of no other."""
     fit = made_fit()
     one = dataclasses.replace(
         fit.estimates["surge.d1"],
@@ -83,7 +83,7 @@ def test_groups_may_name_their_thrusters():
 
 
 def test_calibrations_follow_each_other(tmp_path):
-    """Thruster, motor and hydrodynamics in sequence, through files: all records stay, oldest first."""
+    """Thruster, motor and hydrodynamics in sequence, through files: all records are kept, oldest first."""
     vehicle = load_vehicle("finsrov")
     for i, kind in enumerate(("thruster", "motor", "hydrodynamics")):
         fit = made_fit(vehicle, kind=kind, trials={f"trial {i}": f"{i}" * 64})
@@ -96,14 +96,14 @@ def test_calibrations_follow_each_other(tmp_path):
 
 
 def test_equal_fits_make_equal_files(tmp_path):
-    """No clock time enters."""
+    """They contain no clock time."""
     for name in ("a.yaml", "b.yaml"):
         write_vehicle(calibrated(made_fit()), tmp_path / name)
     assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
 
 
 def test_an_interrupted_fit_says_so(tmp_path):
-    """In the record and in the origin of every number."""
+    """The interruption is noted in the record and in the origin of every number."""
     write_vehicle(calibrated(made_fit(interrupted=True)), tmp_path / "v.yaml")
     vehicle = load_vehicle(tmp_path / "v.yaml")
     assert vehicle.calibrations[0].interrupted
@@ -111,13 +111,13 @@ def test_an_interrupted_fit_says_so(tmp_path):
 
 
 def test_estimates_that_no_vehicle_can_have_are_refused():
-    """A mass matrix that is not positive definite is a sentence, not a vehicle."""
+    """A mass matrix that is not positive definite is refused in a sentence."""
     with pytest.raises(CalibrationError, match="do not form a valid vehicle: .*not positive definite"):
         calibrated(made_fit(changes={f"{SET}.added_mass.0.0": -400.0}))
 
 
 def test_an_unphysical_vehicle_is_reported():
-    """Damping that gives energy is a finding that its parent did not have."""
+    """Damping that adds energy is a finding that its parent did not have."""
     fit = made_fit(
         changes={f"{SET}.linear_damping.1.1": -4.0}, quality={"sway": {"r2": -0.5}, "surge": {"r2": 0.9}}
     )
@@ -132,7 +132,7 @@ def test_an_unphysical_vehicle_is_reported():
 
 
 def test_json_has_the_keys_of_the_contract():
-    """Every parameter with estimate, ci95, unit, identifiable and note; what is not finite is null."""
+    """Every parameter has estimate, ci95, unit, identifiable and note; non-finite values are null."""
     fit = made_fit()
     found = json.loads(json.dumps(fit_json(fit, calibrated(fit), findings=fit.findings), allow_nan=False))
     assert found.keys() >= {
@@ -147,7 +147,7 @@ def test_json_has_the_keys_of_the_contract():
 
 
 def test_the_table_fits_a_hundred_columns():
-    """Every parameter, its interval, what the file had and what became of it, on lines of 100 columns at most."""
+    """Every parameter, its interval, the file's value and the outcome are on lines of 100 columns at most."""
     fit = made_fit()
     text = io.StringIO()
     fit_report(fit, calibrated(fit), fit.findings).show(Console(file=text, width=100))
@@ -161,7 +161,7 @@ def test_the_table_fits_a_hundred_columns():
 
 
 def test_a_thrust_scale_is_the_note_of_what_it_multiplies():
-    """Coefficients and limits of every thruster say which scale they had."""
+    """The notes of coefficients and limits of every thruster state their scale."""
     vehicle = load_vehicle("finsrov")
     changes = {f"thrusters.{name}.c_plus": 0.97 * t.c_plus for name, t in vehicle.thrusters.items()}
     fit = made_fit(changes=changes)
@@ -175,7 +175,7 @@ def test_a_thrust_scale_is_the_note_of_what_it_multiplies():
 
 
 def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):
-    """The file had nothing there, which is zero; its row is readable however long the notes are."""
+    """The file's missing entry counts as zero; its row is readable however long the notes are."""
     fit = made_fit(changes={f"{SET}.linear_damping.1.5": 0.5})
     after = calibrated(fit)
     assert number_in(fit.before, f"{SET}.linear_damping.1.5") == 0.0
@@ -186,7 +186,7 @@ def test_a_coupling_of_a_diagonal_matrix_was_zero(tmp_path):
 
 
 def test_a_part_of_the_drag_is_written_as_unsure():
-    """Linear and quadratic damping go into the file together where only their sum is told."""
+    """Linear and quadratic damping are written together where only their sum is identifiable."""
     fit = made_fit(
         changes={f"{SET}.linear_damping.5.5": 0.4, f"{SET}.quadratic_damping.5.5": 0.1},
     )

@@ -1,4 +1,4 @@
-"""Ranges written from intervals are ranges that training takes, and episodes stay inside them."""
+"""Ranges written from intervals are accepted by training, and episodes stay inside them."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ def test_the_rule():
     assert factors["linear_damping.sway"] == (0.9, 1.1, "not fitted")
     assert factors["time_constant"][:2] == pytest.approx((0.1 / 0.15, 0.2 / 0.15))
     assert factors["thrust.all"][:2] == pytest.approx((0.95 / 0.97, 0.99 / 0.97), abs=0.001)
-    assert "quadratic_damping.surge" not in factors  # it is zero: a factor on it is nothing
+    assert "quadratic_damping.surge" not in factors  # a factor on zero has no effect
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_the_rule():
     ],
 )
 def test_factors_are_possible_whatever_the_interval(estimate, ci95, expected):
-    """Very narrow, across zero, very wide, about nothing, unknown."""
+    """The cases are very narrow, across zero, very wide, around zero, and unknown intervals."""
     one = Estimate(
         name="sway.d1",
         estimate=estimate,
@@ -56,7 +56,7 @@ def test_factors_are_possible_whatever_the_interval(estimate, ci95, expected):
 
 
 def test_buoyancy_moves_the_volume():
-    """An excess of 1 N to 2 N of a vehicle that weighs W is a volume of (W + 1)/(W + 1.5) to (W + 2)/(W + 1.5)."""
+    """For a vehicle of weight W, 1 N to 2 N of excess is a volume of (W + 1)/(W + 1.5) to (W + 2)/(W + 1.5)."""
     one = Estimate(name="buoyancy_excess", estimate=1.5, ci95=(1.0, 2.0), unit="N", identifiable=True)
     fit = dataclasses.replace(made_fit(), estimates={"buoyancy_excess": one}, changes={})
     vehicle = calibrated(fit)
@@ -67,7 +67,7 @@ def test_buoyancy_moves_the_volume():
 
 
 def test_every_episode_stays_within_the_intervals(tmp_path):
-    """Training's environment with these ranges: the drawn damping fills the 95 % interval and never leaves it."""
+    """In training's environment with these ranges, the drawn damping fills the 95 % interval and never leaves it."""
     fit = made_fit()
     vehicle = calibrated(fit)
     write_ranges(fit, tmp_path / "pool.yaml", vehicle)
@@ -92,7 +92,7 @@ def test_the_file_says_why(tmp_path):
 
 @pytest.mark.parametrize("name", ["bluerov2", "rexrov", "remus100", "warpauv"])
 def test_other_vehicles(tmp_path, name):
-    """Six thrusters, full matrices, one propeller, no calibrated set before the fit: a file that loads."""
+    """Six thrusters, full matrices, one propeller, or no calibrated set before the fit each give a file that loads."""
     vehicle = load_vehicle(name)
     changes = {f"{SET}.linear_damping.0.0": 39.1}
     if "calibrated" not in vehicle.hydrodynamics:
@@ -103,6 +103,6 @@ def test_other_vehicles(tmp_path, name):
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
-    """Another suffix."""
+    """A file with another suffix is refused."""
     with pytest.raises(CalibrationError, match=r"expected \.yaml"):
         write_ranges(made_fit(), tmp_path / "r.json")

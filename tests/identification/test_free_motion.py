@@ -1,4 +1,4 @@
-"""Trials without thrust: frequency and damping of a swing, drag of a coast, speed of a rise, and what was assumed."""
+"""Trials without thrust: frequency and damping of a swing, drag of a coast, speed of a rise, and assumptions."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ HINSDALE = Path(__file__).parents[1] / "data" / "hinsdale"
 HEAVY = load_vehicle("bluerov2_heavy")
 
 NEUTRAL = HEAVY.replace({"body.displaced_volume": HEAVY.weight / (HEAVY.water.density * HEAVY.water.gravity)})
-"""It stays in place while it swings: one that sinks is turned upright by its added mass as well."""
+"""Vehicle that keeps its depth while it swings: in a sinking one, added mass contributes to the righting moment."""
 
 ROV = load_vehicle("bluerov2")
 
@@ -27,7 +27,7 @@ SHAPES = {"linear": (0.25, 0.0), "quadratic": (0.0, 0.7), "both": (0.1, 0.5)}
 
 
 def decay(w2, c1, c2, *, seed, angle=0.15, release=3.0, duration=20.0, axis="roll", trim=0.03, drift=0.0):
-    """Return a trial at 50 Hz of a vehicle that is held at an angle and let go.
+    """Return a trial at 50 Hz of a vehicle that is held at an angle and released.
 
     phi_dot_dot + c1 phi_dot + c2 |phi_dot| phi_dot + w2 (sin phi - trim) = 0, with noise; the trim moves by `drift`
     [1/s] from the release on.
@@ -50,7 +50,7 @@ def decay(w2, c1, c2, *, seed, angle=0.15, release=3.0, duration=20.0, axis="rol
 
 
 def rise(speed, z, noise=0.003, seed=0):
-    """Return a trial at 20 Hz whose depth is measured, of a height z [m] that a speed [m/s] leads to."""
+    """Return a trial at 20 Hz with measured depth, for a height z [m] that follows from a speed [m/s]."""
     t = 0.05 * np.arange(len(speed))
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * 0.05])
     z = z + way + noise * np.random.default_rng(seed).normal(size=len(t))
@@ -66,7 +66,7 @@ def speed_and_way(t, v0, c1, c2):
 
 
 def coasts(rng, c1, c2, *, count=6, noise=0.004, column="yaw", rate=30.0, seconds=15.0):
-    """Return trials of a heading, a rate, or a velocity of a vehicle that stays level and on its course."""
+    """Return trials with a heading, a rate, or a velocity of a vehicle that stays level and on course."""
     out = []
     for k in range(count):
         t = np.arange(0.0, seconds, 1.0 / rate)
@@ -86,7 +86,7 @@ def coasts(rng, c1, c2, *, count=6, noise=0.004, column="yaw", rate=30.0, second
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis", "w2", "c1", "c2"), [("roll", 4.0, 0.4, 0.0), ("pitch", 6.0, 0.0, 3.0)])
 def test_a_swing_gives_frequency_and_damping(axis, w2, c1, c2):
-    """Ratios to the inertia and the right kind of damping come back, and the release is found."""
+    """The ratios to the inertia and the right kind of damping are recovered, and the release is found."""
     trial = decay(w2, c1, c2, seed=1, axis=axis)
     begin = released(streams(trial, NEUTRAL), [axis]).drive.spans[0, 0]
     assert (
@@ -105,19 +105,19 @@ def test_a_swing_gives_frequency_and_damping(axis, w2, c1, c2):
 
 @pytest.mark.slow
 def test_intervals_of_a_swing_hold_the_truth():
-    """In most of 10 noisy decays, those of frequency and damping do."""
+    """In most of 10 noisy decays, the intervals of frequency and damping contain the truth."""
     hits = np.zeros(2)
     for seed in range(10):
         trial = decay(5.0, 0.5, 0.0, seed=seed, duration=12.0)
         found = fit_by_simulation([trial], NEUTRAL, damping="linear").estimates
         ends = [found[f"roll.{name}"].ci95 for name in ("natural_frequency", "d1/m_eff")]
         hits += [low <= value <= high for (low, high), value in zip(ends, (np.sqrt(5.0), 0.5), strict=True)]
-    assert (hits >= 7).all()  # 9.5 expected; 1 in 900 has fewer
+    assert (hits >= 7).all()  # 9.5 expected; 1 case in 900 has fewer
 
 
 @pytest.mark.slow
 def test_an_equilibrium_that_moves_is_followed():
-    """A trim that drifts, as under a moving arm, does not bend the damping."""
+    """A drifting trim, as with a moving arm, does not bias the damping."""
     fit = fit_by_simulation([decay(4.0, 0.4, 0.0, seed=2, drift=0.02, duration=16.0)], NEUTRAL)
     assert fit.estimates["roll.d1/m_eff"].estimate == pytest.approx(0.4, rel=0.05)
     assert fit.estimates["roll.natural_frequency"].estimate == pytest.approx(2.0, rel=0.02)
@@ -125,7 +125,7 @@ def test_an_equilibrium_that_moves_is_followed():
 
 @pytest.mark.slow
 def test_absolute_values_name_what_was_assumed():
-    """With the stiffness or with the inertia as known: which is stated, and both agree in ratio."""
+    """Either the stiffness or the inertia is assumed known, which is stated; both agree in the ratio."""
     trials = [decay(4.0, 0.4, 0.0, seed=s) for s in range(2)]
     k = HEAVY.buoyancy * HEAVY.body.center_of_buoyancy[2]
     stiff = fit_by_simulation(trials, NEUTRAL, axes=["roll"]).estimates
@@ -140,7 +140,7 @@ def test_absolute_values_name_what_was_assumed():
 
 @pytest.mark.slow
 def test_releases_that_disagree_widen_the_interval():
-    """Four equal decays give a narrow interval; where frequencies differ by a fifth it holds all of them."""
+    """Four equal decays give a narrow interval; if frequencies differ by a fifth, it contains all of them."""
     same, apart = (
         fit_by_simulation(
             [decay(w2, 0.4, 0.0, seed=seed) for seed, w2 in enumerate((4.0, 4.0, other, other))],
@@ -169,7 +169,7 @@ def test_a_vehicle_at_rest_does_not_swing():
 @pytest.mark.slow
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_a_rise_gives_terminal_speed_and_excess(quadratic):
-    """From rest: the speed where drag equals the excess, and the excess over the mass from the acceleration."""
+    """From rest: the speed at which drag equals the excess, and the excess over the mass from the acceleration."""
     e, top = 0.08, 0.2
     speed, w = np.zeros(400), 0.0
     for i in range(40, 400):
@@ -181,7 +181,7 @@ def test_a_rise_gives_terminal_speed_and_excess(quadratic):
     assert found["heave.terminal_speed"].estimate == pytest.approx(top, rel=0.01)
     assert found[f"heave.{'d1' if quadratic else 'd2'}"].ci95[0] == 0.0
     m = float(np.diag(HEAVY.mass_matrix())[2])
-    # At one speed the other shape keeps a tenth of the probability, and draws the excess along.
+    # At one speed the other shape keeps a tenth of the probability, and biases the excess.
     assert found["buoyancy_excess"].estimate == pytest.approx(e * m, rel=0.1)
     assert found["buoyancy_excess"].ci95[0] < e * m < found["buoyancy_excess"].ci95[1]
     assert "from the acceleration" in found["buoyancy_excess"].note
@@ -189,7 +189,7 @@ def test_a_rise_gives_terminal_speed_and_excess(quadratic):
 
 @pytest.mark.slow
 def test_a_file_that_sinks_where_the_vehicle_rises_is_reported():
-    """A rise contradicts a file heavier than water, even where the excess is not known well enough to be written."""
+    """A rise contradicts a file heavier than water, even if the excess is too uncertain to be written."""
     t = np.arange(0.0, 20.0, 0.05)
     speed = 0.2 * (1.0 - np.exp(-np.maximum(t - 2.0, 0.0) / 2.5))
     sinks = HEAVY.replace({"body.displaced_volume": 0.995 * HEAVY.weight / 9810.0})
@@ -206,7 +206,7 @@ def test_a_file_that_sinks_where_the_vehicle_rises_is_reported():
     ("column", "shape"), [("yaw", "quadratic"), ("r", "both"), ("u", "linear"), ("v", "quadratic")]
 )
 def test_a_coast_gives_drag_over_inertia(column, shape):
-    """From a heading alone, a gyro, or a velocity; the file's inertia scales it."""
+    """The data are a heading alone, a gyro, or a velocity; the file's inertia scales the drag."""
     c1, c2 = SHAPES[shape]
     axis = {"yaw": "yaw", "r": "yaw", "u": "surge", "v": "sway"}[column]
     fit = fit_by_simulation(coasts(np.random.default_rng(1), c1, c2, column=column), ROV)
@@ -224,10 +224,10 @@ def test_a_coast_gives_drag_over_inertia(column, shape):
 
 @pytest.mark.slow
 def test_the_shape_of_drag_is_right_and_its_interval_holds_the_truth():
-    """Linear or quadratic alone is most probable in at least 10 of 12 draws, and the interval of the ratio holds the
-    truth in at least 9.
+    """The true shape, linear or quadratic, is most probable in at least 10 of 12 draws, and the interval of the ratio
+    contains the truth in at least 9.
 
-    11.6 and 11.4 are expected; 1 in 200 and 1 in 50 have fewer.
+    11.6 and 11.4 are expected; 1 case in 200 and 1 in 50 have fewer.
     """
     rng = np.random.default_rng(5)
     right = held = 0
@@ -245,8 +245,8 @@ def test_the_shape_of_drag_is_right_and_its_interval_holds_the_truth():
 
 @pytest.mark.slow
 def test_five_spins_that_agree_are_written_with_one_scatter():
-    """Five spins at 20 Hz or 1 Hz, each pulled at otherwise: the file gets the drag, the interval of its ratio is below
-    a third of it and holds the truth."""
+    """For five spins at 20 Hz or 1 Hz, each with another pull, the file gets the drag; the interval of its ratio is
+    below a third of it and contains the truth."""
     for rate in (20.0, 1.0):
         rng = np.random.default_rng(3)
         trials = coasts(rng, 0.1, 0.65, count=5, column="r", noise=0.01, rate=rate)
@@ -260,7 +260,7 @@ def test_five_spins_that_agree_are_written_with_one_scatter():
 
 @pytest.mark.slow
 def test_a_damping_that_was_asked_for_is_what_a_coast_gives():
-    """Quadratic alone: no linear term is estimated, and the file's is written as zero."""
+    """With quadratic damping alone, no linear term is estimated, and the file's is written as zero."""
     trials = coasts(np.random.default_rng(1), 0.0, 0.7, column="r", noise=0.01, count=5)
     file = ROV.replace({"hydrodynamics.calibrated.linear_damping.5.5": 0.05})
     fit = fit_by_simulation(trials, file, damping="quadratic")
@@ -270,7 +270,7 @@ def test_a_damping_that_was_asked_for_is_what_a_coast_gives():
 
 
 def test_one_coast_is_enough_and_a_push_ends_it():
-    """A single trial gets its interval from blocks; what comes after another push does not count."""
+    """A single trial gets its interval from blocks; samples after another push do not count."""
     (one,) = coasts(np.random.default_rng(2), 0.0, 0.7, count=1, column="r", noise=0.01)
     again = one.channels["r"].copy()
     again[300:] += np.sign(again[0]) * 0.4
@@ -282,14 +282,14 @@ def test_one_coast_is_enough_and_a_push_ends_it():
 
 
 def test_each_trial_is_announced_before_it_is_prepared():
-    """A person sees within a moment that something happens."""
+    """A user sees progress within a moment."""
     names = []
     prepare(coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r"), ROV, ["yaw"], names.append)
     assert names == ["coast_0", "coast_1"]
 
 
 def test_what_does_not_coast_is_refused():
-    """A vehicle at rest, and one that turns on, show no drag."""
+    """A vehicle at rest, and one that keeps turning, show no drag."""
     t = np.arange(0.0, 10.0, 0.05)
     for y in (0.001 * np.sin(t), np.full(len(t), 1.0)):
         trial = Trial(name="still", t=t, channels={"r": y}, header=Header(passive=True))
@@ -319,7 +319,7 @@ def hinsdale(name):
 
 @pytest.mark.slow
 def test_a_real_release_is_found_and_fitted():
-    """A BlueROV2 with an arm, let go by hand: roll and pitch ring with periods of about 3 s, lightly damped."""
+    """A BlueROV2 with an arm, released by hand, rolls and pitches with periods of about 3 s and light damping."""
     trial = hinsdale("traj005-1")
     assert 1.0 < released(streams(trial, HEAVY), ["roll", "pitch"]).drive.spans[0, 0] < 3.5
     fit = fit_by_simulation([trial], HEAVY, axes=["roll", "pitch"])
@@ -332,14 +332,14 @@ def test_a_real_release_is_found_and_fitted():
 
 @pytest.mark.slow
 def test_surge_and_sway_are_judged_by_a_coordinate_each():
-    """Motion capture gives no u and v: x would stand for both."""
+    """Motion capture gives no u and v, and x would be used for both."""
     fit = fit_by_simulation([hinsdale("traj005-1")], HEAVY, axes=["surge", "sway"])
     assert [curve.y_label for curve in fit.curves] == ["x [m]", "y [m]"]
 
 
 @pytest.mark.slow
 def test_real_releases_that_disagree_write_nothing():
-    """The arm moved between the two: one pitch cannot explain both, which is stated."""
+    """The arm moved between the two: one pitch stiffness does not fit both, which is stated."""
     trials = [hinsdale(name) for name in ("traj005-1", "traj_alt_009-0")]
     fit = fit_by_simulation(trials, HEAVY, axes=["pitch"])
     assert [one.subject for one in fit.findings if one.code == "axis_refused"] == ["pitch"]
@@ -347,6 +347,6 @@ def test_real_releases_that_disagree_write_nothing():
 
 
 def test_a_real_trial_without_a_release_is_refused():
-    """The arm stays still and nobody lets go: no decay, not a made-up one."""
+    """The arm stays still and the vehicle is not released: no decay is reported."""
     with pytest.raises(CalibrationError, match="does not ring down"):
         fit_by_simulation([hinsdale("baseline2")], HEAVY, axes=["roll"])

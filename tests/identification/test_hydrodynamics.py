@@ -1,4 +1,4 @@
-"""From logs as people have them to a vehicle file that replays other trials better than the catalogue's."""
+"""From logs as users record them to a vehicle file that replays other trials better than the catalogue's."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +26,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "reference" / "trial_format.md"
 
 
 def read(pattern, name, folder, tmp):
-    """Trials of a set by the map that the page on trials prints under this name."""
+    """Return the trials of a set, read with the map of this name on the page on trials."""
     block = DOCS.read_text(encoding="utf-8").split(f"# {name}\n", 1)[1].split("```", 1)[0]
     (tmp / name).write_text(block)
     files = sorted(path for p in pattern for path in (DATA / folder).glob(p))
@@ -34,13 +34,13 @@ def read(pattern, name, folder, tmp):
 
 
 def scores(vehicle, trials, **options):
-    """NRMSE by axis, the median over the trials."""
+    """Return the NRMSE by axis, as the median over the trials."""
     return replay(trials, vehicle, **options).aggregate("calibrated").by_axis
 
 
 @pytest.fixture(scope="module")
 def joystick(tmp_path_factory):
-    """Trials to fit, trials to replay."""
+    """Trials to fit, and trials to replay."""
     tmp = tmp_path_factory.mktemp("map")
     held = [f"*_{level}.csv" for level in ("040", "060")]
     return read(["*_025.csv"], "joystick.yaml", "joystick_mocap", tmp), read(
@@ -57,7 +57,8 @@ def by_sticks(joystick):
 
 @pytest.mark.slow
 def test_sticks_and_motion_capture_at_5_hz(joystick, by_sticks):
-    """Fitted at a quarter of the sticks' range, replayed at twice that: below 0.04, and better than the catalogue."""
+    """Fitted at a quarter of the sticks' range and replayed at twice that: below 0.04, and better than the
+    catalogue."""
     vehicle, fit, (_, held) = load_vehicle("bluerov2_heavy"), by_sticks, joystick
     found, before = scores(calibrated(fit), held), scores(vehicle, held)
     assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.04, found
@@ -73,7 +74,7 @@ def test_sticks_and_motion_capture_at_5_hz(joystick, by_sticks):
 
 @pytest.mark.slow
 def test_a_known_voltage_leaves_the_thrust_alone(joystick):
-    """With the voltage in the header no scale is estimated, and the masses are surer."""
+    """With the voltage in the header no scale is estimated, and the masses are more certain."""
     fitted, held = joystick
     vehicle = load_vehicle("bluerov2_heavy")
     told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in fitted]
@@ -84,7 +85,8 @@ def test_a_known_voltage_leaves_the_thrust_alone(joystick):
 
 @pytest.mark.slow
 def test_pulses_and_an_imu_without_any_velocity(tmp_path):
-    """Roll, pitch, yaw three seconds ahead and a yaw trial of a higher level, from gyro, attitude and depth alone."""
+    """Gyro, attitude and depth alone predict roll, pitch, yaw three seconds ahead, and a yaw trial of a
+    higher level."""
     vehicle = load_vehicle("bluerov2")
     fitted = read(["yaw_020*", "yaw_035*", "mixed_035*", "heave_050*"], "pulses.yaml", "pulses_imu", tmp_path)
     held = read(["yaw_050*", "mixed_050*"], "pulses.yaml", "pulses_imu", tmp_path)
@@ -110,10 +112,11 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
 
 @pytest.mark.slow
 def test_a_heading_that_decays(tmp_path):
-    """Spun by hand and weighed by nobody: quadratic drag over inertia, with an interval; an inertia scales it."""
+    """Spun by hand with unknown inertia, it gives quadratic drag over inertia, with an interval; an inertia
+    scales it."""
     vehicle = load_vehicle("bluerov2")
     trials = read(["*.csv"], "decay.yaml", "yaw_decay", tmp_path)
-    options = {"held_out": trials[:1]}  # for what replays worse there is a test below
+    options = {"held_out": trials[:1]}  # a fit that replays worse is tested below
     fit = fit_hydrodynamics(trials, vehicle, **options)
     ratio = fit.estimates["yaw.d2/m_eff"]
     assert ratio.estimate == pytest.approx(0.775, rel=0.01) and ratio.ci95[0] < 0.775 < ratio.ci95[1]
@@ -133,7 +136,7 @@ def test_a_heading_that_decays(tmp_path):
 
 @pytest.mark.slow
 def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
-    """By stretches left out in turn, or by held-out trials; the file keeps the axis that it predicts better."""
+    """The data are segments left out in turn, or held-out trials; the file keeps an axis that it predicts better."""
     vehicle = load_vehicle("bluerov2")
     slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
     words = []
@@ -158,7 +161,7 @@ def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
 
 @pytest.mark.slow
 def test_an_axis_of_the_file_goes_with_the_scale_of_thrust(by_sticks):
-    """Thrust of s and s times mass and drag move as the file does; the other axes keep their numbers."""
+    """Thrust scaled by s with s times mass and drag moves as the file does; the other axes keep their values."""
     quality = by_sticks.quality | {"surge": by_sticks.quality["surge"] | {"held_out": 1.0, "file": 0.9}}
     fit = judged(replace(by_sticks, quality=quality))
     before, after, scale = fit.before, calibrated(fit), fit.estimates["thrust_scale"].estimate
@@ -172,7 +175,7 @@ def test_an_axis_of_the_file_goes_with_the_scale_of_thrust(by_sticks):
 
 @pytest.mark.slow
 def test_places_that_the_file_has_wrong_are_found(by_sticks):
-    """Roll and pitch of the sticks' vehicle are not twice what they are, because the thrusters are too low."""
+    """Thrusters that are too low in the file are moved, so that roll and pitch do not come out twice as large."""
     height = by_sticks.estimates["thruster_height"]
     assert height.identifiable and height.ci95[0] < -0.048 < height.ci95[1] < -0.0725 + 0.04
     said = {one.subject: one for one in by_sticks.findings if one.code == "place_contradicted"}
@@ -190,7 +193,7 @@ def test_places_that_the_file_has_wrong_are_found(by_sticks):
 
 @pytest.mark.slow
 def test_a_known_inertia_tells_the_thrust(joystick, by_sticks):
-    """Yaw's inertia given: the scale is what makes the motion agree with it, and is surer than batteries are."""
+    """With yaw's inertia given, the scale follows from the motion, and is more certain than batteries allow."""
     fitted, held = joystick
     ratio = by_sticks.estimates["yaw.m_eff"].estimate / by_sticks.estimates["thrust_scale"].estimate
     vehicle = load_vehicle("bluerov2_heavy")
@@ -203,8 +206,8 @@ def test_a_known_inertia_tells_the_thrust(joystick, by_sticks):
 
 @pytest.mark.slow
 def test_published_numbers_are_data(joystick, by_sticks):
-    """A bollard pull makes the thrust surer and draws it there; a replay at twice the speed says that it extrapolates;
-    a top speed without surge and a pull where the thrust is known are refused."""
+    """A bollard pull makes the thrust more certain and draws it towards the pull; a replay at twice the speed is
+    reported as extrapolation; a top speed without surge and a pull where the thrust is known are refused."""
     fitted, held = joystick
     vehicle = load_vehicle("bluerov2_heavy")
     before, pull = by_sticks.estimates["thrust_scale"], 0.8 * float(vehicle.wrench_limits[0])
@@ -226,7 +229,7 @@ def test_published_numbers_are_data(joystick, by_sticks):
 
 
 def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
-    """The centre of buoyancy that constant moments of roll and pitch give holds the vehicle where they did."""
+    """The centre of buoyancy that follows from constant roll and pitch moments gives the same tilt as they do."""
     k, buoyancy, tilts = 2.0, 110.0, {"roll.bias": 0.2, "pitch.bias": -0.3}
     found = {
         name: Estimate(name=name, estimate=b, ci95=(b - 0.1, b + 0.1), unit="N m", identifiable=True)
@@ -236,7 +239,9 @@ def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
     arm = buoyancy * np.array(
         [moved["body.center_of_buoyancy.0"] - 0.01, moved["body.center_of_buoyancy.1"], k / buoyancy]
     )
-    moment = np.cross(arm, [0.0, 0.0, 1.0])  # level: what b takes off on the left side of the equation
+    moment = np.cross(
+        arm, [0.0, 0.0, 1.0]
+    )  # level: the moment that b subtracts on the left side of the equation
     np.testing.assert_allclose(moment[:2], [-tilts["roll.bias"], -tilts["pitch.bias"]], atol=1e-12)
     unsure = {"roll.bias": replace(found["roll.bias"], ci95=(-0.1, 0.5))}
     assert trim(unsure, buoyancy, (0.0, 0.0, 0.05)) == {}
@@ -244,7 +249,7 @@ def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
 
 @pytest.mark.parametrize("lead", [0.0, 0.1])
 def test_a_replay_allows_for_two_clocks(lead):
-    """Motion stamped a tenth of a second early: named, and the score is that of one clock."""
+    """Motion stamped a tenth of a second early is reported, and the score is that of one clock."""
     vehicle = load_vehicle("bluerov2_heavy")
     (trial,) = simulate_programme(programmes("yaw", vehicle)[:1], vehicle, seed=2, inputs=("command",))
     n = round(lead * 50)
@@ -257,7 +262,7 @@ def test_a_replay_allows_for_two_clocks(lead):
 
 @pytest.mark.slow
 def test_unequal_thrusters_are_found_in_a_slow_log():
-    """Steps at 5 Hz of thrusters that are up to 6 % off: each gain in its interval of ±1.5 %, and in the file."""
+    """In steps at 5 Hz with thrusters up to 6 % off, each gain is in its interval of ±1.5 %, and in the file."""
     vehicle, axes = load_vehicle("bluerov2_heavy"), ("surge", "sway", "heave", "yaw")
     gains = np.array([1.06, 0.95, 1.0, 0.97, 1.03, 0.98, 1.05, 0.96])
     levels = {a: [part * vehicle.wrench_limits[AXES.index(a)] for part in (0.12, 0.25)] for a in axes}
@@ -282,7 +287,7 @@ def test_unequal_thrusters_are_found_in_a_slow_log():
 
 
 def test_couplings_of_an_axis_of_the_file_stay_symmetric():
-    """Where sway keeps the file's numbers, its coupling with yaw follows yaw's alone, in both rows."""
+    """If sway keeps the file's values, its coupling with yaw follows yaw's alone, in both rows."""
     vehicle, path = load_vehicle("remus100"), "hydrodynamics.calibrated.added_mass"
     own = vehicle.hydrodynamic_set("calibrated").added_mass
     new = {

@@ -1,4 +1,4 @@
-"""Manoeuvres of vehicles with fins, and what a fit finds in them."""
+"""Manoeuvres of vehicles with fins, and fits of them."""
 
 import csv
 
@@ -31,20 +31,20 @@ TURN = Manoeuvre(
 
 
 def test_an_order_holds_until_the_next():
-    """By the time since the start; the last one stays."""
+    """Orders are looked up by the time since the start; the last one stays."""
     assert TURN.duration == 32.0
     assert [TURN.at(t).course for t in (0.0, 8.0, 13.99, 14.0, 40.0)] == [0.0, 0.4, 0.4, -0.4, -0.2]
 
 
 def test_the_set_excites_every_axis_but_roll():
-    """Each manoeuvre says which; none asks for more than the autopilot's fastest."""
+    """Each manoeuvre names its axes and has its own name."""
     chosen = manoeuvres(TORPEDO)
     assert {axis for one in chosen for axis in one.axes} == {"surge", "sway", "heave", "pitch", "yaw"}
     assert len({one.name for one in chosen}) == len(chosen)
 
 
 def test_tables_for_another_autopilot(tmp_path):
-    """`excite --kind manoeuvres` writes the orders; what belongs to other kinds is refused."""
+    """`excite --kind manoeuvres` writes the orders; options of other kinds are refused."""
     file = tmp_path / "torpedo.yaml"
     file.write_text("extends: remus100\n", encoding="utf-8")
     folders = excite("all", vehicle=str(file), plan=PlanSettings(kind="manoeuvres"), out=tmp_path / "plan")
@@ -58,7 +58,7 @@ def test_tables_for_another_autopilot(tmp_path):
 
 
 def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():
-    """What a fit may move, fins and the inflow of propellers, and what it then writes to the file."""
+    """The parameters of a fit are fins and the inflow of propellers; the results are written to the file."""
     tail = {"rudder": TAIL, "stern": {**TAIL, "lift_slope": 2.0}}
     vehicle = hull(tail, propeller={"inflow": {"thrust_loss": 0.01}})
     fields = actuator_fields(vehicle)
@@ -71,7 +71,7 @@ def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():
 
 @pytest.mark.slow
 def test_a_manoeuvre_begins_at_speed_and_ends_in_a_stop():
-    """At the speed of the first order; while the propeller stands still, the fins stay where they were."""
+    """It begins at the speed of the first order; while the propeller stands still, the fins keep their angle."""
     stop = Manoeuvre(
         name="stop",
         axes=("surge", "yaw"),
@@ -92,7 +92,7 @@ def test_a_manoeuvre_begins_at_speed_and_ends_in_a_stop():
 
 @pytest.mark.slow
 def test_a_vehicle_that_turns_over_gives_no_trial():
-    """REMUS with a third of its lift cannot be held by the autopilot of its file."""
+    """REMUS with a third of its lift is not stable under the autopilot of its file."""
     vehicle = load_vehicle("remus100")
     weak = vehicle.replace({f"actuators.{name}.lift_slope": 1.0 for name in vehicle.actuators})
     (dive,) = (one for one in manoeuvres(vehicle) if one.name == "dives_slow")
@@ -102,9 +102,9 @@ def test_a_vehicle_that_turns_over_gives_no_trial():
 
 @pytest.mark.slow
 def test_a_fit_finds_what_is_true(monkeypatch):
-    """Without noise, from numbers that are 15 to 40 % off: drag, added mass and the slope of the fins within 3 %.
+    """Without noise, from values 15 to 40 % off, drag, added mass and the slope of the fins are within 3 %.
 
-    It begins with the file: the weak form does not know the forces of fins.
+    The fit starts from the file, since the weak form does not include the forces of fins.
     """
     monkeypatch.delattr("finssim.identification.stages.weak_form")
     base = "hydrodynamics.calibrated"
@@ -131,8 +131,8 @@ def test_a_fit_finds_what_is_true(monkeypatch):
 def test_derivatives_of_an_unstable_hull_are_those_of_small_changes():
     """Over 3 s of a zigzag of REMUS a change of the initial velocity grows a hundredfold.
 
-    Along every direction of the initial state that changes readings by at most 0.02, the derivatives predict what the
-    simulation does, to 0.003.
+    Along every direction of the initial state that changes readings by at most 0.02, the derivatives predict the
+    simulation to 0.003.
     """
     vehicle, axes = load_vehicle("remus100"), ("sway", "heave", "pitch", "yaw")
     (zigzag,) = (one for one in manoeuvres(vehicle) if one.name == "zigzag_fast")

@@ -1,4 +1,4 @@
-"""The next dive comes from the fit's own information: its forecast is right, and it beats a repeated dive."""
+"""The next dive is designed from the fit's information: its forecast is right, and it beats a repeated dive."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def dived(plan, seed, name=""):
 
 @pytest.mark.slow
 def test_a_designed_second_dive_halves_what_a_repeated_one_leaves():
-    """Median width of the intervals, as long a dive: 0.6 of that of the first dive once more, or less."""
+    """For dives of equal length, the median interval width is at most 0.6 of that after repeating the first dive."""
     plan = programmes("surge,yaw", VEHICLE, levels={"surge": (18.0,), "yaw": (5.0,)})
     first = dived(plan, 1)
     fit = fit_hydrodynamics(first, VEHICLE, design=True)
@@ -35,13 +35,13 @@ def test_a_designed_second_dive_halves_what_a_repeated_one_leaves():
     )
     names = [f"{axis}.{name}" for axis in ("surge", "yaw") for name in ("m_eff", "d1", "d2")]
     assert np.median([np.diff(after[n]) / np.diff(again[n]) for n in names]) < 0.6
-    # The forecast rests on independent errors; trials of one dive differ a little more.
+    # The forecast assumes independent errors; trials of one dive differ a little more.
     width = np.diff(after[dive.widest])[0] / np.diff(fit.intervals[dive.widest])[0]
     assert width < 2.0 * dive.factor
 
 
 def test_a_fit_without_thrust_designs_nothing():
-    """No thrust is known to follow, so that nothing can be said of steps."""
+    """Without known thrust, the effect of steps cannot be predicted."""
     from identification.test_free_motion import ROV, coasts
 
     trials = coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r", noise=0.01)
@@ -50,7 +50,7 @@ def test_a_fit_without_thrust_designs_nothing():
 
 @pytest.mark.slow
 def test_trials_that_measured_different_columns_get_a_dive_too():
-    """One trial with depth, one with speed: the next dive measures both, and depth is then not compared."""
+    """If one trial has depth and one has speed, the next dive measures both, and depth is not compared."""
     plan = programmes("heave", VEHICLE, levels={"heave": (18.0,)}, coast=3.0)[:2]
     some = [
         simulate_programme([one], VEHICLE, seed=1, rate=20.0, columns=[own])[0]

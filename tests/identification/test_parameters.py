@@ -1,4 +1,4 @@
-"""Every vector of the box is a plant that can be."""
+"""Every vector in the parameter box is a physical plant."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def made(name, axes, extras=()):
 
 
 def vectors(p, seed):
-    """Random vectors over orders of magnitude, in and far outside the box."""
+    """Return random vectors over orders of magnitude, in and far outside the box."""
     rng = np.random.default_rng(seed)
     size = p.scale * 10.0 ** rng.uniform(-3.0, 3.0, (20, len(p.scale)))
     return p.start * rng.choice([0.0, 1.0], (20, 1)) + rng.choice([-1.0, 0.0, 1.0], size.shape) * size
@@ -53,7 +53,7 @@ def test_any_vector_is_positive_definite_and_takes_energy_out(name, seed, chosen
         (D2, np.abs(nu) * nu, p.set.quadratic_damping),
     ):
         if np.einsum("ni,ij,nj->n", nu, own, speed).min() < 0.0 or np.any(own - np.diag(np.diag(own))):
-            continue  # couplings of the vehicle file itself, which the fit of some axes keeps
+            continue  # couplings of the vehicle file, which a fit of some axes keeps
         power = np.einsum("ni,wij,nj->wn", nu, matrices, speed)
         size = np.einsum("ni,wij,nj->wn", np.abs(nu), np.abs(matrices), np.abs(speed))
         assert (power >= -1e-9 * size).all()
@@ -61,7 +61,8 @@ def test_any_vector_is_positive_definite_and_takes_energy_out(name, seed, chosen
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_the_start_is_the_vehicle_file(name):
-    """Added mass, damping, buoyancy and stiffness of the start vector are those the simulator makes of the file."""
+    """Added mass, damping, buoyancy and stiffness of the start vector are those that the simulator derives
+    from the file."""
     p = made(name, AXES, ("k", "buoyancy_excess", "thrust_scale"))
     plants = p.plants(p.start)
     own = vehicle_parameters(VEHICLES[name], "calibrated")
@@ -78,7 +79,7 @@ def test_the_start_is_the_vehicle_file(name):
 
 
 def test_what_is_not_free_stays():
-    """A fit of surge leaves every entry of the other axes as the file has it."""
+    """A fit of surge leaves every entry of the other axes unchanged."""
     p = made("bluerov2", ("surge",))
     M_A, D1, D2 = p.matrices(p.start + 3.0)
     rest = ~np.eye(6, dtype=bool)[0]
@@ -88,7 +89,7 @@ def test_what_is_not_free_stays():
 
 
 def test_a_bias_acts_against_the_motion_at_the_reference_point():
-    """M nu_dot + D nu + b = tau: a bias b of surge pushes with -b at the reference point, and so turns the origin."""
+    """M nu_dot + D nu + b = tau: a surge bias b pushes with -b at the reference point, and so turns the origin."""
     p = made("finsrov", ("surge",))
     x = p.start.copy()
     x[p.names.index("surge.bias")] = 2.0
@@ -96,7 +97,7 @@ def test_a_bias_acts_against_the_motion_at_the_reference_point():
 
 
 def test_stiffness_is_the_restoring_moment_of_the_plant():
-    """k = B (z_b - z_r) - W (z_g - z_r), whatever else is free."""
+    """k = B (z_b - z_r) - W (z_g - z_r), whatever other parameters are free."""
     p = made("finsrov", ("roll",), ("k", "buoyancy_excess"))
     x = p.start.copy()
     x[p.names.index("k")], x[p.names.index("buoyancy_excess")] = 5.0, 3.0
@@ -108,7 +109,8 @@ def test_stiffness_is_the_restoring_moment_of_the_plant():
 
 
 def test_what_tilts_a_vehicle_at_rest_turns_it_once_it_rolls():
-    """A bias of roll or pitch is a centre of buoyancy beside that of gravity: B r_b - W r_g = (b_pitch, -b_roll, k)."""
+    """A roll or pitch bias is a centre of buoyancy offset from that of gravity: B r_b - W r_g = (b_pitch,
+    -b_roll, k)."""
     p = made("bluerov2_heavy", AXES, ("k", "buoyancy_excess"))
     x, given = p.start.copy(), {"roll.bias": 0.2, "pitch.bias": -0.3, "k": 2.0, "surge.bias": 1.5}
     for name, value in given.items():
@@ -121,7 +123,7 @@ def test_what_tilts_a_vehicle_at_rest_turns_it_once_it_rolls():
 
 
 def test_a_set_without_coefficients_is_refused():
-    """A mesh has no damping that could be fitted."""
+    """A mesh has no damping coefficients to fit."""
     sets = VEHICLES["finsrov"].hydrodynamics
     bare = VEHICLES["finsrov"].model_copy(update={"hydrodynamics": {"calibrated": sets["mesh"]}})
     with pytest.raises(CalibrationError, match="no coefficients in hydrodynamics.calibrated"):
@@ -129,7 +131,7 @@ def test_a_set_without_coefficients_is_refused():
 
 
 def test_gains_of_thrusters_average_to_one_and_scale_their_columns():
-    """Each gain is that of its thruster, 5 % from 1 beforehand; a common factor of all is left to `thrust_scale`."""
+    """Each gain has a prior of 1 with 5 %; a common factor of all belongs to `thrust_scale`."""
     p = made("bluerov2_heavy", ("surge", "yaw"), ("thrust_scale", "thruster_gains"))
     x = p.expected.copy()
     x[p.names.index("gain.T3")], x[p.names.index("thrust_scale")] = 0.9, 0.7
@@ -147,7 +149,7 @@ def test_gains_of_thrusters_average_to_one_and_scale_their_columns():
 
 
 def test_couplings_scale_with_their_diagonals():
-    """Four times an inertia or a drag couples twice as much; so does an inertia that is given. `rexrov` couples all."""
+    """Four times an inertia, estimated or given, or a drag doubles its couplings. `rexrov` couples all axes."""
     p = made("remus100", ("sway", "yaw"))
     x = p.start.copy()
     for kind in ("sway.added_mass", "yaw.d2"):
@@ -168,7 +170,7 @@ def test_couplings_scale_with_their_diagonals():
 
 
 def test_the_file_keeps_couplings_symmetric():
-    """Only sway is written: its coupling with yaw, in both rows, goes with it and with the file's yaw."""
+    """Only sway is written: its coupling with yaw, in both rows, scales with it and with the file's yaw."""
     p = made("remus100", ("sway", "yaw"))
     path, x = "hydrodynamics.calibrated.added_mass", 4.0 * p.start
     written = changes(p, x, {}, {f"{path}.1.1": 142.0}, unmeasured=(), scaled=False)
@@ -177,7 +179,7 @@ def test_the_file_keeps_couplings_symmetric():
     assert not changes(p, x, {}, {}, unmeasured=(), scaled=False)
 
 
-@pytest.mark.filterwarnings("error")  # a glider has no thrusters whose lags could be averaged
+@pytest.mark.filterwarnings("error")  # a glider has no thrusters with lags to average
 def test_a_parameter_of_a_term_may_be_called_like_a_damping():
     """Only coordinates of the six axes are entries of the matrices."""
     p = Parameters(

@@ -1,4 +1,4 @@
-"""Programmes: the published procedure, levels that fit the vehicle, multi-sines that keep axes and limits apart."""
+"""Programmes: the published procedure, levels that suit the vehicle, multi-sines that separate axes within limits."""
 
 import json
 
@@ -16,7 +16,7 @@ FINSROV = load_vehicle("finsrov")
 
 
 def level(programme):
-    """Peak of the programme's own axis, with its sign."""
+    """Return the signed peak of the programme's own axis."""
     wrench = programme.tau_desired[:, AXES.index(programme.axes[0])]
     return float(wrench[np.abs(wrench).argmax()])
 
@@ -33,7 +33,7 @@ def level(programme):
     ],
 )
 def test_published_levels_are_driven_in_both_directions(axis, levels):
-    """FinsROV's own levels come out as published, each forwards and backwards."""
+    """FinsROV's levels are the published ones, each forwards and backwards."""
     found = sorted(level(p) for p in programmes(axis, FINSROV))
     assert found == pytest.approx(sorted([*levels, *(-x for x in levels)]))
 
@@ -53,7 +53,7 @@ def test_a_step_lasts_as_the_published_procedure_says():
 
 
 def test_a_pulse_rings_down_and_a_dive_coasts():
-    """Roll is pushed for 0.6 s and left for 3 s; a dive is followed by up to 30 s without thrust."""
+    """Roll is pushed for 0.6 s and free for 3 s; a dive is followed by up to 30 s without thrust."""
     pulse = programmes("roll", FINSROV)[0]
     assert (pulse.phase == "excitation").sum() == 30
     assert (pulse.phase == "coast").sum() == 150
@@ -66,7 +66,7 @@ def test_a_pulse_rings_down_and_a_dive_coasts():
 @pytest.mark.parametrize("name", ["bluerov2", "bluerov2_heavy", "rexrov", "remus100", "lauv", "warpauv"])
 @pytest.mark.parametrize("kind", ["published", "validation", "multisine"])
 def test_every_vehicle_gets_levels_within_its_limits(name, kind):
-    """`all` means what the vehicle controls, and the thrusters can give what is asked."""
+    """`all` selects the axes that the vehicle controls, and the thrusters can deliver every level."""
     vehicle = load_vehicle(name)
     plan = programmes("all", vehicle, kind=kind)
     assert {axis for p in plan for axis in p.axes} == set(vehicle.controlled_axes)
@@ -80,7 +80,7 @@ def test_every_vehicle_gets_levels_within_its_limits(name, kind):
 
 
 def test_harmonics_of_a_multisine_belong_to_one_axis_each():
-    """Over the excitation the wrenches of any two axes are orthogonal, and lie in the band."""
+    """Over the excitation the wrenches of any two axes are orthogonal, and lie within the band."""
     p = programmes("all", FINSROV, kind="multisine", band=(0.1, 0.8), duration=40.0)[0]
     tau = p.tau_desired[p.phase == "excitation"]
     scaled = tau / np.linalg.norm(tau, axis=0)
@@ -114,14 +114,14 @@ def test_repeats_of_a_multisine_differ_and_seeds_repeat_them():
     ],
 )
 def test_what_cannot_be_is_refused_with_the_reason(arguments, sentence):
-    """The message says what is wrong and what the limit is."""
+    """The message states the problem and the limit."""
     axes = arguments.pop("axes")
     with pytest.raises(CalibrationError, match=sentence):
         programmes(axes, FINSROV, **arguments)
 
 
 def test_a_recommended_dive_goes_to_both_sides_and_ends_where_it_began(tmp_path):
-    """Equal pushes to both sides; read back from a report, and refused where it cannot be played."""
+    """Pushes to both sides are equal; the dive reads back from a report, and is refused if it cannot be played."""
     leg = Leg("yaw", 2.0, 4.0, times=3)
     one = alternating(leg)
     assert one.tau_desired.sum(axis=0) == pytest.approx(np.zeros(6)) and np.abs(one.tau_desired).max() == 2.0
@@ -149,6 +149,6 @@ def test_a_recommended_dive_goes_to_both_sides_and_ends_where_it_began(tmp_path)
 
 
 def test_an_axis_without_authority_is_refused():
-    """Six thrusters of a BlueROV2 do not pitch it, and the message lists what they do."""
+    """The six thrusters of a BlueROV2 do not pitch it, and the message lists the axes that they control."""
     with pytest.raises(CalibrationError, match="cannot control pitch: its thrusters control surge, sway"):
         which_axes("surge,pitch", load_vehicle("bluerov2"))

@@ -1,4 +1,4 @@
-"""A model replayed on its own recordings is exact; what a recording lacks is said; in-sample trials are told apart."""
+"""A model replayed on its own recordings is exact; missing columns are named; in-sample trials are labelled."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ MIDDLE = {"surge": [8.0], "sway": [6.0], "heave": [6.0], "roll": [0.3], "pitch":
 
 
 def make(axes, hydrodynamics="calibrated", noise="none", **options):
-    """One trial in each direction of each axis."""
+    """Return one trial in each direction of each axis."""
     plan = programmes(axes, FINSROV, levels=MIDDLE, coast=4.0)
     return simulate_programme(plan, FINSROV, noise=noise, hydrodynamics=hydrodynamics, seed=3, **options)
 
 
 @pytest.fixture(scope="module")
 def surge():
-    """Two trials, one to each side, as sensors measure them."""
+    """Two trials, one to each side, as measured by sensors."""
     return make("surge", noise="sensors")
 
 
@@ -47,7 +47,7 @@ def without(trial, *columns):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_reproduces_trials_that_it_made(model):
-    """Without noise the replay differs by the logging of the inputs at 50 Hz alone; every other model is worse."""
+    """Without noise the replay differs only by logging the inputs at 50 Hz; every other model is worse."""
     result = replay(make(AXES, model), FINSROV, hydrodynamics=[model, *[m for m in MODELS if m != model]])
     own, *others = (result.aggregate(m) for m in result.models)
     assert set(own.by_axis) == set(AXES)
@@ -67,7 +67,7 @@ def test_a_good_model_predicts_better_than_persistence_and_a_bad_one_is_told_by_
 
 
 def test_heights_from_another_zero_do_not_lift_the_vehicle_out_of_the_water():
-    """Motion capture counts from the floor: a vehicle that it shows at +1 m and higher is no less submerged."""
+    """Motion capture may count from the floor: a vehicle at +1 m and higher is no less submerged."""
     kept = without(make(["heave"])[0], "depth")
     z = kept.channels["z"]
     raised = dataclasses.replace(kept, channels={**kept.channels, "z": z - z.min() + 1.0})
@@ -122,7 +122,7 @@ def test_after_a_gap_the_replay_starts_anew(surge):
 
 
 def test_an_axis_that_nobody_measured_is_named_and_not_scored(surge):
-    # Only rates and attitude: nothing tells the surge velocity.
+    # Only rates and attitude: the surge velocity is not observed.
     blind = [without(t, "u", "v", "w", "x", "y", "z", "depth") for t in surge]
     result = replay(blind, FINSROV)
     data = result.as_json()
@@ -158,7 +158,7 @@ def test_every_kind_of_input_drives_the_replay(inputs):
 
 
 def test_a_passive_trial_is_replayed_from_its_initial_state():
-    """Thrusters off: a free decay in roll and pitch from the initial tilt."""
+    """With thrusters off, it is a free decay in roll and pitch from the initial tilt."""
     (trial, _) = make("roll", spread=5.0)
     rows = trial.t < 2.0
     passive = dataclasses.replace(
@@ -177,7 +177,7 @@ def test_a_passive_trial_is_replayed_from_its_initial_state():
 
 
 def test_a_diverging_model_has_no_aggregate_and_says_so(surge):
-    """Damping that feeds energy in: the body accelerates without end."""
+    """Damping that adds energy accelerates the body without end."""
     broken = FINSROV.replace({"hydrodynamics.calibrated.quadratic_damping": [-1e4, 0, 0, 0, 0, 0]})
     found = replay(surge, broken)
     total = found.aggregate("calibrated")

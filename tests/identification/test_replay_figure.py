@@ -1,4 +1,4 @@
-"""The figures of a replay show what their captions say: medians and middle halves of sign-aligned, scaled responses."""
+"""The figures of a replay show medians and interquartile ranges of sign-aligned, scaled responses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MODELS = (("calibrated", 0.8), ("mesh", 1.5))
 
 
 def square(level, gain=1.0, axis=0, in_sample=False, name="a"):
-    """A response that follows its input at once: `level` from 2 s to 8 s; one model, `gain` times that."""
+    """Return a response that follows its input at once: `level` from 2 s to 8 s; one model gives `gain` times that."""
     tau = np.zeros((len(T), 6))
     tau[:, axis] = np.where((T >= 2.0) & (T < 8.0), level, 0.0)
     response = "uvwpqr"[axis]
@@ -46,7 +46,7 @@ def test_a_normalised_response_is_one_whatever_its_sign_and_level(level):
 
 
 def test_the_envelope_draws_the_median_of_each_model():
-    """Of trials whose model is 1, 2 and 9 times the measurement, the median is 2."""
+    """For trials whose model is 1, 2 and 9 times the measurement, the median is 2."""
     figure = draw_response_envelopes([square(5.0, 1.0), square(-7.0, 2.0), square(2.0, 9.0)])
     (axes,) = [a for a in figure.axes if a.get_visible()]
     drawn = lines(axes)

@@ -1,4 +1,4 @@
-"""A replay's scores are what their definitions say on signals whose scores can be written down."""
+"""A replay's scores follow their definitions on signals whose scores have a closed form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RATE, HOLD, COAST, LEVEL, DAMPING, MASS = 50.0, 9.0, 4.0, 12.0, 40.0, 27.0
 
 
 def step_response(t, level=LEVEL, damping=DAMPING, mass=MASS):
-    """Surge of m u' = tau - d u under `level` from 1 s to 10 s, from rest."""
+    """Return the surge of m u' = tau - d u under `level` from 1 s to 10 s, from rest."""
     lag, terminal = mass / damping, level / damping
     rise = terminal * (1.0 - np.exp(-(t - 1.0) / lag))
     at_end = terminal * (1.0 - np.exp(-HOLD / lag))
@@ -30,7 +30,7 @@ def step_response(t, level=LEVEL, damping=DAMPING, mass=MASS):
 
 
 def make_pair(simulated, *, t=None, noise=0.0, named=None, axes=("surge",), in_sample=False, name="a"):
-    """A surge step with the given simulated surge (or a function of time)."""
+    """Return a surge step with the given simulated surge (or a function of time)."""
     t = np.arange(round((1.0 + HOLD + COAST) * RATE) + 1) / RATE if t is None else t
     tau = np.zeros((len(t), 6))
     tau[:, 0] = np.where((t >= 1.0) & (t < 1.0 + HOLD), LEVEL, 0.0)
@@ -59,14 +59,14 @@ def test_a_shifted_signal_has_the_shift_over_the_span(offset):
 
 @pytest.mark.parametrize("gain", [0.0, 0.5, 1.0, 2.0])
 def test_a_scaled_sine_has_the_closed_form(gain):
-    """|1 - g| A/√2 over the span 2 A sin(0.45 π) of a sine of amplitude A: a tenth of a turn is above P95."""
+    """|1 - g| A/√2 over the span 2 A sin(0.45 π) of a sine of amplitude A: a tenth of a period is above P95."""
     x = 0.3 * np.sin(2.0 * np.pi * np.arange(10000) / 10000)
     expected = abs(1.0 - gain) / np.sqrt(2.0) / (2.0 * np.sin(0.45 * np.pi))
     assert nrmse(x, gain * x, span(x)).value == pytest.approx(expected, abs=1e-4)
 
 
 def test_the_mean_as_prediction_of_a_uniform_ramp():
-    """The deviation of a uniform distribution is 1/√12 of its range, its P5-P95 span 0.9 of it."""
+    """A uniform distribution has a deviation of 1/√12 of its range and a P5-P95 span of 0.9 of it."""
     x = np.linspace(-2.0, 3.0, 20001)
     assert nrmse(x, np.full_like(x, x.mean()), span(x)).value == pytest.approx(
         1 / np.sqrt(12) / 0.9, rel=1e-3
@@ -84,7 +84,7 @@ def test_a_perfect_replay_scores_zero():
 
 
 def test_scores_cover_excitation_and_coast_only():
-    """An error before the excitation counts for nothing."""
+    """An error before the excitation does not count."""
     pair = make_pair(lambda t: np.where(t < 1.0, 5.0, step_response(t)))
     assert score(pair, "calibrated", "u").value == 0.0
     assert score(pair, "calibrated", "u", "baseline").value > 10.0
@@ -100,7 +100,7 @@ def test_degenerate_responses_are_told_in_words():
         "the measured response does not vary: its P5 to P95 span is zero",
     )
     assert response_span(still, "v").why == response_span(still, "w").why == "not measured"
-    still.measured["u"] = 0.0005 * np.sin(still.t)  # a vehicle on the bench, well measured
+    still.measured["u"] = 0.0005 * np.sin(still.t)  # a vehicle at rest on the bench, measured well
     assert "at rest" in score(still, "calibrated", "u").why
     still.measured["u"] = 0.004 * np.random.default_rng(0).standard_normal(len(still.t))
     still.noise["u"] = 0.01
@@ -148,7 +148,7 @@ def test_excited_axes_come_from_the_header_or_the_input():
 
 
 def test_the_heights_of_a_vehicle_file_do_not_choose_the_axes():
-    """A push 5 cm above the reference, or at it: pitch counts if it swings, and alone if nothing else is driven."""
+    """For a push 5 cm above the reference, or at it, pitch counts if it swings, and alone if nothing else is driven."""
     limits, tau = np.array([20.0, 20.0, 28.0, 3.0, 3.0, 7.0]), np.zeros((50, 6))
     tau[:, 0] = 20.0
     for height in (0.0, 0.05):
@@ -173,7 +173,7 @@ def test_one_wild_trial_does_not_move_the_median():
 
 
 def test_the_interval_of_a_median_is_the_textbook_one():
-    """Standard error 1.253 s/√n of a normal sample's median, 1.96 of them to each side, for many trials of one axis."""
+    """For many trials of one axis it is ±1.96 times the standard error 1.253 s/√n of a normal sample's median."""
     x = np.random.default_rng(3).normal(0.3, 0.05, 400)
     low, high = aggregate([{"surge": value} for value in x]).ci95
     assert high - low == pytest.approx(2.0 * 1.96 * 1.253 * 0.05 / 20.0, rel=0.35)
@@ -193,7 +193,7 @@ def test_no_interval_from_a_single_trial_of_an_axis():
 
 
 def test_the_error_ahead_of_a_drift_grows_in_proportion():
-    """Measured x = v t from each start, predicted constant plus half of it: half the error of persistence."""
+    """With x = v t measured from each start and half of it predicted, the error is half that of persistence."""
     ahead = np.arange(0, 151) / RATE
     starts = np.zeros(7)
     measured = np.outer(ahead, np.linspace(0.1, 0.7, 7))

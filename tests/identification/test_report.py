@@ -1,4 +1,4 @@
-"""A calibration's report stands alone and says what a reader needs to trust or to repeat it."""
+"""A calibration's report is self-contained and has all that a reader needs to judge or repeat it."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ COMMAND = "finssim calibrate hydrodynamics trials --vehicle finsrov --out mine.y
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The report of a fit made by hand."""
+    """The report of a hand-made fit."""
     fit = made_fit()
     out = tmp_path_factory.mktemp("report") / "report"
     write_report(fit, out, calibrated(fit), command=COMMAND, findings=WEAK)
@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 
 def test_the_page_loads_nothing(folder):
-    """Pictures are inside; no script, no style sheet, no address; text is escaped."""
+    """Pictures are embedded; there is no script, style sheet or address; text is escaped."""
     html = (folder / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)
     assert len(sources) == 2 and all(source.startswith("data:image/png;base64,") for source in sources)
@@ -39,7 +39,7 @@ def test_the_page_loads_nothing(folder):
 
 
 def test_a_reader_finds_what_they_need(folder):
-    """Estimates with intervals, what was kept, warnings, trials by digest, and how to do it again."""
+    """It contains estimates with intervals, kept values, warnings, trials by digest, and the command to repeat it."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     vehicle = calibrated(made_fit())
     for words in (
@@ -56,7 +56,7 @@ def test_a_reader_finds_what_they_need(folder):
 
 
 def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
-    """Curves, then what is known, what is not and the next dive, then tables."""
+    """Curves come first, then known and unknown parameters and the next dive, then tables."""
     dive = Dive(legs=(Leg("yaw", 2.0, 4.0, times=3),), widest="yaw.d2", factor=0.4)
     fit = made_fit(next_dive=dive)
     write_report(fit, tmp_path / "report", calibrated(fit))
@@ -74,7 +74,7 @@ def test_the_page_begins_with_a_picture_and_what_to_record_next(tmp_path):
 
 
 def test_a_given_inertia_is_not_called_determined_and_a_kept_stiffness_is_one():
-    """The file holds the height of the centre of buoyancy; k follows from it."""
+    """The file contains the height of the centre of buoyancy, from which k follows."""
     given = Estimate(
         name="yaw.m_eff", estimate=0.4, ci95=(0.4, 0.4), unit="kg m²", identifiable=True, note="given"
     )
@@ -91,7 +91,7 @@ def test_a_given_inertia_is_not_called_determined_and_a_kept_stiffness_is_one():
 
 
 def test_words_of_numbers_fit_what_they_are_of():
-    """A place in metres, tight intervals with a decimal, and a kept stiffness instead of the height in the file."""
+    """A position is in metres, tight intervals have a decimal, and a kept stiffness replaces the height in the file."""
     more = [
         Estimate(name=name, estimate=value, ci95=ci, unit=unit, identifiable=told, note="", path=path)
         for name, value, ci, unit, told, path in (
@@ -108,7 +108,7 @@ def test_words_of_numbers_fit_what_they_are_of():
 
 
 def test_the_pictures_are_files_too(folder):
-    """Every picture of the page is a PNG beside it."""
+    """Every picture of the page is also a PNG beside it."""
     pictures = sorted(folder.glob("*.png"))
     assert [path.name for path in pictures] == ["correlation.png", "curves_1.png"]
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
@@ -116,14 +116,14 @@ def test_the_pictures_are_files_too(folder):
 
 
 def test_equal_fits_make_equal_reports(folder, tmp_path):
-    """No clock time enters, in pictures either."""
+    """They contain no clock time, nor do the pictures."""
     fit = made_fit()
     write_report(fit, tmp_path / "r", calibrated(fit), command=COMMAND, findings=WEAK)
     assert (tmp_path / "r" / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 
 def test_a_fit_of_almost_nothing_has_a_report(tmp_path):
-    """No curve, no correlation, no finite interval."""
+    """There is no curve, no correlation and no finite interval."""
     fit = made_fit()
     fit = dataclasses.replace(
         fit,
@@ -150,7 +150,7 @@ def test_many_curves_are_drawn_up_to_a_limit_that_is_said(tmp_path):
 
 
 def test_lines_of_a_curve_break_at_gaps():
-    """Two stretches with a gap in the first: a hole in each line between them, and time goes on."""
+    """For two segments with a gap in the first, the line breaks at the gap and between them, and time continues."""
     t = np.concatenate([np.arange(0.0, 1.0, 0.1), np.arange(11.0, 12.0, 0.1)])
     curve = Curve.joined(
         "c",

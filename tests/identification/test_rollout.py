@@ -1,4 +1,4 @@
-"""Segments under candidate plants move as in a simulator of their own."""
+"""Segments under candidate plants move as in a separate simulator."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ DEPTH = 50.0
 
 
 def segment(vehicle, force, *, B=None, commanded=True, before=None, changes=None, start=None, **fields):
-    """A stretch that starts level and at rest with motors that have been told the first force for long."""
+    """Return a segment that starts level and at rest, with motors settled at the first force."""
     force = np.asarray(force, float)
     thrusters = B is None
     drive = Drive(
@@ -59,13 +59,13 @@ def segment(vehicle, force, *, B=None, commanded=True, before=None, changes=None
 
 
 def steps_of(vehicle, n, seed=0, size=3.0):
-    """Thruster forces that jump every 0.2 s."""
+    """Return thruster forces that jump every 0.2 s."""
     levels = size * np.random.default_rng(seed).normal(size=(n // 10 + 1, len(vehicle.thrusters)))
     return np.repeat(levels, 10, axis=0)[:n]
 
 
 def plain(vehicle, force, *, hydrodynamics="calibrated"):
-    """Velocity after every step of an ordinary simulation whose motors already ran on the first command."""
+    """Return the velocity after every step of an ordinary simulation with motors settled at the first command."""
     sim = Simulator(vehicle, control_step=STEP, substeps=1, integrator="rk4", hydrodynamics=hydrodynamics)
     for _ in range(100):
         sim.set_thrust(force[0])
@@ -84,7 +84,7 @@ def plain(vehicle, force, *, hydrodynamics="calibrated"):
 @pytest.mark.parametrize("hydrodynamics", ["calibrated", "mesh"])
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2", "bluerov2_heavy"])
 def test_a_rollout_is_an_ordinary_simulation(name, hydrodynamics):
-    """Motors, delay and hydrodynamics are the simulator's: every candidate's world moves as a plain run does."""
+    """Motors, delay and hydrodynamics are the simulator's: every candidate's world moves as in a plain run."""
     vehicle = load_vehicle(name)
     force = steps_of(vehicle, 60)
     response = Rollouts(vehicle, [segment(vehicle, force)], hydrodynamics=hydrodynamics).run(candidates=2)
@@ -95,7 +95,7 @@ def test_a_rollout_is_an_ordinary_simulation(name, hydrodynamics):
 
 @pytest.mark.parametrize("domain", ["force", "speed"])
 def test_motors_of_a_later_segment_are_already_running(domain):
-    """A segment cut from a run goes on as that run did, lag and delay line included."""
+    """A segment cut from a run continues as that run did, lag and delay line included."""
     slew = {"force": 100.0, "speed": 2000.0}[domain]
     vehicle = load_vehicle("finsrov").replace({"thrusters.*.domain": domain, "thrusters.*.slew": slew})
     force, begin = steps_of(vehicle, 120), 80
@@ -108,7 +108,7 @@ def test_motors_of_a_later_segment_are_already_running(domain):
 
 
 def test_a_wrench_acts_as_the_thrusters_that_make_it():
-    """Applied thruster forces f and the applied wrench B f are one drive."""
+    """Applied thruster forces f and the applied wrench B f give the same motion."""
     vehicle = load_vehicle("bluerov2")
     force = steps_of(vehicle, 60)
     B = vehicle.thruster_matrix()
@@ -122,7 +122,7 @@ def test_a_wrench_acts_as_the_thrusters_that_make_it():
 
 @pytest.mark.parametrize("thrusters", [True, False])
 def test_what_was_commanded_is_delayed_and_what_acted_is_not(thrusters):
-    """FinsROV's motors wait 0.05 s: a commanded step moves nothing before, an applied one does."""
+    """FinsROV's motors have a delay of 0.05 s: a commanded step moves nothing before, an applied one does."""
     vehicle = load_vehicle("finsrov")
     force = np.repeat(vehicle.thruster_matrix()[:1] * 3.0, 20, axis=0)
     B = None
@@ -146,12 +146,12 @@ def test_an_applied_force_is_linear_between_its_samples():
         force = np.outer(20.0 * t, [1.0, 0, 0, 0, 0, 0])
         s = segment(vehicle, force, B=np.eye(6), commanded=False, before=np.zeros((5, 6)), step=step)
         ends.append(Rollouts(vehicle, [s]).run().nu[-1, 0, 0, 0])
-    # A staircase would lead by half a coarse step, 0.25 N of 40 N.
+    # A zero-order hold would lead by half a coarse step, 0.25 N of 40 N.
     np.testing.assert_allclose(*ends, rtol=2e-3)
 
 
 def test_a_batch_equals_its_parts():
-    """No world knows of another: candidates and segments together give bitwise what each gives alone."""
+    """Worlds are independent: candidates and segments together are bit-identical to each alone."""
     vehicle = load_vehicle("finsrov")
     parts = [segment(vehicle, steps_of(vehicle, n, seed=n)) for n in (30, 50)]
     damping = np.stack([np.diag([s, 50.0, 80.0, 1.0, 1.0, 0.3]) for s in (20.0, 40.0, 60.0)])[:, None]
@@ -165,7 +165,7 @@ def test_a_batch_equals_its_parts():
 
 
 def test_the_passes_of_a_large_batch_change_nothing(monkeypatch):
-    """Candidates that do not fit into memory at once are simulated in turns."""
+    """Candidates that exceed the memory together are simulated in several passes."""
     vehicle = load_vehicle("finsrov")
     rollouts = Rollouts(vehicle, [segment(vehicle, steps_of(vehicle, 20))])
     mass = np.linspace(10.0, 14.0, 7)[:, None]
@@ -175,7 +175,7 @@ def test_the_passes_of_a_large_batch_change_nothing(monkeypatch):
 
 
 def test_the_water_of_a_trial_is_its_own():
-    """Denser water in the trial's header is the same as denser water in the vehicle file."""
+    """Denser water in the trial's header has the same effect as in the vehicle file."""
     vehicle = load_vehicle("finsrov")
     still = np.zeros((50, 8))
     dense = Rollouts(vehicle, [segment(vehicle, still, density=1050.0)]).run().nu[-1, 0, 0]
@@ -185,7 +185,7 @@ def test_the_water_of_a_trial_is_its_own():
 
 
 def test_a_current_carries_the_vehicle():
-    """At rest in a current, drag and the water's own acceleration pull it along until it drifts with the water."""
+    """From rest in a current, drag and the water's own acceleration pull it along until it drifts with the water."""
     vehicle = load_vehicle("finsrov")
     current = np.array([0.1, 0.0, 0.0])
     response = Rollouts(vehicle, [segment(vehicle, np.zeros((600, 8)), current=current)]).run()
@@ -193,7 +193,8 @@ def test_a_current_carries_the_vehicle():
 
 
 def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
-    """A force along the body at the start acts as one that is fixed in the world, beside one that is not."""
+    """A force along the body at the start equals one that is fixed in the world; one that turns with the body
+    differs."""
     vehicle = load_vehicle("bluerov2_heavy")
     turn = vehicle.thruster_matrix()[5] * 8.0
     force, heading = np.tile(turn, (150, 1)), quat_from_euler(0.0, 0.0, 0.7)
@@ -218,7 +219,7 @@ def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
 
 
 def test_pulls_say_nothing_of_an_unknown_thrust():
-    """Their deviation is known for the thrust of the file's voltage: they have the scale of all forces."""
+    """Their deviation is relative to the thrust at the file's voltage, so they have the scale of all forces."""
     vehicle = load_vehicle("bluerov2_heavy")
     times = np.linspace(0.1, 1.9, 10)
     measured = {name: (times, np.zeros(10)) for name in ("u", "v")}
@@ -240,7 +241,7 @@ def test_pulls_say_nothing_of_an_unknown_thrust():
 
 
 def test_a_submerged_vehicle_does_not_surface_while_it_drifts():
-    """Simulated far below and reported where it began, buoyancy stays whole however high it rises."""
+    """It is simulated far below and reported at its start, so that buoyancy stays complete however high it rises."""
     vehicle = load_vehicle("finsrov").replace({"body.displaced_volume": 0.0121})
     response = Rollouts(
         vehicle, [segment(vehicle, np.zeros((500, 8)), start={"position": np.array([0.0, 0.0, -0.5])})]
@@ -251,7 +252,7 @@ def test_a_submerged_vehicle_does_not_surface_while_it_drifts():
 
 
 def test_a_candidate_that_diverges_is_told_and_harms_no_other():
-    """Negative damping grows without bound; its neighbour moves as ever."""
+    """Negative damping grows without bound; the neighbour's motion is unchanged."""
     vehicle = load_vehicle("finsrov")
     D2 = np.zeros((2, 1, 6, 6))
     D2[1, 0, 0, 0] = -1e5
@@ -272,7 +273,7 @@ def test_segments_of_different_steps_are_refused():
 
 
 def test_a_sampled_command_changes_when_it_is_told_to():
-    """Old before and new after a time between two samples, 0.2 s apart, is the command that changed then."""
+    """The command changes at a time between two samples 0.2 s apart: old before, new after."""
     vehicle = load_vehicle("bluerov2")
     old, new = steps_of(vehicle, 20)[[0, 10]]
     n, which = np.arange(60), np.full(60, -1)
@@ -292,7 +293,7 @@ def test_a_sampled_command_changes_when_it_is_told_to():
 
 
 def test_a_slow_command_is_halfway_between_samples_unless_stated_to_hold():
-    """Pulses at 5 Hz change in the middle on average; `inputs_between: held` keeps them as they are."""
+    """Pulses at 5 Hz change in the middle on average; `inputs_between: held` keeps them as logged."""
     vehicle = load_vehicle("bluerov2")
     t = 0.2 * np.arange(20)
     columns = {f"command_{name}": np.where(t < 2.0, 0.0, 5.0) for name in vehicle.thrusters}

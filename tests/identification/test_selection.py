@@ -1,4 +1,4 @@
-"""The damping of an axis is the average over the shapes that its trials support, with an honest interval."""
+"""The damping of an axis is the average over the shapes that its trials support, with a valid interval."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ SET = "hydrodynamics.calibrated"
     [("finsrov", "surge", "d2"), ("bluerov2_heavy", "sway", "d1"), ("bluerov2_heavy", "heave", None)],
 )
 def test_only_absent_damping_is_improbable(name, axis, absent):
-    """The shape without a damping of zero is the most probable one in most of 3 draws, and the interval of that damping
-    holds zero; both dampings are written as they are estimated."""
+    """The shape without a zero damping is the most probable one in most of 3 draws, and the interval of that damping
+    contains zero; both dampings are written as estimated."""
     count, i = {"d1": 0, "d2": 0}, AXES.index(axis)
     paths = {"d1": f"{SET}.linear_damping.{i}.{i}", "d2": f"{SET}.quadratic_damping.{i}.{i}"}
     for seed in range(3):
@@ -46,7 +46,7 @@ def test_only_absent_damping_is_improbable(name, axis, absent):
 
 @pytest.mark.slow
 def test_intervals_reach_from_the_free_drag_to_the_averaged_one():
-    """With another drag the other numbers move; their intervals keep the ends that they had and gain the way."""
+    """With another drag the other parameters move; their intervals keep their ends and extend by the shift."""
     vehicle, some = trials("bluerov2_heavy", "sway")
     fit = Stages(prepare(some[::3], vehicle)[0], vehicle, ("sway",), (), {}, None, FitProgress(None))
     free = fit.first({"sway": "both"}, {})
@@ -60,11 +60,12 @@ def test_intervals_reach_from_the_free_drag_to_the_averaged_one():
 
 
 def test_the_average_over_shapes_holds_what_the_data_cannot_exclude():
-    """The force at one speed is known, its shape is not: all shapes share in the numbers; apart, only one does."""
+    """If only the force at one speed is known, all shapes contribute; where shapes are distinguishable, only
+    one does."""
     top, size = 0.25, 80.0
     drag = np.array(
         [25.0, 18.0]
-    )  # of a vehicle whose stronger trials give 13 and 87: 29.5 at 0.25 m/s, not 34.8
+    )  # a vehicle whose stronger trials give 13 and 87: 29.5 at 0.25 m/s, not 34.8
     across, along = np.array([1.0, top]), np.array([top, -1.0])
     S = 1.5**2 * np.outer(across, across) + 14.0**2 * np.outer(along, along)
     value, ends, weights, _ = _average(drag, WIDER**2 * S, size, top)
@@ -92,7 +93,7 @@ def test_asking_for_one_kind_gives_it():
 
 
 def test_unknown_damping_is_refused():
-    """With the available words."""
+    """The message lists the available words."""
     vehicle, some = trials("bluerov2", "surge")
     with pytest.raises(CalibrationError, match="available: auto, linear, quadratic, both"):
         fit_by_simulation(some, vehicle, damping="cubic")
@@ -100,7 +101,7 @@ def test_unknown_damping_is_refused():
 
 @pytest.mark.slow
 def test_slow_speeds_do_not_make_a_quadratic_term():
-    """Steps of 1 N: at 2 cm/s the quadratic damping of heave cannot show; it is not called identifiable."""
+    """Steps of 1 N reach 2 cm/s, where the quadratic damping of heave has no effect: it is not called identifiable."""
     vehicle = load_vehicle("finsrov").replace(
         {"thrusters.*.dead_rpm_plus": 1.0, "thrusters.*.dead_rpm_minus": -1.0}
     )

@@ -1,4 +1,4 @@
-"""Trials of the simulator give back the numbers that they were simulated with, and say what they cannot tell."""
+"""Fits of simulated trials recover the true parameters, and report those that are not identifiable."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ SET = "hydrodynamics.calibrated"
 
 
 def truth(vehicle, axis):
-    """m_eff, d1 and d2 of an axis at the set's reference point."""
+    """Return m_eff, d1 and d2 of an axis at the set's reference point."""
     chosen, i = vehicle.hydrodynamics["calibrated"], AXES.index(axis)
     back = np.linalg.inv(twist_shift(chosen.reference_point))
     M = back.T @ vehicle.rigid_body_mass_matrix() @ back + chosen.added_mass
@@ -30,7 +30,7 @@ def truth(vehicle, axis):
 
 
 def wrong(vehicle):
-    """The same vehicle with coefficients that are off by factors of two."""
+    """Return the same vehicle with coefficients that are off by factors of two."""
     chosen = vehicle.hydrodynamics["calibrated"]
     return vehicle.replace(
         {
@@ -47,12 +47,12 @@ def without(some, *columns):
 
 
 def trials_of(vehicle, axes, *, count=3, **options):
-    """Return trials of every second step of a programme: three levels in turns ahead and astern."""
+    """Return trials of every second step of a programme: three levels, alternately ahead and astern."""
     return simulate_programme(programmes(axes, vehicle)[::2][:count], vehicle, **{"seed": 3, **options})
 
 
 def check(fit, vehicle, axes, within):
-    """Every identifiable number within a part of the truth, and the truth inside its interval widened by as much."""
+    """Check identifiable values to a tolerance, and that intervals widened by half their width contain the truth."""
     for axis in axes:
         for name, value in truth(vehicle, axis).items():
             found = fit.estimates[f"{axis}.{name}"]
@@ -82,14 +82,14 @@ CASES = {
         0.10,
     ),
 }
-"""Vehicle, axes, every which step of their programmes is made, options of the simulation, and how near the numbers
-come: with seven seeds of the noise, all came nearer."""
+"""Vehicle, axes, stride of their programmes, options of the simulation, and tolerance: with seven seeds of the
+noise, all errors were smaller."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_numbers_come_back(name):
-    """From coefficients off by factors of two, whatever drives and measures the vehicle."""
+    """They are recovered from coefficients off by factors of two, for every kind of input and sensor."""
     vehicle, axes, every, options, within = CASES[name]
     vehicle = load_vehicle(vehicle)
     some = simulate_programme(programmes(axes, vehicle)[::every], vehicle, seed=3, **options)
@@ -102,7 +102,7 @@ def test_numbers_come_back(name):
 
 @pytest.mark.slow
 def test_a_calibrated_vehicle_holds_the_numbers():
-    """The changes turn the wrong vehicle into one whose added mass and damping force are the true one's."""
+    """The changes give the wrong vehicle the added mass and damping force of the true one."""
     vehicle = load_vehicle("finsrov")
     fit = fit_by_simulation(trials_of(vehicle, "yaw"), wrong(vehicle))
     found, true = (v.hydrodynamics["calibrated"] for v in (wrong(vehicle).replace(fit.changes), vehicle))
@@ -122,7 +122,7 @@ def spiked(trial, column, value):
 
 @pytest.mark.slow
 def test_rare_spikes_leave_a_right_fit_and_do_not_hide_a_wrong_one():
-    """R² and NRMSE are those of the samples without spikes; a velocity that ignores its inputs stays unexplained."""
+    """R² and NRMSE exclude spikes; a velocity that ignores its inputs stays unexplained."""
     vehicle = load_vehicle("finsrov")
     some = trials_of(vehicle, "yaw", count=2, rate=20.0, columns=("u", "v", "r"), inputs=("wrench",))
     fit = fit_by_simulation([spiked(t, "r", 10.0) for t in some], vehicle)
@@ -158,7 +158,7 @@ def test_damping_at_zero_rests_on_its_bound():
 
 @pytest.mark.slow
 def test_damping_that_slow_motion_does_not_show_stays_the_files():
-    """Of 0.02 rad/s: FinsROV's d2 of yaw cannot be distinguished from zero or from others, and keeps its origin."""
+    """At 0.02 rad/s, d2 of FinsROV's yaw is not distinguishable from zero or other values, and keeps its origin."""
     vehicle = load_vehicle("finsrov")
     trials = simulate_programme(programmes("yaw", vehicle, levels={"yaw": (0.005,)}), vehicle, seed=3)
     fit = fit_by_simulation(trials, vehicle)
@@ -172,7 +172,8 @@ def test_damping_that_slow_motion_does_not_show_stays_the_files():
 
 @pytest.mark.slow
 def test_a_small_swing_is_fitted_and_integrals_are_not_compared():
-    """Roll of a stiff vehicle under sway is fitted though nothing drives it; places add nothing to velocities."""
+    """Roll of a stiff vehicle under sway is fitted although it is not driven; positions add no information to
+    velocities."""
     file = load_vehicle("bluerov2_heavy")
     stiff = file.replace({"body.center_of_buoyancy": [0.0, 0.0, 0.04]})
     plan = programmes("sway", stiff, levels={"sway": (23.0,)})[:1]
@@ -193,7 +194,7 @@ def test_a_small_swing_is_fitted_and_integrals_are_not_compared():
 
 @pytest.mark.slow
 def test_pushes_that_tilt_a_vehicle_drive_it_up_and_down_too():
-    """Surge steps that pitch a vehicle by up to 25° move heave; taken as seen, it biased the drag of surge by 20 %."""
+    """Surge steps that pitch a vehicle by up to 25° move heave; taken as measured, heave biased surge drag by 20 %."""
     vehicle = load_vehicle("bluerov2_heavy")
     some = simulate_programme(programmes("surge", vehicle), vehicle, seed=2, inputs=("force",))
     bare = [replace(t, header=t.header.model_copy(update={"axis": ()})) for t in some]
@@ -230,7 +231,7 @@ def test_an_axis_that_a_trial_does_not_excite_moves_as_it_was_seen_to():
 
 @pytest.mark.slow
 def test_a_tether_that_pulls_in_one_direction_does_not_bend_the_drag():
-    """The vehicle turns under a pull of 1.8 N; without a pull of its own in each segment, mass and drag are lost."""
+    """The vehicle turns under a pull of 1.8 N; without a separate pull in each segment, mass and drag are wrong."""
     vehicle, force = load_vehicle("bluerov2_heavy"), np.array([1.5, -1.0, 0.0])
 
     def pull(simulator):
@@ -265,7 +266,7 @@ def test_a_late_stream_is_found_and_does_not_bias_the_mass():
 
 @pytest.mark.slow
 def test_outliers_and_gaps_are_survived():
-    """A second without measurements and a hundred wild samples leave the numbers where they were."""
+    """A second without measurements and a hundred outliers do not change the result."""
     vehicle, rng = load_vehicle("finsrov"), np.random.default_rng(0)
     bad = []
     for trial in trials_of(vehicle, "surge"):
@@ -278,7 +279,7 @@ def test_outliers_and_gaps_are_survived():
 
 @pytest.mark.slow
 def test_one_trial_says_what_its_intervals_rest_on():
-    """With a single trial, blocks within it stand for trials, which is said."""
+    """With a single trial, blocks within it replace trials, which is reported."""
     vehicle = load_vehicle("finsrov")
     fit = fit_by_simulation(trials_of(vehicle, "yaw", count=1), wrong(vehicle))
     (found,) = [one for one in fit.findings if one.code == "block_intervals"]
@@ -288,19 +289,19 @@ def test_one_trial_says_what_its_intervals_rest_on():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """Over 8 noise draws of three trials, 95 % intervals of mass and damping hold the truth in at least 6."""
+    """Over 8 noise draws of three trials, 95 % intervals of mass and damping contain the truth in at least 6."""
     names = ("surge.m_eff", "surge.d1", "surge.d2")
     hits = np.zeros(3)
     for seed in range(8):
         vehicle, some = known_trials.trials("bluerov2_heavy", "surge", seed=seed)
         found, expected = fit_by_simulation(some[::2], vehicle).estimates, known_trials.truth(vehicle)
         hits += [found[n].ci95[0] <= expected[n] <= found[n].ci95[1] for n in names]
-    assert (hits >= 6).all()  # 7.6 expected; 1 in 170 has fewer
+    assert (hits >= 6).all()  # 7.6 expected; 1 case in 170 has fewer
 
 
 @pytest.mark.slow
 def test_a_velocity_later_than_the_gyro_costs_no_mass():
-    """u is logged 120 ms late and the gyro is not: the lag of the one stream is found, the mass is within 5 %."""
+    """u is logged 120 ms later than the gyro: the lag of that stream is found, and the mass is within 5 %."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge")
     late = []
     for t in some[::2]:
@@ -315,7 +316,7 @@ def test_a_velocity_later_than_the_gyro_costs_no_mass():
 
 @pytest.mark.slow
 def test_all_axes_moving_at_once():
-    """A multi-sine on all axes: Coriolis terms and couplings are part of the simulation."""
+    """For a multi-sine on all axes, the simulation includes Coriolis terms and couplings."""
     vehicle, some = known_trials.trials("bluerov2_heavy", *AXES, kind="multisine")
     found, expected = fit_by_simulation(some, vehicle).estimates, known_trials.truth(vehicle)
     for axis in AXES:
@@ -324,7 +325,7 @@ def test_all_axes_moving_at_once():
 
 @pytest.mark.slow
 def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
-    """Only rates and attitude are logged: yaw and roll are fitted, and surge is named as unmeasured."""
+    """With only rates and attitude logged, yaw and roll are fitted, and surge is reported as unmeasured."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge", "roll", "yaw")
     some = [next(t for t in some if t.name.startswith(axis)) for axis in ("surge", "roll", "yaw")]
     fit = fit_by_simulation(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
@@ -334,7 +335,7 @@ def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
 
 @pytest.mark.slow
 def test_roll_without_attitude_rests_on_its_swing():
-    """Without any angle the gyro alone shows how fast roll swings back: stiffness and mass are in their intervals."""
+    """Without any angle, the gyro alone shows how fast roll swings back: stiffness and mass are in their intervals."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "roll")
     found = fit_by_simulation(without(some[::2], "qx", "qy", "qz", "qw"), vehicle).estimates
     for name in ("roll.m_eff", "roll.k"):
@@ -344,7 +345,8 @@ def test_roll_without_attitude_rests_on_its_swing():
 
 @pytest.mark.slow
 def test_bursts_of_a_wrong_wrench_make_the_intervals_wide():
-    """Two quarters of a second with three times the largest wrench in each trial: reported, nothing is identifiable."""
+    """Each trial has two quarters of a second with three times the largest wrench: reported, nothing is
+    identifiable."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge")
     bad = [with_bursts(t, j)[0] for j, t in enumerate(some)]
     fit, expected = fit_by_simulation(bad, vehicle), known_trials.truth(vehicle)
@@ -356,7 +358,7 @@ def test_bursts_of_a_wrong_wrench_make_the_intervals_wide():
 
 @pytest.mark.slow
 def test_axes_that_hardly_move_do_not_shake_the_others():
-    """Small pulses on roll and pitch, with velocities that are noise: both come back, and surge's numbers stay."""
+    """With small pulses on roll and pitch, and noise as velocities, both are recovered, and surge is unchanged."""
     vehicle, some = known_trials.trials("finsrov", "roll", "pitch")
     centre = {"body.center_of_gravity": vehicle.body.center_of_gravity.tolist()}
     file = wrong(vehicle).replace(centre, Provenance("measured", "weighed"))
@@ -370,7 +372,7 @@ def test_axes_that_hardly_move_do_not_shake_the_others():
 
 @pytest.mark.slow
 def test_dive_and_coast_gives_the_buoyancy():
-    """The coast after a dive shows the excess by itself; where it goes in the file reproduces it."""
+    """The coast after a dive determines the excess alone, and the displaced volume in the file reproduces it."""
     vehicle, some = known_trials.trials("bluerov2", "heave")
     fit = fit_by_simulation(some, vehicle)
     excess = fit.estimates["buoyancy_excess"]
@@ -382,7 +384,7 @@ def test_dive_and_coast_gives_the_buoyancy():
 
 @pytest.mark.slow
 def test_a_file_that_is_too_heavy_is_reported():
-    """An effective mass below the file's rigid mass: no negative added mass is written."""
+    """For an effective mass below the file's rigid mass, no negative added mass is written."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "surge", inputs=("wrench",))
     heavy = vehicle.replace({"body.mass": 25.0, "body.displaced_volume": 0.0249})
     fit = fit_by_simulation(some[::2], heavy)
@@ -394,7 +396,7 @@ def test_a_file_that_is_too_heavy_is_reported():
 
 @pytest.mark.slow
 def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
-    """The velocity of heave is another vehicle's: nothing of it is identifiable or written, and yaw is as usual."""
+    """Heave has another vehicle's velocity: none of its parameters is identifiable or written; yaw is unaffected."""
     vehicle, some = known_trials.trials("bluerov2_heavy", "heave", "yaw")
     rng = np.random.default_rng(3)
     foreign = []
@@ -414,7 +416,7 @@ def test_a_motion_that_the_wrench_does_not_explain_writes_nothing():
 @pytest.mark.slow
 @pytest.mark.parametrize("axes", [("surge", "yaw"), ("surge", "heave")])
 def test_a_vehicle_that_turns_over_is_simulated_as_it_turned(axes):
-    """Surge steps pitch bluerov2 to 80°: from a wrong file, surge and the other axis come back all the same."""
+    """Surge steps pitch bluerov2 to 80°: from a wrong file, surge and the other axis are recovered all the same."""
     levels = (("surge", (41.0, 82.0, 123.0)), ("sway", (31.0, 62.0, 93.0)))
     vehicle, some = known_trials.trials("bluerov2", *axes, levels=levels)
     added = 0.5 * vehicle.hydrodynamics["calibrated"].added_mass
@@ -426,7 +428,7 @@ def test_a_vehicle_that_turns_over_is_simulated_as_it_turned(axes):
 
 @pytest.mark.slow
 def test_an_interrupt_returns_the_best_until_then():
-    """Ctrl-C while fitting ends with estimates and the mark of an interrupted fit."""
+    """Ctrl-C while fitting returns estimates, marked as those of an interrupted fit."""
     vehicle = load_vehicle("finsrov")
 
     def interrupt(part, words):
@@ -440,7 +442,7 @@ def test_an_interrupt_returns_the_best_until_then():
 
 @pytest.mark.slow
 def test_equal_seeds_give_equal_fits():
-    """Nothing depends on threads, time or chance."""
+    """The result does not depend on threads, time or chance."""
     vehicle = load_vehicle("finsrov")
     trials = trials_of(vehicle, "yaw", count=1)
     a, b = (fit_by_simulation(trials, wrong(vehicle)) for _ in range(2))
@@ -448,7 +450,7 @@ def test_equal_seeds_give_equal_fits():
 
 
 def test_what_cannot_be_fitted_is_refused():
-    """Held-out trials, unknown words, and trials that measure nothing of an axis."""
+    """Refused: held-out trials, unknown words, and trials without a measurement of an axis."""
     vehicle = load_vehicle("finsrov")
     trials = trials_of(vehicle, "yaw", count=2)
     held = [replace(t, header=t.header.model_copy(update={"role": "held-out"})) for t in trials]

@@ -1,4 +1,4 @@
-"""Eliminating what belongs to one segment changes nothing but the size of the system."""
+"""Eliminating the unknowns of single segments changes only the size of the system."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,8 @@ from finssim.identification.shooting import (
 
 
 class Decays:
-    """y = a exp(-b t) + c_g + noise: b is shared, c_g is of a trial, which is shared too, a is of a segment."""
+    """Problem y = a exp(-b t) + c_g + noise: b and the c_g of each trial are shared unknowns, a belongs to a
+    segment."""
 
     def __init__(self, seed=0, noise=0.01, outliers=0, segments=6, low=0.0):
         rng = np.random.default_rng(seed)
@@ -63,7 +64,7 @@ class Decays:
 
 
 def dense(problem, point, std):
-    """Normal matrix and right-hand side of all unknowns at once, by an explicit Jacobian."""
+    """Return normal matrix and right-hand side of all unknowns at once, by an explicit Jacobian."""
     linear = problem.linearise(point)
     P, (S, q) = len(point.theta), point.z.shape
     J = np.zeros((len(linear.residual), P + S * q))
@@ -79,7 +80,7 @@ def dense(problem, point, std):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_schur_complement_gives_the_step_of_the_whole_system(seed):
-    """Shared unknowns move as if all were solved for together, and so do their covariances."""
+    """Steps and covariances of shared unknowns equal those of a joint solution."""
     problem = Decays(seed, outliers=3)
     rng = np.random.default_rng(seed)
     point = Point(np.append(0.8, rng.normal(size=3)), rng.uniform(1, 2, (6, 1)))
@@ -94,12 +95,12 @@ def test_the_schur_complement_gives_the_step_of_the_whole_system(seed):
 
 
 def start(rate):
-    """A decay rate, and nothing else."""
+    """Return a point with a decay rate alone."""
     return Point(np.array([rate, 0.0, 0.0, 0.0]), np.zeros((6, 1)))
 
 
 def test_a_fit_finds_what_the_data_were_made_with():
-    """Rate, offsets and amplitudes come back to a few standard errors of the noise."""
+    """Rate, offsets and amplitudes are recovered to a few standard errors of the noise."""
     problem = Decays()
     solution = solve(problem, start(4.0))
     assert solution.converged
@@ -115,7 +116,7 @@ def test_outliers_hardly_move_a_fit():
 
 
 def test_a_residual_of_five_standard_deviations_weighs_half():
-    """Huber's weight is 1 up to 2.5 standard deviations and 2.5 / size beyond; over the variance."""
+    """Huber's weight is 1 up to 2.5 standard deviations and 2.5 / size beyond, divided by the variance."""
     std = np.array([0.1, 0.1, 3.0, 3.0])
     weight = weights_of(np.array([2.4, 5.0, -2.4, -25.0]) * std, std)
     np.testing.assert_allclose(weight * std**2, [1.0, 0.5, 1.0, 0.1])
@@ -123,7 +124,7 @@ def test_a_residual_of_five_standard_deviations_weighs_half():
 
 @pytest.mark.parametrize("cut", [2.5, np.inf])
 def test_slopes_and_curvatures_are_those_of_the_loss(cut):
-    """Against differences of half Huber's loss of r / std, away from its kink."""
+    """They equal differences of half Huber's loss of r / std, away from its kink."""
     std, r, h = np.full(6, 0.2), 0.2 * np.array([-30.0, -2.6, -2.4, 0.0, 1.0, 9.0]), 1e-4
 
     def half_loss(r):
@@ -137,8 +138,8 @@ def test_slopes_and_curvatures_are_those_of_the_loss(cut):
 
 
 def test_a_fit_among_many_outliers_takes_steps_of_newtons_kind():
-    """With a fifth of the samples off to one side it takes 9 iterations from a third of the rate; with the whole of
-    Huber's weights as curvatures it took 16."""
+    """With a fifth of the samples off to one side it takes 9 iterations from a third of the rate; with Huber's full
+    weights as curvatures it took 16."""
     problem = Decays()
     problem.value[::5] += 0.05 * np.sign(problem.t[::5].mean() - np.tile(problem.t, 6)[::5])
     solution = solve(problem, start(0.4))
@@ -146,7 +147,7 @@ def test_a_fit_among_many_outliers_takes_steps_of_newtons_kind():
 
 
 def test_an_unknown_that_is_held_does_not_stiffen_the_others():
-    """Next to a prior of 1e-9, a start that is off by 1 is found in one step."""
+    """Next to an unknown with a prior of 1e-9, a start that is off by 1 is corrected in one step."""
     rows = np.array([[1.0, 0.0], [1.0, 1e-3], [1.0, -1e-3]])
     block = block_of(np.zeros((3, 1)), rows, np.ones(3))
     held = block._replace(aa=np.eye(1), bb=block.bb + np.diag([1e-4, 1e18]))
@@ -156,7 +157,7 @@ def test_an_unknown_that_is_held_does_not_stiffen_the_others():
 
 def test_a_segment_that_overshoots_does_not_stop_the_others():
     """One reading ends in a plateau, as where the time of a change has reached the next sample: a full step of that
-    segment's amplitude is as bad as it gets, and the rest converges all the same."""
+    segment's amplitude gives the largest error, and the rest converges all the same."""
     problem, straight = Decays(), Decays.predicted
 
     def predicted(points):
@@ -181,7 +182,7 @@ def test_a_segment_that_overshoots_does_not_stop_the_others():
 
 
 def test_a_fit_stops_at_a_bound():
-    """Where the best rate lies outside the box, the edge is the answer and the rest fits as it can."""
+    """If the best rate lies outside the box, the result is at the edge and the rest fits as well as possible."""
     problem = Decays(low=2.0)
     solution = solve(problem, start(4.0))
     assert solution.point.theta[0] == 2.0 and solution.converged
@@ -204,7 +205,7 @@ def test_ctrl_c_keeps_the_best_so_far():
 
 @given(seed=st.integers(0, 10_000))
 def test_a_step_in_a_box_satisfies_the_conditions_of_karush_kuhn_and_tucker(seed):
-    """Inside the box, stationary where free, pushed against the bounds where not."""
+    """Inside the box, it is stationary in free directions and pushed against active bounds."""
     rng = np.random.default_rng(seed)
     n = rng.integers(1, 6)
     root = rng.normal(size=(n, n))

@@ -1,4 +1,4 @@
-"""Synthetic trials obey the equations of motion row by row, and their noise is what was asked for."""
+"""Synthetic trials obey the equations of motion row by row, and have the requested noise."""
 
 from dataclasses import replace
 
@@ -26,13 +26,13 @@ D1 = 39.073593
 
 @pytest.mark.parametrize("rate", [50.0, 5.0])
 def test_momentum_between_rows_is_the_impulse_of_the_inputs(rate):
-    """m Δu = ∫ (tau - d1 u) dt from row to row: states and inputs at t_k."""
+    """m Δu = ∫ (tau - d1 u) dt from row to row: states and inputs are both at t_k."""
     trial = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0, rate=rate)[0]
     u, tau, x = (trial.channels[c] for c in ("u", "tau_x", "x"))
     heading = trial.channels["qz"][0], trial.channels["qw"][0]
     assert heading == pytest.approx((0.0, 1.0), abs=1e-6)
     missing = M * np.diff(u) + D1 * np.diff(x) - 0.5 * (tau[1:] + tau[:-1]) / rate
-    # The trapezoid errs by dt³ tau''/12 where motors start.
+    # The trapezoidal rule errs by dt³ tau''/12 where motors start.
     scale = 12.0 / rate
     assert np.abs(missing).max() < 0.12 * scale
     assert abs(missing.sum()) < 2e-3 * scale
@@ -57,7 +57,7 @@ def test_accelerometer_reads_the_acceleration_of_its_place_and_gravity():
 
 @pytest.mark.slow
 def test_equal_seeds_give_equal_trials():
-    """A trial is the same bit for bit when run again; other seeds give other motion and noise."""
+    """They are bit-identical when run again; other seeds give other motion and noise."""
     digest = [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
     assert digest == [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
     assert not set(digest) & {t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=5)}
@@ -65,7 +65,7 @@ def test_equal_seeds_give_equal_trials():
 
 
 def test_noise_can_be_drawn_again_over_one_motion():
-    """Two seeds over one recording differ by noise alone, of the profile's size."""
+    """Two seeds for one recording differ by noise alone, of the profile's size."""
     recording = record(SURGE, FINSROV, seed=1)
     truth, a, b = (
         trials_of(recording, SURGE, FINSROV, noise=noise, seed=seed)[0]
@@ -78,7 +78,8 @@ def test_noise_can_be_drawn_again_over_one_motion():
 
 
 def test_the_vehicles_own_sensors_measure():
-    """Depth comes at the sensor's 20 Hz with its quantum; the gyroscope has a bias that stays within a trial."""
+    """Depth is sampled at the sensor's 20 Hz with its quantisation; the gyroscope has a bias that is constant
+    in a trial."""
     trial = simulate_programme(SURGE, FINSROV, noise="sensors", seed=2)[0]
     t, depth = trial.series("depth")
     assert len(t) == pytest.approx(20.0 * trial.duration, abs=2)
@@ -93,7 +94,7 @@ def test_the_vehicles_own_sensors_measure():
 
 
 def test_a_row_has_the_newest_sample_and_the_commands_from_then_on():
-    """A gyro without errors reads the true rate of the row, and the thrusts add up to the wrench that was asked for."""
+    """An ideal gyro reads the true rate of the row, and the thrusts add up to the requested wrench."""
     names = ("gyro_noise_density", "gyro_bias_walk", "gyro_bias_initial", "gyro_quantisation", "latency")
     vehicle = FINSROV.replace({f"sensors.imu.{name}": 0.0 for name in names})
     plan = programmes("yaw", vehicle, levels=[1.0])[:1]
@@ -121,7 +122,7 @@ def test_published_noise_takes_velocity_from_noisy_positions():
 
 
 def test_a_plant_may_differ_from_the_file():
-    """A weaker propeller slows the vehicle while telemetry reads as before; a current carries it off."""
+    """A weaker propeller slows the vehicle with unchanged telemetry; a current carries it away."""
     nominal = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0)[0]
     weak = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0, plant={"gain": np.full(8, 0.8)})[0]
     np.testing.assert_allclose(weak.channels["tau_x"], nominal.channels["tau_x"], atol=1e-6)
@@ -130,20 +131,21 @@ def test_a_plant_may_differ_from_the_file():
     adrift = simulate_programme(
         SURGE, FINSROV, noise="none", spread=0.0, water=Water(current=(0.0, 0.1, 0.0))
     )[0]
-    # It also turns a little, for a current from the side and the way ahead make a Munk moment.
+    # It also turns a little: a current from the side and forward motion give a Munk moment.
     assert np.diff(adrift.channels["y"])[-1] * 50.0 == pytest.approx(0.1, rel=0.05)
     assert adrift.header.water.current == (0.0, 0.1, 0.0)
 
 
 def test_worlds_may_have_plants_of_their_own():
-    """A field given for each world acts in that world."""
+    """A value given for each world acts in that world."""
     gain = np.stack([np.full(8, 1.0), np.full(8, 0.5)])
     plus, minus = simulate_programme(SURGE, FINSROV, noise="none", spread=0.0, plant={"gain": gain})
     assert minus.channels["u"][500] == pytest.approx(-0.5 * plus.channels["u"][500], rel=1e-3)
 
 
 def test_a_log_may_hold_few_columns_slowly():
-    """5 Hz of wrench and velocity alone, and pulse widths that the file turns back into the thrust asked for."""
+    """A log with 5 Hz of wrench and velocity alone has pulse widths that the file converts back to the
+    requested thrust."""
     trial = simulate_programme(SURGE, FINSROV, rate=5.0, columns=("u", "r"), inputs=("wrench",))[0]
     assert set(trial.channels) == {"tau_x", "tau_y", "tau_z", "tau_k", "tau_m", "tau_n", "u", "r"}
     assert np.diff(trial.t) == pytest.approx(0.2)
@@ -155,7 +157,7 @@ def test_a_log_may_hold_few_columns_slowly():
     for name, thruster in six.thrusters.items():
         thrust = thruster.thrust(thruster.shaft_speed(strong.channels[f"pwm_{name}"]))
         np.testing.assert_allclose(thrust, strong.channels[f"command_{name}"], atol=1e-5)
-        # Within the dead band nothing turns, though 0.2 N were asked for.
+        # Within the dead band nothing turns, although 0.2 N were requested.
         assert not weak.channels[f"command_{name}"].any()
     assert abs(weak.channels["u"]).max() < 1e-3 < abs(strong.channels["u"]).max()
 
@@ -185,7 +187,7 @@ def test_a_dive_ends_when_the_ascent_is_steady():
     ],
 )
 def test_what_cannot_be_is_refused(arguments, sentence):
-    """Bad arguments are named together with what there is."""
+    """Bad arguments are named together with the valid ones."""
     with pytest.raises(ValueError, match=sentence):
         simulate_programme(SURGE[:1], FINSROV, **arguments)
 

@@ -1,4 +1,4 @@
-"""Intervals hold what they promise, whatever the trials have in common; trade-offs are named."""
+"""Intervals cover at their nominal rate, whatever errors the trials share; trade-offs are named."""
 
 from dataclasses import replace
 
@@ -20,7 +20,8 @@ TRUTH = np.array([3.0, -1.0, 0.5])
 
 
 def fitted(rng, trials, *, shared=0.0, unequal=False, samples=20):
-    """Least squares on trials whose errors share an offset and a slope within each trial: estimate, evidence."""
+    """Return estimate and evidence of least squares on trials whose errors share an offset and a slope within
+    each trial."""
     X, y = [], []
     for g in range(trials):
         x = np.column_stack([np.ones(samples), rng.normal(size=(samples, 2)) + [rng.normal(), 0.0]])
@@ -43,7 +44,7 @@ def fitted(rng, trials, *, shared=0.0, unequal=False, samples=20):
 @pytest.mark.parametrize("shared", [0.0, 0.5])
 @pytest.mark.parametrize("unequal", [False, True])
 def test_intervals_cover_the_truth(trials, shared, unequal):
-    """95 % intervals hold the truth in at least 90 % of 400 fits, and from 6 trials on are not far too wide either.
+    """95 % intervals contain the truth in at least 90 % of 400 fits, and from 6 trials on are not far too wide either.
 
     Trials may be few, of unequal weight, and differ as a whole.
     """
@@ -53,13 +54,13 @@ def test_intervals_cover_the_truth(trials, shared, unequal):
         theta, evidence = fitted(rng, trials, shared=shared, unequal=unequal)
         ends = intervals(theta, trial_covariance(evidence))
         hits += (ends[:, 0] <= TRUTH) & (TRUTH <= ends[:, 1])
-    assert (hits >= 0.88 * 400).all()  # 0.90 less 1.3 standard errors of the count
+    assert (hits >= 0.88 * 400).all()  # 0.90 minus 1.3 standard errors of the count
     assert (hits <= 0.9975 * 400).all() or trials < 6
 
 
 @pytest.mark.slow
 def test_pooled_intervals_of_five_trials_cover_the_truth_and_are_shorter():
-    """One factor from all trials and parameters: the truth is inside in 92 to 99 % of 400 fits."""
+    """With one factor from all trials and parameters, 92 to 99 % of 400 fits contain the truth."""
     rng = np.random.default_rng(4)
     hits, length = np.zeros(3), np.zeros((2, 400, 3))
     for k in range(400):
@@ -72,7 +73,7 @@ def test_pooled_intervals_of_five_trials_cover_the_truth_and_are_shorter():
 
 
 def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():
-    """Errors shared within a trial: the local covariance misses them, the disagreement of the trials shows them."""
+    """Errors shared within a trial do not enter the local covariance, but the disagreement of the trials shows them."""
     rng = np.random.default_rng(0)
     errors, local, trials = [], [], []
     for _ in range(300):
@@ -87,7 +88,7 @@ def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():
 
 
 def test_the_sandwich_agrees_with_trials_drawn_anew():
-    """Two ways to read the same disagreement: the formula, and 2000 draws of 60 trials with replacement."""
+    """Two estimates of the same disagreement: the formula, and 2000 draws of 60 trials with replacement."""
     _, evidence = fitted(np.random.default_rng(1), 60, shared=0.5)
     times = np.random.default_rng(3).multinomial(60, np.full(60, 1.0 / 60), size=2000).astype(float)
     normal = np.einsum("rg,gij->rij", times, evidence.normal)
@@ -97,7 +98,7 @@ def test_the_sandwich_agrees_with_trials_drawn_anew():
 
 @pytest.mark.parametrize("std", [0.01, 0.1, 1.0])
 def test_intervals_with_a_prior_hold_truths_drawn_from_it(std):
-    """Estimates pulled to a prior's mean: 95 % intervals hold the truth, and follow the narrower of the two sources."""
+    """For estimates drawn towards a prior's mean, 95 % intervals cover, and follow the narrower of the two sources."""
     rng, hits, width = np.random.default_rng(4), [], []
     for _ in range(300):
         theta, evidence = fitted(rng, 8)
@@ -120,7 +121,7 @@ def test_intervals_with_a_prior_hold_truths_drawn_from_it(std):
 
 
 def test_one_trial_leaves_the_local_answer():
-    """With one trial there is no disagreement: the local covariance has to serve."""
+    """One trial has no disagreement, so the local covariance is used."""
     theta, evidence = fitted(np.random.default_rng(2), 1, samples=200)
     covariance = trial_covariance(evidence)
     assert covariance.alone.all()
@@ -148,7 +149,7 @@ def test_what_only_one_trial_shows_is_not_called_certain():
 
 
 def test_unknown_directions_have_infinite_intervals():
-    """Two regressors that are always equal: neither is known, the third is."""
+    """Of two regressors that are always equal, neither is known; the third is."""
     rng = np.random.default_rng(4)
     x = [np.column_stack([a := rng.normal(size=30), a, rng.normal(size=30)]) for _ in range(5)]
     evidence = Evidence(
@@ -161,7 +162,7 @@ def test_unknown_directions_have_infinite_intervals():
 
 
 def test_correlated_samples_of_an_autoregression():
-    """An AR(1) series with coefficient φ: one independent sample stands for (1 + φ)/(1 - φ)."""
+    """In an AR(1) series with coefficient φ, (1 + φ)/(1 - φ) samples count as one independent sample."""
     from scipy.signal import lfilter
 
     noise = np.random.default_rng(5).normal(size=40000)
@@ -172,7 +173,7 @@ def test_correlated_samples_of_an_autoregression():
 
 
 def test_thrust_scale_against_mass_is_named():
-    """Known to 1 % as ratios and to 40 % each: the finding names all of them."""
+    """The ratios are known to 1 % and each value to 40 %: the finding names all of them."""
     theta = np.array([1.0, 25.0, 40.0, 0.3])
     relative = 0.4**2 * np.ones((4, 4)) + 0.01**2 * np.eye(4)
     relative[3, :3] = relative[:3, 3] = 0.0
@@ -184,7 +185,7 @@ def test_thrust_scale_against_mass_is_named():
 
 
 def test_well_known_parameters_need_no_warning():
-    """Strong correlation does not matter where every parameter is known to 1 %."""
+    """A strong correlation is harmless where every parameter is known to 1 %."""
     theta = np.array([25.0, 40.0])
     covariance = np.array([[1.0, 0.999], [0.999, 1.0]]) * np.outer(0.01 * theta, 0.01 * theta)
     assert degeneracy(("surge.d1", "surge.d2"), covariance, theta)[1] == []
@@ -193,7 +194,7 @@ def test_well_known_parameters_need_no_warning():
 
 
 def test_infinite_variance_is_said():
-    """A parameter without information is named and does not spoil the correlations of the others."""
+    """A parameter without information is named and does not affect the correlations of the others."""
     covariance = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, np.inf]])
     found, findings = degeneracy(("a", "b", "sway.d1"), covariance)
     assert findings[0].values == {"parameters": ("sway.d1",)}
@@ -202,14 +203,14 @@ def test_infinite_variance_is_said():
 
 
 def test_numbers_that_overflow_are_refused():
-    """As inputs of millions of revolutions a minute make them."""
+    """They occur with inputs of millions of revolutions a minute."""
     evidence = Evidence(names=("c",), normal=np.full((2, 1, 1), np.nan), score=np.zeros((2, 1)))
     with pytest.raises(CalibrationError, match="numbers that overflow: check the units"):
         trial_covariance(evidence)
 
 
 def test_a_parameter_that_is_hardly_known_overflows_nothing():
-    """Its variance has no square that a float holds; the degrees of freedom are those of the others all the same."""
+    """The square of its variance overflows a float; the degrees of freedom are those of the others all the same."""
     noise = np.random.default_rng(0).standard_normal((5, 2))
     for tiny in (1e-9, 1e-200):
         scale = np.array([1.0, tiny])

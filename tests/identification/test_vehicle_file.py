@@ -1,4 +1,4 @@
-"""A vehicle written to a file of its own is the same vehicle, and its file says where every number is from."""
+"""A vehicle written to a file is the same vehicle, and the file states the origin of every number."""
 
 import shutil
 
@@ -22,7 +22,7 @@ RECORD = CalibrationRecord(
 
 @pytest.mark.parametrize("name", catalogue())
 def test_every_vehicle_reads_back_as_itself(tmp_path, name):
-    """Hash, every origin with source and note, prose and order of the thrusters are kept, for every kind of vehicle."""
+    """Hash, every origin with source and note, texts and order of the thrusters are kept, for every kind of vehicle."""
     vehicle = load_vehicle(name)
     write_vehicle(vehicle, tmp_path / "again.yaml")
     again = load_vehicle(tmp_path / "again.yaml")
@@ -34,7 +34,7 @@ def test_every_vehicle_reads_back_as_itself(tmp_path, name):
 
 
 def test_a_changed_vehicle_reads_back_with_the_origin_of_each_entry(tmp_path):
-    """One entry of a diagonal, one of a thruster in a group, and a coupling: only these are measured."""
+    """One entry of a diagonal, one of a thruster in a group, and a coupling change: only these are measured."""
     vehicle = load_vehicle("finsrov")
     D2 = np.array(vehicle.hydrodynamic_set("calibrated").quadratic_damping)
     D2[1, 5] = D2[5, 1] = 0.25
@@ -62,14 +62,14 @@ def test_a_changed_vehicle_reads_back_with_the_origin_of_each_entry(tmp_path):
 
 
 def test_origins_fold_as_reading_folds_them():
-    """The folded origins of a vehicle are those its own file gave."""
+    """The folded origins of a vehicle are those in its own file."""
     for name in ("finsrov", "remus100"):
         vehicle = load_vehicle(name)
         assert folded(file_tree(vehicle), number_origins(vehicle)) == vehicle.provenance
 
 
 def test_records_travel_with_the_vehicle_and_not_with_its_hash(tmp_path):
-    """Trials are remembered through write, read, `replace` and `extends`; digests that look like numbers stay words."""
+    """Trials persist through write, read, `replace` and `extends`; digests that look like numbers stay strings."""
     vehicle = load_vehicle("finsrov")
     fitted = vehicle.model_copy(update={"calibrations": (RECORD,)})
     assert fitted.sha256 == vehicle.sha256
@@ -96,7 +96,7 @@ def test_records_travel_with_the_vehicle_and_not_with_its_hash(tmp_path):
     ],
 )
 def test_a_wrong_record_is_refused(tmp_path, old, new, sentence):
-    """A record is checked like every section."""
+    """A record is validated like every section."""
     fitted = load_vehicle("finsrov").model_copy(update={"calibrations": (RECORD,)})
     write_vehicle(fitted, tmp_path / "v.yaml")
     text = (tmp_path / "v.yaml").read_text(encoding="utf-8").replace(old, new)
@@ -107,7 +107,7 @@ def test_a_wrong_record_is_refused(tmp_path, old, new, sentence):
 
 
 def test_a_hull_mesh_comes_along(tmp_path):
-    """The folder can be moved: the mesh and its licence notice lie beside the file, once."""
+    """The folder can be moved: the mesh and its licence notice are written beside the file, once."""
     vehicle = load_vehicle("rexrov")
     for name in ("one.yaml", "two.yaml"):
         write_vehicle(vehicle, tmp_path / "here" / name)
@@ -128,7 +128,7 @@ def test_another_suffix_is_refused(tmp_path):
 
 
 def test_the_file_is_for_people(tmp_path):
-    """Groups are kept, vectors stand on one line, and the file is no longer than twice the catalogue's."""
+    """Groups are kept, vectors are on one line, and the file is at most twice as long as the catalogue's."""
     vehicle = load_vehicle("finsrov")
     write_vehicle(vehicle, tmp_path / "v.yaml")
     text = (tmp_path / "v.yaml").read_text(encoding="utf-8")
@@ -138,7 +138,7 @@ def test_the_file_is_for_people(tmp_path):
 
 
 def test_numbers_of_one_source_share_it_and_keep_their_notes(tmp_path):
-    """Each with an interval of its own: the source stands once, at the section."""
+    """Each has its own interval; the source appears once, at the section."""
     vehicle = load_vehicle("finsrov")
     for i, key in enumerate(("mass", "displaced_volume", "surface_half_height")):
         vehicle = vehicle.replace(
@@ -153,7 +153,7 @@ def test_numbers_of_one_source_share_it_and_keep_their_notes(tmp_path):
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("name", ["finsrov", "rexrov", "lauv"])
 def test_any_mixture_of_origins_is_kept(tmp_path, name, seed):
-    """Sources and notes drawn for every number, many equal and many empty: folding loses none of them."""
+    """Sources and notes are drawn for every number, many equal and many empty: folding loses none of them."""
     rng = np.random.default_rng(seed)
     vehicle = load_vehicle(name)
     pool = [

@@ -1,4 +1,4 @@
-"""The weak form gives start values near the truth, and none where the trials determine no inertia."""
+"""The weak form gives initial values near the truth, and none where the trials determine no inertia."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from identification.known_trials import trials, truth
     ("name", "axis"), [("finsrov", "surge"), ("bluerov2_heavy", "heave"), ("finsrov", "yaw")]
 )
 def test_start_values_are_near_the_truth(name, axis):
-    """Steps with the noise of real sensors: inertia within 15 %, drag at the top speed within a twentieth."""
+    """In steps with the noise of real sensors, inertia is within 15 %, drag at the top speed within a twentieth."""
     vehicle, some = trials(name, axis)
     expected, prepared = truth(vehicle), [streams(t, vehicle) for t in some]
     found = weak_form(prepared, axis, vehicle, {}).values
@@ -29,7 +29,7 @@ def test_start_values_are_near_the_truth(name, axis):
 
 
 def test_a_late_motion_is_no_inertia():
-    """Velocities logged 60 ms late: the lag is found, and the inertia is as before."""
+    """For velocities logged 60 ms late, the lag is found, and the inertia is unchanged."""
     vehicle, some = trials("bluerov2_heavy", "surge")
     late = [
         replace(
@@ -46,21 +46,21 @@ def test_a_late_motion_is_no_inertia():
 
 
 def without_places(some):
-    """Return trials whose velocity is known from the log alone."""
+    """Return trials whose only velocity is the logged one."""
     return [
         replace(t, channels={n: c for n, c in t.channels.items() if n not in ("x", "y", "z")}) for t in some
     ]
 
 
 def test_numbers_that_are_known_are_kept():
-    """A given inertia stays, and the drag follows from it."""
+    """A given inertia is kept, and the drag follows from it."""
     vehicle, some = trials("finsrov", "surge")
     found = weak_form([streams(t, vehicle) for t in some], "surge", vehicle, {"m_eff": 30.0}).values
     assert found["m_eff"] == 30.0 and found["d1"] > 0.0
 
 
 def test_trials_that_show_nothing_give_no_start():
-    """Where the axis was not measured there is no number."""
+    """An axis that was not measured has no value."""
     vehicle, some = trials("finsrov", "yaw")
     prepared = [streams(t, vehicle) for t in some]
     unknown = [replace(s, motion=replace(s.motion, nu=np.full_like(s.motion.nu, np.nan))) for s in prepared]
@@ -68,7 +68,8 @@ def test_trials_that_show_nothing_give_no_start():
 
 
 def test_bursts_of_a_wrong_wrench_are_found_and_lose_their_weight():
-    """Two quarters of a second with three times the largest wrench in each trial: mass within 5 %; clean ones: none."""
+    """With two quarters of a second of three times the largest wrench per trial, mass is within 5 %; clean
+    trials have none."""
     vehicle, some = trials("bluerov2_heavy", "surge")
     assert weak_form([streams(t, vehicle) for t in some], "surge", vehicle, {}).jolts == []
     bad = [with_bursts(t, j) for j, t in enumerate(some)]

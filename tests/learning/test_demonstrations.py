@@ -1,4 +1,4 @@
-"""Demonstrations: what an expert did, written as a Minari data set, read back as it was."""
+"""Demonstrations: an expert's actions, written as a Minari data set, and read back unchanged."""
 
 import json
 
@@ -25,7 +25,7 @@ SHORT = {"time_limit": 1.0}
 
 
 class Constant:
-    """Wants the same everywhere."""
+    """Expert with the same action everywhere."""
 
     name = "constant"
 
@@ -44,7 +44,7 @@ def environment(worlds=3, seed=7):
 
 
 def test_episodes_are_what_the_environment_gave():
-    """Seven episodes of three worlds: three of the first, two of each other; observations chained, rewards its own."""
+    """Of seven episodes, three are of the first world, two of each other; observations chain, rewards are its own."""
     found = record_episodes(environment(), Constant(), 7)
     assert len(found) == 7 and all(
         e.observation.shape == (11, 16) and e.action.shape == (10, 6) for e in found
@@ -64,7 +64,7 @@ def test_episodes_are_what_the_environment_gave():
 
 
 def test_what_is_disturbed_is_done_and_not_written():
-    """Another way is taken, but the expert's own wish stands beside each observation."""
+    """The disturbed action changes the path, but each observation is stored with the expert's own action."""
     calm, disturbed = (record_episodes(environment(), Constant(), 3, disturb=d, seed=1) for d in (0.0, 0.3))
     assert all((e.action == 0.5).all() for e in disturbed)
     assert not np.array_equal(calm[0].observation, disturbed[0].observation)
@@ -73,8 +73,8 @@ def test_what_is_disturbed_is_done_and_not_written():
 
 
 def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_path):
-    """Its world gives the one that begins in its place, whole."""
-    monkeypatch.chdir(tmp_path)  # where its last states are written
+    """Its world contributes the complete episode that begins next."""
+    monkeypatch.chdir(tmp_path)  # the folder of its last states
     env, step = environment(), Environment.step
 
     def breaking(self, action):
@@ -91,7 +91,7 @@ def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_
 
 
 def test_worlds_that_always_break_are_refused(monkeypatch, tmp_path):
-    """In place of waiting for an episode that never ends well."""
+    """The alternative would be to wait for a good episode forever."""
     monkeypatch.chdir(tmp_path)
     env, step = environment(), Environment.step
 
@@ -108,7 +108,7 @@ def test_worlds_that_always_break_are_refused(monkeypatch, tmp_path):
 
 
 def test_written_and_read_back(tmp_path):
-    """By us and by Minari itself, bit for bit."""
+    """The data are bit-identical, read by us and by Minari itself."""
     episodes = record_episodes(environment(), Constant(), 4)
     described = {"task": "t1", "expert": "constant", "vehicle": {"name": "finsrov", "sha256": "0"}}
     out = save(tmp_path / "set", episodes, described)
@@ -123,7 +123,7 @@ def test_written_and_read_back(tmp_path):
 
 
 def test_collecting_by_name(tmp_path):
-    """Vehicle, expert, action and revision are kept; equal seeds give equal sets; the expert of T1 holds."""
+    """Vehicle, expert, action and revision are stored; equal seeds give equal sets; the expert of T1 succeeds."""
     told = [
         collect(
             "pid",
@@ -165,7 +165,7 @@ def test_who_is_no_expert_is_refused():
 
 
 def test_commands(tmp_path, capsys):
-    """Collected, listed by folder and by name, as a table and as JSON."""
+    """Sets are collected, and listed by folder and by name, as a table and as JSON."""
     words = f"collect pid --task t1 --episodes 1 --disturb 0.1 --out {tmp_path / 'a'}".split()
     assert boundary.run(app, [*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["disturb"] == 0.1

@@ -1,4 +1,4 @@
-"""What an expert remembers goes into a state on disk and comes back as it was."""
+"""An expert's memory is saved with a state on disk and restored unchanged."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from finssim.tasks import make, numeric_tasks
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in numeric_tasks() if baselines_of(task)])
 def test_every_baselines_memory_survives(task, tmp_path):
-    """After one action of three rows: from disk it gives the same second action."""
+    """After one action of three rows, the memory from disk gives the same second action."""
     who = baseline(task, next(iter(baselines_of(task))))
     environment = make(task, worlds=3, seed=1)
     seen = environment.arrays.observation.numpy().reshape(3 * environment.agents, -1)

@@ -1,4 +1,4 @@
-"""A written policy computes what the network did, and is written whole or not at all."""
+"""A written policy computes the network's output, and is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def perceptron(activation: type[nn.Module], n: int = 16, m: int = 6, width: int 
 
 
 class Gated(nn.Module):
-    """Not a plain stack of layers, so torch's exporter has to write it."""
+    """Network that is not a plain stack of layers, so that torch's exporter has to write it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ def test_onnxruntime_computes_what_torch_does(tmp_path, network):
 
 
 def test_a_plain_perceptron_is_exported_in_half_a_second(tmp_path):
-    """Training to written policy has 40 s in all; torch's own exporter would take several of them."""
+    """The whole training may take 40 s; torch's own exporter would take several of them."""
     network = perceptron(nn.Tanh, width=256)
     export_policy(network, tmp_path / "first", description())
     start = time.process_time()
@@ -126,7 +126,7 @@ def test_a_network_of_other_sizes_is_refused_and_leaves_nothing(tmp_path):
 
 
 def test_a_trained_network_with_large_gains_is_exported(tmp_path):
-    """Float32 alone rounds such a network's actions by more than 1e-6; that is not a fault of the export."""
+    """Float32 alone rounds such a network's actions by more than 1e-6, which is not an error of the export."""
     network = perceptron(nn.ELU, width=256)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -176,7 +176,7 @@ def test_an_interrupted_export_leaves_the_earlier_policy(tmp_path, monkeypatch):
 
 
 def learned_elsewhere(library, worlds):
-    """A model of that library, as it begins, and what it does with observations (N, n)."""
+    """Return an untrained model of that library, and its output for observations (N, n)."""
     n, m = worlds.observation_size, worlds.action_size
     if library == "torch":
         model = nn.Sequential(nn.Linear(n, 8), nn.Tanh(), nn.Linear(8, m))
@@ -207,7 +207,7 @@ def learned_elsewhere(library, worlds):
 
 @pytest.mark.parametrize("library", ["torch", "PPO", "SAC", "rsl-rl"])
 def test_what_is_learned_elsewhere_runs_everywhere(library, tmp_path):
-    """Written with its environment's task, vehicle, limits and scale; the robot's agent does what the model does."""
+    """It is written with its environment's task, vehicle, limits and scale; the robot's agent acts like the model."""
     worlds = finssim.make("t1", worlds=2, vehicle="bluerov2_heavy", wrench_scale=0.5, seed=3)
     model, act = learned_elsewhere(library, worlds)
     folder = save_policy(model, worlds, tmp_path / "policy", steps=12)
@@ -223,7 +223,7 @@ def test_what_is_learned_elsewhere_runs_everywhere(library, tmp_path):
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
-    """A model that scales what it sees by itself, one of another size, and what is no model."""
+    """Refused: a model that scales its own observations, one of another size, and an object that is no model."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 

@@ -1,4 +1,4 @@
-"""The Gymnasium adapters pass Gymnasium's own checks and keep ends and final observations apart."""
+"""The Gymnasium adapters pass Gymnasium's own checks and separate ends from final observations."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ from finssim.tasks import TASKS, EnvironmentSetupError, StationKeeping, numeric_
 SHORT = StationKeeping(time_limit=0.5)
 ALONE = [name for name in numeric_tasks() if len(TASKS[name].agents) == 1]
 UNBOUNDED = pytest.mark.filterwarnings("ignore:.*infinity.*")
-"""Offsets have no bound, and the space says so."""
+"""Ignores a warning: offsets have no bound, and the space declares it."""
 
 
 @UNBOUNDED
@@ -34,9 +34,9 @@ def test_every_task_of_one_agent_is_registered():
 @UNBOUNDED
 @pytest.mark.parametrize("task", ["t1", "pursuit"])
 def test_a_task_of_one_agent_can_be_made_by_name(task):
-    """`gymnasium.make` and `make_vec` know it by its class, and pass options on."""
+    """`gymnasium.make` and `make_vec` find it by its class, and pass options on."""
     name, size = f"finssim/{TASKS[task].__name__}-v0", TASKS[task]().observation_size
-    # A task commands others by wrench.
+    # Agents of a team task are commanded by wrench.
     action, wide = ("wrench6", 6) if TASKS[task]().others else ("thruster8", 8)
     env = gymnasium.make(name, action=action)
     assert env.reset(seed=1)[0].shape == (size,) and env.action_space.shape == (wide,)
@@ -72,7 +72,7 @@ def test_observations_lie_in_their_space():
 
 
 def test_the_last_observation_is_returned_with_the_end():
-    """A single environment stays at its end: the same observation as the batch keeps as final."""
+    """A single environment stays at its end, with the observation that the batch keeps as final."""
     env, batch = Env(SHORT), VectorEnv(1, SHORT)
     env.reset(seed=4)
     batch.reset(seed=4)
@@ -85,7 +85,7 @@ def test_the_last_observation_is_returned_with_the_end():
 
 
 def test_the_batch_says_how_it_resets_and_gives_final_observations():
-    """SAME_STEP: the observation is the next episode's first; final_obs, with its mask, the last of the old."""
+    """SAME_STEP: the observation is the next episode's first; final_obs, with its mask, the last of the old one."""
     batch = VectorEnv(6, SHORT)
     assert batch.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     first, info = batch.reset(seed=1)
@@ -104,9 +104,9 @@ def test_the_batch_says_how_it_resets_and_gives_final_observations():
 
 
 def test_the_next_episode_may_begin_in_the_next_step():
-    """NEXT_STEP: the last observation comes with the end, the first of the next episode a step later, for reward 0.
+    """NEXT_STEP: the last observation comes with the end, the first of the next episode a step later, with reward 0.
 
-    A world in mid-episode does what it does beside worlds that begin anew: bit for bit as in SAME_STEP.
+    A world in mid-episode is not affected by worlds that reset: it is bit-identical to SAME_STEP.
     """
     batch, same = VectorEnv(3, SHORT, autoreset_mode="NextStep"), VectorEnv(3, SHORT)
     assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -137,7 +137,7 @@ def test_the_next_episode_may_begin_in_the_next_step():
 
 
 def test_gymnasiums_statistics_are_the_tasks():
-    """Its wrapper, which takes NEXT_STEP alone, counts returns and lengths as the task does."""
+    """Its wrapper, which supports only NEXT_STEP, counts returns and lengths as the task does."""
     batch = RecordEpisodeStatistics(VectorEnv(2, SHORT, autoreset_mode=AutoresetMode.NEXT_STEP))
     batch.reset(seed=2)
     for _ in range(11):
@@ -154,7 +154,7 @@ def test_another_way_to_begin_is_refused():
 
 
 def test_what_was_returned_stays():
-    """Results are copies: the next step does not change them."""
+    """Results are copies, which the next step does not change."""
     batch = VectorEnv(2)
     first, _ = batch.reset(seed=3)
     kept = first.copy()
@@ -185,7 +185,7 @@ def test_a_task_with_other_settings_is_taken():
 
 
 def test_after_its_end_an_episode_goes_on_until_reset():
-    """Stepping further moves the same vehicle; every step is reported as truncated."""
+    """Further steps move the same vehicle; each is reported as truncated."""
     env = Env(SHORT)
     env.reset(seed=1)
     ends = [env.step(np.ones(6, np.float32))[3] for _ in range(8)]
@@ -194,7 +194,7 @@ def test_after_its_end_an_episode_goes_on_until_reset():
 
 
 def test_a_world_that_breaks_has_started_over_when_step_returns(tmp_path):
-    """The last finite observation, reward 0, terminated; the next step is the new episode's first."""
+    """The step returns the last finite observation, reward 0, terminated; the next step is the new episode's first."""
     env = Env("t1", crash_directory=tmp_path)
     env.reset(seed=1)
     still = np.zeros(6, np.float32)

@@ -1,4 +1,4 @@
-"""The held evaluation measures the mean policy on its own episodes, and nothing else notices."""
+"""The held evaluation measures the mean policy on its own episodes, without side effects."""
 
 import numpy as np
 import torch
@@ -11,14 +11,14 @@ from reference.guess import BEST, Guess, GuessTogether
 
 
 def gain(value):
-    """The network that answers `value` times the sign that it sees."""
+    """Return a network whose output is `value` times the observed sign."""
     linear = nn.Linear(1, 6, bias=False)
     nn.init.constant_(linear.weight, value)
     return linear
 
 
 def test_what_it_measures_is_known():
-    """r = 1 - (value - c)² for each of the agents, of one and of two; success from 0.9 on."""
+    """r = 1 - (value - c)² for each agent, with one and with two agents; success from 0.9 on."""
     for task in (Guess(), GuessTogether()):
         held = HeldEvaluation(finssim.make(task, worlds=4, seed=held_seed(1)))
         for value in (0.0, 0.3, BEST):
@@ -29,7 +29,7 @@ def test_what_it_measures_is_known():
 
 
 def test_it_is_always_the_same_and_draws_from_no_stream_of_the_learner():
-    """Twice the same on whole episodes of T1, with the random streams of torch and NumPy where they were."""
+    """Whole episodes of T1 give the same result twice, and leave the random streams of torch and NumPy unchanged."""
     held = HeldEvaluation(finssim.make("t1", worlds=3, seed=held_seed(2), observe="training"))
     network = nn.Linear(16, 6)
     before = random_state()

@@ -1,4 +1,5 @@
-"""Gradients by hand are torch's own, with NumPy and with torch; a policy as plain arrays is what onnxruntime runs."""
+"""Hand-written gradients equal torch's, with NumPy and torch; a policy as plain arrays equals its onnxruntime
+output."""
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ LIBRARIES = pytest.mark.parametrize("device", [None, "cpu"], ids=["numpy", "torc
 
 @LIBRARIES
 def test_a_stacks_gradient_is_torchs(device):
-    """Of weights, biases and inputs, in two calls of different size: what the first left behind has no part in it."""
+    """Gradients of weights, biases and inputs agree in two calls of different size, without leftovers of the first."""
     arrays, rng = Arrays(1, device), np.random.default_rng(2)
     stack = TanhLayers(arrays, [5, 7, 6, 3])
     NetworkParameters(arrays, stack)
@@ -55,7 +56,7 @@ def test_a_stacks_gradient_is_torchs(device):
 
 @LIBRARIES
 def test_a_grus_gradient_is_torchs_through_time(device):
-    """With episodes that start within the piece of time, in some of its rows."""
+    """In some rows, episodes start within the time segment."""
     arrays, rng = Arrays(1, device), np.random.default_rng(3)
     n, k, T, rows = 4, 5, 6, 3
     gru = Gru(arrays, n, k)
@@ -87,7 +88,7 @@ def test_a_grus_gradient_is_torchs_through_time(device):
 
 @LIBRARIES
 def test_adam_is_torchs(device):
-    """Over steps whose gradient is longer than the limit, and shorter."""
+    """The steps include gradients longer and shorter than the limit."""
     arrays, rng = Arrays(1, device), np.random.default_rng(4)
     row = FreeRow(9)
     parameters = NetworkParameters(arrays, row)
@@ -105,7 +106,7 @@ def test_adam_is_torchs(device):
 
 
 def network(rng, history, last_action, cell, scaled, errors=()):
-    """A network of 4 observations and 3 actions, with weights from a hat."""
+    """Return a network of 4 observations and 3 actions, with random weights."""
 
     def linear(inputs, outputs):
         return Linear(*(rng.normal(size=s).astype(np.float32) for s in ((inputs, outputs), (outputs,))))
@@ -138,7 +139,7 @@ def network(rng, history, last_action, cell, scaled, errors=()):
     ],
 )
 def test_onnxruntime_computes_what_the_arrays_do(history, last_action, errors, cell, scaled):
-    """Step by step, each with the memory of its own step before; and so does torch on the same arrays."""
+    """They agree step by step, each with its own memory of the previous step; so does torch on the same arrays."""
     import onnxruntime
 
     rng = np.random.default_rng(5)
@@ -157,7 +158,7 @@ def test_onnxruntime_computes_what_the_arrays_do(history, last_action, errors, c
 
 
 def test_integrals_grow_near_the_goal_up_to_a_limit():
-    """By rate · e · exp(-(e / reach)²) a step, and are seen on top of the error; a way to go adds nothing."""
+    """They grow by rate · e · exp(-(e / reach)²) a step and are added to the error; a distant goal adds nothing."""
     observation = np.array([[0.02, 5.0, -0.04], [1.0, 5.0, 0.0]])
     seen, z = with_integrals(np, observation, np.zeros((2, 2)), (0, 2))
     expected = INTEGRAL_RATE * np.array([[0.02 * np.exp(-0.25), -0.04 * np.exp(-1.0)], [0.0, 0.0]])
@@ -170,7 +171,7 @@ def test_integrals_grow_near_the_goal_up_to_a_limit():
 
 
 def test_a_history_is_of_the_last_observations_newest_first():
-    """Scaled, behind zeros at the start of an episode; the last action as it was limited."""
+    """It is scaled and padded with zeros at the start of an episode; the last action is the limited one."""
     weight = np.zeros((4, 1), np.float32)
     weight[0] = 10.0
     ours = Network(
@@ -192,7 +193,7 @@ def test_a_history_is_of_the_last_observations_newest_first():
 
 
 def test_torchs_layers_are_the_same_network():
-    """The activations that torch has and ONNX too."""
+    """This covers the activations that both torch and ONNX have."""
     torch.manual_seed(6)
     module = nn.Sequential(
         nn.Linear(5, 6), nn.ELU(0.7), nn.Linear(6, 6), nn.ReLU(), nn.Linear(6, 2, bias=False)
@@ -203,7 +204,7 @@ def test_torchs_layers_are_the_same_network():
 
 
 def test_equal_seeds_are_equal_numbers():
-    """Noise, orders and first weights; a state goes on where it was taken."""
+    """Noise, orders and initial weights are equal; a saved state continues where it was saved."""
     draws = []
     for seed in (1, 1, 2):
         arrays = Arrays(seed)
@@ -220,7 +221,7 @@ def test_equal_seeds_are_equal_numbers():
 
 
 def test_first_weights_are_orthogonal():
-    """Whichever side is longer, scaled by the gain."""
+    """They are scaled by the gain, whichever side is longer."""
     for rows, columns in ((4, 7), (7, 4)):
         w = Arrays(1).orthogonal(rows, columns, 2.0)
         square = w @ w.T if rows < columns else w.T @ w

@@ -1,4 +1,4 @@
-"""Trainings in several processes: networks that stay equal, and what is refused."""
+"""Training in several processes: networks stay equal, and invalid requests are refused."""
 
 import time
 
@@ -26,7 +26,7 @@ def test_gradients_are_averaged(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_is_trained_by_two_processes(tmp_path):
-    """On a processor, by gloo; curves count the steps of both."""
+    """They run on a CPU with gloo; curves count the steps of both."""
     settings = TrainingSettings(worlds=32, steps=3 * 4096, processes=2, seed=3)
     policy = Policy.load(train("t1", settings, out=tmp_path / "p"))
     assert policy.description.training["complete"] and policy.description.training["processes"] == 2
@@ -43,7 +43,7 @@ def test_a_policy_is_trained_by_two_processes(tmp_path):
     ],
 )
 def test_what_several_processes_cannot_share_is_refused(tmp_path, changes, sentence):
-    """In one sentence, before anything is made."""
+    """Each request is refused in one sentence, before anything is created."""
     options = {"worlds": 32, "processes": 2, **changes}
     resume = options.pop("resume", False)
     if resume:

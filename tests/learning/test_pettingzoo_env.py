@@ -1,4 +1,4 @@
-"""The PettingZoo environment passes PettingZoo's tests, and ends all agents together."""
+"""The PettingZoo environment passes PettingZoo's tests, and ends the episode of all agents together."""
 
 import numpy as np
 import pytest

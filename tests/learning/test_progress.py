@@ -1,4 +1,4 @@
-"""What is told of a training on no terminal: a line for every tenth, with the time that is left."""
+"""Progress of a training without a terminal: a line for every tenth, with the remaining time."""
 
 import io
 
@@ -11,7 +11,7 @@ ROW = {"steps": 0, "steps_per_s": 50_000, "mean_return": 1.25, "held": 0.5}
 
 
 def lines(monkeypatch, steps, begun=0):
-    """What is printed when the clock shows a second more at every look."""
+    """Return the printed lines, with a clock that advances by a second at every reading."""
     ticks = iter(range(1000))
     monkeypatch.setattr(training_loop.time, "perf_counter", lambda: float(next(ticks)))
     console = Console(file=io.StringIO(), width=200)
@@ -24,7 +24,7 @@ def lines(monkeypatch, steps, begun=0):
 
 
 def test_the_time_left_follows_from_the_steps_of_this_run(monkeypatch):
-    """250 steps in the first second leave 3 s; of a training that goes on at 500, 250 in a second leave 1 s."""
+    """250 steps in the first second leave 3 s; for a training resumed at 500, 250 in a second leave 1 s."""
     assert lines(monkeypatch, [250])[0].endswith("held 50 %  3 s left")
     assert lines(monkeypatch, [750], begun=500)[0].startswith("training  75%")
     assert lines(monkeypatch, [750], begun=500)[0].endswith("1 s left")

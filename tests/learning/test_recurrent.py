@@ -1,4 +1,4 @@
-"""A policy that remembers: exported as learnt, carried from action to action, and begun anew in every episode."""
+"""A recurrent policy: exported as learnt, with memory carried from action to action and reset in every episode."""
 
 import hashlib
 from dataclasses import replace
@@ -30,7 +30,7 @@ READING = Reading(5.0, np.array([0.2, 0.1, -0.4]), np.array([0.0, 0.0, 0.1, 0.99
 
 
 def parts():
-    """A GRU of torch's and layers behind it, with weights as large as a trained network's."""
+    """Return a torch GRU and layers behind it, with weights as large as a trained network's."""
     gru, layers = nn.GRU(16, 16), nn.Sequential(nn.Linear(16, 8), nn.ELU(), nn.Linear(8, 6))
     with torch.no_grad():
         for i, parameter in enumerate(nn.ModuleList([gru, layers]).parameters()):
@@ -40,7 +40,7 @@ def parts():
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """Of station keeping, with weights from a hat."""
+    """A policy for station keeping with random weights."""
     gru, layers = parts()
     weights = {name: parameter.detach() for name, parameter in gru.named_parameters()}
     cell = Cell(*(Linear(weights[f"weight_{x}_l0"].T, weights[f"bias_{x}_l0"]) for x in ("ih", "hh")))
@@ -49,7 +49,7 @@ def policy(tmp_path_factory):
 
 
 def test_it_acts_as_torch_steps_its_gru(policy):
-    """Step by step with memory, each in its own row, and through the start of an episode in some rows."""
+    """They agree step by step, each row with its own memory, and through the start of an episode in some rows."""
     gru, layers = parts()
     run = Policy.load(policy)
     rng, state, memory = np.random.default_rng(2), torch.zeros(1, 5, 16), run.reset(5)
@@ -69,7 +69,8 @@ def test_it_acts_as_torch_steps_its_gru(policy):
 
 
 def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
-    """None, or other rows; one for a policy that has none; and a network that remembers otherwise than is said."""
+    """Refused: no memory, other rows, one for a policy without memory, and a network whose memory differs
+    from its file."""
     run, seen = Policy.load(policy), np.zeros((2, 16))
     with pytest.raises(
         PolicyError,
@@ -98,7 +99,7 @@ def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
 
 
 def test_a_module_that_remembers_is_not_exported(tmp_path):
-    """Torch's exporter knows nothing of memories."""
+    """Torch's exporter does not support memories."""
     with pytest.raises(ExportError, match="a torch module with memory cannot be written"):
         written(Counting(), tmp_path / "p", StationKeeping(), 6)
     size = StationKeeping().schema.size
@@ -107,7 +108,7 @@ def test_a_module_that_remembers_is_not_exported(tmp_path):
 
 
 def test_a_pilot_remembers_until_it_is_reset(policy):
-    """The thrusts of the policy's own steps; after `reset` the first ones again."""
+    """Its thrusts are those of the policy's own steps; after `reset` the first ones come again."""
     pilot, run = make_pilot(policy, FINSROV), Policy.load(policy)
     mode, seen = action_mode("wrench6", FINSROV), Observer("t1", FINSROV).observe(READING, STATION, 0.0)
     memory, given = run.reset(1), []
@@ -121,7 +122,7 @@ def test_a_pilot_remembers_until_it_is_reset(policy):
 
 
 def test_an_agent_remembers_and_begins_anew_where_an_episode_does(policy):
-    """The policy's own steps, row by row, evaluated or imitated."""
+    """Its actions are those of the policy's own steps, row by row, in evaluation and imitation."""
     environment, task = finssim.make("t1", worlds=3, seed=4), StationKeeping()
     agent, run = agent_for(policy, FINSROV, task), Policy.load(policy)
     expert = expert_for(policy, FINSROV, task, "wrench6")
@@ -141,7 +142,7 @@ def test_an_agent_remembers_and_begins_anew_where_an_episode_does(policy):
 
 
 class Counting(nn.Module):
-    """Remembers how often it was asked."""
+    """Module that counts its calls."""
 
     memory_size = 1
 
@@ -155,7 +156,7 @@ class Counting(nn.Module):
 
 
 def test_a_held_evaluation_begins_without_memory():
-    """And carries it from step to step."""
+    """It carries the memory from step to step."""
     held = HeldEvaluation(finssim.make(replace(StationKeeping(), time_limit=1.0), worlds=2, seed=5))
     network = Counting()
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The RSL-RL environment: groups, rows, ages and ends; and its runner trains."""
+"""The RSL-RL environment: groups, rows, ages and ends; and RSL-RL's runner trains with it."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SHORT = StationKeeping(time_limit=0.5)
 @pytest.mark.slow
 @KINDS
 def test_the_runner_trains(task, tmp_path, capsys):
-    """RSL-RL's own runner, with its checks of every number, and its log of the task's metrics."""
+    """RSL-RL's own runner checks every number, and logs the task's metrics."""
     env = RslRlVecEnv(task, worlds=4)
     runner = OnPolicyRunner(env, rsl_rl_settings(), str(tmp_path))
     runner.learn(2, init_at_random_ep_len=True)
@@ -72,7 +72,7 @@ def test_a_seed_starts_over():
 
 
 def test_a_critic_may_know_what_was_drawn():
-    """Its group has the privileged numbers behind the observation; the policy's has not."""
+    """Its group has the privileged numbers after the observation; the policy's does not."""
     env = RslRlVecEnv(SHORT, worlds=3, randomize="hold_for_position", privileged=True)
     groups, drawn = env.get_observations(), env.environment.arrays.privileged.numpy()
     assert groups["policy"].shape == (3, 16) and drawn.shape[1] == len(env.environment.privileged_names) > 0

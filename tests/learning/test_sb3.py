@@ -1,4 +1,4 @@
-"""The SB3 adapter: terminal observations, truncation apart from termination, values bootstrapped where right."""
+"""The SB3 adapter: terminal observations, truncation separate from termination, and correct bootstrapping."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_the_single_environment_passes_sb3s_checker(task):
 
 @KINDS
 def test_sb3_learns(task):
-    """PPO takes the batch, through SB3's own check that no number is NaN or infinite."""
+    """PPO accepts the batch, through SB3's own check that no number is NaN or infinite."""
     venv = VecCheckNan(Sb3VecEnv(task, worlds=4, seed=1), raise_exception=True)
     model = PPO("MlpPolicy", venv, n_steps=4, batch_size=8, n_epochs=1, device="cpu")
     before = [p.detach().clone() for p in model.policy.parameters()]

@@ -1,4 +1,4 @@
-"""What adapters are made from: a task with the arguments of `finssim.make`, or an environment."""
+"""Arguments of adapters: a task with the arguments of `finssim.make`, or an environment."""
 
 import numpy as np
 import pytest

@@ -30,7 +30,7 @@ def test_torchrls_checker_passes_with_groups():
 
 
 def test_torchrls_own_wrapper_takes_gymnasiums_form():
-    """GymWrapper around VectorEnv: its checker passes, and a rollout goes through two ends."""
+    """With GymWrapper around VectorEnv, its checker passes, and a rollout spans two ends."""
     env = GymWrapper(VectorEnv(3, SHORT))
     check_env_specs(env)
     done = env.rollout(12, break_when_any_done=False)["next", "done"][..., 0]
@@ -38,7 +38,7 @@ def test_torchrls_own_wrapper_takes_gymnasiums_form():
 
 
 def played(env, steps=12, seed=5):
-    """A rollout over ends, with actions that depend on nothing."""
+    """Return a rollout over ends, with predetermined actions."""
     rng = np.random.default_rng(9)
     env.set_seed(seed)
     now, out = env.reset(), []
@@ -50,7 +50,7 @@ def played(env, steps=12, seed=5):
 
 
 def test_a_rollout_is_the_environments_own_steps():
-    """Observations, last observations, rewards and ends are those of `Environment.step`, through two ends."""
+    """Observations, last observations, rewards and ends are those of `Environment.step`, over two ends."""
     got, plain, rng = played(TorchRlEnv(SHORT, worlds=4)), make(SHORT, worlds=4), np.random.default_rng(9)
     observation = plain.reset(seed=5).copy()
     for k in range(12):

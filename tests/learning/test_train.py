@@ -1,4 +1,4 @@
-"""`finssim train`: a directory that runs, repeats by its seed, survives Ctrl-C, and holds station once trained."""
+"""`finssim train`: a directory that runs, is repeatable by seed, survives Ctrl-C, and holds station once trained."""
 
 import csv
 import hashlib
@@ -36,7 +36,7 @@ TINY = {"worlds": 16, "steps": 8192}
 
 @dataclass(frozen=True, kw_only=True)
 class Unmeasured(Guess):
-    """A task whose episodes neither succeed nor fail."""
+    """Task whose episodes neither succeed nor fail."""
 
     name: str = "unmeasured"
 
@@ -55,7 +55,7 @@ def trained(tmp_path_factory):
 
 
 def test_the_policy_loads_for_what_it_was_trained_with(trained):
-    """Vehicle, task, action mode and rate are those of the training, and actions come out."""
+    """Vehicle, task, action mode and rate are those of the training, and it computes actions."""
     vehicle, task = load_vehicle("finsrov"), StationKeeping()
     schema = task.schema.model_dump(mode="json")
     policy = Policy.load(
@@ -69,7 +69,7 @@ def test_the_policy_loads_for_what_it_was_trained_with(trained):
 
 
 def test_the_description_is_enough_to_repeat_the_training(trained):
-    """Seed, settings of learner and task, vehicle's hash, steps done, revision."""
+    """It contains the seed, settings of learner and task, the vehicle's hash, completed steps, and the revision."""
     told = yaml.safe_load((trained / "policy.yaml").read_text(encoding="utf-8"))
     training = told["training"]
     assert told["seed"] == 5 and told["vehicle"]["sha256"] == load_vehicle("finsrov").sha256
@@ -81,7 +81,7 @@ def test_the_description_is_enough_to_repeat_the_training(trained):
 
 
 def test_curves_and_log_are_written(trained):
-    """A row for every update; TensorBoard's file stands beside the policy."""
+    """There is a row for every update; TensorBoard's file is beside the policy."""
     with (trained / "curves.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["steps"]) for row in rows] == [4096, 8192]
@@ -93,13 +93,13 @@ def test_curves_and_log_are_written(trained):
 
 @pytest.mark.slow
 def test_equal_seeds_are_equal_policies(trained, tmp_path):
-    """Bit for bit; another seed is another policy, which may be trained into the same directory."""
+    """They are bit-identical; another seed gives another policy, which may be trained into the same directory."""
     assert network(train("t1", TrainingSettings(seed=6, **TINY), out=tmp_path / "p")) != network(trained)
     assert network(train("t1", TrainingSettings(seed=5, **TINY), out=tmp_path / "p")) == network(trained)
 
 
 def test_options_reach_the_policy(tmp_path):
-    """Action mode, model, ranges and what is seen are recorded as they were used."""
+    """Action mode, model, ranges and observations are recorded as used."""
     out = train(
         "t1",
         TrainingSettings(
@@ -119,7 +119,7 @@ def test_options_reach_the_policy(tmp_path):
 
 
 def interrupt_after(updates, monkeypatch):
-    """Ctrl-C in the update that follows so many."""
+    """Raise Ctrl-C in the update after a number of updates."""
     update = TrainingLoop._update
 
     def interrupt(self, total):
@@ -132,7 +132,8 @@ def interrupt_after(updates, monkeypatch):
 
 @pytest.mark.slow
 def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch):
-    """Ctrl-C in the fourth update: a whole policy directory, that says so, then the interrupt goes on."""
+    """Ctrl-C in the fourth update gives a complete directory, marked as interrupted, and the interrupt is
+    raised again."""
     interrupt_after(3, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         train("t1", TrainingSettings(worlds=16, steps=100_000), out=tmp_path / "p")
@@ -142,7 +143,7 @@ def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_path, monkeypatch, capsys):
-    """The policy so far goes beside it, which is said; a finished training replaces it as ever."""
+    """The policy so far is written beside it, which is reported; a finished training replaces it as usual."""
     out = tmp_path / "p"
     shutil.copytree(trained, out)
     interrupt_after(2, monkeypatch)
@@ -155,7 +156,7 @@ def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_pat
 
 
 def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_path, monkeypatch, capsys):
-    """Neither anew nor over an earlier one: the network would be the random one that it started as."""
+    """It writes neither a new one nor over an earlier one: the network would be the random initial one."""
     interrupt_after(0, monkeypatch)
     shutil.copytree(trained, tmp_path / "earlier")
     for name in ("new", "earlier"):
@@ -167,14 +168,14 @@ def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_
 
 
 SMALL = {"worlds": 16, "steps": 4096, "seed": 5, "settings": {"rollout": 32, "batch": 128, "epochs": 2}}
-"""Eight updates; a checkpoint after every second one."""
+"""Options of a training of eight updates, with a checkpoint after every second one."""
 
 
 @pytest.mark.slow
 def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
-    """Each stands beside the policy, under the steps it had seen, and loads.
+    """Each is beside the policy, named by its steps, and loads.
 
-    Those of an earlier and longer training go: they would be taken for the newest, and this one's would go.
+    Those of an earlier and longer training are removed: they would count as newer, and this one's would be removed.
     """
     for steps, names in ((4096, ("000003072", "000004096")), (2048, ("000001536", "000002048"))):
         train("t1", TrainingSettings(**{**SMALL, "steps": steps}), out=tmp_path / "p")
@@ -184,7 +185,7 @@ def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
 
 
 def die_in_the_sixth_update(out, learner, options):
-    """A training that kill -9 ends."""
+    """Run a training and end it by kill -9."""
     update = TrainingLoop._update
 
     def dying(self, total):
@@ -200,13 +201,13 @@ def die_in_the_sixth_update(out, learner, options):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.parametrize("learner", ["ppo", "ppo from pid", "sb3-ppo"])
 def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
-    """kill -9 in the sixth of eight updates, then --resume: network and curves as if nothing had been."""
+    """After kill -9 in the sixth of eight updates and --resume, network and curves are as without interruption."""
     options = dict(SMALL)
     if learner == "ppo from pid":
         learner, options["init"] = "ppo", "pid"
         options["settings"] = {**SMALL["settings"], "taught": 0.9}
     whole = train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "whole")
-    # A forked child has everything imported.
+    # A forked child has already imported everything.
     run = multiprocessing.get_context("fork").Process(
         target=die_in_the_sixth_update, args=(tmp_path / "p", learner, options)
     )
@@ -229,7 +230,7 @@ def test_a_killed_training_goes_on_to_the_same_policy(tmp_path, learner):
 
 @pytest.mark.slow
 def test_only_the_same_training_is_resumed(tmp_path, capsys):
-    """Other arguments are named; where nothing was begun that is said; before the first checkpoint it begins anew."""
+    """Other arguments are named; a missing training is reported; before the first checkpoint it starts afresh."""
     with pytest.raises(ResumeError, match="nothing to resume: there is no folder .*leave out --resume"):
         train("t1", TrainingSettings(**SMALL), out=tmp_path / "p", resume=True)
     first = network(train("t1", TrainingSettings(**SMALL), out=tmp_path / "p"))
@@ -254,7 +255,7 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
 
 @pytest.mark.parametrize("learner", ["ppo", pytest.param("torchrl-ppo", marks=pytest.mark.slow)])
 def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
-    """One sentence, and no policy."""
+    """It gives one sentence and no policy."""
     options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
     with pytest.raises((LearningError, EnvironmentSetupError), match="diverged"):
         train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "p")
@@ -297,7 +298,7 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     ],
 )
 def test_what_cannot_be_trained_is_refused_at_once(tmp_path, options, error, sentence):
-    """One sentence, and nothing is left behind."""
+    """One sentence refuses it, and no files are left."""
     task = options.pop("task", "t1")
     with pytest.raises(error, match=sentence):
         train(task, TrainingSettings(**{**TINY, **options}), out=tmp_path / "p")
@@ -305,7 +306,7 @@ def test_what_cannot_be_trained_is_refused_at_once(tmp_path, options, error, sen
 
 
 def test_somebodys_files_are_not_replaced(tmp_path):
-    """A folder that holds anything but a policy is refused before the training."""
+    """A folder that contains anything but a policy is refused before the training."""
     (tmp_path / "thesis.tex").write_text("years", encoding="utf-8")
     with pytest.raises(OutputError, match="already holds files"):
         train("t1", TrainingSettings(**TINY), out=tmp_path)
@@ -313,7 +314,7 @@ def test_somebodys_files_are_not_replaced(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
-    """All eight in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default settings."""
+    """All eight are held in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default settings."""
     result = evaluate_controller(
         train("t1", TrainingSettings(seed=1), out=tmp_path / "p"), load_plant("nominal")
     ).result
@@ -322,7 +323,7 @@ def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
 
 
 def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
-    """Twice in a row, before its steps are done; the curves end there, and the policy is complete."""
+    """Two successes in a row end it before its steps are done; the curves end there, and the policy is complete."""
     settings = {"learning_rate": 1e-2, "discount": 0.5, "rollout": 16, "batch": 64, "hidden": [16, 16]}
     folder = train(
         Guess(),
@@ -347,7 +348,7 @@ def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
 
 
 def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
-    """Of the held evaluations' the one with the most successes, of equals the greater return, of those the later."""
+    """Among the held evaluations it has the most successes; ties are decided by the return, then by the later one."""
     scores = iter(
         [(0.1, 5.0), (0.9, 1.0), (0.9, 2.0), (0.9, 2.0), (0.5, 9.0), (0.9, 1.9), (0.0, 0.0), (0.8, 8.0)]
     )
@@ -367,7 +368,7 @@ def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
 
 
 def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
-    """50,000 steps, an eighth of the default, hold all setpoints; begun from nothing they hold none."""
+    """After 50,000 steps, an eighth of the default, it holds all setpoints; trained from scratch it holds none."""
     folder = train("t1", TrainingSettings(seed=1, steps=50_000, init="pid"), out=tmp_path / "p")
     result = evaluate_controller(folder, load_plant("nominal")).result
     assert (result["success"], result["trials"]) == (8, 8) and result["e_p_m"] < 0.005
@@ -378,7 +379,7 @@ def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
 
 
 def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
-    """In the task's own action mode, unless another teacher or none is asked for."""
+    """This is in the task's own action mode, unless another teacher or none is requested."""
     tiny = {"worlds": 8, "steps": 4096, "settings": {"hidden": [16]}}
     for options, teacher in (({}, "formation"), ({"action": "wrench6"}, ""), ({"init": "none"}, "")):
         folder = train("team-pursuit", TrainingSettings(**tiny, **options), out=tmp_path / "p")
@@ -399,7 +400,7 @@ def test_an_end_that_cannot_come_is_refused(tmp_path, task, until, sentence):
 
 
 def test_trajectory_tracking_is_trained_too(tmp_path):
-    """T2's own settings and noise, in a policy that the robot's observation fits."""
+    """The policy has T2's own settings and noise, and fits the robot's observation."""
     folder = train("t2", TrainingSettings(seed=1, randomize="hold_for_position", **TINY), out=tmp_path / "t2")
     policy = Policy.load(
         folder, task={"name": "t2", "observation": TrajectoryTracking().schema.model_dump(mode="json")}
@@ -414,7 +415,7 @@ def test_trajectory_tracking_is_trained_too(tmp_path):
 
 @pytest.mark.slow
 def test_a_short_training_follows_the_straight_line(tmp_path):
-    """After half of the usual steps: within 3 cm, several times better than the paper's best on hardware."""
+    """After half of the usual steps the error is within 3 cm, several times below the paper's best on hardware."""
     folder = train("t2", TrainingSettings(seed=1, steps=300_000), out=tmp_path / "t2")
     result = evaluate_controller(folder, load_plant("nominal"), TrialSettings(trials=1), task="t2").result
     assert result["horizontal_rmse_m"] < 0.03 and result["vertical_rmse_m"] < 0.03

@@ -1,8 +1,8 @@
-"""Bootstrapping, library by library, against a value that is known in closed form.
+"""Bootstrapping, library by library, checked against a value in closed form.
 
-Where every step gives the reward r, the value of any state under any policy is V = r / (1 - γ) if episodes are only cut
-by a time limit, since the task goes on, and r if the task ends in every step. A critic that says V everywhere must find
-V as the target of every step: if a library took the cut for an end, or the end for a cut, targets would be off by γ V.
+If every step gives the reward r, the value of any state under any policy is V = r / (1 - γ) if episodes are only cut by
+a time limit, since the task continues, and r if the task ends in every step. With a critic that returns V everywhere,
+the target of every step must be V: confusing a cut with an end, or an end with a cut, shifts targets by γ V.
 """
 
 import numpy as np
@@ -28,17 +28,17 @@ GAMMA = 0.9
 FLAT = Reward(
     position_scale=1e9, distance=0.0, heading=0.0, turn=0.0, action=0.0, change=0.0, rate=0.0, loss=0.0
 )
-"""1 in every step, wherever the vehicle is."""
+"""Reward of 1 in every step, wherever the vehicle is."""
 CUT = StationKeeping(time_limit=0.5, reward=FLAT)
-"""Cut after five steps: the value is 10."""
+"""Task that is cut after five steps: the value is 10."""
 ENDS = StationKeeping(bounds=(0.0, 0.0), reward=FLAT)
-"""Ends in every step: the value is 1."""
+"""Task that ends in every step: the value is 1."""
 CASES = pytest.mark.parametrize(("task", "value"), [(CUT, 10.0), (ENDS, 1.0)], ids=["cut", "ends"])
 STEPS = 8
 
 
 def says(layer: nn.Linear, value: float) -> None:
-    """Make a critic's last layer say this everywhere."""
+    """Make a critic's last layer return this value everywhere."""
     with torch.no_grad():
         layer.weight.zero_()
         layer.bias.fill_(value)
@@ -79,7 +79,7 @@ def test_torchrl(task, value):
 
 
 def test_torchrl_with_agents():
-    """Agent a gets a + 1 in every step: 10 and 20."""
+    """Agent a gets a + 1 in every step, so the values are 10 and 20."""
     critic = ValueOperator(
         nn.Linear(7, 1), in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
     )
@@ -87,7 +87,7 @@ def test_torchrl_with_agents():
         critic.module.weight.copy_(torch.tensor([[0.0] * 6 + [10.0]]))
         critic.module.bias.fill_(10.0)
     data = TorchRlEnv(constant(time_limit=0.5), worlds=3).rollout(STEPS, break_when_any_done=False)
-    for end in ("done", "terminated"):  # TorchRL wants the ends of a group beside its rewards
+    for end in ("done", "terminated"):  # TorchRL expects the ends of a group beside its rewards
         shape = data["next", "agents", "reward"].shape
         data["next", "agents", end] = data["next", end].unsqueeze(-1).expand(shape)
     estimator = GAE(gamma=GAMMA, lmbda=0.95, value_network=critic)
@@ -101,18 +101,19 @@ def test_torchrl_with_agents():
 
 
 def target(reward, value, done, after):
-    """The one-step target of a textbook: the reward, and the value of what followed unless the task ended."""
+    """Return the textbook one-step target: the reward, plus the value of the next state unless the task ended."""
     return reward + GAMMA * value(after) * (1.0 - done)
 
 
 def place(observation):
-    """A value that tells states apart: 10 and a little of the goal's offset."""
+    """Return a value that distinguishes states: 10 plus a little of the goal's offset."""
     return 10.0 + observation[..., 0]
 
 
 @CASES
 def test_gymnasiums_batch(task, value):
-    """What follows is `final_obs` where an episode ended: with it the target is V, without it that of another state."""
+    """The next state is `final_obs` where an episode ended: with it the target is V, without it another
+    state's value."""
     batch, single = VectorEnv(3, task), Env(task)
     batch.reset(seed=1), single.reset(seed=1)
     for _ in range(5):

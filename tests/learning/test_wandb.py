@@ -28,7 +28,7 @@ def test_curves_go_to_one_run_which_a_resumed_training_goes_on_with(tmp_path, mo
 
 @pytest.mark.slow
 def test_nobody_logged_in_is_one_sentence(tmp_path):
-    """In a process of its own, as Weights & Biases reads its environment once."""
+    """The test uses a separate process, as Weights & Biases reads its environment only once."""
     words = [
         "train",
         "t1",

@@ -1,4 +1,4 @@
-"""Our camera files give the lens that was written, and what is missing or unknown is refused in one sentence."""
+"""A written camera file gives the same lens, and missing or unknown entries are refused in one sentence."""
 
 import pytest
 
@@ -45,7 +45,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_file_that_tells_no_lens_is_refused(case, tmp_path):
-    """The sentence names the file and what is wrong."""
+    """The sentence names the file and the problem."""
     text, expected = REFUSED[case]
     path = tmp_path / "camera.yaml"
     path.write_text(text)
@@ -55,6 +55,6 @@ def test_a_file_that_tells_no_lens_is_refused(case, tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    """A path that is not there is refused by name."""
+    """A path that does not exist is refused by name."""
     with pytest.raises(LocalizationError, match="nowhere.yaml: cannot be read"):
         load_camera(tmp_path / "nowhere.yaml")

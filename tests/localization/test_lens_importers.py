@@ -1,4 +1,4 @@
-"""Each importer of lenses gives the pixels of its program's own equations, and refuses what it cannot read."""
+"""Each lens importer reproduces the pixels of its program's own equations, and refuses unreadable files."""
 
 import json
 import struct
@@ -22,7 +22,7 @@ MATRIX = [FX, 0.0, CX, 0.0, FY, CY, 0.0, 0.0, 1.0]
 
 
 def brown(k=(K1, K2, K3), p=(P1, P2), below=(0.0, 0.0, 0.0)):
-    """Brown's equations, pixels at centres: radial polynomial, over another one, and tangential terms."""
+    """Return pixels by Brown's equations, from pixel centres: a ratio of radial polynomials and tangential terms."""
     x, y = (POINTS[:, :2] / POINTS[:, 2:]).T
     r2 = x * x + y * y
     radial = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
@@ -33,7 +33,7 @@ def brown(k=(K1, K2, K3), p=(P1, P2), below=(0.0, 0.0, 0.0)):
 
 
 def kannala(t=(T1, T2, T3, T4)):
-    """Kannala's and Brandt's equations: a polynomial of the angle to the axis."""
+    """Return pixels by Kannala and Brandt's equations: a polynomial of the angle to the axis."""
     x, y = (POINTS[:, :2] / POINTS[:, 2:]).T
     r = np.hypot(x, y)
     angle = np.arctan(r)
@@ -47,7 +47,7 @@ def text(content):
 
 
 def xml(**more):
-    """Return what OpenCV's FileStorage writes as XML, under the names of its older sample."""
+    """Return the XML of OpenCV's FileStorage, with the names of its older sample."""
     values = "".join(f"<{key}>{value}</{key}>" for key, value in more.items())
     k = " ".join(map(repr, MATRIX))
     return (
@@ -134,7 +134,7 @@ KALIBR = f"""cam0:
 
 
 def opencv(coefficients, more=""):
-    """Return what OpenCV's FileStorage writes as YAML, under the names of its sample."""
+    """Return the YAML of OpenCV's FileStorage, with the names of its sample."""
 
     def matrix(numbers):
         return f"!!opencv-matrix\n   rows: {len(numbers)}\n   cols: 1\n   dt: d\n   data: {list(numbers)}\n"
@@ -158,7 +158,7 @@ def colmap_binary(kind, *parameters):
 
 
 FOCAL = (FX, FY, CX + 0.5, CY + 0.5)
-"""As programs write it that count pixels from the corner of the first one."""
+"""Focal lengths and centre as written by programs that count pixels from the corner of the first one."""
 
 
 def nerfstudio(frame=None, **more):
@@ -169,7 +169,7 @@ def nerfstudio(frame=None, **more):
 
 
 def orb(kind, prefix="Camera", **lens):
-    """Return the settings of ORB-SLAM2, or of ORB-SLAM3, where the camera is Camera1."""
+    """Return the settings of ORB-SLAM2, or of ORB-SLAM3, where the camera is named Camera1."""
     lines = [f"{prefix}.{key}: {value}" for key, value in lens.items()]
     focal = [f"{prefix}.{name}: {x}" for name, x in (("fx", FX), ("fy", FY), ("cx", CX), ("cy", CY))]
     return text(
@@ -204,7 +204,7 @@ ONE = np.array([[FX, 0, CX + 1], [0, FY, CY + 1], [0, 0, 1]])
 EIGHT = (*FIVE, 0.01, 0.002, -0.001)
 RATIONAL = {"below": EIGHT[5:]}
 OLDER = ONE.T.tolist()
-"""The camera matrix of older versions of MATLAB is transposed."""
+"""Camera matrix of older versions of MATLAB, which is transposed."""
 
 READ = {
     "ROS": ("c.yaml", text(ros("plumb_bob", FIVE)), brown()),
@@ -269,7 +269,7 @@ READ = {
 
 @pytest.mark.parametrize("name", READ)
 def test_a_foreign_lens_gives_the_pixels_of_its_own_equations(name, tmp_path):
-    """To a millionth of a pixel, in which the order of the coefficients and the first pixel show."""
+    """They agree to a millionth of a pixel, which reveals the order of coefficients and the pixel origin."""
     file, write, pixels = READ[name]
     write(tmp_path / file)
     lens = load_camera(tmp_path / file).lens
@@ -376,7 +376,7 @@ def test_what_is_no_lens_of_ours_is_refused_by_name(name, tmp_path):
 
 
 def test_a_principal_point_far_from_the_middle_is_questioned(tmp_path):
-    """A quarter of the size away, as where width and height, or cx and cy, are exchanged; a little off is usual."""
+    """An offset of a quarter of the size, as when width and height, or cx and cy, are swapped, gives a warning."""
     path, far = tmp_path / "c.yaml", f"{FX}, 0.0, 359.5, 0.0, {FY}, 639.5"
     path.write_text(ros("plumb_bob", STRAIGHT).replace(f"{FX}, 0.0, {CX}, 0.0, {FY}, {CY}", far))
     with pytest.warns(

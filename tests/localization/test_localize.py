@@ -1,4 +1,4 @@
-"""From files to poses: times are kept apart, what is missing is said, nothing is made up."""
+"""From files to poses: times are kept separate, missing data are reported, and nothing is invented."""
 
 import csv
 import json
@@ -21,13 +21,13 @@ PORT = np.array([0.0, 0.0, -0.115])  # finsrov.yaml
 
 
 def state(t):
-    """A vehicle that dives, leans and turns: position above the water's plane, roll, pitch, yaw about its normal."""
+    """Return position above the water's plane, and roll, pitch, yaw about its normal, of a manoeuvring vehicle."""
     position = np.array([0.3 * np.sin(0.5 * t), -0.2 + 0.2 * np.cos(0.4 * t), 0.45 + 0.1 * np.sin(0.9 * t)])
     return position, np.array([0.1 * np.sin(2.0 * t), 0.1 * np.cos(1.7 * t), 3.0 + 0.2 * t])
 
 
 def depth_of(t):
-    """What its pressure port reads [m]."""
+    """Return the reading of its pressure port [m]."""
     position, angles = state(t)
     port = position + rotation(angles, tuple(POOL.interface.normal)) @ PORT
     return -float(POOL.interface.distance(port))
@@ -35,7 +35,7 @@ def depth_of(t):
 
 @pytest.fixture
 def files(tmp_path):
-    """A pool, detections at 5 Hz with stamps late by the latency, depth at 20 Hz and IMU at 100 Hz."""
+    """A pool, detections at 5 Hz with stamps delayed by the latency, depth at 20 Hz and IMU at 100 Hz."""
     write_pool(POOL, tmp_path / "pool.yaml")
     up = tuple(POOL.interface.normal)
     frames = [
@@ -53,7 +53,7 @@ def files(tmp_path):
 
 
 def given(files, **options):
-    """Arguments of `run`."""
+    """Return arguments of `run`."""
     tables = {
         name: options.pop(name) for name in ("depth", "imu", "times", "tilt_std_deg") if name in options
     }
@@ -69,14 +69,14 @@ def given(files, **options):
 
 
 def located(files, **options):
-    """What `run` wrote, and its JSON."""
+    """Return the rows that `run` wrote, and its JSON."""
     found = localize.run(files / "tags.csv", **given(files, **options))
     with (files / "out.csv").open() as file:
         return found, list(csv.DictReader(file))
 
 
 def errors(rows):
-    """Root mean square distance [m] and turn [rad] of the pictures that were located from where the vehicle was."""
+    """Return the rms distance [m] and rotation [rad] of located pictures from the true pose."""
     off = []
     for row in (row for row in rows if row["status"] == "ok"):
         (x, y, _), angles = state(float(row["time"]) - LATENCY)
@@ -111,14 +111,14 @@ def test_poses_are_those_of_the_exposure(files, capsys):
 
 
 def test_reading_at_the_stamp_would_miss(files):
-    """The latency matters: without it depth and tilt belong to another moment, and the error grows fourfold."""
+    """Without the latency, depth and tilt belong to another time, and the error grows fourfold."""
     write_pool(replace(POOL, latency=0.0), files / "pool.yaml")
     _, rows = located(files, depth=files / "depth.csv", imu=files / "imu.csv")
     assert errors(rows)[0] > 8e-4
 
 
 def test_a_constant_depth_needs_no_time(files, capsys):
-    """Pictures without time stamps are located with one depth; without IMU as level, and it says so."""
+    """Pictures without time stamps are located with one depth; without IMU a level vehicle is assumed and reported."""
     position, angles = np.array([0.3, -0.2, 0.4]), np.array([0.0, 0.0, 0.5])
     up = tuple(POOL.interface.normal)
     detections = tuple(seen(POOL, position, angles, up=up))
@@ -129,7 +129,7 @@ def test_a_constant_depth_needs_no_time(files, capsys):
     assert "assumed level, within 2.0 degrees" in printed
     assert [float(rows[0][k]) for k in "xyz"] == pytest.approx(position, abs=1e-6)
     assert rows[1]["reason"] == "no tag seen"
-    assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a depth sensor's centimetre
+    assert float(rows[0]["std_x"]) > 3e-3  # 2 degrees of tilt, and a centimetre of depth error
     _, rows = located(files, depth=files / "depth.csv")
     assert "no time stamp" in rows[0]["reason"]
 
@@ -143,14 +143,14 @@ def test_a_constant_depth_needs_no_time(files, capsys):
     ],
 )
 def test_a_wrong_imu_file_is_refused(files, text, words):
-    """Degrees, foreign columns and quaternions that are none are told apart from attitudes."""
+    """Degrees, foreign columns and invalid quaternions are each recognised."""
     (files / "imu.csv").write_text(text)
     with pytest.raises(LocalizationError, match=words):
         located(files, depth=0.5, imu=files / "imu.csv")
 
 
 def test_corners_in_another_order_give_the_same_poses(files):
-    """As AprilTag's own library lists them: bottom left first, counter-clockwise; the vehicle has two tags."""
+    """The order is that of AprilTag's own library: bottom left first, counter-clockwise; the vehicle has two tags."""
     options = {"depth": files / "depth.csv", "imu": files / "imu.csv"}
     _, expected = located(files, **options)
     frames = [
@@ -172,7 +172,7 @@ def test_tags_of_another_family_are_not_ours(files):
 
 
 def test_height_follows_from_pressure_behind_a_wall(tmp_path):
-    """Where the plane is a wall, the surface is the world frame's origin."""
+    """Where the plane is a wall, the surface contains the world frame's origin."""
     pool = replace(POOLS["window wall"], world_position=(0.0, 0.0, 1.2))
     known = prior_sources(pool, load_vehicle("finsrov"), depth=0.5, imu=None)
     found = known.at(0.0, needs_height=True)

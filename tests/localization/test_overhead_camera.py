@@ -1,4 +1,4 @@
-"""The pool file: what is written is read, short forms mean what they say, frames agree with each other."""
+"""The pool file: a written file reads back, short forms equal full ones, and frames agree with each other."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ HEAD = """camera:
 
 
 def pool(**changes):
-    """A camera over level water in a frame with its origin on the floor."""
+    """Return a camera over level water in a frame with its origin on the floor."""
     camera = Camera(LENS, np.array([0.03, -0.17, 2.17]), DOWN)
     return replace(Pool(camera, Interface.water(0.96), latency=0.03), **changes)
 
@@ -46,7 +46,7 @@ POOLS = {
 
 @pytest.mark.parametrize("name", POOLS)
 def test_a_written_pool_reads_back(name, tmp_path):
-    """Every digit survives, so the hash does too, and the record comes along."""
+    """Every digit is kept, so the hash is too, and so is the record."""
     made = replace(POOLS[name], record={"kind": "pool", "rms_px": 0.21})
     write_pool(made, tmp_path / "pool.yaml")
     read = load_pool(tmp_path / "pool.yaml")
@@ -62,13 +62,13 @@ def test_pool_and_world_frames_are_inverse(name):
 
 
 def test_the_world_lies_on_the_water_where_nothing_else_is_said():
-    """A point on the surface above the survey's origin is the world's origin, z = 0 on the still surface."""
+    """The world's origin is the surface point above the survey's origin, with z = 0 on the still surface."""
     np.testing.assert_allclose(pool().T_wp @ [0.0, 0.0, 0.96, 1.0], [0, 0, 0, 1], atol=1e-15)
     assert pool().is_surface and not POOLS["wall"].is_surface
 
 
 def test_the_hash_is_of_the_geometry_alone():
-    """A record changes no measurement, a millimetre of water does."""
+    """A record does not change it, a millimetre of water does."""
     assert pool(record={"a": 1}).sha256 == pool().sha256
     assert pool(interface=Interface.water(0.961)).sha256 != pool().sha256
 
@@ -78,7 +78,7 @@ def test_the_hash_is_of_the_geometry_alone():
     ["{height: 0.96}", "{normal: [0, 0, 1], offset: -0.96}", "{normal: [0, 0, 1], point: [3, 4, 0.96]}"],
 )
 def test_level_water_may_be_written_in_three_ways(interface, tmp_path):
-    """Height, offset and a point of the plane mean the same plane."""
+    """Height, offset and a point of the plane define the same plane."""
     path = tmp_path / "pool.yaml"
     path.write_text(HEAD + f"interface: {interface}\n")
     assert load_pool(path).interface.height(1.0, -2.0) == pytest.approx(0.96, abs=1e-15)
@@ -99,7 +99,7 @@ def test_the_lens_may_stand_in_a_file_of_its_own(tmp_path):
     [({}, 0.5), ({"residual": {"pixel_sigma": 0.83}}, 0.83), ({"residual": {"pixel_sigma": 0.001}}, 0.05)],
 )
 def test_the_noise_of_a_corner_is_what_the_calibration_found(record, expected):
-    """From its residuals, but never below what a detector can do; half a pixel where nobody knows."""
+    """It is that of the residuals, but never below a detector's limit; half a pixel if it is unknown."""
     assert pool(record=record).pixel_std == expected
 
 
@@ -118,7 +118,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_file_that_tells_no_pool_is_refused(case, tmp_path):
-    """The sentence names file, section and what was expected."""
+    """The sentence names file, section and the expected values."""
     text, expected = REFUSED[case]
     path = tmp_path / "pool.yaml"
     path.write_text(text)

@@ -1,4 +1,4 @@
-"""Tables of points to pixels and back: what is written, carried along, said and refused."""
+"""Tables of points to pixels and back: output, kept columns, messages and refusals."""
 
 import csv
 import io
@@ -26,26 +26,26 @@ far,9.0,0.2,0.3
 
 @pytest.fixture
 def pool(tmp_path):
-    """A pool file: a camera above water."""
+    """A pool file with a camera above water."""
     path = tmp_path / "pool.yaml"
     write_pool(Pool(CAMERA, WATER), path)
     return path
 
 
 def given(tmp_path, text, name="points.csv"):
-    """A table in a file."""
+    """Return the path of a table written to a file."""
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def table(text):
-    """Rows of a CSV, as dicts."""
+    """Return the rows of a CSV as dicts."""
     return list(csv.DictReader(io.StringIO(text)))
 
 
 def test_points_become_pixels(tmp_path, pool, capsys):
-    """Pixels of what is seen, nothing for what is not; columns are carried along; reasons are told and counted."""
+    """Visible points have pixels, others none; other columns are kept; reasons are printed and counted."""
     run_project(given(tmp_path, POINTS), pool=pool)
     shown = capsys.readouterr()
     rows = table(shown.out)
@@ -71,7 +71,7 @@ def test_points_become_pixels(tmp_path, pool, capsys):
     ],
 )
 def test_tables_as_others_write_them(tmp_path, pool, capsys, text):
-    """Any order, capitals, units, separators, decimal commas, comments, no header: the same pixel."""
+    """Any order, capitals, units, separators, decimal commas, comments, or no header give the same pixel."""
     run_project(given(tmp_path, text), pool=pool)
     (row,) = table(capsys.readouterr().out)
     expected = project(CAMERA, WATER, [0.1, 0.2, 0.3]).pixels
@@ -79,13 +79,13 @@ def test_tables_as_others_write_them(tmp_path, pool, capsys, text):
 
 
 def test_there_and_back_through_files(tmp_path, pool, monkeypatch, capsys):
-    """What project writes, backproject takes, from a file or piped in, and gives the points back."""
+    """`backproject` reads the output of `project`, from a file or a pipe, and recovers the points."""
     run_project(
         given(tmp_path, "id,x,y,z\na,0.1,0.2,0.3\nb,-0.4,0.1,-0.5\n"), pool=pool, out=tmp_path / "pixels.csv"
     )
     assert capsys.readouterr().out == ""
     text = (tmp_path / "pixels.csv").read_text(encoding="utf-8")
-    run_backproject(tmp_path / "pixels.csv", pool=pool)  # the heights are in it
+    run_backproject(tmp_path / "pixels.csv", pool=pool)  # the file contains the heights
     from_file = capsys.readouterr().out
     monkeypatch.setattr(sys, "stdin", io.StringIO(text))
     run_backproject(Path("-"), pool=pool)
@@ -100,7 +100,7 @@ def test_there_and_back_through_files(tmp_path, pool, monkeypatch, capsys):
 
 
 def test_height_plane_and_column(tmp_path, pool, capsys):
-    """A height and the plane at that height give the same points; a column z goes before the height."""
+    """A height and the plane at that height give the same points; a column z takes precedence over the height."""
     pixels = given(tmp_path, "u,v\n600,300\n700,420\n")
     run_backproject(pixels, pool=pool, z=0.2)
     by_height = table(capsys.readouterr().out)
@@ -115,7 +115,7 @@ def test_height_plane_and_column(tmp_path, pool, capsys):
 
 
 def test_a_plane_above_the_water_is_not_met(tmp_path, pool, capsys):
-    """No point, and the reason."""
+    """There is no point, and the reason is given."""
     run_backproject(given(tmp_path, "u,v\n600,300\n"), pool=pool, z=1.5)
     shown = capsys.readouterr()
     (row,) = table(shown.out)
@@ -124,7 +124,7 @@ def test_a_plane_above_the_water_is_not_met(tmp_path, pool, capsys):
 
 
 def test_the_error_of_a_pixel_becomes_one_of_the_point(tmp_path, pool, capsys):
-    """sigma equals the scatter of the points of pixels that scatter by that much, within 5 % for 4000 draws."""
+    """sigma equals the scatter of points whose pixels have that error, within 5 % for 4000 draws."""
     run_backproject(given(tmp_path, "u,v\n900,200\n"), pool=pool, plane="0.3,0,1,0", pixel_std=0.5)
     (row,) = table(capsys.readouterr().out)
     pixels = np.array([900.0, 200.0]) + 0.5 * np.random.default_rng(0).standard_normal((4000, 2))
@@ -149,7 +149,7 @@ def test_the_error_of_a_pixel_becomes_one_of_the_point(tmp_path, pool, capsys):
     ],
 )
 def test_wrong_tables_are_refused_by_line(tmp_path, pool, text, words):
-    """File, line and cell are named; nothing is written."""
+    """The refusal names file, line and cell; nothing is written."""
     with pytest.raises(LocalizationError) as refused:
         run_project(given(tmp_path, text), pool=pool, out=tmp_path / "out.csv")
     assert words in str(refused.value) and "points.csv" in str(refused.value)

@@ -1,4 +1,4 @@
-"""A teacher and a student with a camera: training, its policy directory, and who runs it."""
+"""A teacher and a student with a camera: training, its policy directory, and running the policy."""
 
 from dataclasses import replace
 
@@ -103,7 +103,7 @@ def test_a_training_goes_on_from_its_state_bit_for_bit():
 
 
 def test_the_student_scales_its_row_by_what_the_first_rollout_saw():
-    """Velocities of centimetres a second count as much as features do; what hardly varies is not blown up."""
+    """Velocities of centimetres a second weigh as much as features; inputs that hardly vary are not amplified."""
     kind = learner_named("distill")
     learner = kind(Environment(TASK, worlds=8, seed=3), kind.settings(TASK, changes=TINY), seed=3)
     learner.update()
@@ -119,7 +119,7 @@ def test_the_student_scales_its_row_by_what_the_first_rollout_saw():
 
 
 def test_the_student_learns_what_the_teacher_does():
-    """The teacher goes straight ahead: after a few rounds the student does too, and its buffer is no larger."""
+    """The teacher goes straight ahead: after a few rounds the student does too, and its buffer has not grown."""
     kind = learner_named("distill")
     changes = {**TINY, "expert_rounds": 1, "steps": 2000, "learning_rate": 3e-3}
     learner = kind(Environment(TASK, worlds=8, seed=3), kind.settings(TASK, changes=changes), seed=3)
@@ -131,7 +131,7 @@ def test_the_student_learns_what_the_teacher_does():
 
 
 def test_demonstrations_keep_what_was_seen(tmp_path):
-    """Bit for bit what the environment showed, by us and by Minari itself; the last picture is the episode's own."""
+    """Data are bit-identical to the environment's, read by us and by Minari; the last picture is the episode's own."""
     task = CameraDocking(time_limit=0.5)
     told = collect("light-servo", task, episodes=3, out=tmp_path / "set", settings=CollectSettings(seed=4))
     assert told["episodes"] == 3 and told["steps"] == 15
@@ -152,7 +152,7 @@ def test_demonstrations_keep_what_was_seen(tmp_path):
 
 
 def shown_spots(folder, rows=400):
-    """A set of which the truth is known: the action says where in a dark picture a bright spot stands."""
+    """Write a set with known truth: the action is the position of a bright spot in a dark picture."""
     random = np.random.default_rng(0)
     picture = random.integers(0, 60, (rows + 1, 27, 48, 3), np.uint8)
     column = random.integers(4, 44, rows + 1)
@@ -169,7 +169,7 @@ def shown_spots(folder, rows=400):
 
 
 def test_cloning_learns_from_pictures(tmp_path):
-    """Where the picture alone says what to do, a tenth of the variance is left; another size is refused."""
+    """Where the picture alone determines the action, a tenth of the variance is left; another size is refused."""
     place = shown_spots(tmp_path / "set")
     changes = {
         "demonstrations": place,

@@ -1,4 +1,4 @@
-"""Behaviour cloning and DAgger: they become the expert, go on bitwise, and refuse what they cannot imitate."""
+"""Behaviour cloning and DAgger: they match the expert, resume bit-identically, and refuse unsuitable data."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def shown(tmp_path_factory):
 
 
 def linear(folder, rows=4000):
-    """A set of which the truth is known: the action is a linear function of the observation, inside the limits."""
+    """Write a set with known truth: the action is a linear function of the observation, inside the limits."""
     rng = np.random.default_rng(0)
     observation = rng.normal(size=(rows + 1, 16)).astype(np.float32)
     W = rng.uniform(-0.1, 0.1, (16, 6)).astype(np.float32)
@@ -56,7 +56,7 @@ def linear(folder, rows=4000):
 
 @pytest.mark.slow
 def test_cloning_finds_the_function_that_was_shown(tmp_path):
-    """To a tenth of its spread after forty passes; more steps, less error."""
+    """The error is a tenth of its spread after forty passes, and decreases with more steps."""
     place, observation, action = linear(tmp_path / "set")
     learner = made("bc", demonstrations=place, steps=160_000, rollout=16_000, learning_rate=3e-3)
     losses = []
@@ -69,13 +69,13 @@ def test_cloning_finds_the_function_that_was_shown(tmp_path):
 
 
 def test_dagger_keeps_what_the_expert_says_of_where_the_learner_came(shown):
-    """The PID's action for every kept observation, with its memory along the learner's own way."""
+    """Every kept observation has the PID's action, with its memory along the learner's own path."""
     learner = made("dagger", expert_rounds=0)
     learner.update()
     rows, told = learner._observation.numpy(), learner._action.numpy()
     assert rows.shape == (20 * 4, 16) and told.shape == (20 * 4, 6)
     memory = learner._expert.reset(4)
-    for k in range(20):  # 2 s episodes: none ends before its first is over, but shortened ones do
+    for k in range(20):  # 2 s episodes: none ends before the first is over, but shortened ones do
         wanted, memory = learner._expert.act(memory, Known(rows[4 * k : 4 * k + 4]), NOWHERE)
         if k == 0:
             assert np.allclose(told[:4], np.clip(wanted, -1.0, 1.0), atol=1e-6)
@@ -83,7 +83,7 @@ def test_dagger_keeps_what_the_expert_says_of_where_the_learner_came(shown):
 
 
 def test_dagger_begins_with_the_expert_at_the_helm():
-    """In the first round what is done is what the expert says; afterwards it is not."""
+    """In the first round the expert's actions are executed; afterwards they are not."""
     learner = made("dagger", expert_rounds=1)
     actions = []
     step = learner._worlds.step
@@ -107,7 +107,7 @@ def test_dagger_takes_demonstrations_to_begin_with(shown):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_a_training_goes_on_bitwise(name, shown, tmp_path):
-    """Two updates, a state on disk, two more in another learner: the same numbers."""
+    """Two updates, a state on disk, and two more in another learner give the same numbers."""
     changes = {} if name == "dagger" else {"demonstrations": shown}
     whole = made(name, **changes)
     for _ in range(2):
@@ -122,7 +122,7 @@ def test_a_training_goes_on_bitwise(name, shown, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(shown):
-    """No set, another task, vehicle or mode."""
+    """A missing set, and another task, vehicle or mode are refused."""
     with pytest.raises(LearningError, match="no demonstrations are named: collect some with finssim collect"):
         made("bc")
     kind = learner_named("bc")

@@ -1,7 +1,7 @@
-"""An episode that time ends is worth what its last observation is: with a value known in closed form.
+"""An episode that time ends has the value of its last observation, checked with a value in closed form.
 
-Where every step pays 1 and only time ends an episode, V = 1 / (1 - discount) everywhere. A critic that says so is
-right: all returns that a learner computes are V, in the steps in which an episode ends too.
+If every step pays 1 and only time ends an episode, V = 1 / (1 - discount) everywhere. With a critic that returns
+this value, all returns that a learner computes are V, also in the steps in which an episode ends.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ def made(name, task):
 
 
 def answer(critic, value):
-    """Let a network's last layer say `value` whatever it is shown."""
+    """Make a network's last layer return `value` for any input."""
     last = [layer for layer in critic.modules() if isinstance(layer, nn.Linear)][-1]
     with torch.no_grad():
         last.weight.zero_()
@@ -34,7 +34,7 @@ def answer(critic, value):
 
 
 def returns(name, learner, value):
-    """The returns that an update learns from, where the critic says `value`."""
+    """Return the returns that an update learns from, with a critic that returns `value`."""
     if name.startswith("sb3-"):
         answer(learner.model.policy.value_net, value)
         learner.update()
@@ -56,7 +56,7 @@ def returns(name, learner, value):
     ],
 )
 def test_time_ends_no_value(name, task):
-    """Four worlds over twelve steps, with an end by time at least twice in each."""
+    """Four worlds run for twelve steps, with an end by time at least twice in each."""
     learner = made(name, task())
     value = 1.0 / (1.0 - DISCOUNT)
     np.testing.assert_allclose(returns(name, learner, value), value, rtol=1e-5)
@@ -65,6 +65,6 @@ def test_time_ends_no_value(name, task):
 
 @pytest.mark.parametrize("name", ["sb3-ppo", "rsl-rl", "torchrl-ppo"])
 def test_an_end_by_the_task_ends_the_value(name):
-    """Of a task of one step the return is its reward, whatever the critic says of what comes after."""
+    """In a task of one step the return is its reward, whatever the critic returns for later states."""
     learner = made(name, Guess())
     assert returns(name, learner, 10.0).max() <= 1.0 + 1e-5

@@ -1,4 +1,4 @@
-"""Every learner: learns what is known, on every task, goes on bitwise, and refuses what it cannot do."""
+"""Every learner learns a known solution, works on every task, resumes bit-identically, and refuses invalid requests."""
 
 import sys
 from dataclasses import replace
@@ -16,7 +16,7 @@ from finssim.tasks import numeric_tasks, task_named
 from reference.guess import BEST, Guess, GuessTogether
 
 IMITATING = ("bc", "dagger", "distill")
-"""Tested where demonstrations and pictures are."""
+"""Learners that are tested with demonstrations and pictures."""
 REINFORCED = [name for name in LEARNERS if name not in IMITATING]
 ONE = [name for name in REINFORCED if LEARNERS[name].agents != "several"]
 SEVERAL = [name for name in REINFORCED if LEARNERS[name].agents != "one"]
@@ -30,18 +30,18 @@ TRAINED = [
         if task != "t1"
     ),
 ]
-"""Every learner, and every task."""
+"""Every pair of learner and task."""
 
 
 def small(name, task, **changes):
-    """Settings with which an update takes a fraction of a second."""
+    """Return settings with which an update takes a fraction of a second."""
     kind = learner_named(name)
     few = {"worlds": 8, "rollout": 16, "hidden": (16, 16), "batch": 64, "epochs": 2, **changes}
     return replace(kind.settings(task), **few)
 
 
 def made(name, task, seed=3, **changes):
-    """A learner in a small environment of its own."""
+    """Return a learner in its own small environment."""
     task = task_named(task) if isinstance(task, str) else task
     settings = small(name, task, **changes)
     ranges = "fossen_learn_to_swim" if task.name in numeric_tasks() else None
@@ -50,7 +50,7 @@ def made(name, task, seed=3, **changes):
 
 
 def flat(value):
-    """All numbers of a state, in order."""
+    """Return all numbers of a state, in order."""
     if isinstance(value, dict):
         return [x for key in sorted(value, key=str) for x in flat(value[key])]
     if isinstance(value, list | tuple):
@@ -73,7 +73,7 @@ def same(first, second):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "task"), PAIRS)
 def test_it_finds_the_best_action(name, task):
-    """Of a task of one step: c where +1 is seen and -c where -1, by every agent; the held evaluation says success."""
+    """In a task of one step, every agent plays c for +1 and -c for -1; the held evaluation reports success."""
     steps, batch = 10_000, 64 * len(task.agents)
     changes = {"worlds": 32, "learning_rate": 1e-2, "steps": steps, "batch": batch, "discount": 0.5}
     learner = made(name, task(), **changes)
@@ -95,7 +95,7 @@ def test_it_finds_the_best_action(name, task):
 @pytest.mark.slow  # importing torchrl starts a process
 @pytest.mark.parametrize(("name", "task"), [("torchrl-ppo", "team-pursuit"), ("torchrl-mappo", "t1")])
 def test_one_agent_is_not_several(name, task):
-    """With what to take instead."""
+    """The refusal names an alternative."""
     with pytest.raises(LearningError, match="has .* and this learner trains .*: use "):
         made(name, task)
 
@@ -103,7 +103,8 @@ def test_one_agent_is_not_several(name, task):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "task"), sorted(set(TRAINED)))
 def test_it_learns_and_goes_on_bitwise(tmp_path, name, task):
-    """Two updates, a state through a file into another learner, two more: parameters, rows and worlds are equal."""
+    """After two updates, a state through a file into another learner, and two more, parameters, rows and
+    worlds are equal."""
     whole = made(name, task, steps=1000)
     first = whole.state()["learner"]
     for _ in range(2):
@@ -121,7 +122,7 @@ def test_it_learns_and_goes_on_bitwise(tmp_path, name, task):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REINFORCED)
 def test_equal_seeds_are_equal_learners(name):
-    """And another seed is another."""
+    """Another seed gives another learner."""
     task = Guess() if name in ONE else GuessTogether()
     ends = []
     for seed in (1, 1, 2):
@@ -156,7 +157,7 @@ def test_unknown_names_are_refused():
     ],
 )
 def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sentence):
-    """Else they end in a division by zero, or after the first update; what may be left out may be 0."""
+    """Otherwise they would cause a division by zero, or fail after the first update; optional values may be 0."""
     kind = learner_named("sb3-ppo")
     with pytest.raises(LearningError, match=sentence):
         kind.settings(Guess(), changes={name: value})
@@ -168,7 +169,7 @@ def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sente
     [("rsl-rl", "rsl_rl.algorithms", "learn,rsl-rl"), ("sb3-ppo", "torch", "learn")],
 )
 def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extras):
-    """With what to install."""
+    """The refusal names the extra to install."""
     kind = learner_named(name)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"finssim.learning.learners.{kind.module}", raising=False)
@@ -180,7 +181,7 @@ def test_a_library_that_is_missing_is_named(monkeypatch, name, library, extras):
 
 @pytest.mark.slow  # importing torchrl starts a process
 def test_settings_are_changed_by_name():
-    """As numbers or as words, in the setting's own type."""
+    """Values are numbers or words, converted to the setting's type."""
     changes = {"learning_rate": "1e-3", "hidden": [32, 16], "epochs": 3}
     settings = learner_named("torchrl-ppo").settings(Guess(), worlds=64, steps=5, changes=changes)
     assert (settings.learning_rate, settings.hidden, settings.epochs) == (1e-3, (32, 16), 3)

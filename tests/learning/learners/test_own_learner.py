@@ -1,4 +1,4 @@
-"""A learner from outside the package: one file with a class, by name on the command line."""
+"""A learner from outside the package: one file with a class, selected by name on the command line."""
 
 import pytest
 
@@ -73,7 +73,7 @@ def file(tmp_path):
 
 
 def test_a_learner_of_ones_own_trains_resumes_and_says_what_it_is(file, tmp_path):
-    """Its settings, its name and its steps stand in the policy, which runs without it."""
+    """Its settings, name and steps are recorded in the policy, which runs without it."""
     folder = train(
         "t1", TrainingSettings(learner=f"{file}:Climb", seed=3, settings={"spread": 0.2}), out=tmp_path / "p"
     )
@@ -88,7 +88,7 @@ def test_a_learner_of_ones_own_trains_resumes_and_says_what_it_is(file, tmp_path
 
 
 def test_what_is_no_learner_is_refused(file, tmp_path):
-    """A class of another kind, a name that is not there, and a file that is not there."""
+    """Refused: a class of another kind, an unknown name, and a missing file."""
     with pytest.raises(LearningError, match="is no learner: derive it from finssim.learning.learners.base"):
         learner_named(f"{file}:Nothing")
     with pytest.raises(EnvironmentSetupError, match="has no learner 'Climp'; learners there: Climb"):

@@ -1,4 +1,4 @@
-"""PPO of our own: the same with NumPy and torch, without the host; it remembers, scales, and values what was drawn."""
+"""Our own PPO: equal with NumPy and torch, without the host; memory, scaling, and values of randomised quantities."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,7 +28,7 @@ FEW = {"worlds": 8, "rollout": 8, "batch": 32, "epochs": 2, "hidden": (16, 16), 
 
 
 class Torch(Arrays):
-    """Torch on the processor with NumPy's random numbers."""
+    """Torch on the CPU with NumPy's random numbers."""
 
     def __init__(self, seed):
         super().__init__(seed, "cpu")
@@ -54,7 +54,7 @@ def made(task, arrays=None, seed=3, ranges="fossen_learn_to_swim", **changes):
 
 
 STILL = np.array([0.0, 1.0], np.float32)
-"""A step of Adam that moves nothing."""
+"""A step of Adam that changes nothing."""
 
 VARIANTS = [
     {},
@@ -67,7 +67,7 @@ VARIANTS = [
 
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_torch_learns_what_numpy_learns(changes):
-    """Equal random numbers, three updates: parameters within what float32 rounds differently, and equal curves."""
+    """With equal random numbers, three updates give equal curves, and parameters within float32 rounding."""
     numpy, torchs = made(StationKeeping(), **changes), made(StationKeeping(), Torch(3), **changes)
     for _ in range(3):
         rows = [learner.update() for learner in (numpy, torchs)]
@@ -79,7 +79,7 @@ def test_torch_learns_what_numpy_learns(changes):
 
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
-    """As on a GPU: torch, with the environment's own look at frozen worlds, which is rare there, left aside."""
+    """As on a GPU, this is torch without the environment's own check for frozen worlds, which is rare there."""
     learner = made(StationKeeping(), Torch(3), **changes)
     held = HeldEvaluation(finssim.make(StationKeeping(time_limit=1.0), worlds=4, seed=1))
     touched = []
@@ -129,9 +129,9 @@ def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
 
 
 class Tape(TorchDispatchMode):
-    """What a CUDA graph is of, on a processor: the operations of a function, repeated with the same memory and scalars.
+    """CPU stand-in for a CUDA graph: the operations of a function, repeated with the same memory and scalars.
 
-    As a graph does, it refuses to read a number back.
+    Like a graph, it refuses to read a number back.
     """
 
     def __init__(self, function, arguments):
@@ -154,7 +154,7 @@ class Tape(TorchDispatchMode):
 
 
 class Taped(Torch):
-    """A GPU's recordings by tapes; the first call is taken down while it is made."""
+    """Emulation of a GPU's recordings by tapes; the first call is recorded while it runs."""
 
     replays = 0
 
@@ -178,7 +178,7 @@ class Taped(Torch):
 
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_recorded_operations_learn_the_same_when_repeated(changes):
-    """Each part of an update depends on nothing but memory that stays: a graph of a GPU can repeat it."""
+    """Each part of an update depends only on persistent memory, so that a CUDA graph can repeat it."""
     learners = [made(StationKeeping(time_limit=1.0), arrays, **changes) for arrays in (Torch(3), Taped(3))]
     for _ in range(4):
         rows = [learner.update() for learner in learners]
@@ -190,7 +190,7 @@ def test_recorded_operations_learn_the_same_when_repeated(changes):
 
 
 def torch_module(network):
-    """A held evaluation takes a network of arrays as it takes a module, where it runs with torch."""
+    """Return a network of arrays as a module: a held evaluation takes either where it runs with torch."""
 
     class Module(torch.nn.Module):
         memory_size = network.memory_size
@@ -204,13 +204,13 @@ def torch_module(network):
 
 @wp.func
 def shown_once(arrays: TaskArrays, w: int) -> float:
-    """The sign, in the first of three steps."""
+    """Return the sign, in the first of three steps."""
     return wp.where(arrays.time[w] < 0.05, arrays.goal_position[w][0], 0.0)
 
 
 @wp.func
 def recalled(state: State, arrays: TaskArrays, p: Any, w: int) -> float:
-    """The third step is paid."""
+    """Return the reward, which only the third step pays."""
     return wp.where(state.steps[w] >= 3, guessed(arrays, p, w, 0), 0.0)
 
 
@@ -248,7 +248,7 @@ LEARN = {
     ids=["blind", "history", "gru"],
 )
 def test_what_was_seen_two_steps_ago_is_remembered(tmp_path, changes, remembers):
-    """With a history or a GRU the held episodes pay 1, in onnxruntime too; without, no more than 1 - c² on average."""
+    """With a history or a GRU the held episodes pay 1, in onnxruntime too; without, at most 1 - c² on average."""
     learner = made(Recall(), ranges=None, **{**LEARN, **changes})
     while learner.steps < learner.settings.steps:
         learner.update()
@@ -268,7 +268,7 @@ def test_what_was_seen_two_steps_ago_is_remembered(tmp_path, changes, remembers)
 
 
 def test_observations_of_any_size_are_scaled():
-    """The running mean and deviation are those of all that was seen."""
+    """The running mean and deviation are those of all past observations."""
     learner = made(StationKeeping(), normalize=True)
     seen = []
     for _ in range(3):
@@ -282,7 +282,7 @@ def test_observations_of_any_size_are_scaled():
 
 @pytest.mark.parametrize("asymmetric", [True, False])
 def test_the_critic_sees_what_was_drawn_and_the_policy_does_not(asymmetric):
-    """Numbers that randomisation drew, in columns of their own, those of the episode that ended included."""
+    """Randomised quantities have their own columns, including those of the episode that ended."""
     learner = made(StationKeeping(), asymmetric=asymmetric)
     told = len(learner.environment.privileged_names)
     assert told > 0 and learner.actor.sizes[0] == 16 and learner.critic.sizes[0] == 16 + told * asymmetric
@@ -296,7 +296,7 @@ def test_the_critic_sees_what_was_drawn_and_the_policy_does_not(asymmetric):
 @pytest.mark.parametrize("task", [Steady, SteadyTogether])
 @pytest.mark.parametrize("changes", [{}, {"memory": 4}, {"history": 1, "normalize": True}])
 def test_time_ends_no_value(task, changes):
-    """With a critic that says 1 / (1 - γ), where every step pays 1, every return is that, across ends by time."""
+    """If every step pays 1 and the critic returns 1 / (1 - γ), every return is that value, across ends by time."""
     learner = made(task(), ranges=None, rollout=12, discount=0.9, **changes)
     learner.critic.weights[-2][:], learner.critic.weights[-1][:] = 0.0, 10.0
     learner._roll_out()
@@ -314,7 +314,7 @@ def test_an_end_by_the_task_ends_the_value():
 
 
 def test_advantages_are_the_discounted_sum_of_differences_up_to_the_end():
-    """A_t = Σ (γ λ)^k δ_(t+k), summed forwards in each episode; nothing of the next one enters."""
+    """A_t = Σ (γ λ)^k δ_(t+k), summed forwards in each episode; the next episode does not contribute."""
     learner = made(Guess(), ranges=None, discount=0.9, gae_lambda=0.7)
     random = np.random.default_rng(0)
     for x in (learner._r, learner._c):
@@ -350,7 +350,7 @@ def test_the_noise_of_an_action_is_known_exactly():
 def test_the_policy_follows_the_gradient_of_the_clipped_objective(clip, entropy_weight):
     """L = -E[min(r A, clip(r, 1 - ε, 1 + ε) A)] - w H, A standardised (Schulman et al. 2017, eq. 7 and 9), by autograd.
 
-    In units of the mean and of log σ; with ratios from 0.2 to 5 about two thirds of the batch are clipped or would be.
+    In units of the mean and of log σ; with ratios from 0.2 to 5 about two thirds of the batch are or would be clipped.
     """
     learner = made(StationKeeping(), clip=clip, entropy_weight=entropy_weight)
     rng, m = np.random.default_rng(5), learner.noise.values.size
@@ -382,7 +382,7 @@ def test_the_policy_follows_the_gradient_of_the_clipped_objective(clip, entropy_
 
 
 def test_the_value_follows_the_gradient_of_the_mean_squared_error():
-    """L = E[(V - V_target)²] / 2, of the parameters, by autograd through a copy of the critic."""
+    """L = E[(V - V_target)²] / 2 as a function of the parameters, by autograd through a copy of the critic."""
     learner = made(StationKeeping())
     rng = np.random.default_rng(6)
     seen = rng.normal(size=(32, learner._c.shape[2])).astype(np.float32)
@@ -404,7 +404,7 @@ def test_the_value_follows_the_gradient_of_the_mean_squared_error():
 
 
 def test_the_first_gradient_step_sees_the_policy_that_acted():
-    """Ratio 1 everywhere before the first step: no divergence and nothing clipped; later ones differ."""
+    """Before the first step all ratios are 1: no divergence and no clipping; later ones differ."""
     learner, numbers = made(StationKeeping(), learning_rate=0.1), []
     improve = learner._improve_policy
 
@@ -419,7 +419,7 @@ def test_the_first_gradient_step_sees_the_policy_that_acted():
 
 
 def test_imitation_is_half_the_mean_squared_distance_of_the_actions():
-    """The reported loss is 1/2 E |mean - label|², summed over an action's numbers."""
+    """The reported loss is 1/2 E |mean - label|², summed over an action's components."""
     learner = made(StationKeeping())
     rng = np.random.default_rng(7)
     inputs = learner.actor.shapes()[0][0]

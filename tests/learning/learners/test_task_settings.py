@@ -1,4 +1,4 @@
-"""Settings by task: what outranks what, and every line of the tables is of something that there is."""
+"""Settings by task: precedence, and every line of the tables names something that exists."""
 
 import sys
 from dataclasses import replace
@@ -13,7 +13,7 @@ from reference.guess import Guess
 
 
 def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
-    """Every task, then the task; `on-policy`, then the learner; plain, then randomised."""
+    """The precedence is: every task, then the task; `on-policy`, then the learner; plain, then randomised."""
     plain = {"*": {"on-policy": {"a": 1, "b": 1}}, "t1": {"on-policy": {"b": 2, "c": 2}, "rsl-rl": {"c": 3}}}
     drawn = {"*": {"on-policy": {"a": 4, "b": 4}}, "t1": {"on-policy": {"d": 5}}}
     monkeypatch.setattr(base, "SETTINGS", plain)
@@ -34,7 +34,7 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
     ],
 )  # importing torchrl starts a process
 def test_a_training_begins_with_its_tasks_settings(name, randomized):
-    """And what the command says outranks them."""
+    """Options of the command take precedence over them."""
     kind = learner_named(name)
     for task in numeric_tasks():
         settings = kind.settings(task_named(task), randomized=randomized)
@@ -59,7 +59,7 @@ def test_a_task_of_ones_own_has_the_defaults():
 
 
 def test_a_gpu_takes_as_many_gradient_steps_of_more_samples():
-    """Worlds, samples of a step and steps grow alike, or with the worlds that are asked for; a change stays."""
+    """Worlds, samples per step and steps grow alike, or with the requested worlds; an explicit setting is kept."""
     kind, task = learner_named("ppo"), task_named("t1")
     cpu, gpu = kind.settings(task), kind.settings(task, device="cuda")
     assert (gpu.worlds, gpu.batch, gpu.steps) == (64 * cpu.worlds, 64 * cpu.batch, 64 * cpu.steps)
@@ -73,7 +73,7 @@ def test_a_gpu_takes_as_many_gradient_steps_of_more_samples():
 
 
 def test_a_training_that_imitates_first_keeps_its_size_on_a_gpu():
-    """Whom it imitates acts on the host, in every world."""
+    """Its teacher acts on the host, in every world."""
     kind, task = learner_named("ppo"), task_named("t1")
     plain = _values(TrainingSettings(device="cuda"), kind, "ppo", task)
     taught = _values(TrainingSettings(device="cuda", init="pid"), kind, "ppo", task)

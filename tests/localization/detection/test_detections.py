@@ -1,4 +1,4 @@
-"""Detections survive their file, foreign files are understood, and broken ones are refused where they break."""
+"""Detections survive a round trip, foreign files are read, and broken ones are refused with the position."""
 
 import math
 
@@ -20,7 +20,7 @@ NUMBERS = ",".join(str(x) for x in RING.ravel().tolist())
 
 
 def same(a, b):
-    """Whether two detections hold the same."""
+    """Return whether two detections have the same contents."""
     margins = a.margin == b.margin or (math.isnan(a.margin) and math.isnan(b.margin))
     return (
         margins
@@ -30,7 +30,7 @@ def same(a, b):
 
 
 def test_what_is_written_reads_back_bit_for_bit(tmp_path):
-    """Times, names, corners, unknown margins, pictures without tags and pictures without a time."""
+    """This covers times, names, corners, unknown margins, pictures without tags and pictures without a time."""
     frames = [
         Frame(0.1, "a.png", (Detection(15, RING, 71.3, 1, "tag25h9"), Detection(16, RING + 1.0 / 3.0))),
         Frame(0.2, "b.png", ()),
@@ -58,7 +58,7 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path):
 )
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_foreign_column_names_are_understood(tmp_path, header, delimiter):
-    """Names in any case, corners counted from 0 or 1, image and time missing, columns nobody asked for."""
+    """Names may have any case and corners start at 0 or 1; image and time may be missing; other columns are ignored."""
     text = f"# made by hand\n{header},note\n7,{NUMBERS},x\n".replace(",", delimiter)
     (tmp_path / "d.csv").write_text(text, encoding="utf-8-sig")
     [frame] = read_detections(tmp_path / "d.csv")
@@ -67,7 +67,7 @@ def test_foreign_column_names_are_understood(tmp_path, header, delimiter):
 
 
 def test_columns_may_stand_in_any_order(tmp_path):
-    """The same cells in reverse give the same detection, in pictures in the order of the file."""
+    """The same cells in reverse give the same detections; pictures keep the order of the file."""
     row = ["0.5", "z.png", "7", *(str(x) for x in RING.ravel().tolist()), "50.0", "0", "tag36h11"]
     other = ["0.6", "a.png", *row[2:]]
     lines = [",".join(reversed(cells)) for cells in (COLUMNS, row, other)]
@@ -103,21 +103,22 @@ def test_a_cell_that_is_no_number_is_refused_by_name(tmp_path, cell, place):
     ],
 )
 def test_a_file_that_is_no_detections_file_is_refused(tmp_path, text, sentence):
-    """One sentence that says what is missing."""
+    """One sentence states what is missing."""
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(LocalizationError, match=sentence):
         read_detections(tmp_path / "d.csv")
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    """Also a directory."""
+    """A directory is refused too."""
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(LocalizationError, match="cannot be read"):
             read_detections(path)
 
 
 def test_a_file_cut_anywhere_opens_up_to_the_cut(tmp_path):
-    """Every cut of the last row leaves the rows before it, and is told; no cut number is ever taken for a whole one."""
+    """A cut in the last row leaves the rows before it, and is reported; a cut number never passes for a
+    complete one."""
     frames = [Frame(float(i), f"{i}.png", (Detection(i, RING, 55.25, 0, "tag25h9"),)) for i in range(3)]
     write_detections(frames, tmp_path / "d.csv")
     raw = (tmp_path / "d.csv").read_bytes()
@@ -132,7 +133,7 @@ def test_a_file_cut_anywhere_opens_up_to_the_cut(tmp_path):
 
 
 def test_the_most_certain_of_two_of_one_id_stays():
-    """Fewer corrected bits first, then the greater margin; a known margin before an unknown one."""
+    """Fewer corrected bits come first, then the greater margin; a known margin comes before an unknown one."""
     weak, strong = Detection(4, RING, 20.0, 0), Detection(4, RING, 60.0, 0)
     corrected, unknown = Detection(4, RING, 90.0, 1), Detection(4, RING)
     other = Detection(5, RING, 10.0)

@@ -1,4 +1,4 @@
-"""Every refinement finds drawn tags where they were drawn, in one order and one pixel convention."""
+"""Every refinement finds rendered tags at their true positions, in one order and one pixel convention."""
 
 import re
 from functools import cache
@@ -15,15 +15,15 @@ from reference.tag_picture import draw, pose_corners
 PHOTOGRAPHS = Path(__file__).parents[2] / "data" / "apriltag"
 
 USUAL = ("tag16h5", "tag25h9", "tag36h11", "tagStandard41h12")
-"""Families for which everything is measured; of the others, where corners lie."""
+"""Families with all measurements; for the others, only corner positions are checked."""
 LARGEST_BIAS = 0.05
-"""Mean error of the corners of many tags, per axis [px]: a wrong convention is 0.5."""
+"""Largest mean error of the corners of many tags, per axis [px]: a wrong convention gives 0.5."""
 RMS = {"fit": 0.04, "edges": 0.12, "none": 0.5}
-"""Largest error allowed at a border of 40 px, root mean square per axis [px]."""
+"""Largest allowed error at a border of 40 px, root mean square per axis [px]."""
 
 
 def poses(count, edge, seed, family="tag25h9"):
-    """Corners of tags at random sub-pixel places, turned and tilted at random, and the picture's size."""
+    """Return corners of tags at random sub-pixel positions, rotations and tilts, and the picture's size."""
     rng = np.random.default_rng(seed)
     side = round(edge * (3 if FAMILIES[family].outside > 2 else 2) + 50)
     for k in range(count):
@@ -35,7 +35,7 @@ def poses(count, edge, seed, family="tag25h9"):
 
 @cache
 def pictures(family, edge, count, seed, **light):
-    """Pictures of one tag each: (tag, corners, picture)."""
+    """Yield pictures of one tag each: (tag, corners, picture)."""
     drawn = []
     for k, (side, ring) in enumerate(poses(count, edge, seed, family)):
         tag = (7 * k) % FAMILIES[family].count
@@ -44,7 +44,7 @@ def pictures(family, edge, count, seed, **light):
 
 
 def errors(family, find, *, edge=40.0, count=12, seed=1, **light):
-    """Detected minus drawn corners, (n, 4, 2), and the drawn ones."""
+    """Return detected minus rendered corners, (n, 4, 2), and the rendered ones."""
     missed, drawn = [], []
     for tag, ring, picture in pictures(family, edge, count, seed, **light):
         for found in find.detect(picture):
@@ -55,7 +55,7 @@ def errors(family, find, *, edge=40.0, count=12, seed=1, **light):
 
 
 def outward(missed, drawn):
-    """Mean distance of corners outward along the diagonal [px]."""
+    """Return the mean outward distance of corners along the diagonal [px]."""
     from_centre = drawn - drawn.mean(axis=1, keepdims=True)
     unit = from_centre / np.linalg.norm(from_centre, axis=-1, keepdims=True)
     return float(np.mean(np.sum(missed * unit, axis=-1)))
@@ -65,7 +65,7 @@ def outward(missed, drawn):
 @pytest.mark.parametrize("refine", REFINEMENTS)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_corners_lie_where_they_were_drawn(family, refine):
-    """One order, integers at pixel centres, no bias, and the error that the way of refinement allows."""
+    """Corners have one order, integers at pixel centres, no bias, and the error that the refinement allows."""
     find = detector(family, refine=refine)
     missed, drawn = errors(family, find, blur=0.7, noise=2.0)
     assert len(missed) >= 11
@@ -81,7 +81,7 @@ def test_corners_lie_where_they_were_drawn(family, refine):
 @pytest.mark.parametrize("family", USUAL)
 @pytest.mark.parametrize("blur", [0.0, 0.5, 1.0])
 def test_the_fit_is_better_than_a_tenth_of_a_pixel_on_small_tags(family, blur):
-    """Borders of 25 px, noise of 2.5 levels, a margin narrower than the one cell that is asked for."""
+    """Conditions are borders of 25 px, noise of 2.5 levels, and a margin narrower than the required cell."""
     missed, drawn = errors(family, detector(family), edge=25.0, count=12, blur=blur, noise=2.5, margin=0.78)
     assert len(missed) >= 11
     assert np.sqrt(np.mean(missed**2)) < 0.07
@@ -92,18 +92,18 @@ def test_the_fit_is_better_than_a_tenth_of_a_pixel_on_small_tags(family, blur):
 @pytest.mark.slow
 @pytest.mark.parametrize("family", USUAL)
 def test_linear_light_takes_the_bias_of_encoded_pictures_away(family):
-    """Encoded with 2.2, dark borders shrink by tenths of a pixel; `gamma=2.2` puts corners where they were drawn."""
+    """Encoded with 2.2, dark borders shrink by tenths of a pixel; `gamma=2.2` restores the corners' positions."""
     light = {"blur": 0.7, "noise": 1.0, "gamma": 2.2}
     naive = outward(*errors(family, detector(family, refine="edges"), **light))
     linear = outward(*errors(family, detector(family, refine="fit", gamma=2.2), **light))
-    inward = -1.0 if FAMILIES[family].outside == 0 else 1.0  # where white lies inside the edge, it grows
+    inward = -1.0 if FAMILIES[family].outside == 0 else 1.0  # if white is inside the edge, the border grows
     assert inward * naive > 0.15
     assert abs(linear) < 0.02
 
 
 @pytest.mark.parametrize("family", USUAL[1:])
 def test_the_fit_finds_its_way_from_a_coarse_start(family):
-    """From corners wrong by up to 0.8 px each, the same corners to a hundredth of a pixel."""
+    """Starting corners that are off by up to 0.8 px each give the same corners to a hundredth of a pixel."""
     [(side, ring)] = poses(1, 36.0, 5)
     picture = draw((side, side), {3: ring}, family=family, blur=0.6, noise=1.0)
     rng = np.random.default_rng(2)
@@ -114,29 +114,29 @@ def test_the_fit_finds_its_way_from_a_coarse_start(family):
 
 
 def glare(light, u, v, at):
-    """A bright spot of the size of a cell."""
+    """Add a bright spot of the size of a cell."""
     return light + 100.0 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 50.0)
 
 
 def finger(light, u, v, at):
-    """Something gray of 7 by 7 px on the tag."""
+    """Cover 7 by 7 px of the tag with gray."""
     return np.where((abs(u - at[0]) < 4) & (abs(v - at[1]) < 4), 90.0, light)
 
 
 def caustic(light, u, v, at):
-    """A bright line across the tag."""
+    """Add a bright line across the tag."""
     return light + 60.0 * (abs(0.6 * (u - at[0]) + 0.8 * (v - at[1])) < 1.0)
 
 
 def shadow(light, u, v, at):
-    """The edge of a shadow across the tag."""
+    """Add the edge of a shadow across the tag."""
     return light * np.where(0.6 * (u - at[0]) + 0.8 * (v - at[1]) > 0.0, 0.7, 1.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("disturb", "rms"), [(glare, 0.25), (finger, 0.12), (caustic, 0.15), (shadow, 0.25)])
 def test_uneven_light_and_covered_cells_move_corners_little(disturb, rms):
-    """Local contrast counts, not gray, and cells that do not fit lose their weight: a fraction of a pixel is left."""
+    """The fit uses local contrast, and cells that do not fit lose their weight: a fraction of a pixel remains."""
     rng = np.random.default_rng(4)
     missed = []
     for tag, ring, picture in pictures("tag25h9", 36.0, 16, 3, blur=0.7, noise=2.5):
@@ -148,7 +148,7 @@ def test_uneven_light_and_covered_cells_move_corners_little(disturb, rms):
 
 
 def test_where_there_is_no_tag_the_fit_says_so():
-    """Noise and a flat picture have no correlation with it; half outside of the picture, or no ring, is no fit."""
+    """Noise and a flat picture do not correlate with the tag; half outside of the picture, or no ring, gives no fit."""
     ring = pose_corners(30.0, centre=(40.0, 40.0))
     noise = np.random.default_rng(0).integers(0, 255, (80, 80)).astype(np.uint8)
     flat = np.full((80, 80), 100, np.uint8)
@@ -159,7 +159,7 @@ def test_where_there_is_no_tag_the_fit_says_so():
 
 
 def test_another_tag_in_its_place_has_less_correlation():
-    """What a wrong id would get: too little to be reported."""
+    """A wrong id has too little correlation to be reported."""
     ring = pose_corners(40.0, centre=(50.0, 50.0), turn=0.4)
     picture = draw((100, 100), {3: ring}, family="tag25h9", blur=0.6, noise=1.0)
     assert fit_tag(picture, "tag25h9", 3, ring).correlation > 0.99
@@ -167,7 +167,7 @@ def test_another_tag_in_its_place_has_less_correlation():
 
 
 def test_a_region_gives_the_corners_of_the_whole_picture():
-    """Searching a part, clipped to the picture, changes no corner; what lies outside the part is not found."""
+    """Searching a region, clipped to the picture, changes no corner; tags outside the region are not found."""
     rings = {
         3: pose_corners(40.0, centre=(60.3, 70.7), turn=0.3),
         9: pose_corners(40.0, centre=(180.1, 60.2), turn=2.0),
@@ -185,7 +185,7 @@ def test_a_region_gives_the_corners_of_the_whole_picture():
 
 
 def test_corrected_bits_are_counted():
-    """One wrong cell is counted as one; a detector that corrects none does not report the tag."""
+    """One wrong cell counts as one; a detector that corrects none does not report the tag."""
     picture = printable("tag36h11", 11, pixels_per_cell=8, margin=2.0)
     start = 2 * 8 + 3 * 8
     picture[start : start + 8, start : start + 8] = 255 - picture[start : start + 8, start : start + 8]
@@ -196,7 +196,7 @@ def test_corrected_bits_are_counted():
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_printed_pictures_are_read_upright(family):
-    """A printed tag's first corner is its top left; its edges have the length that its cells say, without bias."""
+    """A printed tag's first corner is its top left; its edges have the length of its cells, without bias."""
     kind = FAMILIES[family]
     for tag in (0, kind.count - 1):
         picture = printable(family, tag, pixels_per_cell=10, margin=1.5)
@@ -233,9 +233,9 @@ def test_tags_of_a_family_differ_in_as_many_cells_as_its_name_says(family):
 
 
 def photograph(name):
-    """A real photograph, and the published corners of its tags in our order and convention.
+    """Return a real photograph, and the published corners of its tags in our order and convention.
 
-    Published are AprilTag 3's own corners: from the bottom left against the clock, pixel centres at half integers.
+    The published corners are AprilTag 3's: counter-clockwise from the bottom left, pixel centres at half integers.
     """
     import cv2
 
@@ -247,7 +247,7 @@ def photograph(name):
 
 
 def matched(found, rings):
-    """Detected minus given corners [px], (4, 2) each, of the given ones that have a detection within 3 px."""
+    """Return detected minus given corners [px], (4, 2) each, of given tags with a detection within 3 px."""
     apart = [
         min((d.corners - ring for d in found), key=lambda x: np.linalg.norm(x.mean(axis=0))) for ring in rings
     ]
@@ -256,9 +256,9 @@ def matched(found, rings):
 
 @pytest.mark.parametrize("name", ["33369213973_9d9bb4cc96_c", "34139872896_defdb2f8d9_c"])
 def test_photographs_agree_with_the_published_corners(name):
-    """Real photographs: every published tag is found, in its published place.
+    """In real photographs, every published tag is found at its published position.
 
-    Published are corners without refinement; against the fit they are off by about half a pixel.
+    The published corners are without refinement, and differ from the fit by about half a pixel.
     """
     picture, published = photograph(name)
     plain = matched(detector("tag36h11", refine="none").detect(picture), published)
@@ -283,20 +283,20 @@ def test_photographs_agree_with_the_published_corners(name):
     ],
 )
 def test_what_does_not_exist_is_refused(arguments, sentence):
-    """One sentence that says what there is."""
+    """One sentence lists the available names."""
     with pytest.raises(LocalizationError, match=re.escape(sentence)):
         detector(**arguments)
 
 
 @pytest.mark.parametrize("picture", [np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9))])
 def test_a_picture_that_is_not_gray_bytes_is_refused(picture):
-    """Colour and numbers of another kind."""
+    """Colour pictures and other number types are refused."""
     with pytest.raises(LocalizationError, match="expected gray bytes"):
         detector("tag25h9").detect(picture)
 
 
 def test_families_answer_to_their_usual_names():
-    """As AprilTag, OpenCV and people call them."""
+    """The names of AprilTag, OpenCV and everyday use are accepted."""
     for name in ("25h9", "Tag25h9", "DICT_APRILTAG_25h9"):
         assert family_named(name).name == "tag25h9"
     assert family_named("41h12") is FAMILIES["tagStandard41h12"]

@@ -1,4 +1,4 @@
-"""Pictures come in order, with their times, and what cannot be read is named."""
+"""Pictures come in order, with their times, and unreadable ones are named."""
 
 import math
 
@@ -13,17 +13,17 @@ RNG = np.random.default_rng(0)
 
 
 def scene(level):
-    """A smooth gray picture whose mean tells which it is."""
+    """Return a smooth gray picture identified by its mean."""
     return np.clip(np.linspace(0, 40, 64)[None, :] + np.full((48, 1), float(level)), 0, 255).astype(np.uint8)
 
 
 def listed(source, **options):
-    """Everything the stream gives, as a list."""
+    """Return the contents of the stream as a list."""
     return list(pictures(source, **options))
 
 
 def test_a_folder_comes_in_natural_order_without_other_files(tmp_path):
-    """2 before 10; text files, hidden files and folders are no pictures."""
+    """2 comes before 10; text files, hidden files and folders are skipped."""
     for number in (10, 2, 1):
         write_picture(scene(10 * number), tmp_path / f"view{number}.png")
     (tmp_path / "notes.txt").write_text("x")
@@ -50,7 +50,7 @@ def test_a_folder_comes_in_natural_order_without_other_files(tmp_path):
     ],
 )
 def test_times_are_read_from_names_that_carry_one(tmp_path, name, time):
-    """Seconds with a decimal point, and counts since 1970; running numbers and dates are no times."""
+    """Seconds with a decimal point and counts since 1970 are times; running numbers and dates are not."""
     write_picture(scene(50), tmp_path / name)
     [(got, shown, _)] = listed(tmp_path / name)
     assert shown == name
@@ -58,7 +58,7 @@ def test_times_are_read_from_names_that_carry_one(tmp_path, name, time):
 
 
 def test_times_may_come_from_a_table(tmp_path):
-    """By name; a picture that the table misses is refused before anything is read, as is a time that is no number."""
+    """Times are looked up by name; a picture missing from the table and an invalid time are refused before reading."""
     for number in (1, 2):
         write_picture(scene(50), tmp_path / f"{number}.png")
     table = tmp_path / "times.csv"
@@ -78,7 +78,8 @@ def test_times_may_come_from_a_table(tmp_path):
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.95])
 def test_a_picture_cut_short_is_named_and_left_out(tmp_path, suffix, share):
-    """Also where the decoder would fill the rest with gray; the others are read, and the number is told."""
+    """This holds even where the decoder would fill the rest with gray; the others are read, and the number is
+    reported."""
     busy = RNG.integers(0, 255, (48, 64)).astype(np.uint8)
     for number in (1, 2, 3):
         write_picture(busy, tmp_path / f"{number}{suffix}")
@@ -90,7 +91,7 @@ def test_a_picture_cut_short_is_named_and_left_out(tmp_path, suffix, share):
 
 
 def test_a_whole_jpeg_with_something_behind_it_is_read(tmp_path):
-    """Phones append to pictures; a small picture inside the header does not end the large one."""
+    """Phones append data to pictures; a thumbnail inside the header does not end the large picture."""
     write_picture(scene(90), tmp_path / "a.jpg")
     raw = (tmp_path / "a.jpg").read_bytes()
     small = b"\xff\xe1" + (2 + len(raw)).to_bytes(2, "big") + raw
@@ -102,7 +103,7 @@ def test_a_whole_jpeg_with_something_behind_it_is_read(tmp_path):
 
 
 def test_a_run_of_which_nothing_can_be_read_is_refused(tmp_path):
-    """With the first reason."""
+    """The refusal contains the first reason."""
     for number in (1, 2):
         (tmp_path / f"{number}.png").write_bytes(b"no picture")
     told = []
@@ -112,7 +113,7 @@ def test_a_run_of_which_nothing_can_be_read_is_refused(tmp_path):
 
 
 def test_what_is_not_there_is_refused_at_once(tmp_path):
-    """Before the first picture is asked for."""
+    """The refusal comes before the first picture is requested."""
     (tmp_path / "a.txt").write_text("x")
     for source, sentence in [
         (tmp_path / "none", "no such file or folder"),
@@ -126,7 +127,7 @@ def test_what_is_not_there_is_refused_at_once(tmp_path):
 
 
 def test_two_pictures_of_one_name_are_told_apart(tmp_path):
-    """By their folders."""
+    """Their names include the folders."""
     for folder in ("a", "b"):
         write_picture(scene(50), tmp_path / folder / "1.png")
     names = [name for _, name, _ in listed([tmp_path / "a", tmp_path / "b"])]
@@ -135,7 +136,7 @@ def test_two_pictures_of_one_name_are_told_apart(tmp_path):
 
 @pytest.mark.parametrize(("suffix", "code"), [(".avi", "MJPG"), (".mp4", "mp4v")])
 def test_a_video_gives_its_pictures_with_their_times(tmp_path, suffix, code):
-    """Eight pictures at 10 Hz, each 0.1 s after the last; half a video gives what is left of it or is left out."""
+    """Eight pictures come at 10 Hz, 0.1 s apart; half a video gives its remaining pictures or is skipped."""
     path = tmp_path / f"run{suffix}"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 10.0, (64, 48))
     for number in range(8):
@@ -159,7 +160,7 @@ def test_notes_on_turning_the_picture_are_not_followed(tmp_path):
     raw = (tmp_path / "a.jpg").read_bytes()
     entry = (
         b"\x01\x12" + b"\x00\x03" + b"\x00\x00\x00\x01" + b"\x00\x06\x00\x00"
-    )  # orientation 6: turn by 90°
+    )  # orientation 6: rotate by 90°
     exif = b"Exif\0\0MM\x00\x2a\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
     (tmp_path / "a.jpg").write_bytes(
         raw[:2] + b"\xff\xe1" + (2 + len(exif)).to_bytes(2, "big") + exif + raw[2:]

@@ -1,4 +1,4 @@
-"""A tag is searched where it is expected, found again wherever it reappears, and never reported twice."""
+"""A tag is searched near its expected position, found again wherever it reappears, and never reported twice."""
 
 import itertools
 
@@ -13,18 +13,18 @@ EMPTY = np.full(SHAPE, 120, np.uint8)
 
 
 def picture(seed=0, **tags):
-    """A picture with tags t15=(u, v), each of 32 px."""
+    """Return a picture with tags t15=(u, v), each of 32 px."""
     rings = {int(name[1:]): ring_at(*place) for name, place in tags.items()}
     return draw(SHAPE, rings, family="tag25h9", blur=0.6, noise=1.5, seed=seed, oversampling=4)
 
 
 def ring_at(u, v):
-    """Corners of a tag of 32 px, a little turned."""
+    """Return corners of a slightly rotated tag of 32 px."""
     return pose_corners(32.0, centre=(u, v), turn=0.2)
 
 
 class Searches:
-    """A detector that remembers where it searched; None is the whole picture."""
+    """Detector that records its search regions; None is the whole picture."""
 
     def __init__(self):
         self.find, self.regions = detector("tag25h9"), []
@@ -40,7 +40,7 @@ class Searches:
 
 @pytest.mark.slow
 def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search():
-    """After the first picture only regions are searched, a fraction of the pixels, at 9 px per picture."""
+    """At 9 px per picture, only regions are searched after the first picture, a fraction of the pixels."""
     searches = Searches()
     tracker = RegionTracker(searches, [15, 16])
     for k in range(8):
@@ -56,7 +56,7 @@ def test_a_moving_tag_is_followed_in_regions_with_the_corners_of_a_whole_search(
 
 
 def test_a_tag_that_jumps_is_found_in_the_same_picture():
-    """Nothing where it was expected: the whole picture is searched at once."""
+    """If the tag is not at its expected position, the whole picture is searched at once."""
     searches = Searches()
     tracker = RegionTracker(searches, [15])
     places = [(60, 60), (62, 60), (400, 300), (402, 300)]
@@ -68,7 +68,7 @@ def test_a_tag_that_jumps_is_found_in_the_same_picture():
 
 @pytest.mark.slow
 def test_a_missing_tag_is_searched_in_the_whole_picture_every_so_often():
-    """One of two is seen; the other is looked for near its last place always, and everywhere every third picture."""
+    """The unseen one of two is always searched near its last position, and everywhere in every third picture."""
     searches = Searches()
     tracker = RegionTracker(searches, [15, 16], search_every=3)
     tracker.detect(picture(t15=(100, 100), t16=(300, 250)), 0.0)
@@ -81,7 +81,7 @@ def test_a_missing_tag_is_searched_in_the_whole_picture_every_so_often():
 
 
 def test_a_tag_that_is_hidden_for_a_while_is_found_near_where_it_was():
-    """The region grows while it is lost, and follows its last velocity."""
+    """While it is lost, the region grows and follows its last velocity."""
     corners = ring_at(100, 100)
     widths = [np.diff(np.reshape(region_around(corners, lost), (2, 2)), axis=0).min() for lost in range(5)]
     assert all(a < b for a, b in itertools.pairwise(widths))
@@ -98,24 +98,24 @@ def test_a_tag_that_is_hidden_for_a_while_is_found_near_where_it_was():
 
 @pytest.mark.parametrize("times", [True, False])
 def test_an_id_is_never_reported_twice(times):
-    """Two plates with one id, and regions that overlap: the surer one stays."""
+    """For two plates with one id, and for overlapping regions, the more certain one stays."""
     rings = {15: ring_at(100, 100), 16: ring_at(145, 110)}
     tracker = RegionTracker(detector("tag25h9"))
     for k in range(4):
         image = draw(SHAPE, rings, family="tag25h9", seed=k, oversampling=4)
-        image[200:300, 250:350] = image[50:150, 50:150]  # 15 a second time
+        image[200:300, 250:350] = image[50:150, 50:150]  # a second detection of 15
         found = tracker.detect(image, 0.1 * k if times else np.nan)
         assert sorted(d.tag for d in found) == [15, 16]
 
 
 def test_tags_nobody_asked_for_are_left_out():
-    """Only the ids of the vehicle."""
+    """Only the vehicle's ids are reported."""
     tracker = RegionTracker(detector("tag25h9"), [15])
     assert [d.tag for d in tracker.detect(picture(t15=(100, 100), t3=(300, 200)))] == [15]
 
 
 def test_pictures_without_tags_cost_one_whole_search_each():
-    """And give nothing."""
+    """They give no detections."""
     searches = Searches()
     tracker = RegionTracker(searches, [15])
     assert [tracker.detect(EMPTY, 0.1 * k) for k in range(3)] == [[], [], []]
@@ -123,7 +123,7 @@ def test_pictures_without_tags_cost_one_whole_search_each():
 
 
 def test_merged_regions_cover_the_same_places_without_overlap():
-    """Chains of overlaps become one; regions that only touch stay apart."""
+    """Chains of overlaps become one region; regions that only touch stay separate."""
     assert merged([(0, 0, 10, 10), (10, 0, 20, 10)]) == [(0, 0, 10, 10), (10, 0, 20, 10)]
     assert merged([(0, 0, 10, 10), (18, 0, 30, 10), (9, 0, 19, 10)]) == [(0, 0, 30, 10)]
     rng = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""Corners of tags lie where the vehicle file puts them."""
+"""Corners of tags agree with the vehicle file."""
 
 import math
 
@@ -9,7 +9,7 @@ from finssim.vehicles import load_vehicle
 
 
 def test_corners_run_clockwise_as_printed_and_span_the_edge():
-    """Seen from the printed side (z towards the eye, y up) the order is clockwise, on a square of that edge."""
+    """From the printed side (z towards the viewer, y up) the order is clockwise, on a square of that edge."""
     ring = corners(0.093)
     sides = np.roll(ring, -1, axis=0) - ring
     assert np.allclose(np.linalg.norm(sides, axis=1), 0.093)
@@ -18,7 +18,7 @@ def test_corners_run_clockwise_as_printed_and_span_the_edge():
 
 
 def test_a_mount_moves_its_tag_rigidly():
-    """FinsROV's tags lie on its back, turned by 90°: the printed top (y of the tag) points to -x of the body."""
+    """FinsROV's tags lie on its back, rotated by 90°: the printed top (y of the tag) points to -x of the body."""
     tags = load_vehicle("finsrov").tags
     for tag, ring_b in tag_corners_b(tags).items():
         assert np.allclose(ring_b.mean(axis=0), tags.mounts[tag].position, atol=1e-12)

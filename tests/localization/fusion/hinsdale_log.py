@@ -21,7 +21,7 @@ def write_table(path, names, rows):
 
 
 def hinsdale(folder, trial, every=1.0):
-    """Gyro and tilt of a trial as its IMU, mocap as truth, and mocap once in `every` seconds as the camera."""
+    """Write gyro and tilt of a trial as its IMU, mocap as truth, and mocap once in `every` seconds as the camera."""
     read = {
         n: np.genfromtxt(HINSDALE / f"{trial}_{n}.csv", delimiter=",", names=True) for n in ("imu", "mocap")
     }
@@ -47,7 +47,7 @@ def hinsdale(folder, trial, every=1.0):
 
 
 def clock_offset(trial, width=0.3):
-    """By how much the IMU's stamps are late, from rates of roll and pitch of both streams over `width` seconds [s]."""
+    """Return the delay of the IMU's stamps [s], from roll and pitch rates of both streams over `width` seconds."""
     read = {
         n: np.genfromtxt(HINSDALE / f"{trial}_{n}.csv", delimiter=",", names=True) for n in ("imu", "mocap")
     }

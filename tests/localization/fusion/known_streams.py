@@ -1,4 +1,4 @@
-"""Streams of a vehicle whose motion is known exactly: smooth paths, and the samples that its sensors make of them."""
+"""Streams of a vehicle with exactly known motion: smooth paths, and samples of its sensors."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from finssim.localization.fusion.streams import DepthSample, ImuSample, VisionSa
 
 GRAVITY = 9.81
 SITE = Site(up=(0.0, 0.0, 1.0), offset=-1.0, depth_port=(0.0, 0.0, -0.115), imu=(0.05, 0.0, 0.02))
-"""A pool with its origin on the floor and one metre of water."""
+"""Pool with its origin on the floor and one metre of water."""
 
 
 def position(t):
-    """Body origin, pool frame [m], (..., 3)."""
+    """Return the position of the body origin, pool frame [m], (..., 3)."""
     t = np.asarray(t, float)
     return np.stack(
         [
@@ -36,28 +36,28 @@ def position(t):
 
 
 def attitude(t):
-    """q_pb, (..., 4); the heading crosses the half turn."""
+    """Return q_pb, (..., 4); the heading crosses the half turn."""
     t = np.asarray(t, float)
     return quat_from_euler(0.06 * np.sin(1.3 * t), 0.05 * np.sin(1.1 * t + 0.5), yaw(t))
 
 
 def yaw(t):
-    """Heading [rad], (...), not wrapped."""
+    """Return the heading [rad], (...), not wrapped."""
     return 2.8 + 0.9 * np.sin(0.4 * np.asarray(t, float))
 
 
 def slope(f, t, h=1e-4):
-    """Time derivative of a smooth function."""
+    """Return the time derivative of a smooth function."""
     return (f(t + h) - f(t - h)) / (2.0 * h)
 
 
 def body_rates(t, h=1e-4):
-    """Angular rate, body frame [rad/s], (..., 3)."""
+    """Return the angular rate, body frame [rad/s], (..., 3)."""
     return quat_to_rotvec(quat_multiply(quat_conjugate(attitude(t - h)), attitude(t + h))) / (2.0 * h)
 
 
 def specific_force(t, lever, h=1e-2):
-    """At a body point, body frame [m/s²], (..., 3)."""
+    """Return the specific force at a body point, body frame [m/s²], (..., 3)."""
 
     def point(s):
         return position(s) + quat_rotate(attitude(s), np.asarray(lever, float))
@@ -85,7 +85,7 @@ QUIET = Noise(0.0, 0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 def streams(
     duration, *, seed=0, noise=Noise(), tilt=True, latency=0.06, site=SITE, rates=(100.0, 20.0, 30.0)
 ):
-    """Samples of IMU, depth sensor and camera, in the order of their arrival."""
+    """Return samples of IMU, depth sensor and camera, in the order of their arrival."""
     rng = np.random.default_rng(seed)
     imu_rate, depth_rate, vision_rate = rates
     samples = []
@@ -110,12 +110,12 @@ def streams(
 
 
 def without_vision(samples, start, end):
-    """The samples less the fixes of a time."""
+    """Return the samples without the fixes of a time interval."""
     return [s for s in samples if s.stream != "vision" or not start <= s.time < end]
 
 
 def with_outliers(samples, share, rng):
-    """Some fixes moved by 0.5 to 1 m."""
+    """Return the samples with some fixes moved by 0.5 to 1 m."""
     out = []
     for s in samples:
         if s.stream == "vision" and rng.random() < share:
@@ -128,7 +128,7 @@ def with_outliers(samples, share, rng):
 
 
 def with_flips(samples, share, rng):
-    """Some yaws turned by a half or a quarter."""
+    """Return the samples with some yaws turned by a half or a quarter turn."""
     turns = (np.pi, np.pi / 2, -np.pi / 2)
     return [
         replace(s, yaw=s.yaw + turns[rng.integers(3)]) if s.stream == "vision" and rng.random() < share else s
@@ -137,14 +137,14 @@ def with_flips(samples, share, rng):
 
 
 def shuffled(samples, longest, share, rng):
-    """Every sample up to `longest` seconds late, and some of them twice, in the order of their arrival."""
+    """Return samples delayed by up to `longest` seconds, some of them duplicated, in the order of their arrival."""
     late = [replace(s, arrival=s.time + rng.uniform(0.0, longest)) for s in samples]
     late += [replace(s, arrival=s.time + longest) for s in late if rng.random() < share]
     return sorted(late, key=lambda s: s.arrival)
 
 
 def run(estimator, samples, times):
-    """Feed samples as they arrive, and ask at the times: estimates."""
+    """Feed samples as they arrive, and return the estimates at the times."""
     estimates, k = [], 0
     for t in times:
         while k < len(samples) and samples[k].arrival <= t + 1e-9:

@@ -1,4 +1,4 @@
-"""Where a vehicle is without a camera: Doppler log and compass, motion capture, acoustics; and how sure it is of it."""
+"""Navigation without the pool camera: Doppler log and compass, motion capture, acoustics, and the uncertainty."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEEDS = range(6)
 
 
 class Sea:
-    """A vehicle that goes around a bend at 0.3 m/s, level, and instruments with the errors of its file."""
+    """A level vehicle that follows a bend at 0.3 m/s, and instruments with the errors of its file."""
 
     def __init__(self, seed: int) -> None:
         self.random = random = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ class Sea:
     def imu(self, t):
         noise = SETTINGS.imu.gyro.rate * math.sqrt(RATE) * self.random.standard_normal(3)
         r = 0.08 * math.cos(0.1 * t)
-        # On a bend the acceleration is r x v: to the left of the way.
+        # On a bend the acceleration is r x v, to the left of the path.
         force = np.array([0.0, 0.3 * r, SITE.gravity])
         force = force + SETTINGS.imu.accel_noise * math.sqrt(RATE) * self.random.standard_normal(3)
         return ImuSample(t, tuple(np.array([0.0, 0.0, r]) + self.gyro + noise), tuple(force), (0.0, 0.0))
@@ -77,7 +77,8 @@ class Sea:
 
 
 def swim(seed, *, log=True, rate=0.0, std=0.5, yaw_std=0.0, outliers=0.0, late=0.0, settings=SETTINGS):
-    """Samples of `DURATION` seconds through an estimator, fixes as late as they come; error (2,) and covariance."""
+    """Run samples of `DURATION` seconds through an estimator, fixes as late as they come; return error (2,),
+    covariance."""
     sea, estimator = Sea(seed), Estimator(settings, SITE, mode="error-state")
     estimator.add(sea.fix(0.0, 0.05, yaw_std=yaw_std))
     waiting = []
@@ -94,7 +95,7 @@ def swim(seed, *, log=True, rate=0.0, std=0.5, yaw_std=0.0, outliers=0.0, late=0
             waiting.append(sea.fix(t, std, yaw_std=yaw_std, outliers=outliers, late=late))
         while waiting and waiting[0].arrival <= t + 1e-9:
             estimator.add(waiting.pop(0))
-    for fix in waiting:  # those that are still on their way
+    for fix in waiting:  # fixes that are still pending
         estimator.add(fix)
     found = estimator.estimate(DURATION)
     return found.x[:2] - sea.position(DURATION), found.P[:2, :2], estimator
@@ -110,7 +111,7 @@ CHOICES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("choice", CHOICES)
 def test_errors_are_as_large_as_the_covariance_says(choice):
-    """NEES of x and y at the end, summed over seeds, inside the 99 % band of chi-square; acoustics with outliers."""
+    """NEES of x and y at the end, summed over seeds, is inside the 99 % band of chi-square; acoustics have outliers."""
     options = dict(CHOICES[choice])
     if choice == "motion capture":
         options["settings"] = settings_of(load_vehicle("bluerov2_heavy"))
@@ -122,7 +123,7 @@ def test_errors_are_as_large_as_the_covariance_says(choice):
 
 @pytest.mark.slow
 def test_fixes_bound_what_log_and_compass_alone_let_grow():
-    """And an outlier of acoustics is refused by its gate."""
+    """An acoustic outlier is refused by the gate."""
     alone, fixed = swim(0)[1], swim(0, **CHOICES["log, compass and acoustics"])
     assert np.trace(fixed[1]) < np.trace(alone)
     assert fixed[2].counts["vision"].get("gate", 0) >= 1
@@ -130,14 +131,14 @@ def test_fixes_bound_what_log_and_compass_alone_let_grow():
 
 @pytest.mark.slow
 def test_a_late_fix_changes_what_it_would_have_changed_in_time():
-    """The state after 0.4 s of lateness is that of fixes without any."""
+    """After 0.4 s of delay, the state is the same as with fixes in time."""
     late, timely = (swim(1, **{**CHOICES["log, compass and acoustics"], "late": x}) for x in (0.4, 0.0))
     np.testing.assert_allclose(late[0], timely[0], atol=1e-9)
     np.testing.assert_allclose(late[1], timely[1], atol=1e-12)
 
 
 def test_without_log_and_compass_nothing_is_added():
-    """Settings of a vehicle without them have no aids; samples of them are refused by name."""
+    """Settings of such a vehicle have no aids; samples of them are refused by name."""
     assert settings_of(load_vehicle("finsrov")).aids is None and Settings().aids is None
     for mode in ("constant-velocity", "error-state"):
         estimator = Estimator(mode=mode)
@@ -148,7 +149,7 @@ def test_without_log_and_compass_nothing_is_added():
 
 @pytest.mark.parametrize("std", [0.0, 0.5 * AIDS.velocity_std, 5.0 * AIDS.velocity_std])
 def test_a_velocity_may_be_less_certain_than_the_log(std):
-    """Never more certain: its own variance is that of its residual, where it is greater."""
+    """It is never more certain: its own variance is that of its residual, if that is greater."""
     distances = []
     for own in (0.0, std):
         estimator = Estimator(SETTINGS, SITE)
@@ -164,7 +165,7 @@ def test_a_velocity_may_be_less_certain_than_the_log(std):
 
 
 def test_a_compass_starts_the_heading_and_its_offset_stays_in_doubt():
-    """However many samples of it there are; and a velocity is then turned into the pool frame."""
+    """The offset stays uncertain however many samples there are; a velocity is then rotated into the pool frame."""
     estimator = Estimator(Settings(aids=Aids(heading_bias=0.05, heading_std=0.01)), SITE)
     estimator.add(VisionSample(0.0, (1.0, 2.0), None))
     for k in range(100):

@@ -1,4 +1,4 @@
-"""Roll and pitch from gyro and accelerometer: signs, convergence, bias, and pushes that are not gravity."""
+"""Roll and pitch from gyro and accelerometer: signs, convergence, bias, and accelerations other than gravity."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ GAINS = TiltGains()
 
 
 def at_rest(roll, pitch):
-    """What an accelerometer reads at rest, body axes."""
+    """Return an accelerometer's reading at rest, body axes."""
     return quat_rotate(quat_conjugate(quat_from_euler(roll, pitch, 0.7)), [0.0, 0.0, GRAVITY])
 
 
@@ -42,7 +42,7 @@ def test_a_point_ahead_sinks_with_the_nose():
 
 
 def test_nose_down_is_positive_and_lifts_the_force_off_the_nose():
-    """Nose down by 0.2 rad, the body's x axis points down and reads less than nothing: -g sin 0.2."""
+    """Nose down by 0.2 rad, the body's x axis points down and its reading is negative: -g sin 0.2."""
     accel = np.array([-GRAVITY * np.sin(0.2), 0.0, GRAVITY * np.cos(0.2)])
     assert float(roll_pitch(tilt_from(accel).up)[1]) == pytest.approx(0.2)
 
@@ -58,7 +58,7 @@ def test_the_gyro_alone_follows_a_tilting_path():
 
 @pytest.mark.slow
 def test_a_wrong_start_and_a_bias_die_away():
-    """From 0.3 rad wrong and with a gyro 0.01 rad/s off, the angles of a moving vehicle are found to 0.02 rad."""
+    """Starting 0.3 rad off and with a gyro bias of 0.01 rad/s, the angles of a moving vehicle are found to 0.02 rad."""
     rng, dt = np.random.default_rng(0), 0.02
     tilt = Tilt(up_of(0.3, -0.2), np.zeros(3))
     errors = []
@@ -73,7 +73,7 @@ def test_a_wrong_start_and_a_bias_die_away():
 
 
 def test_a_hard_push_is_not_taken_for_gravity():
-    """Two seconds of 5 m/s² sideways tilt the estimate by less than a degree; believed, they would by 27 degrees."""
+    """Two seconds of 5 m/s² sideways tilt the estimate by less than a degree; taken as gravity, by 27 degrees."""
     tilt = tilt_from(np.array([0.0, 0.0, GRAVITY]))
     for _ in range(200):
         tilt = follow(tilt, np.zeros(3), np.array([0.0, 5.0, GRAVITY]), 0.01, GAINS)

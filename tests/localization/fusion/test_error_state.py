@@ -1,4 +1,4 @@
-"""The error-state filter: its Jacobians, exact motions, and honest covariances."""
+"""The error-state filter: its Jacobians, exact motions, and consistent covariances."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def some_state(seed=0, batch=()):
 
 
 def moved(state, d):
-    """The state that an error leads to."""
+    """Return the state after adding an error."""
     return InertialState(
         state.x + d[..., 0:6],
         state.P,
@@ -63,14 +63,14 @@ def moved(state, d):
 
 
 def error(true, found):
-    """The error that leads from the found state to the true one, (..., 15)."""
+    """Return the error that leads from the estimated state to the true one, (..., 15)."""
     turn = quat_to_rotvec(quat_multiply(true.q, quat_conjugate(found.q)))
     parts = (true.x - found.x, turn)
     return np.concatenate([*parts, true.gyro_bias - found.gyro_bias, true.accel_bias - found.accel_bias], -1)
 
 
 def jacobian(f, m, h=1e-6):
-    """Central differences of f, which takes an error state."""
+    """Return central differences of f, which takes an error state."""
     return np.stack([(f(h * e) - f(-h * e)) / (2 * h) for e in np.eye(15)], axis=-1).reshape(m, 15)
 
 
@@ -80,7 +80,7 @@ def test_propagation_carries_errors_as_its_covariance_says():
     after = predict(state, omega, force, dt, SILENT, GRAVITY)
     F = jacobian(lambda d: error(predict(moved(state, d), omega, force, dt, SILENT, GRAVITY), after), 15)
     expected = F @ state.P @ F.T
-    # F is first order in the turn of one step, omega dt = 0.01.
+    # F is first order in the rotation of one step, omega dt = 0.01.
     np.testing.assert_allclose(after.P, expected, atol=0.01 * dt * np.abs(expected).max())
 
 
@@ -94,7 +94,7 @@ def test_propagation_carries_errors_as_its_covariance_says():
     ids=["position", "depth", "yaw"],
 )
 def test_measurement_jacobians_are_derivatives(model, m):
-    """Central differences of each measurement over all fifteen errors."""
+    """They equal central differences of each measurement over all fifteen errors."""
     state = some_state(1)
     numeric = jacobian(lambda d: model(moved(state, d))[0] - model(state)[0], m)
     np.testing.assert_allclose(model(state)[1], numeric, atol=1e-8)
@@ -109,7 +109,7 @@ def aided_state(random):
 
 @pytest.mark.parametrize("model", ["velocity", "heading"])
 def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
-    """Central differences through `correct`, which moves the error into the state."""
+    """They equal central differences through `correct`, which moves the error into the state."""
     random = np.random.default_rng(3)
     s, omega, lever = aided_state(random), random.standard_normal(3), np.array([0.1, -0.2, 0.3])
 
@@ -128,7 +128,7 @@ def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
 
 
 def test_a_doppler_log_reads_what_a_turning_vehicle_moves_at():
-    """At rest but turning, a log ahead of the IMU reads ω x l; scale and offset are on top."""
+    """At rest but turning, a log ahead of the IMU reads ω x l, with scale and offset added."""
     q, none = quat_from_euler(0.0, 0.0, 0.7), np.zeros(3)
     turning = InertialState(np.zeros(6), np.eye(20), q, none, none, np.zeros(5))
     read = velocity_model(turning, np.array([0.0, 0.0, 0.5]), np.array([0.4, 0.0, 0.0])).value
@@ -140,7 +140,7 @@ def test_a_doppler_log_reads_what_a_turning_vehicle_moves_at():
 
 
 def test_a_constant_push_in_a_turn_is_followed_to_second_order():
-    """Circling at constant speed: position after a turn returns, to the error of the midpoint rule."""
+    """Circling at constant speed, the position after one turn returns, within the error of the midpoint rule."""
     speed, rate, dt = 0.5, 1.0, 0.01
     n = round(2 * np.pi / rate / dt)
     dt = 2 * np.pi / rate / n
@@ -154,7 +154,7 @@ def test_a_constant_push_in_a_turn_is_followed_to_second_order():
 
 
 def test_at_rest_with_the_right_biases_nothing_moves():
-    """Level or tilted, an accelerometer that reads gravity and its bias leaves the vehicle where it is."""
+    """Level or tilted, an accelerometer that reads gravity and its bias leaves the vehicle at rest."""
     state = replace(some_state(2), x=some_state(2).x * [1, 1, 1, 0, 0, 0])
     force = quat_rotate(quat_conjugate(state.q), -GRAVITY) + state.accel_bias
     after = state
@@ -205,7 +205,7 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
 
 
 def measured(found, true, name, variance, rng, nis):
-    """The filter after one measurement of each run."""
+    """Return the filter after one measurement of each run."""
     model = {
         "xy": lambda s: (position_model(s, LEVER).value[..., :2], position_model(s, LEVER).H[..., :2, :]),
         "yaw": yaw_model,
@@ -221,7 +221,8 @@ def measured(found, true, name, variance, rng, nis):
 
 
 def test_restarts_and_caps_keep_the_covariance_positive():
-    """Restarted axes and headings are as sure as their measurement; capped doubt is bounded; nothing turns negative."""
+    """Restarted axes and headings have the variance of their measurement; caps bound variances, and none is
+    negative."""
     state = predict(some_state(), np.zeros(3), np.array([0, 0, 9.81]), 1.0, NOISE, GRAVITY)
     after = turned(restarted(state, [0, 1], np.array([3.0, 4.0]), np.eye(2) * 0.01, 0.3), 0.5, 0.02)
     np.testing.assert_array_equal(after.x[:2], [3.0, 4.0])

@@ -1,4 +1,4 @@
-"""The estimator: order of delivery, silences, lies of the camera, broken clocks, and what it says of itself."""
+"""The estimator: order of delivery, silences, wrong camera data, clock faults, and its status messages."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def estimator(mode="constant-velocity", **changed):
 
 
 def errors(estimates, times):
-    """Of x, y, z [m] and yaw [rad], (n, 4)."""
+    """Return the errors of x, y, z [m] and yaw [rad], (n, 4)."""
     e = np.array([x.x[:3] for x in estimates]) - position(times)
     return np.column_stack([e, wrap_angle(np.array([x.yaw for x in estimates]) - yaw(times))])
 
@@ -52,7 +52,7 @@ def rms(e):
 @pytest.mark.slow
 @both
 def test_the_path_is_followed(mode):
-    """With 1 cm and 1.1 degrees of noise and a biased IMU: 1 cm and half a degree, and speeds to 6 cm/s."""
+    """With 1 cm and 1.1 degrees of noise and a biased IMU, errors are 1 cm, half a degree, and 6 cm/s."""
     times = np.arange(2.0, 20.0, 1 / 60)
     found = run(estimator(mode), streams(20.0), times)
     assert np.all(rms(errors(found, times)) < [0.012, 0.012, 0.01, math.radians(0.5)])
@@ -62,7 +62,7 @@ def test_the_path_is_followed(mode):
 @pytest.mark.slow
 @both
 def test_tilt_is_found_where_the_imu_does_not_tell_it(mode):
-    """From gyro and accelerometer alone, roll and pitch are right to a degree and the depth's lever with them."""
+    """From gyro and accelerometer alone, roll and pitch are right to a degree, and so is the depth's lever arm."""
     times = np.arange(8.0, 15.0, 0.1)
     found = run(estimator(mode), streams(15.0, tilt=False), times)
     assert rms(np.array([x.roll for x in found]) - 0.06 * np.sin(1.3 * times)) < math.radians(1.0)
@@ -70,7 +70,7 @@ def test_tilt_is_found_where_the_imu_does_not_tell_it(mode):
 
 
 def test_the_estimator_is_its_filters():
-    """Position and covariance are those of predict and update by hand, and what holds of the filters holds of it."""
+    """Position and covariance equal predict and update by hand, so that the tests of the filters apply."""
     e, s = estimator(), Settings()
     up, state, then = np.array([[*SITE.up, 0.0, 0.0, 0.0]]), None, 0.0
     samples = sorted(streams(3.0, seed=2), key=lambda s: s.time)
@@ -91,18 +91,18 @@ def test_the_estimator_is_its_filters():
 
 
 def tilt_before(time):
-    """Roll and pitch of the IMU's sample before a time."""
+    """Return roll and pitch of the last IMU sample before a time."""
     t = np.floor(time * 100.0 + 1e-6) / 100.0
     return 0.06 * np.sin(1.3 * t), 0.05 * np.sin(1.1 * t + 0.5)
 
 
 def height_of(sample):
-    """Height of the body that a depth tells."""
+    """Return the height of the body from a depth."""
     return -sample.depth - SITE.offset - float(up_of(*tilt_before(sample.time)) @ np.array(SITE.depth_port))
 
 
 def by_hand_start(depth, fix, s):
-    """The state after one depth and the first fix."""
+    """Return the state after one depth and the first fix."""
     P = np.diag([0.0, 0.0, s.depth_std**2] + [s.speed_std**2] * 3)
     state = PositionState(np.array([0.0, 0.0, height_of(depth), 0.0, 0.0, 0.0]), P)
     state = position_filter.predict(state, fix.time - depth.time, s.motion)
@@ -111,7 +111,7 @@ def by_hand_start(depth, fix, s):
 
 
 def by_hand(state, sample, s, up):
-    """The state after a depth or a fix."""
+    """Return the state after a depth or a fix."""
     if sample.stream == "depth":
         H, z, R = up, np.array([height_of(sample)]), np.array([[s.depth_std**2]])
     else:
@@ -123,7 +123,7 @@ def by_hand(state, sample, s, up):
 @both
 @pytest.mark.parametrize("seed", [0, 1])
 def test_shuffled_delivery_ends_in_the_same_state(mode, seed):
-    """Up to 200 ms late, twice, with outliers and flips among them: the state is that of ordered delivery to 1e-9."""
+    """Up to 200 ms late, duplicated, with outliers and flips: the state equals that of ordered delivery to 1e-9."""
     rng = np.random.default_rng(seed)
     samples = with_flips(with_outliers(streams(6.0, seed=seed), 0.05, rng), 0.05, rng)
     samples = sorted(samples, key=lambda s: s.time)
@@ -145,7 +145,7 @@ def test_shuffled_delivery_ends_in_the_same_state(mode, seed):
 
 
 def test_a_duplicate_makes_nothing_surer():
-    """A fix delivered three times leaves the covariance of one."""
+    """A fix delivered three times gives the covariance of one."""
     once, thrice = estimator(), estimator()
     for s in streams(1.0):
         once.add(s)
@@ -155,7 +155,7 @@ def test_a_duplicate_makes_nothing_surer():
 
 
 def test_what_is_later_than_the_horizon_is_refused_and_counted():
-    """A fix 1.2 s late is left out, one 0.8 s late is not."""
+    """A fix 1.2 s late is refused, one 0.8 s late is not."""
     e = estimator()
     for s in streams(3.0):
         e.add(s)
@@ -186,7 +186,7 @@ def test_states_follow_the_published_timings(mode, age, mode_then):
 
 
 def test_nothing_is_initialized_before_the_first_fix():
-    """Depth and IMU alone: height is known, place is not, and nothing pretends to be."""
+    """Depth and IMU alone give the height but no position, and the estimate reports it."""
     e = estimator()
     for s in without_vision(streams(2.0), 0.0, 2.0):
         e.add(s)
@@ -201,7 +201,7 @@ def test_nothing_is_initialized_before_the_first_fix():
 @both
 @pytest.mark.parametrize("all_silent", [False, True], ids=["camera", "everything"])
 def test_the_state_never_runs_away(mode, all_silent):
-    """With vision lost the vehicle is held within what it may travel until it stops, and doubt only grows, for ever."""
+    """Without vision the vehicle stays within its possible travel until it stops, and the uncertainty only grows."""
     e = estimator(mode)
     samples = without_vision(streams(14.0), 5.0, 99.0)
     samples = [s for s in samples if not all_silent or s.time < 5.0]
@@ -211,23 +211,25 @@ def test_the_state_never_runs_away(mode, all_silent):
     ages = [10.0, 60.0, 3600.0, 1e6, 1e9]
     found = [e.estimate(start + age) for age in ages]
     stopped = found[0].x[:2]
-    # At 0.3 m/s: 0.75 s on, then slowing with a half life of 1 s, or drawn by an accelerometer 0.04 m/s² off.
+    # At 0.3 m/s: 0.75 s on, then slowing with a half life of 1 s, or driven by an accelerometer 0.04 m/s² off.
     assert np.linalg.norm(stopped - position(start)[:2]) < 1.0
     for x in found:
-        np.testing.assert_allclose(x.x[:2], stopped, atol=1e-4)  # of the IMU, with a lever of 5 cm
+        np.testing.assert_allclose(x.x[:2], stopped, atol=1e-4)  # speed of the IMU, with a lever arm of 5 cm
         np.testing.assert_array_equal(x.x[3:5], 0.0)
         assert np.isfinite(x.P).all() and math.isfinite(x.yaw)
         assert np.linalg.eigvalsh(x.P)[0] > -1e-6
     extra_variance = [x.P[0, 0] for x in found]
     assert all(b >= a * (1 - 1e-9) for a, b in zip(extra_variance, extra_variance[1:], strict=False))
-    assert extra_variance[-1] <= Settings().largest_variance * 1.001  # of the IMU, with a lever of 5 cm
+    assert (
+        extra_variance[-1] <= Settings().largest_variance * 1.001
+    )  # speed of the IMU, with a lever arm of 5 cm
     assert extra_variance[1] > 0.1
 
 
 @pytest.mark.slow
 @both
 def test_dropouts_of_three_seconds_are_survived(mode):
-    """Three silences of 3 s: errors stay within four of the stated deviations, and settle in half a second."""
+    """In three silences of 3 s, errors stay within four of the stated deviations, and settle in half a second."""
     samples = streams(24.0, seed=4)
     for start in (5.0, 11.0, 17.0):
         samples = without_vision(samples, start, start + 3.0)
@@ -237,13 +239,13 @@ def test_dropouts_of_three_seconds_are_survived(mode):
     assert np.all(np.abs(e[:, :2]) < 4.0 * np.array([x.std()[:2] for x in found]) + 0.01)
     silent = (times % 6.0 > 5.0) | (times % 6.0 < 2.6)
     assert np.abs(e[~silent, :2]).max() < 0.06
-    # Half a second of a camera whose errors are white brings it back.
+    # Half a second of a camera with white noise restores it.
     assert np.abs(e[silent, :2]).max() < (1.1 if mode == "constant-velocity" else 0.35)
     assert np.abs(e[:, 3]).max() < math.radians(2.5)  # the gyro carries the heading through
 
 
 def flipped(samples, start, end, turn):
-    """Every yaw of a time turned."""
+    """Return the samples with every yaw of a time interval turned."""
     return [
         replace(s, yaw=s.yaw + turn) if s.stream == "vision" and start <= s.time < end else s for s in samples
     ]
@@ -253,8 +255,8 @@ def flipped(samples, start, end, turn):
 @both
 @pytest.mark.parametrize("lasts, turn", [(1.5, 0.47), (4.0, np.pi / 2)])
 def test_a_flip_that_lasts_is_not_believed_surely(mode, lasts, turn):
-    """The camera's yaw is wrong by 27 or 90 degrees for seconds: the gyro carries the right one, or the doubt is told,
-    and when the camera is right again the heading is back at once."""
+    """The camera's yaw is wrong by 27 or 90 degrees for seconds: the gyro keeps the right one, or the deviation covers
+    the error, and when the camera is right again the heading recovers at once."""
     samples = flipped(streams(26.0, seed=3), 12.0, 12.0 + lasts, turn)
     times = np.arange(8.0, 25.5, 0.1)
     found = run(estimator(mode), samples, times)
@@ -267,7 +269,7 @@ def test_a_flip_that_lasts_is_not_believed_surely(mode, lasts, turn):
 
 @both
 def test_a_heading_that_was_wrong_from_the_start_is_left(mode):
-    """The first second of the camera's yaws is turned: what comes after outvotes it within a second."""
+    """The camera's yaws are turned in the first second: later ones outvote them within a second."""
     times = np.arange(3.5, 8.0, 0.1)
     found = run(estimator(mode), flipped(streams(8.0, seed=4), 0.0, 1.0, 0.6), times)
     assert np.all(np.abs(errors(found, times)[:, 3]) < math.radians(4.0))
@@ -275,7 +277,7 @@ def test_a_heading_that_was_wrong_from_the_start_is_left(mode):
 
 @both
 def test_outliers_and_flips_are_refused(mode):
-    """5 % of fixes off by 0.5 to 1 m and 5 % of yaws off by 90 or 180 degrees: the path is followed as without.
+    """With 5 % of fixes off by 0.5 to 1 m and 5 % of yaws off by 90 or 180 degrees, the path is followed as without.
 
     The very first yaw is one of them; the next two outvote it, and no gate opens again after that.
     """
@@ -293,7 +295,7 @@ def test_outliers_and_flips_are_refused(mode):
 
 
 def kidnapped(seed=6):
-    """Fixes that, from 5 s on, are 1.5 m and 2 rad away from before: the vehicle was carried, or wrong until then."""
+    """Return fixes that jump by 1.5 m and 2 rad at 5 s: the vehicle was carried, or earlier fixes were wrong."""
     return [
         replace(s, position=(s.position[0] - 1.5, s.position[1]), yaw=s.yaw + 2.0)
         if s.stream == "vision" and s.time < 5.0
@@ -304,7 +306,7 @@ def kidnapped(seed=6):
 
 @both
 def test_a_locked_gate_opens_again(mode):
-    """Consistent fixes elsewhere are refused for a second, and then believed."""
+    """Consistent fixes elsewhere are refused for a second, and then accepted."""
     e = estimator(mode)
     times = np.array([5.8, 6.5])
     before, after = errors(run(e, kidnapped(), times), times)
@@ -314,7 +316,7 @@ def test_a_locked_gate_opens_again(mode):
 
 
 def broken():
-    """Samples that must change nothing."""
+    """Return samples that must change nothing."""
     nan, inf = math.nan, math.inf
     return [
         DepthSample(nan, 0.5),
@@ -333,7 +335,7 @@ def broken():
 @pytest.mark.slow
 @both
 def test_broken_samples_are_refused_counted_and_leave_no_trace(mode):
-    """NaN, infinities, times long past and far ahead: every one is counted, and the state is the same bit by bit."""
+    """NaN, infinities, times long past and far ahead are each counted, and the state is bit-identical."""
     clean, dirty = estimator(mode), estimator(mode)
     for s in streams(6.0):
         clean.add(s)
@@ -355,12 +357,12 @@ def test_broken_samples_are_refused_counted_and_leave_no_trace(mode):
 
 @pytest.mark.parametrize("jump", [-1000.0, -3.0, 5000.0])
 def test_another_clock_is_believed_once_all_agree_on_it(jump):
-    """When every stamp jumps, a few samples are refused, then the estimator works on the new clock."""
+    """When every stamp jumps, a few samples are refused, then the estimator works with the new clock."""
     samples = streams(10.0)
     moved = [
         s if s.arrival < 5.0 else replace(s, time=s.time + jump, arrival=s.arrival + jump) for s in samples
     ]
-    # Arrivals of a jumped clock jump too, and so cannot vouch for it forwards.
+    # Arrival times of a jumped clock jump too, and so cannot confirm it forwards.
     moved = [replace(s, arrival=None) for s in moved]
     e = estimator()
     for s in moved:
@@ -371,7 +373,7 @@ def test_another_clock_is_believed_once_all_agree_on_it(jump):
 
 
 def test_a_silence_is_no_clock_jump():
-    """After half a minute without a sample, arrivals vouch for the first one."""
+    """After half a minute without a sample, arrival times confirm the first one."""
     samples = [s for s in streams(40.0) if not 5.0 <= s.time < 36.0]
     e = estimator()
     verdicts = [e.add(s) for s in samples]
@@ -381,7 +383,7 @@ def test_a_silence_is_no_clock_jump():
 
 @pytest.mark.parametrize("latency", [0.0, 0.1])
 def test_the_camera_may_be_late(latency):
-    """A tenth of a second of delay costs a prediction over that time, not an error of speed times delay."""
+    """A delay of a tenth of a second adds the error of a prediction over that time, not speed times delay."""
     times = np.arange(2.0, 12.0, 1 / 60)
     found = run(estimator(), streams(12.0, noise=QUIET, latency=latency), times)
     e = errors(found, times)
@@ -390,7 +392,7 @@ def test_the_camera_may_be_late(latency):
 
 
 def test_a_latency_that_is_not_told_is_an_error_of_speed_times_delay():
-    """The same delay stamped as if it were none."""
+    """The same delay is stamped as zero."""
     samples = [
         replace(s, time=s.time + 0.1) if s.stream == "vision" else s for s in streams(12.0, noise=QUIET)
     ]
@@ -401,7 +403,7 @@ def test_a_latency_that_is_not_told_is_an_error_of_speed_times_delay():
 
 
 def test_surroundings_are_those_of_the_exposure():
-    """Tilt and depth are interpolated to the time of the picture, in a straight line between two samples."""
+    """Tilt and depth are interpolated linearly between two samples to the time of the picture."""
     e = estimator()
     for s in streams(5.0, noise=QUIET):
         e.add(s)
@@ -415,7 +417,7 @@ def test_surroundings_are_those_of_the_exposure():
 
 
 def test_a_tilt_of_the_vehicle_moves_the_depth_port():
-    """On its side the port is beside the body, and the depth is the body's own."""
+    """On its side, the vehicle has the port beside the body, and the depth is the body's own."""
     e = estimator()
     e.add(ImuSample(1.0, (0.0, 0.0, 0.0), None, (math.pi / 2, 0.0)))
     e.add(DepthSample(1.0, 0.4))
@@ -427,7 +429,7 @@ def test_a_tilt_of_the_vehicle_moves_the_depth_port():
 
 
 def test_health_is_plain_json_with_the_published_keys():
-    """Every key of the status message, and no number that JSON does not know."""
+    """It has every key of the status message, and only numbers that JSON can represent."""
     e = estimator()
     text = json.dumps(e.health(e.estimate()).as_json(), allow_nan=False)
     for s in streams(2.0):
@@ -446,8 +448,8 @@ def test_health_is_plain_json_with_the_published_keys():
 @pytest.mark.slow
 @both
 def test_innovations_are_as_large_as_expected(mode):
-    """NIS per dimension of 20 s is about 1 for noises as set: below the 1.2 of a filter too sure of itself."""
-    # Noises as they are simulated; the path is smoother than white acceleration, so a little below 1 is honest.
+    """NIS per dimension over 20 s is about 1 for the configured noises, below 1.2 as of an overconfident filter."""
+    # Noises are as simulated; the path is smoother than white acceleration, so slightly below 1 is expected.
     e = estimator(mode, vision_floor=(0.0, 0.0))
     for s in streams(20.0, seed=8):
         e.add(s)
@@ -458,7 +460,7 @@ def test_innovations_are_as_large_as_expected(mode):
 
 @pytest.mark.slow
 def test_acceleration_helps_where_the_camera_is_silent():
-    """Over the same silences of 1.5 s, the error-state filter is off by less than half of what constant velocity is."""
+    """Over silences of 1.5 s, the error of the error-state filter is less than half of that of constant velocity."""
     samples = streams(20.0, seed=9)
     for start in (5.0, 10.0, 15.0):
         samples = without_vision(samples, start, start + 1.5)
@@ -469,7 +471,7 @@ def test_acceleration_helps_where_the_camera_is_silent():
 
 @both
 def test_times_since_1970_are_as_good(mode):
-    """Stamps of 1.7e9 s, which a double resolves to 0.2 microseconds, change nothing that matters."""
+    """With stamps of 1.7e9 s, which a double resolves to 0.2 microseconds, differences are negligible."""
     e, other = estimator(mode), estimator(mode)
     for s in streams(4.0, seed=3):
         e.add(s)
@@ -481,7 +483,7 @@ def test_times_since_1970_are_as_good(mode):
 
 @dataclass(frozen=True)
 class AltitudeSample:
-    """Height above the surface, of an instrument that the package does not know."""
+    """Height above the surface, of an instrument that the package does not include."""
 
     time: float
     height: float
@@ -491,7 +493,7 @@ class AltitudeSample:
 
 @both
 def test_a_new_sensor_is_one_entry_of_the_table(mode, monkeypatch):
-    """An instrument that measures the port's height to a millimetre is used, gated and counted by both filters."""
+    """A sensor of the port's height with millimetre accuracy is used, gated and counted by both filters."""
     entry = SensorModel(
         stream="altitude",
         quantity="height",
@@ -516,6 +518,6 @@ def test_a_new_sensor_is_one_entry_of_the_table(mode, monkeypatch):
 
 
 def test_an_unknown_mode_is_refused_with_the_names():
-    """The sentence names what there is."""
+    """The sentence lists the available modes."""
     with pytest.raises(LocalizationError, match="constant-velocity, error-state"):
         Estimator(mode="kalman")

@@ -1,4 +1,4 @@
-"""`finssim fuse`: logs in, table out; on real motion capture and IMU recordings, and on streams known exactly."""
+"""`finssim fuse` from logs to a table: with real motion capture and IMU recordings, and with exactly known streams."""
 
 import csv
 import json
@@ -46,13 +46,13 @@ def pool(tmp_path):
 
 
 def samples(duration=6.0, **options):
-    """Streams of a FinsROV in that pool, IMU at the body origin."""
+    """Return streams of a FinsROV in that pool, with the IMU at the body origin."""
     site = replace(SITE, imu=(0.0, 0.0, 0.0))
     return streams(duration, site=site, **options)
 
 
 def write_log(folder, items, *, camera=0.04, names=("p", "q", "r", "ax", "ay", "az")):
-    """A folder of tables; pictures are stamped `camera` after their exposure."""
+    """Write a folder of tables; pictures are stamped `camera` after their exposure."""
     by = {s: [x for x in items if x.stream == s] for s in ("imu", "depth", "vision")}
     tilt = ("roll", "pitch")
     rows = [(s.time, *s.omega, *s.force, *s.tilt) for s in by["imu"]]
@@ -76,7 +76,7 @@ def read_out(path):
 
 @pytest.mark.parametrize("mode", list(MODELS))
 def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
-    """60 rows a second with states, deviations and counts; errors against the truth file are centimetres."""
+    """It has 60 rows a second with states, deviations and counts; errors against the truth file are centimetres."""
     log = write_log(tmp_path / "log", samples())
     run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", settings=FuseSettings(estimator=mode))
     columns, states = read_out(tmp_path / "out.csv")
@@ -94,7 +94,7 @@ def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
 
 
 def test_json_holds_the_summary(tmp_path, pool, capsys):
-    """One object, without NaN, with states, refusals by reason, NIS, errors and the health at the end."""
+    """It is one object, without NaN, with states, refusals by reason, NIS, errors and the health at the end."""
     log = write_log(tmp_path / "log", samples(3.0))
     run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", as_json=True)
     summary = json.loads(capsys.readouterr().out)
@@ -128,7 +128,7 @@ def test_one_table_of_all_columns_is_the_same_log(tmp_path, pool):
     ]
     assert counts[0] == counts[1]
     a, b = (np.array([row[1:4] for row in fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows]) for log in logs)
-    assert np.nanmax(np.abs(a - b)) < 0.05  # the table has no deviations, and takes the settings'
+    assert np.nanmax(np.abs(a - b)) < 0.05  # the table has no deviations, and the settings' are used
 
 
 def test_columns_in_the_sensors_axes_are_turned(tmp_path, pool):
@@ -164,7 +164,7 @@ def test_columns_in_the_sensors_axes_are_turned(tmp_path, pool):
 
 
 def test_rows_rest_on_what_had_arrived(tmp_path, pool):
-    """Rows before a time do not change when everything after it is cut off."""
+    """Rows up to a time do not change when all later samples are removed."""
     site = load_pool(pool)
     log = load_log(write_log(tmp_path / "log", samples(4.0)), FINSROV, latency=site.latency)
     whole = fuse(log, site, FINSROV, CONSTANT_VELOCITY).rows
@@ -176,7 +176,7 @@ def test_rows_rest_on_what_had_arrived(tmp_path, pool):
 
 
 def write_pictures(folder, items, site):
-    """Tags of the vehicle as the camera sees them through the water, 15 times a second, in place of fixes."""
+    """Write the vehicle's tags as seen by the camera through the water, 15 times a second, instead of fixes."""
     tags, frames = tag_corners_b(FINSROV.tags), []
     rng = np.random.default_rng(0)
     for s in [s for s in items if s.stream == "vision"][::2]:
@@ -195,7 +195,7 @@ def write_pictures(folder, items, site):
 
 @pytest.mark.parametrize("mode", list(MODELS))
 def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path, pool, mode):
-    """Corners alone, through refracting water: the path to 2 cm, each fix as uncertain as it says."""
+    """Corners through refracting water give the path to 2 cm, each fix with a correct uncertainty."""
     site, items = load_pool(pool), samples(6.0)
     folder = write_log(tmp_path / "log", items)
     frames = write_pictures(folder, items, site)
@@ -208,7 +208,7 @@ def test_detections_become_fixes_with_depth_and_tilt_of_their_exposure(tmp_path,
 
 
 def test_the_table_of_localize_is_read_with_its_covariances_and_refusals(tmp_path, pool):
-    """What `finssim localize` writes: a full covariance for each fix, and refused pictures counted by their reason."""
+    """`finssim localize` writes a full covariance for each fix, and refused pictures are counted by reason."""
     site, items = load_pool(pool), samples(3.0)
     folder = write_log(tmp_path / "log", items)
     pictures, constraints = write_pictures(folder, items, site), Constraints(z_b=0.0)
@@ -232,14 +232,14 @@ def test_the_table_of_localize_is_read_with_its_covariances_and_refusals(tmp_pat
 
 
 def still_pool(pool):
-    """The pool without latency: stamps of the motion capture are taken as they are."""
+    """The pool without latency: stamps of the motion capture are used unchanged."""
     return replace(load_pool(pool), latency=0.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", ["traj005-1", "traj026-0", "traj_alt_009-0"])
 def test_a_real_gyro_carries_a_heading_seen_once_a_second(trial, tmp_path, pool):
-    """BlueROV2, gyro at 20 Hz and mocap heading at 1 Hz against the full rate: at most 1.0 degree rms.
+    """A BlueROV2's gyro at 20 Hz with mocap heading at 1 Hz is within 1.0 degree rms of the full rate.
 
     These trials are clean: the markers are never lost for more than 0.13 s and the heading never jumps by 2.5 degrees.
     No stream is shifted in time; by their rates of roll and pitch the clocks agree to 0.02 s.
@@ -260,7 +260,7 @@ def test_a_real_gyro_carries_a_heading_seen_once_a_second(trial, tmp_path, pool)
 
 @pytest.mark.slow
 def test_a_real_flip_is_refused(tmp_path, pool):
-    """`baseline2`: around 33.6 s the mocap is turned over for some frames, by 160 degrees. None of them is believed."""
+    """In `baseline2`, around 33.6 s the mocap is flipped for some frames, by 160 degrees. All of them are refused."""
     folder, t, heading = hinsdale(tmp_path / "b", "baseline2", every=None)
     log = load_log(folder, FINSROV)
     log.samples = [s for s in log.samples if s.time < 35.5]
@@ -279,7 +279,7 @@ def test_a_real_flip_is_refused(tmp_path, pool):
 
 
 def test_missing_stretches_of_the_imu_cost_doubt_not_the_heading(tmp_path, pool):
-    """A gap of 1.5 s in the gyro: the deviation of yaw grows over it, and the next fix brings it back."""
+    """In a gap of 1.5 s in the gyro, the deviation of yaw grows, and the next fix reduces it again."""
     items = [s for s in samples(6.0) if not (s.stream == "imu" and 3.0 < s.time < 4.5)]
     items = [s for s in items if not (s.stream == "vision" and 3.0 < s.time < 4.6)]
     site = load_pool(pool)
@@ -294,7 +294,7 @@ def test_missing_stretches_of_the_imu_cost_doubt_not_the_heading(tmp_path, pool)
 
 
 def test_a_slow_stream_written_into_every_row_is_thinned(tmp_path, pool):
-    """Depth repeated in a fast table counts once, and that is said."""
+    """Depth repeated in a fast table counts once, which is reported."""
     rows = [(0.01 * k, 0.0, 0.0, 0.0, 0.5 + 0.001 * (k // 10)) for k in range(100)]
     log = load_log(write_table(tmp_path / "all.csv", ("t", "p", "q", "r", "depth"), rows), FINSROV)
     assert sum(s.stream == "depth" for s in log.samples) == 10
@@ -326,7 +326,7 @@ def test_a_slow_stream_written_into_every_row_is_thinned(tmp_path, pool):
     ids=["wrong column", "no time", "no rows", "no rate", "two clocks", "milliseconds"],
 )
 def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, write, sentence):
-    """What is wrong, where, and what was expected."""
+    """The sentence states the problem, its position, and the expected form."""
     write(tmp_path / "log")
     with pytest.raises(LocalizationError, match=sentence):
         run(tmp_path / "log", pool=pool, vehicle="finsrov", out=tmp_path / "out.csv")
@@ -334,7 +334,7 @@ def test_logs_that_cannot_be_used_are_refused_in_a_sentence(tmp_path, pool, writ
 
 
 def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
-    """Without IMU and depth nothing is refused, what is missing is said, and the state is never ready."""
+    """Without IMU and depth nothing is refused, the missing streams are reported, and the state is never ready."""
     folder = write_log(tmp_path / "log", samples(4.0))
     (folder / "imu.csv").unlink()
     (folder / "depth.csv").unlink()
@@ -349,7 +349,7 @@ def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
 
 @pytest.mark.parametrize("std", [0.0, -0.01])
 def test_a_fix_that_is_exact_or_better_is_refused(tmp_path, std):
-    """A deviation of zero or below is no deviation."""
+    """A deviation of zero or below is invalid."""
     names = ("t", "x", "y", "yaw", "std_x", "std_y", "std_yaw")
     path = write_table(tmp_path / "log" / "vision.csv", names, [(0, 1, 1, 0, std, 0.1, 0.1)])
     (fix,) = load_log(path.parent, FINSROV).samples
@@ -357,7 +357,7 @@ def test_a_fix_that_is_exact_or_better_is_refused(tmp_path, std):
 
 
 def test_acceleration_without_gravity_is_no_specific_force(tmp_path, pool):
-    """It is left out, which is said, and the error-state mode then says what it needs."""
+    """It is ignored, which is reported, and the error-state mode then names the data it needs."""
     items = [replace(s, force=(0.1, 0.0, 0.2)) if s.stream == "imu" else s for s in samples(0.5)]
     log = load_log(write_log(tmp_path / "log", items), FINSROV)
     assert any("hold no gravity" in note for note in log.notes)
@@ -373,7 +373,7 @@ def test_a_pool_with_z_down_is_refused(tmp_path, pool):
 
 
 def test_errors_against_the_truth_are_those_of_each_column():
-    """Rows that are off by 1, 2 and 3 cm and 0.04 rad, with velocities that must not be taken for a position."""
+    """Rows are off by 1, 2 and 3 cm and 0.04 rad, with velocities that must not be mistaken for positions."""
     t = np.arange(0.0, 2.0, 0.1)
     rows = []
     for time in t:

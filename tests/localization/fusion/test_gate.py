@@ -1,4 +1,4 @@
-"""Gates pass the stated share of honest measurements, and give in to a run that agrees with itself."""
+"""Gates pass the stated share of valid measurements, and accept a run of refused ones that is self-consistent."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,8 @@ def test_the_limit_passes_its_share(dimension, probability):
 
 @pytest.mark.parametrize("carried", [False, True])
 def test_an_outlier_is_what_lies_beyond_the_limit(carried):
-    """99.9 % of chi-square: a yaw passes at 10.82 and not at 10.84, a position in the plane at 13.8 and not at 13.9."""
+    """At 99.9 % of chi-square, a yaw passes at 10.82 and not at 10.84, a position in the plane at 13.8 and
+    not at 13.9."""
 
     def verdict(distance, dimension):
         memory, R = GateMemory(5), 1e-4 * np.eye(dimension)
@@ -30,7 +31,7 @@ def test_an_outlier_is_what_lies_beyond_the_limit(carried):
 
 
 def refused(gate, values, period=0.1, variance=1e-4, support=5):
-    """Verdicts on far measurements of those values, of a state that so many others have supported."""
+    """Return verdicts on distant measurements, for a state supported by a number of others."""
     memory, verdicts, R = GateMemory(support), [], variance * np.eye(len(values[0]))
     for k, value in enumerate(values):
         verdict, memory = judge(gate, memory, k * period, np.asarray(value, float), R, 1e6, 0.3)
@@ -39,34 +40,34 @@ def refused(gate, values, period=0.1, variance=1e-4, support=5):
 
 
 def test_a_run_that_agrees_takes_over_in_time():
-    """Refused for a second at 10 Hz, the eleventh measurement ends the run."""
+    """Refused for a second at 10 Hz, the run is accepted with the eleventh measurement."""
     assert refused(OutlierGate(), [(5.0, 1.0)] * 11) == ["gate"] * 10 + ["reacquired"]
 
 
 def test_a_slow_stream_needs_its_number():
-    """At 1 Hz five measurements are asked for, not two."""
+    """At 1 Hz five measurements are required, not two."""
     assert refused(OutlierGate(), [(5.0, 1.0)] * 5, period=1.0) == ["gate"] * 4 + ["reacquired"]
 
 
 def test_scattered_outliers_never_take_over():
-    """Measurements that agree with nothing stay refused for ever."""
+    """Inconsistent measurements are refused forever."""
     values = np.random.default_rng(2).uniform(-50, 50, (200, 2))
     assert set(refused(OutlierGate(), values)) == {"gate"}
 
 
 def test_outliers_in_between_do_not_stop_a_run():
-    """With every third measurement an outlier, the run still ends in time."""
+    """With every third measurement an outlier, the run is still accepted in time."""
     values = [(5.0, 1.0) if k % 3 else (np.sin(k) * 40, 30.0) for k in range(1, 20)]
     assert "reacquired" in refused(OutlierGate(), values)[:13]
 
 
 def test_the_run_may_move():
-    """A vehicle that drives while it is refused agrees with itself."""
+    """Measurements of a vehicle that moves while it is refused are consistent."""
     assert refused(OutlierGate(), [(5.0 + 0.03 * k, 1.0) for k in range(11)])[-1] == "reacquired"
 
 
 def test_a_gate_that_never_gives_in():
-    """`reacquire_after` of infinity."""
+    """This is `reacquire_after` of infinity."""
     assert set(refused(OutlierGate(reacquire_after=np.inf), [(5.0, 1.0)] * 100)) == {"gate"}
 
 
@@ -80,7 +81,7 @@ def test_an_accepted_measurement_clears_the_memory():
 
 
 def test_a_first_measurement_is_outvoted_by_the_next_two():
-    """A state started from an outlier is taken over by two that agree, and then stays where five have supported it."""
+    """A state started from an outlier is replaced by two that agree, and then kept once five have supported it."""
     assert refused(OutlierGate(), [(5.0, 1.0)] * 2, support=1) == ["gate", "reacquired"]
     assert refused(OutlierGate(), [(5.0, 1.0)] * 4, support=3) == ["gate"] * 3 + ["reacquired"]
     assert refused(OutlierGate(reacquire_after=np.inf), [(5.0, 1.0)] * 9, support=1) == ["gate"] * 9

@@ -1,4 +1,4 @@
-"""The position filter knows how wrong it is, and its steps are those of the motion it assumes."""
+"""The position filter has a consistent covariance, and its steps follow its motion model."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ def start(batch=()):
 
 
 def compared(state, H, z, R):
-    """The innovation of a measurement z = H x + noise."""
+    """Return the innovation of a measurement z = H x + noise."""
     return state.innovation(z - state.x @ H.T, H, R)
 
 
 @pytest.mark.parametrize("motion", [MOTION, SLOWING], ids=["constant", "slowing"])
 def test_two_steps_are_one_of_both_lengths(motion):
-    """The model is one in continuous time: any division of a step gives the same mean and covariance."""
+    """The model is in continuous time: any division of a step gives the same mean and covariance."""
     state = PositionState(np.arange(6.0), start().P)
     once = predict(state, 0.7, motion)
     parts = predict(predict(predict(state, 0.1, motion), 0.35, motion), 0.25, motion)
@@ -43,7 +43,7 @@ def test_two_steps_are_one_of_both_lengths(motion):
 
 
 def test_process_noise_is_the_integral_of_white_acceleration():
-    """Q = q [dt³/3 dt²/2; dt²/2 dt], against the covariance of many finely integrated paths."""
+    """Q = q [dt³/3 dt²/2; dt²/2 dt] is compared with the covariance of many finely integrated paths."""
     q, dt, n = 0.05, 0.5, 500
     rng = np.random.default_rng(1)
     steps = rng.standard_normal((20000, n)) * np.sqrt(q * dt / n)
@@ -87,7 +87,7 @@ def test_covariance_stays_symmetric_and_positive_with_a_measurement_nearly_exact
 
 
 def simulate(seed, duration=10.0, rate=120):
-    """200 vehicles that move as the model says, seen at 30 Hz and by their depth at 20 Hz: NEES and NIS by time."""
+    """Simulate 200 vehicles with the model's motion, fixes at 30 Hz and depths at 20 Hz: NEES and NIS by time."""
     rng = np.random.default_rng(seed)
     L = np.linalg.cholesky(process_noise(1.0 / rate, MOTION))
     state = start((RUNS,))
@@ -111,7 +111,7 @@ def simulate(seed, duration=10.0, rate=120):
 
 
 def share_inside(rows, dimension):
-    """Share of times at which the mean over the runs lies in its 95 % band."""
+    """Return the share of times at which the mean over the runs lies in its 95 % band."""
     low, high = chi2.ppf([0.025, 0.975], RUNS * dimension) / RUNS
     mean = rows.mean(axis=1)
     return float(np.mean((mean > low) & (mean < high)))
@@ -120,11 +120,11 @@ def share_inside(rows, dimension):
 def test_errors_and_innovations_are_as_large_as_the_filter_says():
     """NEES (6) and NIS (2 and 1) of 200 runs lie in their 95 % bands about 95 % of the time."""
     nees, nis = simulate(seed=3)
-    # Neighbouring times share their errors, so the share scatters more than independent ones would: +-4 %.
+    # Neighbouring times share their errors, so the share scatters more than with independent ones: +-4 %.
     assert share_inside(nees, 6) == pytest.approx(0.95, abs=0.04)
     for name, dimension in (("vision", 2), ("depth", 1)):
         assert share_inside(nis[name], dimension) == pytest.approx(0.95, abs=0.03)
-        # Innovations are white: their grand mean has the band of all numbers together.
+        # Innovations are white, so the band of their grand mean is that of all numbers together.
         low, high = chi2.ppf([0.025, 0.975], nis[name].size * dimension) / nis[name].size
         assert low < nis[name].mean() < high
 
@@ -143,7 +143,7 @@ def test_a_batch_is_its_runs():
 
 
 def test_restarting_an_axis_leaves_the_others():
-    """The restarted axes are what was measured, at rest; the others keep state and covariance."""
+    """The restarted axes have the measured position, at rest; the others keep state and covariance."""
     state = predict(PositionState(np.arange(6.0), start().P), 1.0, MOTION)
     after = restarted(state, [0, 1], np.array([7.0, 8.0]), np.eye(2) * 0.01, 0.3)
     np.testing.assert_array_equal(after.x, [7.0, 8.0, state.x[2], 0.0, 0.0, state.x[5]])

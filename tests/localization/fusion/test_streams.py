@@ -1,4 +1,4 @@
-"""Samples that can never be used are recognised as such."""
+"""Samples that can never be used are refused."""
 
 import math
 
@@ -12,7 +12,7 @@ BROKEN = [math.nan, math.inf, -math.inf]
 
 @pytest.mark.parametrize("bad", BROKEN)
 def test_numbers_that_are_none_are_refused(bad):
-    """NaN and infinities in any number of any sample are refused, those of times by their own name."""
+    """NaN and infinities in any number of any sample are refused; a bad time has its own reason."""
     assert refusal(DepthSample(bad, 0.5)) == "time not finite"
     assert refusal(DepthSample(1.0, 0.5, arrival=bad)) == "time not finite"
     assert refusal(DepthSample(1.0, bad)) == "not finite"
@@ -34,7 +34,7 @@ def test_numbers_that_are_none_are_refused(bad):
     ids=["indefinite", "asymmetric", "certain", "unknown"],
 )
 def test_a_matrix_that_is_no_covariance_is_refused(R):
-    """A fix must say how wrong it may be, and nothing is known exactly."""
+    """The covariance of a fix must be positive: no measurement is exact."""
     assert refusal(VisionSample(1.0, (0.0, 0.0), 0.0, R)) == "covariance not positive"
 
 

@@ -1,4 +1,4 @@
-"""Yaw: its rate from body rates, the short way round, a bias that is found, and honest variances."""
+"""Yaw: its rate from body rates, the shortest direction, bias estimation, and consistent variances."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def start(batch=(), variance=0.01, bias_std=0.02):
 
 
 def compared(state, seen, variance):
-    """The innovation of a measured yaw."""
+    """Return the innovation of a measured yaw."""
     residual = np.atleast_1d(wrap_angle(seen - state.yaw)[..., None])
     return state.innovation(residual, np.array([[1.0, 0.0]]), np.array([[variance]]))
 
 
 def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
-    """psi_dot = (q sin φ + r cos φ)/cos θ against the derivative of a path that rolls, pitches and turns."""
+    """psi_dot = (q sin φ + r cos φ)/cos θ agrees with the derivative of a path that rolls, pitches and turns."""
     t = np.linspace(0.0, 20.0, 401)
     roll, pitch, _ = quat_to_euler(attitude(t))
     omega = body_rates(t)
@@ -44,7 +44,7 @@ def test_yaw_rate_is_the_derivative_of_yaw_on_a_tilting_path():
 
 
 def test_a_left_turn_raises_yaw():
-    """Level and turning left (r > 0), yaw grows; rolled by 90 degrees, nose-down pitching does so."""
+    """Level and turning left (r > 0), yaw grows; rolled by 90 degrees, nose-down pitching makes it grow."""
     assert yaw_rate(0.0, 0.2, 0.0, 0.0) == pytest.approx(0.2)
     assert yaw_rate(0.2, 0.0, np.pi / 2, 0.0) == pytest.approx(0.2)
 
@@ -59,7 +59,7 @@ def test_correction_goes_the_short_way_round(true):
 
 
 def test_the_bias_is_found():
-    """A gyro 0.02 rad/s off is known to 0.001 rad/s after 20 s of a camera at 10 Hz."""
+    """A gyro bias of 0.02 rad/s is found to 0.001 rad/s after 20 s of a camera at 10 Hz."""
     rng = np.random.default_rng(0)
     state, noise = start(), YawNoise(rate=1e-3, bias_walk=1e-5)
     for k in range(1, 2001):
@@ -72,7 +72,7 @@ def test_the_bias_is_found():
 
 
 def test_without_a_bias_the_gain_is_the_published_one():
-    """q = 0.02 /s, R = 0.05: gain P/(P + R) of one scalar."""
+    """For q = 0.02 /s and R = 0.05, the gain is P/(P + R) of one scalar."""
     noise, R = YawNoise(rate=np.sqrt(0.02), bias_walk=0.0), 0.05
     P = 10.0
     state = start(variance=P, bias_std=0.0)
@@ -95,7 +95,7 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
     for k in range(1, 3000):
         if k % (rate // 100) == 0:
             turning = 0.4 * np.cos(0.3 * k / rate) * np.ones(RUNS)
-            # Within a step the bias walks and the rate is noisy: exact sampling of what `predict` assumes.
+            # Within a step the bias walks and the rate is noisy: exact sampling of the assumptions of `predict`.
             w, b = rng.standard_normal((2, RUNS))
             walk = NOISE.bias_walk * np.sqrt(dt) * w
             inside = NOISE.bias_walk * np.sqrt(dt**3 / 3.0) * (np.sqrt(0.75) * w + 0.5 * b)
@@ -115,7 +115,7 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says():
 
 
 def test_doubt_of_yaw_is_capped():
-    """A gyro silent for a day leaves a finite, positive covariance."""
+    """A gyro that is silent for a day leaves a finite, positive covariance."""
     state = capped(predict(start(), 0.0, 86400.0, YawNoise(rate=0.3)), 10.0)
     assert state.P[0, 0] == pytest.approx(10.0)
     assert np.linalg.eigvalsh(state.P)[0] > -1e-9

@@ -1,4 +1,4 @@
-"""A vehicle with two tags in a pool, and what a camera sees of it: exact corners, to which tests add errors."""
+"""A vehicle with two tags in a pool, and its exact corners in the camera, to which tests add errors."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ FISHEYE = Lens(1280, 960, 420.0, 420.0, 640.0, 480.0, "fisheye", (-0.02, 0.003, 
 DOWN = matrix_to_quat(np.array([[1.0, 0.02, 0.0], [0.02, -1.0, 0.03], [0.0006, -0.03, -1.0]]))
 DOWN = DOWN / np.linalg.norm(DOWN)
 ABOVE = Camera(LENS, np.array([0.03, -0.17, 2.17]), DOWN)
-# Before a wall at y = 0, looking along +y into the water.
+# In front of a wall at y = 0, looking along +y into the water.
 FRONT = Camera(
     LENS, np.array([0.0, -0.5, 0.9]), matrix_to_quat(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]))
 )
@@ -43,7 +43,7 @@ POOLS = {
 
 
 def pose(name, seed):
-    """A position of the field of view at which all corners are seen, and roll, pitch, yaw."""
+    """Return a position in the field of view at which all corners are seen, and roll, pitch, yaw."""
     rng = np.random.default_rng(seed)
     for _ in range(1000):
         low, high = (
@@ -59,12 +59,12 @@ def pose(name, seed):
 
 
 def rotation(angles, up=(0.0, 0.0, 1.0)):
-    """R_pb of roll, pitch, yaw [rad] about a vertical."""
+    """Return R_pb of roll, pitch, yaw [rad] about a vertical."""
     return axes_of_up(up) @ quat_to_matrix(quat_from_euler(*angles))
 
 
 def seen(pool, position, angles, tags=TAGS, up=(0.0, 0.0, 1.0)):
-    """Exact detections of all tags; None where a corner is not within the picture."""
+    """Return exact detections of all tags; None where a corner is not within the picture."""
     R, found = rotation(angles, up), []
     for tag, corners_b in tags.items():
         points = corners_b @ R.T + position
@@ -81,7 +81,7 @@ def seen(pool, position, angles, tags=TAGS, up=(0.0, 0.0, 1.0)):
 
 
 def moved(detections, change):
-    """Detections with a change [px] added to the corners, (n, 4, 2)."""
+    """Return detections with a change [px] added to the corners, (n, 4, 2)."""
     return [
         Detection(d.tag, d.corners + c, d.margin, d.hamming, d.family)
         for d, c in zip(detections, change, strict=True)
@@ -89,5 +89,5 @@ def moved(detections, change):
 
 
 def known(position, angles, **more):
-    """What pressure and inertia know exactly."""
+    """Return exact readings of depth sensor and IMU."""
     return Constraints(z_b=float(position[2]), roll=float(angles[0]), pitch=float(angles[1]), **more)

@@ -1,4 +1,4 @@
-"""Six degrees of freedom through the water: true minima are found, doubtful ones refused, the covariance holds."""
+"""Six degrees of freedom through the water: true minima are found, ambiguous ones refused, the covariance is valid."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ FAR = {15: TAGS[15] + [0.1, 0.0, 0.0], 16: TAGS[16], 17: TAGS[15] + [0.0, 0.25, 
 
 
 def error(found, position, angles):
-    """Position error and rotation vector about pool axes from the true attitude, (6,)."""
+    """Return position error and rotation vector about pool axes from the true attitude, (6,)."""
     turn = quat_to_rotvec(matrix_to_quat(found.rotation @ rotation(angles).T))
     return np.concatenate([found.position - position, turn])
 
@@ -22,7 +22,7 @@ def error(found, position, angles):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POOLS)
 def test_large_tilts_are_found_too(name):
-    """A vehicle leaning by 20 degrees is found from exact corners, without depth or inertia."""
+    """A vehicle that leans by 20 degrees is found from exact corners, without depth or IMU."""
     looked_at = 0
     for seed in (3, 4, 5, 6):
         position, angles = pose(name, seed)
@@ -55,7 +55,7 @@ def test_the_covariance_is_that_of_the_errors():
 
 
 def test_a_far_small_tag_is_ambiguous_until_tilt_decides():
-    """One tag with corners of 1 px fits two attitudes: it is refused, and with roll and pitch it is not."""
+    """One tag with corner noise of 1 px fits two attitudes: it is refused, and accepted with roll and pitch."""
     position, angles, one = np.array([0.9, 0.1, 0.1]), np.zeros(3), {15: TAGS[15]}
     exact = seen(POOL, position, angles, one)
     rng, refusals = np.random.default_rng(1), []
@@ -73,7 +73,7 @@ def test_a_far_small_tag_is_ambiguous_until_tilt_decides():
 
 
 def test_tilt_alone_is_used_and_height_is_not():
-    """A height that is wrong, or not known, changes nothing."""
+    """A height that is wrong or unknown changes nothing."""
     position, angles = np.array([0.5, -0.3, 0.4]), np.array([0.0, 0.1, 1.0])
     detections = seen(POOL, position, angles)
     for z_b in (np.nan, 5.0):
@@ -82,7 +82,7 @@ def test_tilt_alone_is_used_and_height_is_not():
 
 
 def test_an_outlier_moves_it_little():
-    """A corner 20 px astray moves the position by less than 1 cm, thanks to Huber's rho."""
+    """A corner 20 px off moves the position by less than 1 cm, thanks to Huber's rho."""
     position, angles = np.array([0.4, -0.2, 0.4]), np.array([0.0, 0.1, 1.0])
     change = np.zeros((3, 4, 2))
     change[1, 2] = [-12.0, 16.0]
@@ -93,7 +93,7 @@ def test_an_outlier_moves_it_little():
 
 
 def test_a_vehicle_half_out_of_the_water_is_found():
-    """Corners on both sides of the surface are seen each in its medium."""
+    """Each corner on either side of the surface is projected in its own medium."""
     position, angles = np.array([0.4, -0.2, 0.86]), np.array([0.3, 0.05, 1.0])
     found = refractive_bundle(seen(POOL, position, angles), POOL, TAGS, None, 0.05)
     assert found.ok, found.reason

@@ -1,4 +1,4 @@
-"""Every method: where its assumptions hold it finds the pose, where nothing can be said it says why."""
+"""Every method finds the pose where its assumptions hold, and otherwise gives a reason."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ PINHOLE = tuple(name for name in METHODS if name not in REFRACTIVE)
 
 
 def dry(pool):
-    """The same pool filled with air."""
+    """Return the same pool filled with air."""
     interface = pool.interface
     return replace(pool, interface=replace(interface, index_far=interface.index_near, window=()))
 
@@ -54,7 +54,7 @@ def test_without_water_all_methods_agree(method):
 
 
 def test_equal_indices_make_refractive_and_pinhole_depth_the_same():
-    """The same noisy corners give the same numbers to 1e-9, through two different computations of the rays."""
+    """The same noisy corners give the same numbers to 1e-9, by two different computations of the rays."""
     rng = np.random.default_rng(5)
     for name in ("level water", "tilted water", "window wall", "fisheye"):
         pool = dry(POOLS[name])
@@ -72,7 +72,7 @@ def test_equal_indices_make_refractive_and_pinhole_depth_the_same():
 
 @pytest.mark.parametrize("method", PINHOLE)
 def test_water_leads_a_pinhole_astray(method):
-    """Half a metre of water moves what a pinhole camera believes by centimetres at the rim of the picture."""
+    """Half a metre of water shifts the result of a pinhole camera by centimetres at the rim of the picture."""
     position, angles = np.array([1.0, -0.5, 0.4]), np.array([0.0, 0.0, 0.4])
     pool = POOLS["level water"]
     found = METHODS[method](seen(pool, position, angles), pool, TAGS, known(position, angles), 5.0)
@@ -93,7 +93,7 @@ def test_water_leads_a_pinhole_astray(method):
     ],
 )
 def test_a_bad_picture_is_refused_with_a_reason(method, detections, word):
-    """Whatever a detector says, nothing is raised, and the measurement tells why it is none."""
+    """For any detections, no exception is raised, and the measurement states the reason for its refusal."""
     position, angles = pose("level water", 0)
     found = METHODS[method](detections, POOLS["level water"], TAGS, known(position, angles), 0.3)
     assert not found.ok
@@ -104,7 +104,7 @@ def test_a_bad_picture_is_refused_with_a_reason(method, detections, word):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_not_used_is_counted(method):
-    """A stranger's tag and a second sight of a known one change nothing, and are counted."""
+    """An unknown tag and a second detection of a known one change nothing, and are counted."""
     position, angles = pose("level water", 1)
     pool = dry(POOLS["level water"])
     detections = seen(pool, position, angles)
@@ -118,7 +118,7 @@ def test_what_is_not_used_is_counted(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_without_height_only_those_that_need_it_refuse(method):
-    """Constraints are needed where they are used, and nowhere else."""
+    """Constraints are required only by the methods that use them."""
     position, angles = pose("level water", 2)
     detections = seen(POOLS["level water"], position, angles)
     found = METHODS[method](detections, POOLS["level water"], TAGS, None, 0.3)
@@ -129,7 +129,7 @@ def test_without_height_only_those_that_need_it_refuse(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("yaw", [np.pi - 1e-3, -np.pi + 1e-3, 0.0, np.pi / 2])
 def test_yaw_wraps(method, yaw):
-    """Headings on both sides of south come out within [-pi, pi], right to 1e-4 modulo a turn."""
+    """Headings on both sides of south are within [-pi, pi], and right to 1e-4 modulo a turn."""
     position, angles = np.array([0.2, -0.1, 0.4]), np.array([0.02, 0.03, yaw])
     pool = dry(POOLS["level water"])
     found = METHODS[method](seen(pool, position, angles), pool, TAGS, known(position, angles), 0.3)

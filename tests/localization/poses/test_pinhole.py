@@ -1,4 +1,4 @@
-"""Perspective-n-point without water: OpenCV's answer, both attitudes looked at, the apparent depth."""
+"""Perspective-n-point without water: agreement with OpenCV, both candidate attitudes, the apparent depth."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ AIR = replace(POOLS["level water"], interface=replace(POOLS["level water"].inter
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noisy_corners_give_what_opencv_gives(seed):
-    """The minimum of the reprojection error of two tags is that of cv2.solvePnP, refined, to 0.1 mm."""
+    """The minimum of the reprojection error of two tags equals that of cv2.solvePnP, refined, to 0.1 mm."""
     cv2 = pytest.importorskip("cv2")
     rng = np.random.default_rng(seed)
     position, angles = (
@@ -33,7 +33,7 @@ def test_noisy_corners_give_what_opencv_gives(seed):
 
 
 def test_of_two_attitudes_the_known_tilt_takes_the_right_one():
-    """One small tag far off the axis with 1 px of noise: with roll and pitch given, the attitude is never mirrored."""
+    """For one small tag far off the axis with 1 px of noise, given roll and pitch prevent a mirrored attitude."""
     position, angles, one = np.array([1.0, 0.3, 0.1]), np.array([0.0, 0.0, 0.6]), {15: TAGS[15]}
     exact, rng, upright, known_upright = seen(AIR, position, angles, one), np.random.default_rng(0), 0, 0
     for _ in range(25):
@@ -60,9 +60,9 @@ def test_both_attitudes_of_a_tag_put_its_corners_nearly_there():
 
 
 def test_water_lifts_what_a_pinhole_sees():
-    """Seen straight from above, a tag at depth d appears at d n_air/n_water."""
+    """Seen vertically from above, a tag at depth d appears at d n_air/n_water."""
     pool = POOLS["level water"]
-    height = 0.96 - 0.1  # of the body origin with its tags just awash
+    height = 0.96 - 0.1  # height of the body origin with its tags at the surface
     position = np.array([ABOVE.position[0], ABOVE.position[1], height - 0.5])
     found = pinhole(seen(pool, position, np.zeros(3)), pool, TAGS, known(position, np.zeros(3)), 0.5)
     assert height - found.z == pytest.approx(0.5 * 1.0003 / 1.333, abs=0.01)
@@ -85,7 +85,7 @@ def test_a_known_height_pushes_the_error_outwards():
 
 
 def test_the_baseline_answers_where_refraction_is_strong():
-    """At the rim, where leaving the water out costs 10 cm, the baseline says so by its error, not by a refusal."""
+    """At the rim, where ignoring the water costs 10 cm, the baseline gives a result with that error, not a refusal."""
     pool, level = POOLS["level water"], np.zeros(3)
     for position in ([1.0, -0.5, 0.4], [-1.1, 0.4, 0.2], [0.8, 0.3, 0.1]):
         found = pinhole_depth(seen(pool, np.array(position), level), pool, TAGS, known(position, level), 0.3)

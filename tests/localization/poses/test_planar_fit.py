@@ -1,4 +1,4 @@
-"""The constrained measurement: its uncertainty is honest, outliers do little, the surface may cut through a tag."""
+"""The constrained fit: its covariance is valid, outliers have little effect, the surface may cut through a tag."""
 
 from dataclasses import replace
 
@@ -16,12 +16,12 @@ POOL = POOLS["level water"]
 
 
 def errors(found, position, angles):
-    """(x, y, yaw) found minus true."""
+    """Return (x, y, yaw), estimated minus true."""
     return np.array([*(found.position - position)[:2], wrap_angle(found.yaw - angles[2])])
 
 
 def nees(pool, position, angles, truth, runs, rng, up=(0.0, 0.0, 1.0), tags=TAGS):
-    """Mean normalised squared error over runs with noise on corners, height and tilt as `truth` says."""
+    """Return the mean normalised squared error over runs with noise of `truth` on corners, height and tilt."""
     exact = seen(pool, position, angles, tags, up)
     port = np.array(truth.port)
     height = float(np.array(up) @ position) + (tilt_matrix(*angles[:2]) @ port)[2]
@@ -61,20 +61,22 @@ def test_the_covariance_is_that_of_the_errors(case):
         400,
         np.random.default_rng(1),
     )
-    assert 3.0 - 0.42 < value < 3.0 + 0.55  # chi² of 1200 degrees of freedom over 400; Huber's rho adds 3 %
+    assert (
+        3.0 - 0.42 < value < 3.0 + 0.55
+    )  # chi² with 1200 degrees of freedom divided by 400; Huber's rho adds 3 %
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POOLS)
 def test_the_covariance_holds_everywhere(name):
-    """Also at other places, behind windows and under other lenses."""
+    """This includes other positions, windows and lenses."""
     position, angles = pose(name, 7)
     value = nees(POOLS[name], position, angles, CASES["all"], 300, np.random.default_rng(2))
     assert 3.0 - 0.49 < value < 3.0 + 0.64
 
 
 def test_one_tag_alone_has_an_honest_covariance():
-    """Four corners leave five degrees of freedom, and the covariance still holds."""
+    """Four corners leave five degrees of freedom, and the covariance is still valid."""
     one = {15: TAGS[15]}
     value = nees(
         POOL,
@@ -89,12 +91,12 @@ def test_one_tag_alone_has_an_honest_covariance():
 
 
 def test_height_and_tilt_follow_the_water_where_the_survey_is_not_level():
-    """Depth and roll, pitch about the water's own vertical give the pose in the survey's frame, z upwards or down."""
+    """Depth, roll and pitch about the water's vertical give the pose in the survey's frame, with z up or down."""
     for up in (np.array([0.02, -0.03, 1.0]), np.array([0.01, 0.02, -1.0])):
         up = up / np.linalg.norm(up)
         camera = POOL.camera
         pool = replace(POOL, interface=Interface.through([0, 0, 0.96], up))
-        if up[2] < 0.0:  # a survey with z down: the same pool, turned over
+        if up[2] < 0.0:  # a survey with z down: the same pool, turned upside down
             turn = np.diag([1.0, -1.0, -1.0])
             camera = Camera(camera.lens, turn @ camera.position, matrix_to_quat(turn @ camera.R_pc))
             pool = replace(pool, camera=camera, interface=Interface.through([0, 0, -0.96], up))
@@ -108,7 +110,7 @@ def test_height_and_tilt_follow_the_water_where_the_survey_is_not_level():
 
 
 def test_a_corner_far_off_is_left_out_and_counted():
-    """A corner 15 px astray moves the result by less than 2 mm and 1 degree, and is counted."""
+    """A corner 15 px off moves the result by less than 2 mm and 1 degree, and is counted."""
     position, angles = np.array([0.5, 0.3, 0.4]), np.array([0.0, 0.1, -2.0])
     exact = seen(POOL, position, angles)
     for tag, corner in ((0, 0), (0, 2), (1, 3)):
@@ -122,7 +124,7 @@ def test_a_corner_far_off_is_left_out_and_counted():
 
 
 def test_a_corner_a_little_off_does_little():
-    """A corner 3 px astray, too little to be left out, moves the result a third of what it would unweighted."""
+    """A corner 3 px off, too little to be excluded, moves the result by a third of the shift without weights."""
     position, angles = np.array([0.5, 0.3, 0.4]), np.array([0.0, 0.1, -2.0])
     change = np.zeros((2, 4, 2))
     change[0, 0] = [3.0, 0.0]
@@ -137,7 +139,7 @@ def test_a_corner_a_little_off_does_little():
 
 
 def test_tags_that_contradict_each_other_are_refused():
-    """Of two tags half a metre apart that should be 14 cm apart neither is believed; a third one decides."""
+    """Two tags half a metre apart that should be 14 cm apart are both refused; a third one decides."""
     position, angles = np.array([0.4, 0.1, 0.4]), np.array([0.0, 0.0, 1.0])
     elsewhere = seen(POOL, position + [-0.5, 0.1, 0.0], angles)
     here = seen(POOL, position, angles)
@@ -153,7 +155,7 @@ def test_tags_that_contradict_each_other_are_refused():
 
 
 def test_a_tag_of_another_size_is_refused():
-    """A printed edge half as long as the vehicle file says cannot pass for the tag."""
+    """A printed edge half as long as in the vehicle file does not pass as the tag."""
     position, angles = np.array([0.4, 0.1, 0.6]), np.array([0.0, 0.0, 1.0])
     small = {15: TAGS[15].mean(axis=0) + 0.5 * (TAGS[15] - TAGS[15].mean(axis=0))}
     found = planar_fit(seen(POOL, position, angles, small), POOL, TAGS, known(position, angles), 0.3)
@@ -165,7 +167,7 @@ def test_a_tag_of_another_size_is_refused():
     ("z", "roll", "medium"), [(-0.06, 0.0, "air"), (-0.16, 0.0, "water"), (-0.1, 0.3, "both")]
 )
 def test_the_surface_may_lie_below_across_or_above_the_tags(z, roll, medium):
-    """Corners in the air are seen along straight rays, corners in the water along bent ones, as heights say."""
+    """By their heights, corners in the air are seen along straight rays, corners in the water along refracted ones."""
     for name in ("level water", "tilted water"):
         height = float(POOLS[name].interface.height(0.5, -0.3))
         position, angles = np.array([0.5, -0.3, height + z]), np.array([roll, 0.02, 0.3])
@@ -178,8 +180,8 @@ def test_the_surface_may_lie_below_across_or_above_the_tags(z, roll, medium):
 
 
 def test_nothing_happens_while_the_vehicle_surfaces():
-    """From 3 cm under to 3 cm above, a step of 1 mm in depth never moves the result by more than 1 mm and 0.2 degrees
-    beyond the motion itself, although the height that is given is wrong by 1 cm."""
+    """From 3 cm below to 3 cm above, a step of 1 mm in depth never moves the result by more than 1 mm and 0.2 degrees
+    beyond the motion itself, although the given height is wrong by 1 cm."""
     steps = []
     for z in np.arange(0.83, 0.89, 0.001):
         position, angles = np.array([0.5, -0.3, z]), np.array([0.05, 0.02, 0.3])
@@ -191,9 +193,9 @@ def test_nothing_happens_while_the_vehicle_surfaces():
 
 
 def test_weights_in_pixels_are_as_good_as_metres_and_a_little_better():
-    """Near the rim, where a pixel is worth more metres along the ray than across, weighing in pixels loses nowhere.
+    """Near the rim, where a pixel spans more metres along the ray than across, weights in pixels are nowhere worse.
 
-    The corners of one vehicle lie close together, so that all weights are nearly the same ellipse: the gain is 1 %.
+    The corners of one vehicle are close together, so that all weights are nearly the same ellipse: the gain is 1 %.
     """
     position, angles = np.array([1.15, -0.6, 0.15]), np.array([0.3, 0.3, 0.0])
     rng, exact = np.random.default_rng(4), seen(POOL, position, angles)
@@ -212,7 +214,7 @@ def test_weights_in_pixels_are_as_good_as_metres_and_a_little_better():
 
 
 def test_rays_that_miss_are_counted():
-    """A corner beyond the lens's range, or a height above the camera, has no point."""
+    """A corner beyond the lens's range, or a height above the camera, gives no point."""
     position, angles = np.array([0.2, 0.1, 0.4]), np.zeros(3)
     detections = seen(POOL, position, angles)
     above = planar_fit(detections, POOL, TAGS, replace(known(position, angles), z_b=5.0), 0.3)

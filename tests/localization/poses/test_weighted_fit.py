@@ -1,4 +1,4 @@
-"""Corners, depth and tilt together: each counts as far as it is sure, and the covariance says what comes out."""
+"""Corners, depth and tilt together: each is weighted by its uncertainty, and the covariance is valid."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ POSITION, ANGLES = np.array([0.6, -0.3, 0.4]), np.array([0.03, -0.04, 0.7])
 
 
 def noisy(random, std, shared=0.0):
-    """The corners with noise of their own and a shift of the whole picture [px]."""
+    """Return the corners with independent noise and a common shift of the picture [px]."""
     shift = random.normal(0.0, shared, 2)
     return [
         Detection(d.tag, d.corners + random.normal(0.0, std, (4, 2)) + shift)
@@ -24,7 +24,7 @@ def noisy(random, std, shared=0.0):
 
 
 def read(random, z_std, tilt_std, shared=0.0):
-    """What depth and tilt are told to be, with errors of their own."""
+    """Return readings of depth and tilt, with their errors."""
     off = random.normal(0.0, [z_std, tilt_std, tilt_std])
     true = known(POSITION, ANGLES, z_std=z_std, tilt_std=tilt_std)
     return replace(
@@ -63,7 +63,7 @@ def test_the_covariance_tells_the_errors(pixel, z, tilt, shared):
 
 
 def test_sure_corners_correct_the_depth():
-    """With corners sure to 0.05 px and the depth 3 cm wrong, the position is three times nearer than by depth alone."""
+    """With corners to 0.05 px and a depth 3 cm off, the position error is a third of that by depth alone."""
     wrong = known(POSITION, ANGLES, z_std=0.03)
     wrong = replace(wrong, z_b=wrong.z_b + 0.03)
     corners = seen(POOL, POSITION, ANGLES)
@@ -74,13 +74,13 @@ def test_sure_corners_correct_the_depth():
 
 
 def test_unsure_corners_leave_the_depth_as_it_was_read():
-    """With corners unsure to 2 px, the height stays within a tenth of its standard deviation."""
+    """With corner noise of 2 px, the height stays within a tenth of its standard deviation."""
     constraints = known(POSITION, ANGLES, z_std=0.002)
     found = weighted_fit(noisy(np.random.default_rng(1), 0.5), POOL, TAGS, constraints, 2.0)
     assert abs(found.z - POSITION[2]) < 0.0002
 
 
 def test_without_depth_it_refuses():
-    """It needs what it weighs."""
+    """The fit needs every quantity that it weights."""
     found = weighted_fit(seen(POOL, POSITION, ANGLES), POOL, TAGS, None)
     assert not found.ok and "depth" in found.reason
