@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -253,6 +254,17 @@ def test_what_cannot_be_evaluated_gets_its_sentence(controller, options, error, 
     with pytest.raises(error, match=sentence):
         evaluate(controller, out=tmp_path / "e", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_of_a_task_of_ones_own_asks_for_its_file(tmp_path, monkeypatch):
+    """Its description holds the task's name alone."""
+    monkeypatch.setattr(
+        "finssim.evaluation.evaluate.read_description", lambda _: SimpleNamespace(task="keep-depth")
+    )
+    with pytest.raises(
+        EvaluationError, match="a task 'keep-depth' of your own: name it with --task FILE.py:CLASS"
+    ):
+        evaluate(str(tmp_path))
 
 
 def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):

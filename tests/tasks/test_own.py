@@ -28,6 +28,11 @@ def test_a_class_of_a_file_or_module_is_a_task():
             "task.py:Mine",
             "no task 'Mine'; tasks there: Near",
         ),
+        (
+            "from finssim.tasks import Task\nclass Near(Task): pass\n",
+            "task.py",
+            "give task.py:CLASS; tasks there: Near",
+        ),
         ("def Mine(): return 3\n", "task.py:Mine", "makes a int, expected a Task"),
         ("def Mine(x): return 3\n", "task.py:Mine", "cannot be made: .*missing 1 required"),
         ("", "no.where:Mine", "module 'no.where' cannot be imported"),

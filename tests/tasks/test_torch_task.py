@@ -254,6 +254,7 @@ def test_it_is_trained_like_any_task(tmp_path):
     ("function", "answer", "sentence"),
     [
         ("reward", lambda self, w: w.zeros(3), r"reward gives \(2, 3\), expected a tensor \(2,\)"),
+        ("reward", TorchTask.reward, r"define reward\(self, w\) -> tensor"),
         ("terminated", lambda self, w: False, r"terminated gives bool, expected a tensor \(2,\)"),
         ("observe", lambda self, w: (w.zeros(1),), "observe gives 1 tensors, expected 2"),
         (

@@ -16,6 +16,7 @@ from finssim.core.files import atomic_directory, plain_name
 from finssim.core.progress import progress_bar
 from finssim.core.provenance import provenance
 from finssim.core.quiet import start_warp
+from finssim.core.registry import TASKS
 from finssim.evaluation import campaign
 from finssim.evaluation.campaign import write_json
 from finssim.evaluation.figures import ENVELOPE, TRACKS, draw_envelopes, draw_tracking, save_figure
@@ -407,6 +408,10 @@ def _subject(controller: Path, task: str | None, vehicle: str | Vehicle | None) 
             vehicle = vehicle_of(record) if "vehicle" in record.metadata else None
     if controller.is_dir() and (task is None or vehicle is None):
         trained = read_description(controller)
+        if task is None and trained.task not in TASKS:
+            raise EvaluationError(
+                f"{controller} was trained for a task '{trained.task}' of your own: name it with --task FILE.py:CLASS"
+            )
         task = task or trained.task
         if vehicle is None:
             named = trained.vehicle

@@ -202,8 +202,8 @@ class TrainingLoop:
         bad = [name for name, value in learned.items() if not math.isfinite(value)]
         if bad:
             raise LearningError(
-                f"{bad[0]} stopped being finite after {self.learner.steps:,} steps: the learner has diverged; "
-                "use a smaller learning rate, or another seed"
+                f"{bad[0]} stopped being finite after {self.learner.steps:,} steps: the learner has diverged, or the "
+                "task's reward is not finite; use a smaller learning rate or another seed, or check a task of your own"
             )
         if self._passed(math.ceil(total / EVALUATIONS)) or self.learner.steps >= total or not self.curves:
             network = self.learner.network()

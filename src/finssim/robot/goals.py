@@ -92,7 +92,8 @@ def guide_of(goal: str | None, trajectory: str | None) -> Guide:
     """
     if (goal is None) == (trajectory is None):
         raise GoalError(
-            "give either a goal x,y,z,yaw_deg or a trajectory, not " + ("both" if goal else "neither")
+            "give either a goal x,y,z,yaw_deg or a trajectory: "
+            + ("both are given" if goal else "neither is given")
         )
     if goal is not None:
         return station_of(goal)

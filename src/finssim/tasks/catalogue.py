@@ -18,6 +18,7 @@ from finssim.tasks.measurement import ESTIMATOR, MeasurementNoise
 from finssim.tasks.sensing import Sensing, load_sensing
 from finssim.tasks.task import Task
 from finssim.vehicles import Vehicle
+from finssim.vehicles.part import did_you_mean
 
 # User-defined tasks by name: `path/to/file.py:ClassName`, or `package.module:ClassName` of an importable module.
 
@@ -69,9 +70,8 @@ def own_class(reference: str, base: type, kind: str) -> Any:
             for key, value in vars(module).items()
             if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__
         ]
-        raise EnvironmentSetupError(
-            f"{module_path} has no {kind} '{name}'; {kind}s there: {', '.join(have) or 'none'}"
-        )
+        missing = f"{module_path} has no {kind} '{name}'" if name else f"give {module_path}:CLASS"
+        raise EnvironmentSetupError(f"{missing}; {kind}s there: {', '.join(have) or 'none'}")
     return result
 
 
@@ -159,11 +159,12 @@ def task_named(task: str | Task, **settings: Any) -> Task:
     """
     if isinstance(task, Task):
         return task
-    if task not in TASKS and ":" in task:
-        return own_task(task, **settings)
+    if task not in TASKS and (":" in task or task.endswith(".py")):
+        return own_task(task if ":" in task else f"{task}:", **settings)
     if task not in TASKS:
+        hint = did_you_mean(task, list(TASKS))
         raise EnvironmentSetupError(
-            f"unknown task '{task}'; available: {', '.join(TASKS)}; or your own: FILE.py:CLASS"
+            f"unknown task '{task}'{hint} available: {', '.join(TASKS)}; or your own: FILE.py:CLASS"
         )
     try:
         factory = TASKS[task]

@@ -257,7 +257,7 @@ class TorchTask(Task):
 
     def reset(self, w: Worlds) -> Start:
         """Return the start of an episode; random numbers come from `w.uniform` and `w.normal`."""
-        raise NotImplementedError(f"task '{self.name}': define reset(self, w) -> Start")
+        raise EnvironmentSetupError(f"task '{self.name}': define reset(self, w) -> Start")
 
     def observe(self, w: Worlds) -> Sequence[Tensor]:
         """Return the observation of an agent: a tensor for each part of `observation`, in the part's unit.
@@ -265,11 +265,11 @@ class TorchTask(Task):
         The caller divides them by the part's scale and limits them to its clip. Shapes: (worlds, size), or (worlds,
         agents, size) of several agents; a size of 1 may be omitted.
         """
-        raise NotImplementedError(f"task '{self.name}': define observe(self, w) -> tensors")
+        raise EnvironmentSetupError(f"task '{self.name}': define observe(self, w) -> tensors")
 
     def reward(self, w: Worlds) -> Tensor:
         """Return the reward of the latest step: (worlds,), or (worlds, agents) of several agents."""
-        raise NotImplementedError(f"task '{self.name}': define reward(self, w) -> tensor")
+        raise EnvironmentSetupError(f"task '{self.name}': define reward(self, w) -> tensor")
 
     def terminated(self, w: Worlds) -> Tensor:
         """Return where the episode failed, bool, (worlds,): no further reward is possible. The time limit applies
@@ -289,7 +289,7 @@ class TorchTask(Task):
 
     def script(self, w: Worlds) -> Tensor:
         """Return the actions of the `others` in the next step, (worlds, others, size), each in [-1, 1]."""
-        raise NotImplementedError(f"task '{self.name}' has others: define script(self, w) -> tensor")
+        raise EnvironmentSetupError(f"task '{self.name}' has others: define script(self, w) -> tensor")
 
     def terms(self) -> Terms:
         """Return the terms common to all torch tasks, which read the results of their functions."""
