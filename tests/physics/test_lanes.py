@@ -133,8 +133,8 @@ def test_blocks_touch_walls_and_come_to_the_surface_as_single_worlds_do(monkeypa
     )  # fmt: skip
     for field, atol in {"position": 3e-6, "quaternion": 3e-6, "velocity": 2e-5}.items():
         np.testing.assert_allclose(blocks.numpy(field), single.numpy(field), rtol=0, atol=atol)
-    ways, touching = blocks.ways.numpy(), np.abs(single.numpy("pressed")).max(axis=(1, 2)) > 0.0
-    assert ways.min() == 0 and len(np.unique(ways)) > 3 and touching.mean() > 0.1
+    bits, touching = blocks.branch_bits.numpy(), np.abs(single.numpy("pressed")).max(axis=(1, 2)) > 0.0
+    assert bits.min() == 0 and len(np.unique(bits)) > 3 and touching.mean() > 0.1
 
 
 def test_a_world_does_not_depend_on_its_place_in_a_block(monkeypatch):

@@ -54,8 +54,8 @@ def water_acceleration_wrench(
     M_A: mat66,
     r_b: wp.vec3,
     water_b: wp.vec3,
-    passing: wp.vec3,
-    flowing: wp.vec3,
+    rate_at_body: wp.vec3,
+    material_acceleration: wp.vec3,
     omega: wp.vec3,
     displaced: float,
 ) -> vec6:
@@ -70,16 +70,16 @@ def water_acceleration_wrench(
         M_A: Added mass about the body origin [kg, kg m, kg m²].
         r_b: Centre of buoyancy, body frame [m].
         water_b: Velocity of the water v_c, body frame [m/s].
-        passing: Rate of the water's velocity at the moving body: a_x, body frame [m/s²].
-        flowing: Acceleration of the water a_c, body frame [m/s²].
+        rate_at_body: Rate of the water's velocity at the moving body: a_x, body frame [m/s²].
+        material_acceleration: Acceleration of the water a_c, body frame [m/s²].
         omega: Angular velocity of the body, body frame [rad/s].
         displaced: Mass of the displaced water, m_w [kg].
 
     Returns:
         Wrench about the body origin, body frame [N, N m].
     """
-    f = displaced * flowing
-    return M_A * join(passing - wp.cross(omega, water_b), wp.vec3(0.0)) + join(f, wp.cross(r_b, f))
+    f = displaced * material_acceleration
+    return M_A * join(rate_at_body - wp.cross(omega, water_b), wp.vec3(0.0)) + join(f, wp.cross(r_b, f))
 
 
 @wp.func

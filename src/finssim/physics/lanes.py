@@ -31,7 +31,7 @@ LANES = 8
 """Number of worlds in a block."""
 GROUP = 1024
 """Number of worlds that are sorted into blocks by their branches in the last step."""
-WAYS = 5
+REMEMBERED_BRANCHES = 5
 """Number of branches, in the order of the trace, by which worlds are sorted into blocks."""
 
 
@@ -239,8 +239,8 @@ class Trace:
         self.sections: list[list[str]] = [[], [], []]
         self.level = 0
         self._known: ChainMap[Any, Any] = ChainMap()
-        self._names, self._ways = itertools.count(), itertools.count()
-        self._aside: list[tuple[Lane, list[str]]] = []
+        self._names, self._branch_numbers = itertools.count(), itertools.count()
+        self._other_branches: list[tuple[Lane, list[str]]] = []
         self._path: _Path | None = None
         self._world_by_world = False
         self.written = 0
@@ -251,9 +251,9 @@ class Trace:
         """Declarations before the loop over blocks, in the order of insertion."""
 
     @property
-    def aside(self) -> bool:
+    def in_other_branch(self) -> bool:
         """Return whether the lines belong to another branch than that of the example."""
-        return bool(self._aside)
+        return bool(self._other_branches)
 
     @contextmanager
     def exploration(self) -> Iterator[None]:
@@ -270,7 +270,7 @@ class Trace:
 
     def place(self, level: int) -> list[str]:
         """Return the lines of a section, or those of the other branch that is being traced."""
-        return self._aside[-1][1] if self._aside else self.sections[level]
+        return self._other_branches[-1][1] if self._other_branches else self.sections[level]
 
     def line(self, kind: str, expression: str, example: Any, level: int | None = None) -> Lane:
         """Return the lane number of a C++ expression; equal expressions in a section share one lane number."""
@@ -288,7 +288,7 @@ class Trace:
             self._known[statement, level] = True
             self.place(level).append(statement)
 
-    def assume(self, truth: Lane, value: bool) -> None:
+    def set_known(self, truth: Lane, value: bool) -> None:
         """Treat a lane number as a known truth value from now on."""
         key = next(key for key, lane in self._known.items() if lane is truth)
         self._known[key] = value
@@ -308,7 +308,7 @@ class Trace:
         """Remove the worlds in which this truth differs from the example from the block; the kernel for one world
         computes them."""
         if isinstance(truth, Lane):
-            elsewhere = "".join(f" | ~{mask.name}" for mask, _ in self._aside)
+            elsewhere = "".join(f" | ~{mask.name}" for mask, _ in self._other_branches)
             self._keep(f"{'' if truth.example else '~'}{truth.name}{elsewhere}", truth.level)
 
     def _keep(self, truth: str, level: int) -> None:
@@ -353,9 +353,9 @@ class Trace:
         lines: list[str] = []
         ends = [_shared(number) for number in (first, end)]
         known, self._known = self._known, self._known.new_child()
-        self._aside.append((Lane(self, "M", "all_i(-1)", True, self.level), lines))
+        self._other_branches.append((Lane(self, "M", "all_i(-1)", True, self.level), lines))
         each = function(Lane(self, "I", "all_i(index)", 0, self.level), *arguments)
-        self._aside.pop()
+        self._other_branches.pop()
         self._known = known
         names = [f"n{next(self._names)}" for _ in each.numbers]
         self.place(self.level).extend(
@@ -374,12 +374,12 @@ class Trace:
 
         The sum is computed only in the worlds that take the branch being traced.
         """
-        if count > LANES or not self._aside:
+        if count > LANES or not self._other_branches:
             return _row_sum([function(i, *arguments) for i in range(count)])
         lines: list[str] = []
         known, self._known = self._known, self._known.new_child()
-        truth = " & ".join(f"{mask.name}[world]" for mask, _ in self._aside)
-        self._aside.append((self._aside[-1][0], lines))
+        truth = " & ".join(f"{mask.name}[world]" for mask, _ in self._other_branches)
+        self._other_branches.append((self._other_branches[-1][0], lines))
         index = self.line("I", "all_i(0) + I{" + ", ".join(map(str, range(LANES))) + "}", 0)
         alike = [
             _mapped(
@@ -397,7 +397,7 @@ class Trace:
             each = function(index, *alike)
         finally:
             self._world_by_world = False
-        self._aside.pop()
+        self._other_branches.pop()
         self._known = known
         names = [f"n{next(self._names)}" for _ in each.numbers]
         lines += [
@@ -441,19 +441,19 @@ class Trace:
     ) -> Any:
         """Return the result, replaced in the worlds of the mask by the result with other truth values at the
         branches."""
-        depth, lines = len(self._aside), list[str]()
+        depth, lines = len(self._other_branches), list[str]()
         known, path, self._known = self._known, self._path, self._known.new_child()
-        self._aside.append((mask, lines))
+        self._other_branches.append((mask, lines))
         try:
             other = self._explored(function, arguments, answers)
         except LaneError:
-            del self._aside[depth:]
+            del self._other_branches[depth:]
             self._known, self._path = known, path
             self.place(self.level).append(
-                f"ok &= ~({' & '.join([mask.name, *(m.name for m, _ in self._aside)])});"
+                f"ok &= ~({' & '.join([mask.name, *(m.name for m, _ in self._other_branches)])});"
             )
             return result
-        self._aside.pop()
+        self._other_branches.pop()
         if len(lines) <= SHORT:
             known.update(self._known.maps[0])
             self._known = known
@@ -472,8 +472,8 @@ class Trace:
             return Lane(self, kind, name, a.example if isinstance(a, Lane) else a, self.level)
 
         result = _mapped(merged, result, other)
-        if not self._aside and (bit := next(self._ways)) < WAYS:
-            lines.append(f"ways |= {mask.name} & all_i({1 << bit});")
+        if not self._other_branches and (bit := next(self._branch_numbers)) < REMEMBERED_BRANCHES:
+            lines.append(f"branch_bits |= {mask.name} & all_i({1 << bit});")
         self.place(self.level).extend([*names, f"if (any({mask.name} & ok)) {{", *lines, "}"])
         return result
 
@@ -832,7 +832,7 @@ class StructArray:
         first = min(LANES * (index // LANES), self._size - LANES)
         name = f"{self._name}_{first}"
         statement = f"fetch({self._name}_at, {4 * first}, {name});"
-        if self._shared and (f"F {name}[LANES];" in self._trace.outside or not self._trace.aside):
+        if self._shared and (f"F {name}[LANES];" in self._trace.outside or not self._trace.in_other_branch):
             # Data that all worlds share are read for the first block of a group.
             self._trace.outside[f"F {name}[LANES];"] = None
             self._trace.once(f"if (first == 0 || {self._name}_at.world != 0) {statement}", 0)
@@ -1022,7 +1022,7 @@ class WorldArray:
         return value.like([self._read(row, k) for k in range(len(value.numbers))])
 
     def __setitem__(self, index: Any, value: Any) -> None:
-        if self._trace._aside:
+        if self._trace._other_branches:
             raise LaneError(f"{self._name} is written by some worlds alone")
         self._trace.written += 1
         row, i = self._row(index)
@@ -1132,7 +1132,7 @@ def _numbers(struct: SimpleNamespace) -> list[Any]:
 
 
 def group_source(
-    trace: Trace, arrays: Sequence[StructArray | VectorArray], declarations: str, loop: str, way: str
+    trace: Trace, arrays: Sequence[StructArray | VectorArray], declarations: str, loop: str, branches: str
 ) -> str:
     """Return the text of a native function that computes the trace for a group of `count` worlds from `w` on.
 
@@ -1141,8 +1141,8 @@ def group_source(
         arrays: Arrays that it reads and writes.
         declarations: C++ of the symbols, and of the pointer NAME_at of each array.
         loop: Head of the C++ loop around section 1.
-        way: C++ of the number whose bits are the branches that `world` of the group took in the last step. The function
-            updates it; -1 means that the world is not computed. It determines only which worlds share a block.
+        branches: C++ of the number whose bits are the branches that `world` of the group took in the last step. The
+            function updates it; -1 means that the world is not computed. It determines only which worlds share a block.
     """
     lines = [
         FLOATS,
@@ -1155,12 +1155,13 @@ def group_source(
         *trace.sections[1],
         "}",
         *trace.sections[2],
-        "for (int l = 0; l <= last; ++l) way_of(at[l]) = ok[l] ? ways[l] : -1;",
+        "for (int l = 0; l <= last; ++l) branches_of(at[l]) = ok[l] ? branch_bits[l] : -1;",
         *(line for array in arrays for line in array.stores()),
         "}",
     ]
-    text = "\n".join(lines).replace("WAY_OF", way)
-    return text.replace("LANES", str(LANES)).replace("GROUP", str(GROUP)).replace("KINDS", str(1 << WAYS))
+    text = "\n".join(lines).replace("BRANCHES_OF", branches)
+    kinds = str(1 << REMEMBERED_BRANCHES)
+    return text.replace("LANES", str(LANES)).replace("GROUP", str(GROUP)).replace("KINDS", kinds)
 
 
 def world_source(trace: Trace, truth: Any) -> str:
@@ -1184,11 +1185,11 @@ def world_source(trace: Trace, truth: Any) -> str:
 
 
 GATHERING = """
-const auto way_of = [&](int world) -> int& { return WAY_OF; };
+const auto branches_of = [&](int world) -> int& { return BRANCHES_OF; };
 int order[GROUP], kinds[KINDS + 1] = {};
-for (int i = 0; i < count; ++i) ++kinds[way_of(i) < 0 ? KINDS : way_of(i) + 1];
+for (int i = 0; i < count; ++i) ++kinds[branches_of(i) < 0 ? KINDS : branches_of(i) + 1];
 for (int k = 1; k < KINDS; ++k) kinds[k] += kinds[k - 1];
-for (int i = 0; i < count; ++i) order[kinds[way_of(i) < 0 ? KINDS - 1 : way_of(i)]++] = i;
+for (int i = 0; i < count; ++i) order[kinds[branches_of(i) < 0 ? KINDS - 1 : branches_of(i)]++] = i;
 for (int first = 0; first < count; first += LANES) {
 const int last = (count - first < LANES ? count - first : LANES) - 1;
 int at[LANES];
@@ -1251,7 +1252,7 @@ const auto ceiling = [](F x) { return __builtin_elementwise_ceil(x); };
 const auto to_double = [](F x) { return __builtin_convertvector(x, D); };
 const auto to_float = [](auto x) { return __builtin_convertvector(x, F); };
 const auto to_int = [](F x) { return __builtin_convertvector(x, I); };
-M ok = all_i(-1), ways = all_i(0);
+M ok = all_i(-1), branch_bits = all_i(0);
 const auto transpose = [](F* y) {
     F a[LANES], b[LANES];
     for (int i = 0; i < 8; i += 2) {

@@ -224,7 +224,9 @@ class Simulator:
         machines, around = Vehicles(), SimSurroundings()
         machines.command, machines.plant = self.command.array, self.plant.array
         machines.extra, machines.shared = self.plant.extra, self._shared
-        machines.way = self.ways = wp.zeros(self.plant.array.shape, dtype=wp.int32, device=self.device)
+        machines.branch_bits = self.branch_bits = wp.zeros(
+            self.plant.array.shape, dtype=wp.int32, device=self.device
+        )
         around.hull, around.water, around.tether = self.hull, self.water, self.tether.array
         for name in ("walls", "funnel", "solids"):
             setattr(around.obstacles, name, getattr(self, name))

@@ -187,7 +187,7 @@ class Vehicles:
     plant: wp.array2d(dtype=VehicleParameters)
     extra: wp.array3d(dtype=float)  # parameters of terms and actuators, each in its unit [-]
     shared: wp.array(dtype=int)  # 1: all worlds have equal parameters
-    way: wp.array2d(dtype=int)  # position in a block of worlds in the last step; -1: not in a block
+    branch_bits: wp.array2d(dtype=int)  # branches taken in the last step, a bit each; -1: not in a block
 
 
 @wp.struct
@@ -415,11 +415,11 @@ def motion_function(
             if wp.static(water_moving):
                 if water.moving != 0:
                     tau += join(wp.vec3(0.0), wp.cross(water_b, linear(momentum_A)))
-                    passing = flow.acceleration + flow.gradient * position_rate(q, nu)
-                    flowing = flow.acceleration + flow.gradient * flow.velocity
+                    rate_at_body = flow.acceleration + flow.gradient * position_rate(q, nu)
+                    material_acceleration = flow.acceleration + flow.gradient * flow.velocity
                     tau += water_acceleration_wrench(
-                        wet.wet * plant[w, v].M_A, plant[w, v].r_b, water_b, wp.quat_rotate_inv(q, passing),
-                        wp.quat_rotate_inv(q, flowing), angular(nu), wet.displaced,
+                        wet.wet * plant[w, v].M_A, plant[w, v].r_b, water_b, wp.quat_rotate_inv(q, rate_at_body),
+                        wp.quat_rotate_inv(q, material_acceleration), angular(nu), wet.displaced,
                     )  # fmt: skip
         if wp.static(term_wrench is not None):
             r_h = plant[w, v].r_h
@@ -990,7 +990,7 @@ def physics_kernel(features: Features) -> wp.Kernel:
         count = wp.min(wp.static(GROUP), worlds - wp.static(GROUP) * i)
         blocks(state, vehicles, around, control_step, substeps, w, v, count)
         for k in range(count):
-            if vehicles.way[w + k, v] < 0 and state.frozen[w + k] == 0:
+            if vehicles.branch_bits[w + k, v] < 0 and state.frozen[w + k] == 0:
                 step_vehicle(state, vehicles, around, control_step, substeps, w + k, v)
 
     return physics_blocks
@@ -1045,8 +1045,8 @@ def lane_blocks(begin_step: Any, substep: Any, end_step: Any, term_numbers: int,
     trace.level = 1
     trace.sections[1].append("const I k = all_i(pass);")
     k = trace.symbol("I", "k", 1)
-    trace.assume(k < 0, False)
-    trace.assume(k >= 0, True)
+    trace.set_known(k < 0, False)
+    trace.set_known(k >= 0, True)
     timing = SimpleNamespace(step=step, head=head, control_step=control_step, h=h)
     with trace.exploration():
         loop.carry(lane_function(substep)(commands, vehicles, around, 0, 0, timing, k, loop.value()))
@@ -1076,7 +1076,7 @@ const I slots = all_i(c.shape[2]), head = step % slots, place = step % all_i({HI
 const F control = all(control_step), h = all(control_step / (float)substeps);
 """,
         "for (int pass = 0; pass < substeps; ++pass)",
-        "((int*)((char*)vehicles.way.data + (w + world) * vehicles.way.strides[0]))[v]",
+        "((int*)((char*)vehicles.branch_bits.data + (w + world) * vehicles.branch_bits.strides[0]))[v]",
     )
 
     @wp.func_native(source)
