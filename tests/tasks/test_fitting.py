@@ -15,7 +15,7 @@ from finssim.learning.train import TrainingSettings, train
 from finssim.sim import RectangularPool
 from finssim.tasks import TASKS, EnvironmentSetupError, numeric_tasks
 from finssim.tasks.fitting import authority
-from finssim.tasks.given import crew
+from finssim.tasks.validation import vehicles_of_task
 from finssim.vehicles import catalogue, load_vehicle
 from finssim.vehicles.defaults import room
 
@@ -61,9 +61,9 @@ def test_a_vehicle_has_the_axes_of_its_task_or_is_refused_by_name(task, name):
     if missing:
         said = f"vehicle '{name}' does not control {', '.join(missing)}, which task '{task}' needs"
         with pytest.raises(EnvironmentSetupError, match=said):
-            crew(name, TASKS[task](), TASKS[task].action)
+            vehicles_of_task(name, TASKS[task](), TASKS[task].action)
     else:
-        assert crew(name, TASKS[task](), TASKS[task].action)[0].name == name
+        assert vehicles_of_task(name, TASKS[task](), TASKS[task].action)[0].name == name
     unable = {"eca_a9", "lauv", "remus100", "slocum", "torpedo"}
     if "pitch" in needs:  # which six thrusters leave to the water
         unable |= {"bluerov2", "bluerov2_centralenantes", "bluerov2_einarsson"}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finssim.agents.baselines import PERIOD, Rows
 from finssim.physics.types import vec6
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import HydrodynamicSet, Vehicle
 from finssim.vehicles.capability import level_speed, terminal_speeds
 

@@ -19,10 +19,10 @@ from finssim.core.registry import ACTUATORS
 from finssim.evaluation.tables import Table
 from finssim.tasks import TASKS
 from finssim.tasks.catalogue import task_named
-from finssim.tasks.given import crew
 from finssim.tasks.sensing import Sensing, seen_with
 from finssim.tasks.task import Task
 from finssim.tasks.terms import End, ObservationPart, RewardTerm, Total
+from finssim.tasks.validation import vehicles_of_task
 from finssim.vehicles import Vehicle
 
 
@@ -70,7 +70,7 @@ def describe_task(
     """
     the_task = task_named(task)
     mode = action or the_task.action
-    vehicles = crew(vehicle, the_task, mode)
+    vehicles = vehicles_of_task(vehicle, the_task, mode)
     the_task = the_task.fitted(vehicles)
     terms, entries = the_task.terms(), the_task.schema.entries
     parts = [

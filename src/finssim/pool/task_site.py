@@ -242,7 +242,7 @@ class Referee:
         self.world = self.world or task.site(self.arrays, seed)
         task.add_evaluate(self._evaluate, batch)
         self.over = False
-        begun = self.arrays.answers.begun
+        begun = self.arrays.torch_results.begun
         if start is not None and begun is not None and begun.numpy().any():
             raise ControlError(
                 f"task '{task.name}' begins with a memory that its reset draws, and only where it was drawn can it be "

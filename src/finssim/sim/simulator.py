@@ -108,8 +108,8 @@ class Simulator:
         Raises:
             SimulatorError: A name is unknown or a number out of range; the message states which.
         """
-        crew = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
-        self.vehicles = [load_vehicle(v) for v in crew]
+        vehicles_or_names = [vehicles] if isinstance(vehicles, Vehicle | str) else list(vehicles)
+        self.vehicles = [load_vehicle(v) for v in vehicles_or_names]
         self.hydrodynamics = checked_choice(hydrodynamics, tuple(HYDRODYNAMICS), "hydrodynamic model")
         self.integrator = checked_choice(integrator, INTEGRATORS, "integrator")
         for name, count in (("worlds", worlds), ("substeps", substeps), ("vehicles", len(self.vehicles))):

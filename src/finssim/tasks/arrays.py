@@ -72,7 +72,7 @@ class NetTable:
 
 
 @wp.struct
-class Answers:
+class TorchResults:
     """Results of the functions of a task in plain torch, for the kernels that follow; see `torch_task`."""
 
     reward: wp.array2d(dtype=float)  # reward, (worlds, agents)
@@ -138,7 +138,7 @@ class TaskArrays:
     steering: wp.array2d(dtype=Memory)  # (worlds, vehicles): state of the autopilots [m, rad, N, N m, m/s]
     messages: MessageTable  # only for tasks with communication between agents
     net: NetTable  # only for tasks with a net
-    answers: Answers  # only for tasks in plain torch
+    torch_results: TorchResults  # only for tasks in plain torch
     position: wp.array2d(
         dtype=wp.vec3
     )  # (worlds, vehicles), as measured, possibly with noise; world frame [m]

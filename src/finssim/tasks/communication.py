@@ -7,8 +7,8 @@ import warp as wp
 
 from finssim.sim.state import State
 from finssim.tasks.arrays import MessageTable, TaskArrays, allocated
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import measured_velocity
+from finssim.tasks.validation import EnvironmentSetupError
 
 MOST_UNDER_WAY = 32
 """Greatest number of messages of one agent that can be in transit."""

@@ -22,11 +22,11 @@ from finssim.sim.launch import KernelSequence
 from finssim.sim.randomize import Draws, Randomization
 from finssim.sim.site import described_world
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.measurement import MeasurementNoise, connect_measured, measure, measurements
 from finssim.tasks.schedule import Schedule
 from finssim.tasks.sensing import Sensing, SensingBatch
 from finssim.tasks.task import Batch, Task
+from finssim.tasks.validation import EnvironmentSetupError, vehicles_of_task
 from finssim.vehicles import Vehicle
 
 GREATEST_SEED = 2**31 - 1
@@ -194,8 +194,8 @@ class Environment:
             raise EnvironmentSetupError(
                 f"unknown action mode '{self.action_mode}'; available: {', '.join(MODES)}"
             )
-        vehicles = crew(vehicle, task, self.action_mode)
-        self.nominal = vehicles if nominal is None else crew(nominal, task, self.action_mode)
+        vehicles = vehicles_of_task(vehicle, task, self.action_mode)
+        self.nominal = vehicles if nominal is None else vehicles_of_task(nominal, task, self.action_mode)
         refuse_other_thrusters(vehicles, self.nominal)
         self.task = task = task.fitted(self.nominal)
         longest = max(

@@ -22,10 +22,10 @@ from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.catalogue import task_named
-from finssim.tasks.given import EnvironmentSetupError, crew
 from finssim.tasks.path import WaypointTour
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.trajectory_tracking import fill_table
+from finssim.tasks.validation import EnvironmentSetupError, vehicles_of_task
 from finssim.vehicles import Vehicle
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def fitted_task(
     """
     try:
         named = task_named(task)
-        return named.fitted(crew(vehicle, named, action or named.action))
+        return named.fitted(vehicles_of_task(vehicle, named, action or named.action))
     except EnvironmentSetupError as error:
         raise ControlError(str(error)) from None
 
@@ -93,7 +93,7 @@ class Observer:
         self.schema: ObservationSchema = task.schema
         self._place = task.vehicles.index(self.agent)
         mode = action or task.action
-        self._action_size = len(MODES[mode].labels(crew(vehicle, task, mode)[0]))
+        self._action_size = len(MODES[mode].labels(vehicles_of_task(vehicle, task, mode)[0]))
         self._guide: Guide | None = None
         self._path: Waypoints | None = None
         self.beside: tuple[float, float] | None = None
@@ -261,9 +261,9 @@ def _velocity(track: Measured) -> Array:
 def unscored(arrays: TaskArrays) -> bool:
     """Remove the buffers that only a scored episode provides, so that reading them is refused. Return whether there
     were any."""
-    if arrays.answers.memory is None:
+    if arrays.torch_results.memory is None:
         return False
-    arrays.answers.memory = None
+    arrays.torch_results.memory = None
     return True
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice, device_of
 

@@ -9,8 +9,8 @@ from finssim.sim.randomize import Draws
 from finssim.sim.ranges_file import Curriculum, Success
 from finssim.sim.ranges_table import ENTRIES, INDEX
 from finssim.tasks.arrays import TaskArrays, allocated
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
+from finssim.tasks.validation import EnvironmentSetupError
 
 LOOK = 50
 """Control steps between two evaluations of the curriculum."""

@@ -46,8 +46,8 @@ from finssim.sim.sensors.sampling import (
 )
 from finssim.sim.state import HISTORY, State
 from finssim.tasks.arrays import TaskArrays, allocated
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import LONGEST_DELAY, MeasurementNoise
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 
 FIX = 100
@@ -141,8 +141,9 @@ def seen_with(noise: MeasurementNoise | Sensing, vehicle: Vehicle) -> dict[str, 
 
 
 @wp.struct
-class FilterState:
-    """State of the filter of one vehicle; a covariance is (variance, covariance, variance) of a value and its rate."""
+class FilterConstants:
+    """Constants of the filter of one vehicle; a covariance is (variance, covariance, variance) of a value and its
+    rate."""
 
     gauge: wp.bool  # True if z is measured by a pressure sensor
     plane: wp.vec3  # settled covariance of x, and of y [m², m²/s, m²/s²]
@@ -155,13 +156,13 @@ class Estimates:
     """State of the filters, by (world, vehicle); position, velocity and attitude of recent control steps in a ring
     buffer."""
 
-    aboard: wp.array(dtype=FilterState)  # by vehicle
+    filter_constants: wp.array(dtype=FilterConstants)  # by vehicle
     position: wp.array3d(dtype=wp.vec3)  # world frame [m]
     velocity: wp.array3d(dtype=wp.vec3)  # world frame [m/s]
     quaternion: wp.array3d(dtype=wp.quat)  # body to world
     bias: wp.array2d(dtype=wp.vec3)  # bias of the gyroscope, body frame [rad/s]
     rate: wp.array2d(dtype=wp.vec3)  # angular rate in the previous step, body frame [rad/s]
-    plane: wp.array2d(dtype=wp.vec3)  # covariances, as in `FilterState`
+    plane: wp.array2d(dtype=wp.vec3)  # covariances, as in `FilterConstants`
     height: wp.array2d(dtype=wp.vec3)
     yaw: wp.array2d(dtype=wp.vec3)
 
@@ -265,7 +266,7 @@ def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
 
 
 @wp.func
-def begin(
+def initialise(
     state: State,
     r: InstrumentReadings,
     e: Estimates,
@@ -276,21 +277,21 @@ def begin(
 ):
     """Start the filter in its steady state: with errors of its settled covariance and with the persistent offsets."""
     key = sample_key(seed, FIX, w, v, state.episode[w], 0)
-    aboard = e.aboard[v]
+    filter_constants = e.filter_constants[v]
     x = state.position[w, v]
     q = state.quaternion[w, v]
     a = normal3(key, WHITE)
     b = normal3(key, WALK)
-    px = doubted(aboard.plane, a[0], b[0])
-    py = doubted(aboard.plane, a[1], b[1])
-    pz = doubted(aboard.height, a[2], b[2])
-    turn = doubted(aboard.yaw, normal(key, WHITE_2), normal(key, WALK_2))
+    px = doubted(filter_constants.plane, a[0], b[0])
+    py = doubted(filter_constants.plane, a[1], b[1])
+    pz = doubted(filter_constants.height, a[2], b[2])
+    turn = doubted(filter_constants.yaw, normal(key, WHITE_2), normal(key, WALK_2))
     lasting = wp.vec3()
     if has_fixes:
         m = r.fix_errors[w, v]
         lasting = m.position_bias * normal3(key, TURN_ON)
         turn[0] = turn[0] + m.yaw_bias * normal(key, TURN_ON_2)
-    if aboard.gauge:
+    if filter_constants.gauge:
         lasting[2] = -r.gauge.bias[w, v]
     imu = r.imu_errors[w, v]
     up = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, 1.0))
@@ -302,13 +303,13 @@ def begin(
     e.velocity[w, v, k] = wp.quat_rotate(q, wp.vec3(nu[0], nu[1], nu[2])) + wp.vec3(px[1], py[1], pz[1])
     e.bias[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro_bias[w, v]) - turn[1] * up
     e.rate[w, v] = wp.quat_rotate(imu.orientation, r.imu.gyro[w, v]) - e.bias[w, v]
-    e.plane[w, v] = aboard.plane
-    e.height[w, v] = aboard.height
-    e.yaw[w, v] = aboard.yaw
+    e.plane[w, v] = filter_constants.plane
+    e.height[w, v] = filter_constants.height
+    e.yaw[w, v] = filter_constants.yaw
 
 
 @wp.func
-def go_on(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
+def propagate(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """Propagate the state by a control step: attitude from the gyroscope, tilt corrected by the accelerometer, position
     from the velocity.
 
@@ -380,7 +381,7 @@ def correct(e: Estimates, w: int, v: int, at: int, step: int, dt: float, c: Corr
 
 
 @wp.func
-def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: int, v: int):
+def update_with_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: int, v: int):
     """Apply the fixes that arrive in this step, the mean of several in a control step."""
     m = r.fix_errors[w, v]
     dt = r.control_step
@@ -412,7 +413,7 @@ def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: in
     A = value_gain(e.plane[w, v], R)
     B = wp.vec2(0.0, 0.0)
     e.plane[w, v] = value_known(e.plane[w, v], R)
-    if not e.aboard[v].gauge:
+    if not e.filter_constants[v].gauge:
         B = value_gain(e.height[w, v], R)
         e.height[w, v] = value_known(e.height[w, v], R)
     R_yaw = counted(fewer * m.yaw_std, 0.0)
@@ -423,7 +424,7 @@ def take_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int, w: in
 
 
 @wp.func
-def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
+def update_with_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """Apply a depth reading: -z - (R r)_z at the sensor's port. `dt` is in [s]."""
     at = measured_at(e, r.gauge_samples.timing[v].latency, step)
     k = at % e.position.shape[2]
@@ -437,7 +438,7 @@ def take_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int
 
 
 @wp.func
-def take_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
+def update_with_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int, v: int):
     """Apply a velocity reading of the DVL: velocity of the body's origin, v = R_bs z - ω × r, in world axes.
 
     `dt` is in [s].
@@ -472,15 +473,15 @@ def estimate(
     dt = r.control_step
     has_fixes = r.fixes_per_step > wp.float64(0.0)
     if starting:
-        begin(state, r, e, has_fixes, seed, w, v)
+        initialise(state, r, e, has_fixes, seed, w, v)
     else:
-        go_on(r, e, step, dt, w, v)
+        propagate(r, e, step, dt, w, v)
         if has_fixes:
-            take_fix(state, r, e, seed, w, v)
+            update_with_fix(state, r, e, seed, w, v)
         if r.gauge_errors.shape[0] > 0 and r.gauge_samples.fresh[w, v]:
-            take_depth(r, e, step, dt, w, v)
+            update_with_depth(r, e, step, dt, w, v)
         if r.dvl_errors.shape[0] > 0 and r.dvl_samples.fresh[w, v]:
-            take_velocity(r, e, step, dt, w, v)
+            update_with_velocity(r, e, step, dt, w, v)
     k = step % e.position.shape[2]
     q = e.quaternion[w, v, k]
     arrays.position[w, v] = e.position[w, v, k]
@@ -544,8 +545,10 @@ class SensingBatch:
             Estimates, simulator.worlds, simulator.device, position=past, velocity=past, quaternion=past,
             bias=vehicles, rate=vehicles, plane=vehicles, height=vehicles, yaw=vehicles,
         )  # fmt: skip
-        aboard = [_aboard(vehicle, sensing, dt) for vehicle in simulator.vehicles]
-        self.estimates.aboard = wp.array(aboard, dtype=FilterState, device=simulator.device)
+        filter_constants = [_filter_constants(vehicle, sensing, dt) for vehicle in simulator.vehicles]
+        self.estimates.filter_constants = wp.array(
+            filter_constants, dtype=FilterConstants, device=simulator.device
+        )
 
     def add(self, pipeline: KernelSequence, seed: int, mask: wp.array | None = None) -> None:
         """Append the update after a control step, or the start of episodes in the worlds where mask is not 0."""
@@ -568,11 +571,11 @@ class SensingBatch:
         return {"estimates": self.estimates, "readings": self.readings}
 
 
-def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
+def _filter_constants(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
     """Return the initial state of the filter of a vehicle, with its covariance after many control steps."""
     sensors, fixes = vehicle.sensors, sensing.fixes
-    aboard = FilterState()
-    aboard.gauge = sensors.depth is not None
+    filter_constants = FilterConstants()
+    filter_constants.gauge = sensors.depth is not None
     start = (0.0, 0.0, FASTEST**2)
     plane, height = (wp.vec3(*start) for _ in range(2))
     yaw = wp.vec3(0.0, 0.0, sensors.imu.gyro_bias_initial**2 if sensors.imu else 0.0)
@@ -584,7 +587,7 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
         if came:
             R = counted(fixes.position_std, 0.0) / came
             plane = value_known(plane, R)
-            height = height if aboard.gauge else value_known(height, R)
+            height = height if filter_constants.gauge else value_known(height, R)
             yaw = value_known(yaw, counted(fixes.yaw_std, 0.0) / came)
         if sensors.depth is not None and _due(sensors.depth.rate, step, dt):
             height = value_known(height, counted(sensors.depth.noise_std, sensors.depth.quantisation))
@@ -593,10 +596,10 @@ def _aboard(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
             plane, height = rate_known(plane, R), rate_known(height, R)
     if not sensing.rate:  # without fixes, the start is known and only velocities are uncertain
         plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
-        if not aboard.gauge:
+        if not filter_constants.gauge:
             height = wp.vec3(0.0, 0.0, min(height[2], FASTEST**2))
-    aboard.plane, aboard.height, aboard.yaw = plane, height, yaw
-    return aboard
+    filter_constants.plane, filter_constants.height, filter_constants.yaw = plane, height, yaw
+    return filter_constants
 
 
 def _due(rate: float, step: int, dt: float) -> int:

@@ -24,10 +24,10 @@ from finssim.sim.state import State
 from finssim.tasks import terms as library
 from finssim.tasks.arrays import TaskArrays, allocated
 from finssim.tasks.blocks import evaluate_in_blocks
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.measurement import MeasurementNoise
 from finssim.tasks.picture import ObservedPicture
 from finssim.tasks.terms import ObservationPart, Terms
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 
 

@@ -17,7 +17,6 @@ from finssim.core.rotations import quat_rotate
 from finssim.sim.site import described_world
 from finssim.sim.state import State
 from finssim.tasks.arrays import PathTable, TaskArrays, allocated
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.path import (
     ERROR_SCALE,
     PathFollowing,
@@ -42,6 +41,7 @@ from finssim.tasks.terms import (
     turn_rates,
     world_up,
 )
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 from finssim.vehicles.device_files import RangeDevice, device_of
 
@@ -131,7 +131,7 @@ def sound(state: State, arrays: TaskArrays, p: Any, w: int):
 
 
 @wp.func
-def go_on(state: State, arrays: TaskArrays, p: Any, w: int):
+def advance_terrain(state: State, arrays: TaskArrays, p: Any, w: int):
     """Switch legs, and measure the ranges."""
     change_legs(state, arrays, p, w)
     sound(state, arrays, p, w)
@@ -349,7 +349,7 @@ class TerrainFollowing(PathFollowing):
         r = self.reward
         return Terms(
             start=start_over,
-            advance=go_on,
+            advance=advance_terrain,
             shared={"e": altitude_error, "across": beside_line},
             meanings={"track": f"1 at the altitude, 1/e at {self.fit.size * r.track_scale:.3g} m from it."},
             rewards=(

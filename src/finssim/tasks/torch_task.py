@@ -12,49 +12,49 @@ from torch import Tensor
 
 from finssim.sim.launch import KernelSequence
 from finssim.sim.state import State
-from finssim.tasks.arrays import Answers, TaskArrays, allocated
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.arrays import TaskArrays, TorchResults, allocated
 from finssim.tasks.task import Batch, Task
 from finssim.tasks.terms import End, RewardTerm, Terms, Total
+from finssim.tasks.validation import EnvironmentSetupError
 
 # Terms of every task in plain torch, which read the results of its functions, and the random draws.
 
 
 @wp.func
-def answered_start(state: State, arrays: TaskArrays, w: int):
+def result_start(state: State, arrays: TaskArrays, w: int):
     """Copy the start that `reset` returned."""
     for v in range(state.position.shape[1]):
-        state.position[w, v] = arrays.answers.position[w, v]
-        state.quaternion[w, v] = wp.normalize(arrays.answers.quaternion[w, v])
-        state.velocity[w, v] = arrays.answers.velocity[w, v]
-    arrays.goal_position[w] = arrays.answers.goal_position[w]
-    arrays.goal_quaternion[w] = wp.normalize(arrays.answers.goal_quaternion[w])
-    for i in range(arrays.answers.memory.shape[1]):
-        arrays.answers.memory[w, i] = arrays.answers.begun[w, i]
+        state.position[w, v] = arrays.torch_results.position[w, v]
+        state.quaternion[w, v] = wp.normalize(arrays.torch_results.quaternion[w, v])
+        state.velocity[w, v] = arrays.torch_results.velocity[w, v]
+    arrays.goal_position[w] = arrays.torch_results.goal_position[w]
+    arrays.goal_quaternion[w] = wp.normalize(arrays.torch_results.goal_quaternion[w])
+    for i in range(arrays.torch_results.memory.shape[1]):
+        arrays.torch_results.memory[w, i] = arrays.torch_results.begun[w, i]
 
 
 @wp.func
-def answered_reward(arrays: TaskArrays, w: int, a: int) -> float:
+def result_reward(arrays: TaskArrays, w: int, a: int) -> float:
     """Return the result of `reward`."""
-    return arrays.answers.reward[w, a]
+    return arrays.torch_results.reward[w, a]
 
 
 @wp.func
-def answered_end(arrays: TaskArrays, w: int) -> bool:
+def result_end(arrays: TaskArrays, w: int) -> bool:
     """Return the result of `terminated`."""
-    return arrays.answers.terminated[w] != 0
+    return arrays.torch_results.terminated[w] != 0
 
 
 @wp.func
-def answered_inside(arrays: TaskArrays, w: int) -> bool:
+def result_inside(arrays: TaskArrays, w: int) -> bool:
     """Return the result of `inside`."""
-    return arrays.answers.inside[w] != 0
+    return arrays.torch_results.inside[w] != 0
 
 
 @wp.func
-def answered_count(arrays: TaskArrays, w: int, k: int, was: float) -> float:
+def result_count(arrays: TaskArrays, w: int, k: int, was: float) -> float:
     """Return the sum of the results of `counted` under this name, both in its unit."""
-    return was + arrays.answers.counted[w, k]
+    return was + arrays.torch_results.counted[w, k]
 
 
 @wp.kernel(enable_backward=False)
@@ -122,8 +122,8 @@ class Worlds:
         self.goal_quaternion = wp.to_torch(arrays.goal_quaternion, requires_grad=False)
         self._held = wp.to_torch(arrays.held, requires_grad=False)
         self.memory: Mapping[str, Tensor] = _Unknown()
-        if arrays.answers.memory is not None:
-            memory_rows = wp.to_torch(arrays.answers.memory, requires_grad=False)
+        if arrays.torch_results.memory is not None:
+            memory_rows = wp.to_torch(arrays.torch_results.memory, requires_grad=False)
             self.memory = dict(zip(memory, memory_rows.split(list(memory.values()), dim=1), strict=True))
         self._action, self._previous = (
             wp.to_torch(x, requires_grad=False) for x in (arrays.action, arrays.previous_action)
@@ -294,12 +294,12 @@ class TorchTask(Task):
     def terms(self) -> Terms:
         """Return the terms common to all torch tasks, which read the results of their functions."""
         return Terms(
-            start=answered_start,
+            start=result_start,
             shown=False,
-            rewards=(RewardTerm("reward", answered_reward, 1.0),),
-            ends=(End("terminated", answered_end),),
-            inside=answered_inside,
-            totals=tuple(Total(name, answered_count, index=i) for i, name in enumerate(self.totals)),
+            rewards=(RewardTerm("reward", result_reward, 1.0),),
+            ends=(End("terminated", result_end),),
+            inside=result_inside,
+            totals=tuple(Total(name, result_count, index=i) for i, name in enumerate(self.totals)),
         )
 
     def settings_class(self) -> type:
@@ -310,8 +310,8 @@ class TorchTask(Task):
     def allocate(self, arrays: TaskArrays, worlds: int, device: wp.Device) -> None:
         """Allocate the results of the functions."""
         vehicles, memory = len(self.vehicles), sum(self.memory.values())
-        arrays.answers = allocated(
-            Answers, worlds, device, reward=len(self.agents), counted=len(self.totals), position=vehicles,
+        arrays.torch_results = allocated(
+            TorchResults, worlds, device, reward=len(self.agents), counted=len(self.totals), position=vehicles,
             quaternion=vehicles, velocity=vehicles, begun=memory, memory=memory,
         )  # fmt: skip
 
@@ -319,7 +319,7 @@ class TorchTask(Task):
         """Append the call that commands the `others`."""
         w, out = self._worlds(batch, SCRIPT), batch.arrays.scripted
         pipeline.call(
-            partial(_run, batch, lambda: self._answer("script", self.script(w.begin()).flatten(1), out))
+            partial(_run, batch, lambda: self._copy_result("script", self.script(w.begin()).flatten(1), out))
         )
 
     def add_evaluate(self, pipeline: KernelSequence, batch: Batch) -> None:
@@ -330,7 +330,7 @@ class TorchTask(Task):
 
         def score() -> None:
             self._score(true.begin(), batch.arrays)
-            self._look(measured.begin(), batch.arrays, frozen == 0)
+            self._write_observation(measured.begin(), batch.arrays, frozen == 0)
 
         pipeline.call(partial(_run, batch, score))
         super().add_evaluate(pipeline, batch)
@@ -346,17 +346,22 @@ class TorchTask(Task):
         measured = self._worlds(batch, OBSERVE, measured=True)
         starts = wp.to_torch(mask, requires_grad=False)[:, None, None]
         pipeline.call(
-            partial(_run, batch, lambda: self._look(measured.begin(), batch.arrays, starts != 0), mask)
+            partial(
+                _run,
+                batch,
+                lambda: self._write_observation(measured.begin(), batch.arrays, starts != 0),
+                mask,
+            )
         )
 
     def _worlds(self, batch: Batch, stage: int, measured: bool = False) -> Worlds:
         return Worlds(batch, self.memory, self.control_step, stage=stage, measured=measured)
 
     def _score(self, w: Worlds, arrays: TaskArrays) -> None:
-        answers = arrays.answers
-        self._answer("reward", self.reward(w), answers.reward)
-        self._answer("terminated", self.terminated(w), answers.terminated)
-        self._answer("inside", self.inside(w), answers.inside)
+        torch_results = arrays.torch_results
+        self._copy_result("reward", self.reward(w), torch_results.reward)
+        self._copy_result("terminated", self.terminated(w), torch_results.terminated)
+        self._copy_result("inside", self.inside(w), torch_results.inside)
         counted = self.counted(w)
         if counted.keys() != set(self.totals):
             raise EnvironmentSetupError(
@@ -365,9 +370,9 @@ class TorchTask(Task):
             )
         if counted:
             rows = [counted[name].reshape(w.count, 1) for name in self.totals]
-            self._answer("counted", torch.cat(rows, dim=1), answers.counted)
+            self._copy_result("counted", torch.cat(rows, dim=1), torch_results.counted)
 
-    def _look(self, w: Worlds, arrays: TaskArrays, mask: Tensor) -> None:
+    def _write_observation(self, w: Worlds, arrays: TaskArrays, mask: Tensor) -> None:
         """Write the observation of the worlds `mask`, bool, (worlds, 1, 1)."""
         parts, agents = self.observe(w), len(self.agents)
         if len(parts) != len(self.observation):
@@ -391,11 +396,11 @@ class TorchTask(Task):
             first += part.size
 
     def _begin(self, w: Worlds, arrays: TaskArrays) -> None:
-        answers, start = arrays.answers, self.reset(w)
+        torch_results, start = arrays.torch_results, self.reset(w)
         for name in ("position", "quaternion", "velocity", "goal_position", "goal_quaternion"):
-            value, out = getattr(start, name), getattr(answers, name)
+            value, out = getattr(start, name), getattr(torch_results, name)
             if value is not None:
-                self._answer(f"reset: {name}", value, out)
+                self._copy_result(f"reset: {name}", value, out)
             elif name.endswith("quaternion"):
                 out.fill_(wp.quat(0.0, 0.0, 0.0, 1.0))
             else:
@@ -409,9 +414,9 @@ class TorchTask(Task):
         if self.memory:
             rows = [start.memory.get(name, w.zeros(size)) for name, size in self.memory.items()]
             full = torch.cat([row.reshape(w.count, -1) for row in rows], dim=1)
-            self._answer("reset: memory", full, answers.begun)
+            self._copy_result("reset: memory", full, torch_results.begun)
 
-    def _answer(self, name: str, value: Any, out: wp.array) -> None:
+    def _copy_result(self, name: str, value: Any, out: wp.array) -> None:
         """Copy the result of a function to the array that the kernels read."""
         target = wp.to_torch(out, requires_grad=False)
         if (

@@ -12,8 +12,8 @@ from finssim.sim import Dock, RectangularPool
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.docking import OBSERVATION, Docking, HullNumbers, start
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import ObservationPart, Terms
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 
 MOUTH, THROAT, CONE, TUBE = 0.745, 0.32, 0.75, 0.93

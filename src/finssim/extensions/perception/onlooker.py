@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from finssim.core.rotations import quat_from_euler, quat_from_yaw, quat_rotate, quat_yaw
 from finssim.extensions.perception.description import Object, Variation, World
 from finssim.tasks.environment import Environment
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles.device_files import CameraDevice
 
 COLOURS = ((0.95, 0.45, 0.04), (0.10, 0.45, 0.90), (0.85, 0.10, 0.15), (0.55, 0.75, 0.15))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finssim.core.rotations import quat_inverse_rotate
 from finssim.sim.simulator import Simulator
 from finssim.tasks.arrays import TaskArrays
-from finssim.tasks.given import EnvironmentSetupError
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles.device_files import CameraDevice, RangeDevice, SonarDevice, device_of
 
 if TYPE_CHECKING:

@@ -26,7 +26,6 @@ from finssim.tasks.communication import (
     mate_position,
     open_messages,
 )
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.terms import (
     End,
     ObservationPart,
@@ -44,6 +43,7 @@ from finssim.tasks.terms import (
     uniform3,
     world_velocity,
 )
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 
 AGENTS = 3

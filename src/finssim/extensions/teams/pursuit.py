@@ -22,7 +22,6 @@ from finssim.tasks.communication import (
     message_table,
     open_messages,
 )
-from finssim.tasks.given import EnvironmentSetupError
 from finssim.tasks.task import Task
 from finssim.tasks.terms import (
     End,
@@ -38,6 +37,7 @@ from finssim.tasks.terms import (
     place_at_rest,
     world_velocity,
 )
+from finssim.tasks.validation import EnvironmentSetupError
 from finssim.vehicles import Vehicle
 
 Array = NDArray[Any]

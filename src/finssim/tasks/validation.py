@@ -13,7 +13,9 @@ class EnvironmentSetupError(ValueError):
     """An environment cannot be set up, or an action or saved state does not fit it."""
 
 
-def crew(vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: str) -> list[Vehicle]:
+def vehicles_of_task(
+    vehicle: Vehicle | str | Sequence[Vehicle | str], task: "Task", mode: str
+) -> list[Vehicle]:
     """Return the vehicles of a world: those given, or one vehicle repeated for every role of the task.
 
     Raises:
