@@ -29,7 +29,7 @@ from finssim.vehicles.defaults import SITES, room
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
 __all__ = [
-    "SPREADS", "Spread", "cruise", "draw_plant", "hull_share", "less_share", "panel_drag", "positioning_of", "site_of",
+    "SPREADS", "Spread", "cruise", "draw_plant", "hull_share", "panel_drag", "positioning_of", "remaining_damping", "site_of",
     "steady_share",
 ]  # fmt: skip
 
@@ -245,7 +245,7 @@ def steady_share(vehicle: Vehicle, panels: Array, propellers: Mapping[str, float
     return np.where(v > 0.0, drag + deduction * F, 0.0)
 
 
-def less_share(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Array, Array]:
+def remaining_damping(vehicle: Vehicle, D1: Array, D2: Array, drag: Array) -> tuple[Array, Array]:
     """Return the damping without the drag that other parts cause; a third of each coefficient always remains.
 
     Args:
@@ -358,7 +358,7 @@ def _water(
     hull = hull_share(vehicle, about.hull_share, drag)
     panels = hull["form_drag"] * drag
     outer_drag = steady_share(vehicle, panels, sections["propellers"], sum(spread.propulsion.deduction) / 2.0)
-    D1, D2 = _dissipative(*less_share(vehicle, D1, D2, outer_drag))
+    D1, D2 = _dissipative(*remaining_damping(vehicle, D1, D2, outer_drag))
     axes = [
         {
             "center": tuple((np.asarray(hydro.reference_point) + draw.around(about.center, 3)).tolist()),

@@ -85,7 +85,7 @@ class Fleet:
         """Return whether the task is over; the vehicles continue."""
         return False
 
-    def turn(self, now: float, due: bool) -> None:
+    def evaluate(self, now: float, due: bool) -> None:
         """Evaluate the true state; only a task site does this.
 
         Args:

@@ -479,7 +479,7 @@ MOTOR_STEP = 0.001
 
 
 @wp.struct
-class Hidden:
+class HiddenForces:
     """Forces on the body in addition to the engine's own."""
 
     T: mat66  # body twist to the axes of the damping [-, m]
@@ -494,14 +494,14 @@ class Hidden:
 
 
 @wp.func
-def coupled_damping(hidden: Hidden, nu_r: vec6) -> vec6:
+def coupled_damping(hidden: HiddenForces, nu_r: vec6) -> vec6:
     """Return tau_D = -Tᵀ [D1 x + D2 (|x| x)], x = T nu_r, about the body origin [N, N m]."""
     x = hidden.T * nu_r
     return -wp.transpose(hidden.T) * (hidden.D1 * x + hidden.D2 * wp.cw_mul(wp.abs(x), x))
 
 
 @wp.func
-def buoyancy_change(hidden: Hidden, t: float) -> float:
+def buoyancy_change(hidden: HiddenForces, t: float) -> float:
     """Return the slow change of buoyancy at a time [N]."""
     total = float(0.0)
     for i in range(hidden.drifts):
@@ -510,12 +510,12 @@ def buoyancy_change(hidden: Hidden, t: float) -> float:
 
 
 @wp.struct
-class Machinery:
+class PlantModel:
     """Parts of a plant in addition to the engine."""
 
     motors: MotorBank
     propellers: PropellerBank
-    hidden: Hidden
+    hidden: HiddenForces
     circulation: CirculationData
     line: SlackTetherData
 
@@ -525,7 +525,7 @@ def drive(
     state: State,
     command: wp.array2d(dtype=VehicleCommand),
     surroundings: WaterArrays,
-    machinery: Machinery,
+    plant_model: PlantModel,
     step: float,
     motor_steps: int,
     seed: int,
@@ -544,28 +544,28 @@ def drive(
         seed: Seed of the noise of speed measurements.
         world_offset: First world of this launch; not used.
     """
-    hidden = machinery.hidden
+    hidden = plant_model.hidden
     count = state.steps[0]
     t = float(count) * step
     dt = step / float(motor_steps)
     for j in range(motor_steps):
         tick = count * motor_steps + j
-        turn_motors(machinery.motors, tick, dt, wp.rand_init(seed, tick))
+        turn_motors(plant_model.motors, tick, dt, wp.rand_init(seed, tick))
     x = state.position[0, 0]
     q = state.quaternion[0, 0]
     nu = state.velocity[0, 0]
-    water = circulation_at(machinery.circulation, x, t)
+    water = circulation_at(plant_model.circulation, x, t)
     surroundings.current[0] = water
     if surroundings.profile_depth.shape[0] > 0:
         profile = profile_at(surroundings, 0, -wp.min(x[2], 0.0), t)
         water += profile.velocity
     nu_r = nu - join(wp.quat_rotate_inv(q, water), wp.vec3(0.0))
-    command[0, 0].thrust = delivered_thrust(machinery.propellers, machinery.motors.speed, nu_r)
+    command[0, 0].thrust = delivered_thrust(plant_model.propellers, plant_model.motors.speed, nu_r)
     up = up_in_body(q)
     wet = submerged_fraction(x[2] + wp.dot(up, hidden.r_b), hidden.half_height)
     lift = wet * buoyancy_change(hidden, t) * up
     tau = wet * coupled_damping(hidden, nu_r) + join(lift, wp.cross(hidden.r_b, lift))
-    command[0, 0].disturbance = tau + slack_pull(machinery.line, x, q)
+    command[0, 0].disturbance = tau + slack_pull(plant_model.line, x, q)
 
 
 class Plant:
@@ -625,21 +625,21 @@ class Plant:
         s = self.simulator
         pipeline = s.pipeline()
         propellers = propeller_bank(vehicle, spec)
-        machinery = self._machinery = (
-            Machinery()
+        plant_model = self._plant_model = (
+            PlantModel()
         )  # kept: a captured launch does not keep arrays inside structs alive
-        machinery.motors, machinery.propellers, machinery.hidden = (
+        plant_model.motors, plant_model.propellers, plant_model.hidden = (
             self.motors,
             propellers,
             _hidden(vehicle, spec),
         )
-        machinery.circulation, machinery.line = (
+        plant_model.circulation, plant_model.line = (
             circulation_data(spec.circulation, spec.basin),
             slack_line(spec.tether),
         )
         # Different random numbers for every plant: consecutive seeds must not share any.
         key = int(np.random.SeedSequence([seed, 71]).generate_state(1)[0] >> 1)
-        inputs = [s.state, s.command.array, s.water, machinery, self.step, motor_steps, key]
+        inputs = [s.state, s.command.array, s.water, plant_model, self.step, motor_steps, key]
         pipeline.add(drive, inputs)
         s.add_step(pipeline)
         self._step = captured(pipeline.run)
@@ -784,8 +784,8 @@ def _motors_fields() -> dict[str, float]:
     return {"force_min": -1.0e6, "force_max": 1.0e6, "time_constant": 0.0, "slew": NO_LIMIT}
 
 
-def _hidden(vehicle: Vehicle, spec: PlantSpec) -> Hidden:
-    hidden = Hidden()
+def _hidden(vehicle: Vehicle, spec: PlantSpec) -> HiddenForces:
+    hidden = HiddenForces()
     hidden.T = mat66(*spec.damping.to_axes().ravel())
     hidden.D1 = mat66(*np.ravel(spec.damping.linear))
     hidden.D2 = mat66(*np.ravel(spec.damping.quadratic))

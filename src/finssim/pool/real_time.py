@@ -155,7 +155,7 @@ def serve_realtime(
         steps = math.floor(now * RATE)
         if wires.messages is not None:
             wires.messages.poll(now)
-        site.turn(now, due)
+        site.evaluate(now, due)
         if site.over and not announced:
             announced = True
             over()

@@ -278,16 +278,16 @@ def _serve_team(
         for i, name in enumerate(names):
             transports[name] = UdpTransport((bind, port + 10 * i), (host, first + 10 * i))
             stack.callback(transports[name].close)
-            _say(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
+            _print(f"{name}: {_name(transports[name].address)}, for {_name(transports[name].peer)} alone")
             if calibrated is not None:
                 sinks.append(UdpSender((bind, port + 10 * i + 1), (host, first + 10 * i + 1)))
                 stack.callback(sinks[-1].close)
         if calibrated is not None and pool_file is not None:
             write_pool(calibrated, pool_file)
-            _say(f"pool file: {pool_file}")
+            _print(f"pool file: {pool_file}")
         if isinstance(fleet, TaskSite):
             _tell_goal(fleet)
-            _say(f"messages: {_name(server.address)}")
+            _print(f"messages: {_name(server.address)}")
         notify = partial(_tell_episode, fleet)
         pace = serve_realtime(
             fleet,
@@ -300,7 +300,7 @@ def _serve_team(
         )
     if not fleet.over:
         _tell_episode(fleet)
-    _say(f"ended after {pace.duration:.1f} s")
+    _print(f"ended after {pace.duration:.1f} s")
 
 
 def _playing(task: str, bodies: Sequence[Vehicle], choice: SiteChoice) -> tuple[TaskSite, None]:
@@ -385,7 +385,7 @@ def _tell_goal(site: TaskSite) -> None:
         return
     x, y, z = site.referee.arrays.goal_position.numpy()[0]
     yaw = math.degrees(float(quat_yaw(site.referee.arrays.goal_quaternion.numpy()[0].astype(float))))
-    _say(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
+    _print(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
 
 
 def _tell_episode(site: Fleet) -> None:
@@ -393,9 +393,11 @@ def _tell_episode(site: Fleet) -> None:
     if not isinstance(site, TaskSite):
         return
     if site.referee.over:
-        _say("episode: " + ", ".join(f"{name} {value:.4g}" for name, value in site.referee.metrics().items()))
+        _print(
+            "episode: " + ", ".join(f"{name} {value:.4g}" for name, value in site.referee.metrics().items())
+        )
     else:
-        _say(f"episode: not ended after {site.scored} control steps")
+        _print(f"episode: not ended after {site.scored} control steps")
 
 
 def _check_start(start: Station, basin: Basin, text: str) -> None:
@@ -417,9 +419,9 @@ def _lockstep(
         stack.callback(world.close)
         reason = "stopped"
         with suppress(KeyboardInterrupt), interrupting():
-            _say(f"lock-step: {_name(server.address)}")
+            _print(f"lock-step: {_name(server.address)}")
             reason = server.serve(world, duration=duration)
-    _say(f"{reason} at {world.time:.1f} s")
+    _print(f"{reason} at {world.time:.1f} s")
 
 
 def _realtime(
@@ -441,12 +443,12 @@ def _realtime(
         world = make_world(eye)
         stack.callback(world.close)
         if isinstance(transport, GroundLinks):
-            _say(f"autopilot: {_name(transport.address)} (UDP), {_name(transport.tcp)} (TCP)")
-            _say(f"Doppler log: {_name(transport.dvl.address)}")
+            _print(f"autopilot: {_name(transport.address)} (UDP), {_name(transport.tcp)} (TCP)")
+            _print(f"Doppler log: {_name(transport.dvl.address)}")
         else:
-            _say(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
+            _print(f"motor controller: {_name(transport.address)}, for {_name(transport.peer)} alone")
         if eye is not None:
-            _say(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
+            _print(f"pictures: {_name(_next(bind))}, for {_name(_next(robot))}")
         site, sinks = Fleet({plan.vehicle.name: world}), [] if sink is None else [sink]
         transports = {plan.vehicle.name: transport}
         pace = serve_realtime(
@@ -457,9 +459,9 @@ def _realtime(
             clock=timing.now,
             wait=lambda duration: timing.wait(duration, interrupted),
         )
-        _say(f"ended after {pace.duration:.1f} s" if timing.paced else pace.sentence)
+        _print(f"ended after {pace.duration:.1f} s" if timing.paced else pace.sentence)
         if drawn is not None and drawn.dropped:
-            _say(drawn.complaint)
+            _print(drawn.complaint)
 
 
 def _camera(
@@ -484,25 +486,25 @@ def _next(address: tuple[str, int]) -> tuple[str, int]:
 
 def _tell_plant(plan: PoolPlan, files: PoolFiles) -> None:
     spec = plan.spec
-    _say(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
+    _print(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
     if plan.camera is not None:
         s = plan.camera.settings
-        _say(
+        _print(
             f"camera: {plan.camera.mode}, {s.rate:g} Hz, {plan.camera.site.camera.lens.width} x "
             f"{plan.camera.site.camera.lens.height}, ripples of slope {s.ripples:g}"
         )
     if plan.onboard is not None:
         rates = (f"{name} {sensor.rate:g} Hz" for name, sensor in plan.vehicle.perception.items())
-        _say(f"world: {plan.onboard.name}, seed {plan.onboard.seed}; {', '.join(rates)}")
+        _print(f"world: {plan.onboard.name}, seed {plan.onboard.seed}; {', '.join(rates)}")
     for name, path in (("pool file", files.pool_file), ("truth", files.truth)):
         if path is not None:
-            _say(f"{name}: {path}")
+            _print(f"{name}: {path}")
 
 
 def _name(address: tuple[str, int]) -> str:
     return f"{address[0]}:{address[1]}"
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     print(line, flush=True)
     sys.stdout.flush()

@@ -160,17 +160,17 @@ SITE = "site"
 
 
 @wp.func
-def as_told(state: State, arrays: TaskArrays, w: int):
+def keep_given_start(state: State, arrays: TaskArrays, w: int):
     """Do nothing, in place of a task's draws: vehicle and goal are already at their given poses."""
 
 
 @cache
-def _told(kind: type[Task]) -> type[Task]:
+def _with_given_start(kind: type[Task]) -> type[Task]:
     """Return a task class whose start and goal motion are given instead of drawn."""
 
     def terms(task: Task) -> Terms:
         declared = kind.terms(task)
-        return replace(declared, start=as_told, advance=None if task.moving else declared.advance)
+        return replace(declared, start=keep_given_start, advance=None if task.moving else declared.advance)
 
     return type(kind.__name__, (kind,), {"terms": terms, "__module__": kind.__module__})
 
@@ -213,7 +213,9 @@ class Referee:
         """
         self.task = task = fitted_task(task, vehicles)
         if start is not None:
-            task = _told(type(task))(**{field.name: getattr(task, field.name) for field in fields(task)})
+            task = _with_given_start(type(task))(
+                **{field.name: getattr(task, field.name) for field in fields(task)}
+            )
         size = action_size or len(action_mode(task.action, vehicles[0]).labels)
         self._state, self.arrays = one_world(task, size)
         drawn = ", ".join(task.marks) if self.arrays.seabed is None else "the seabed"
@@ -412,19 +414,19 @@ class TaskSite(Fleet):
             for i, (name, vehicle, (body, spec), start) in enumerate(places)
         }
         self._place_dock(worlds)
-        self._goal_is_told = pilots is None and self.task.moving and len(names) == 1
+        self._goal_is_sent = pilots is None and self.task.moving and len(names) == 1
         super().__init__(worlds)
         communication: Communication | None = getattr(self.task, "communication", None)
         self.carrier = self.medium = Medium(self._positions, communication, seed)
         self.scored, self._since = 0, math.nan
         self._actions: dict[str, Array] = {}
         period = self.task.control_step if communication is None else communication.period
-        told = ("target",) if self._target() is not None else ()
+        target_names = ("target",) if self._target() is not None else ()
         for i, (name, vehicle, _, start) in enumerate(places):
             agent = name in self.task.agents
             if agent and name not in steering:
                 continue
-            others = (*(other for other in names if other != name), *told) if agent else ()
+            others = (*(other for other in names if other != name), *target_names) if agent else ()
             self.runtimes[name] = self._runtime(
                 name,
                 vehicle,
@@ -487,7 +489,7 @@ class TaskSite(Fleet):
         def look() -> None:
             self.score(min(runtime.t for runtime in self.runtimes.values()), since=0.0)
 
-        self.tell_target()
+        self.send_target()
         longest = (duration or self.task.time_limit) + 10.0
         stacks = {name: (runtime, self.worlds[name]) for name, runtime in self.runtimes.items()}
         try:
@@ -510,12 +512,12 @@ class TaskSite(Fleet):
         """Return whether the episode has ended."""
         return self.referee.over
 
-    def turn(self, now: float, due: bool) -> None:
+    def evaluate(self, now: float, due: bool) -> None:
         """Score the true state; the episode begins when the thrusters of all agents are enabled."""
         if self.scored or all(self.worlds[name].firmware.driving for name in self.task.agents):
             self.score(now)
         elif due:
-            self.tell_target()
+            self.send_target()
 
     def score(self, now: float, since: float | None = None) -> None:
         """Score the true state with the task, once per control step.
@@ -526,11 +528,11 @@ class TaskSite(Fleet):
         """
         if math.isnan(self._since):
             self._since = now if since is None else since
-            self.tell_target()
+            self.send_target()
         if now - self._since >= (self.scored + 1) * self.task.control_step - 1e-6:
             self.scored += 1
             self.referee.look(truth_of(self.worlds), self._actions)
-            self.tell_target()
+            self.send_target()
         # A new action takes effect from now on: the step is scored with the previous one.
         self._actions = {
             name: getattr(runtime.pilot, "action", np.zeros(0)) for name, runtime in self.runtimes.items()
@@ -539,7 +541,7 @@ class TaskSite(Fleet):
     def _target(self) -> Track | None:
         """Return the drifting object of a task, if any; for a robot in another process also a moving goal."""
         a, net = self.referee.arrays, self.referee.arrays.net
-        if self._goal_is_told:
+        if self._goal_is_sent:
             q = a.goal_quaternion.numpy()[0].astype(float)
             v = quat_inverse_rotate(q, a.target.velocity.numpy()[0].astype(float))
             return Track(a.goal_position.numpy()[0].astype(float), q, np.array([*v, 0.0, 0.0, 0.0]))
@@ -549,7 +551,7 @@ class TaskSite(Fleet):
         nu = np.array([*net.motion.numpy()[0].astype(float), 0.0, 0.0, 0.0])
         return Track(net.target.numpy()[0].astype(float), level, nu)
 
-    def tell_target(self) -> None:
+    def send_target(self) -> None:
         """Send the target's position from the site's own positioning to all vehicles."""
         target = self._target()
         if target is not None:
