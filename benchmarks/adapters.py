@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import finssim
-from finssim.learning.served import age_episodes
+from finssim.learning.adapter import age_episodes
 from finssim.tasks import Environment
 
 ROUNDS, STEPS = 20, 20

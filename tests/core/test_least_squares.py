@@ -43,7 +43,7 @@ def test_the_end_of_a_curved_valley_is_found(start):
         costs.append(cost(x))
         return costs[-1]
 
-    end = descend(np.array(start), watched, linearise, steps=60, still=1e-20)
+    end = descend(np.array(start), watched, linearise, steps=60, tolerance=1e-20)
     np.testing.assert_allclose(end.state, 1.0, atol=1e-8)
     assert end.converged and end.steps == len(costs) - 1 and end.cost == min(costs)
 
@@ -53,7 +53,7 @@ def test_a_linear_problem_takes_a_step_and_its_confirmation():
     t = np.linspace(0.0, 1.0, 20)
     A, y = np.column_stack([t, np.ones(20)]), np.sin(t)
     cost, linearise = problem(lambda x: A @ x - y, lambda x: A)
-    end = descend(np.zeros(2), cost, linearise, steps=20, share=1e-12, damping=1e-9)
+    end = descend(np.zeros(2), cost, linearise, steps=20, relative_tolerance=1e-12, damping=1e-9)
     np.testing.assert_allclose(end.state, np.linalg.lstsq(A, y, rcond=None)[0], atol=1e-8)
     assert end.steps == 2 and end.converged
 
@@ -61,7 +61,7 @@ def test_a_linear_problem_takes_a_step_and_its_confirmation():
 def test_an_impossible_state_is_never_returned():
     """Where the cost is infinite beyond x = 0.5, the search ends before it, and not as converged."""
     cost, linearise = problem(valley, valley_slopes, possible=lambda x: x[0] <= 0.5)
-    end = descend(np.array([-1.2, 1.0]), cost, linearise, steps=400, still=1e-30)
+    end = descend(np.array([-1.2, 1.0]), cost, linearise, steps=400, tolerance=1e-30)
     assert end.state[0] <= 0.5 and math.isfinite(end.cost) and end.cost >= 0.25
 
 

@@ -17,7 +17,7 @@ def lines(monkeypatch, steps, begun=0):
     console = Console(file=io.StringIO(), width=200)
     view = TrainingView(1000, console)
     if begun:
-        view.go_on(begun)
+        view.resume_at(begun)
     for done in steps:
         view.update({**ROW, "steps": done})
     return console.file.getvalue().splitlines()

@@ -44,8 +44,8 @@ def descend(
     linearise: Callable[[State], Step[State]],
     *,
     steps: int,
-    still: float = 0.0,
-    share: float = 0.0,
+    tolerance: float = 0.0,
+    relative_tolerance: float = 0.0,
     damping: float = 1e-3,
 ) -> Descent[State]:
     """Minimise a cost by damped Gauss-Newton steps (Levenberg and Marquardt).
@@ -58,21 +58,21 @@ def descend(
         cost: Function to minimise; infinite where a state is impossible.
         linearise: Function that returns the damped steps of a state.
         steps: Largest number of steps.
-        still: Predicted decrease at or below which the search ends, in the unit of the cost.
-        share: The same limit as a fraction of the cost [-].
+        tolerance: Predicted decrease at or below which the search ends, in the unit of the cost.
+        relative_tolerance: The same limit as a fraction of the cost [-].
         damping: Initial damping [-].
     """
     value, growth, tried, converged = cost(state), 2.0, 0, False
     step = linearise(state)
     while tried < steps and not converged and damping < STEADIEST:
         tried += 1
-        trial, promised = step(damping)
-        converged = abs(promised) <= max(still, share * value)
+        trial, predicted = step(damping)
+        converged = abs(predicted) <= max(tolerance, relative_tolerance * value)
         after = math.inf if trial is None else cost(trial)
         if trial is None or not after <= value:
             damping, growth = damping * growth, 2.0 * growth
             continue
-        gain = min((value - after) / max(promised, 1e-300), 2.0) if math.isfinite(value) else 1.0
+        gain = min((value - after) / max(predicted, 1e-300), 2.0) if math.isfinite(value) else 1.0
         state, value, growth = trial, after, 2.0
         damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12)
         if tried < steps and not converged:
@@ -179,11 +179,11 @@ def arrow_step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Arr
     step, *_ = np.linalg.lstsq(scaled, right / scale, rcond=1e-13)
     step = step / scale
     own = [inner[:, -1] - inner[:, :-1] @ step for inner in inners]
-    promised = sum(
+    predicted = sum(
         step @ (2.0 * block.a - block.aa @ step - 2.0 * block.ab @ y) + y @ (2.0 * block.b - block.bb @ y)
         for block, y in zip(blocks, own, strict=True)
     )
-    return step, own, float(promised)
+    return step, own, float(predicted)
 
 
 def arrow_reduced(blocks: Sequence[Block], damping: float) -> tuple[Array, Array, list[Array]]:

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from finssim.learning.served import copied, served, single_agent
+from finssim.learning.adapter import adapter_environment, copied, single_agent
 from finssim.sim.site import described_world
 from finssim.tasks import TASKS, Environment, EnvironmentSetupError, Task
 
@@ -69,7 +69,9 @@ class Env(gymnasium.Env[Any, Any]):
             EnvironmentSetupError: As for `finssim.make`; or there are several agents or several worlds.
         """
         self.render_mode = options.pop("render_mode", None)
-        self.environment = single_agent(served(task, options, auto_reset=False, pictures=True), "Gymnasium")
+        self.environment = single_agent(
+            adapter_environment(task, options, auto_reset=False, pictures=True), "Gymnasium"
+        )
         if self.environment.worlds != 1:
             raise EnvironmentSetupError(
                 f"worlds is {self.environment.worlds}, expected 1: several are a VectorEnv"
@@ -154,7 +156,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any
         self._same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         if num_envs is not None:
             options["worlds"] = num_envs
-        environment = served(task, options, auto_reset=self._same_step, pictures=True)
+        environment = adapter_environment(task, options, auto_reset=self._same_step, pictures=True)
         self.environment = single_agent(environment, "Gymnasium")
         self.num_envs = self.environment.worlds
         self._ended = np.zeros(self.num_envs, bool)

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from finssim.learning.adapter import adapter_environment
 from finssim.learning.gymnasium_env import action_space, observation_space
-from finssim.learning.served import served
 from finssim.tasks import Environment, EnvironmentSetupError, Task
 
 Observation = NDArray[np.float32]
@@ -32,7 +32,7 @@ class PettingZooEnv(ParallelEnv[str, Observation, Observation]):
             options: Other arguments of `finssim.make`: vehicle, hydrodynamics, action, randomize, seed, ...
         """
         self.render_mode = options.pop("render_mode", None)
-        self.environment = environment = served(task, options, auto_reset=False)
+        self.environment = environment = adapter_environment(task, options, auto_reset=False)
         if environment.worlds != 1:
             raise EnvironmentSetupError(
                 f"worlds is {environment.worlds}, expected 1: PettingZoo steps one world"

@@ -9,7 +9,7 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from finssim.learning.served import served
+from finssim.learning.adapter import adapter_environment
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, Task
 
@@ -32,7 +32,7 @@ class RslRlVecEnv(VecEnv):
             task: A task or its name; or an environment.
             options: Other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, device, ...
         """
-        self.environment = environment = served(task, options)
+        self.environment = environment = adapter_environment(task, options)
         self._tensors = Tensors(environment)
         self._steps = wp.to_torch(environment.simulator.state.steps)
         a, privileged = environment.arrays, bool(environment.privileged_names)

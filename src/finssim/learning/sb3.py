@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from finssim.learning.adapter import adapter_environment, age_episodes, copied
 from finssim.learning.gymnasium_env import action_space, observation_space
-from finssim.learning.served import age_episodes, copied, served
 from finssim.tasks import Environment, Task
 
 
@@ -32,7 +32,7 @@ class Sb3VecEnv(VecEnv):
                 stages of an episode at once is more stable. A shortened episode has no `episode` in its info.
             options: Other arguments of `finssim.make`: worlds, vehicle, hydrodynamics, randomize, seed, ...
         """
-        self.environment = environment = served(task, options, pictures=True)
+        self.environment = environment = adapter_environment(task, options, pictures=True)
         rows = environment.worlds * environment.agents
         super().__init__(rows, observation_space(environment), action_space(environment))
         self._actions: NDArray[np.float32] | None = None

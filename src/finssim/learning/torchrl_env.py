@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from finssim.learning.served import age_episodes, served
+from finssim.learning.adapter import adapter_environment, age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.tasks import Environment, EnvironmentSetupError, Task
 from finssim.tasks.environment import GREATEST_SEED
@@ -46,7 +46,7 @@ class TorchRlEnv(EnvBase):
         Raises:
             EnvironmentSetupError: As for `finssim.make`; or groups do not contain every agent exactly once.
         """
-        environment = served(task, options)
+        environment = adapter_environment(task, options)
         tensors = Tensors(environment)
         super().__init__(device=tensors.device, batch_size=[environment.worlds])
         self.environment, self._tensors, self._stagger = environment, tensors, stagger

@@ -213,7 +213,7 @@ def train(
         )  # fmt: skip
         if checkpoint is not None:
             loop.resume(checkpoint)
-            view.go_on(loop.learner.steps)
+            view.resume_at(loop.learner.steps)
         elif resume:
             console.print(
                 f"no checkpoint in {side} yet: starting from the beginning", soft_wrap=True, markup=False

@@ -81,7 +81,7 @@ class TrainingView:
     ) -> None:
         self._progress.stop()
 
-    def go_on(self, steps: int) -> None:
+    def resume_at(self, steps: int) -> None:
         """Start at a number of earlier steps, which do not count in the time of this training."""
         self._first = steps
         self._next = (int(steps / self.total * 10.0) + 1) / 10.0

@@ -39,11 +39,11 @@ class Fields:
         """Return whether the key has a value that is not null."""
         return self._values.get(key) is not None
 
-    def given(self, key: str) -> bool:
+    def contains(self, key: str) -> bool:
         """Return whether the key is present, with or without a value."""
         return key in self._values
 
-    def take(self, key: str, default: Any = None) -> Any:
+    def get(self, key: str, default: Any = None) -> Any:
         """Return the unchecked value, or the default."""
         self._known.append(key)
         value = self._values.get(key)
@@ -55,7 +55,7 @@ class Fields:
         Raises:
             LocalizationError: The key is missing without a default, or its value is not a finite number.
         """
-        value = self.take(key, default)
+        value = self.get(key, default)
         if value is None:
             raise self.error(f"{key} is missing, expected a number")
         return self._finite(key, value)
@@ -67,7 +67,7 @@ class Fields:
             LocalizationError: The key is missing without a default, the length differs, or an item is not a
                 finite number.
         """
-        value = self.take(key, default)
+        value = self.get(key, default)
         if value is None:
             raise self.error(f"{key} is missing, expected {count or 'some'} numbers")
         if not isinstance(value, (list, tuple)) or (count is not None and len(value) != count):
@@ -80,7 +80,7 @@ class Fields:
         Raises:
             LocalizationError: The key is missing without a default, or its value is not a string.
         """
-        value = self.take(key, default)
+        value = self.get(key, default)
         if not isinstance(value, str):
             raise self.error(f"{key} is {value!r}, expected a word")
         return value
@@ -91,7 +91,7 @@ class Fields:
         Raises:
             LocalizationError: The value is not a mapping.
         """
-        value = self.take(key, {})
+        value = self.get(key, {})
         if not isinstance(value, Mapping):
             raise self.error(f"{key} is {value!r}, expected a section of keys and values")
         return Fields(value, f"{self.where}: {key}")
@@ -243,7 +243,7 @@ def only(tree: Mapping[Any, Any], known: Sequence[str], label: str) -> None:
     """
     fields = Fields(tree, label)
     for key in known:
-        fields.take(key)
+        fields.get(key)
     fields.finish()
 
 

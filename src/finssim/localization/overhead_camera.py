@@ -155,7 +155,7 @@ def _values(pool: Pool) -> dict[str, Any]:
 
 
 def _camera(fields: Fields, path: Path) -> tuple[Camera, float]:
-    lens = fields.take("lens")
+    lens = fields.get("lens")
     if isinstance(lens, str):  # a camera file in the same folder
         lens_ = load_camera(path.parent / lens).lens
     elif isinstance(lens, Mapping):
@@ -173,7 +173,7 @@ def _interface(fields: Fields) -> Interface:
     """Read the plane, from its normal and offset (or a point on it), or from the height of level water."""
     near, far = fields.number("index_near", 1.0003), fields.number("index_far", 1.333)
     layers = []
-    for item in fields.take("window", ()):
+    for item in fields.get("window", ()):
         layer = Fields(item if isinstance(item, Mapping) else {}, f"{fields.where}: window")
         layers.append(Layer(layer.number("thickness"), layer.number("index")))
         layer.finish()

@@ -29,8 +29,8 @@ from finssim.vehicles.defaults import SITES, room
 from finssim.vehicles.hydrodynamics import HydrodynamicSet
 
 __all__ = [
-    "SPREADS", "Spread", "cruise", "draw_plant", "hull_share", "panel_drag", "positioning_of", "remaining_damping", "site_of",
-    "steady_share",
+    "SPREADS", "Spread", "cruise", "draw_plant", "hull_share", "panel_drag", "positioning_of", "remaining_damping",
+    "site_of", "steady_share",
 ]  # fmt: skip
 
 

@@ -328,7 +328,7 @@ def minimise(
 
         return stepped
 
-    return descend(state, cost, linearise, steps=steps, still=1e-19, share=1e-7).state
+    return descend(state, cost, linearise, steps=steps, tolerance=1e-19, relative_tolerance=1e-7).state
 
 
 def as_before(state: MountState, origin: MountState, frozen: Sequence[str]) -> MountState:

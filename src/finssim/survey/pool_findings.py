@@ -36,7 +36,7 @@ CAMERA = "the camera"
 FULL_LENS = "fit: [pose, height, tilt, index, focal, center, distortion]"
 
 
-def touched(fit: Refined, observed: Observations) -> tuple[str, ...]:
+def plane_contacts(fit: Refined, observed: Observations) -> tuple[str, ...]:
     """Return the points in use, and the camera, that stop the plane or its window although the pixels favour
     a position beyond them; the nearest first.
 

@@ -15,7 +15,7 @@ from finssim.identification.fit import Correlation, Estimate
 from finssim.identification.report import AS_STATED
 from finssim.identification.uncertainty import correlation
 from finssim.survey.points import Observations
-from finssim.survey.pool_findings import conflicts, excluded_rows, numbers, separability, touched
+from finssim.survey.pool_findings import conflicts, excluded_rows, numbers, plane_contacts, separability
 from finssim.survey.pool_model import (
     LENS_NAMES,
     NAMES,
@@ -206,7 +206,7 @@ def calibrate_pool(observed: Observations, lens: Lens, settings: PoolFitSettings
         notes.append(finding("camera_below"))
     pinhole = steps.pinhole(straight, fit)
     table, errors = estimates(fit, settings)
-    places = touched(fit, observed)
+    places = plane_contacts(fit, observed)
     return PoolFit(
         **vars(fit),
         settings=settings,

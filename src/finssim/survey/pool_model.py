@@ -484,7 +484,9 @@ def solve(
         e, r = whiten(residuals(model, observed)[0]), prior.rows(model)[0]
         return 0.5 * float(e @ e + r @ r)
 
-    end = descend(start, cost, linearise, steps=iterations, still=1e-12 * tolerance, share=tolerance)
+    end = descend(
+        start, cost, linearise, steps=iterations, tolerance=1e-12 * tolerance, relative_tolerance=tolerance
+    )
     return PoolSolution(end.state, end.cost)
 
 

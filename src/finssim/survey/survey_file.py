@@ -135,7 +135,7 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
     sections = {"": top, **{name: top.section(name) for name in ("tags", "water", "camera", kind)}}
     tags, settings = sections["tags"], _numbers(sections) | _interface(sections[kind], kind)
     _refuse_lone_sigma(sections[kind], kind, settings)
-    names = top.take("fit")
+    names = top.get("fit")
     if names is not None:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise top.error(
@@ -149,7 +149,7 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
         raise top.error(f"unknown unit '{unit}'; available: {', '.join(METRES)}")
     if family is not None:
         family_named(family)
-    grid = _grid(top.section("grid")) if top.given("grid") else {}
+    grid = _grid(top.section("grid")) if top.contains("grid") else {}
     if grid and points is not None:
         raise top.error("points and grid are given, expected one of them")
     file = SurveyFile(
@@ -171,11 +171,13 @@ def _survey_file(top: Fields, path: Path) -> SurveyFile:
 
 def _interface_kind(top: Fields, path: Path) -> str:
     """Return `surface` or `window`, the one of the two that the file contains."""
-    kinds = [kind for kind in ("surface", "window") if top.given(kind)]
+    kinds = [kind for kind in ("surface", "window") if top.contains(kind)]
     if len(kinds) == 1:
         return kinds[0]
     count = "both surface and window are" if kinds else "neither surface nor window is"
-    bundle = f"; give this file as points: {path.name} of a survey file" if top.given("tag_bundles") else ""
+    bundle = (
+        f"; give this file as points: {path.name} of a survey file" if top.contains("tag_bundles") else ""
+    )
     raise top.error(
         f"{count} given, expected one: the interface between camera and points (surface: {{}} is enough){bundle}"
     )
@@ -203,7 +205,7 @@ def _interface(fields: Fields, kind: str) -> dict[str, Any]:
         options: dict[str, Any] = {"window": Layer(fields.number("thickness"), fields.number("index"))}
     except OpticsError as error:
         raise fields.error(str(error)) from None
-    if fields.take("plane") is not None:
+    if fields.get("plane") is not None:
         options["plane"] = fields.numbers("plane", 4)
     return options
 
@@ -225,11 +227,11 @@ def _layout(path: Path) -> TagLayout:
 
 
 def _number(fields: Fields, key: str) -> float | None:
-    return None if fields.take(key) is None else fields.number(key)
+    return None if fields.get(key) is None else fields.number(key)
 
 
 def _word(fields: Fields, key: str) -> str | None:
-    return None if fields.take(key) is None else fields.word(key)
+    return None if fields.get(key) is None else fields.word(key)
 
 
 def _grid(fields: Fields) -> dict[int, SurveyedPoints]:

@@ -14,11 +14,11 @@ import torch
 import warp as wp
 from torch import nn
 
+from finssim.learning.adapter import age_episodes
 from finssim.learning.learners.base import ActingLearner
 from finssim.learning.learners.ppo import Ppo
 from finssim.learning.network import Activation, Linear, Network
 from finssim.learning.resume import ResumeError
-from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import SeeingNetwork
 from finssim.tasks import Environment

@@ -16,11 +16,11 @@ from torch import nn
 from finssim.agents.agent import NOWHERE
 from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
+from finssim.learning.adapter import age_episodes
 from finssim.learning.demonstrations import Demonstrations, load
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.learners.catalogue import LearningError
 from finssim.learning.learners.distill import varied
-from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import SeeingNetwork, stack
 from finssim.tasks import Environment

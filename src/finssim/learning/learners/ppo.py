@@ -27,10 +27,10 @@ from typing import Any
 from finssim.agents.agent import NOWHERE
 from finssim.agents.memory import memory_from, memory_leaves, restarted
 from finssim.control.guidance import Known
+from finssim.learning.adapter import age_episodes
 from finssim.learning.layers import Adam, Array, Arrays, FreeRow, Gru, NetworkParameters, TanhLayers
 from finssim.learning.learners.base import ActingLearner, expert_in
 from finssim.learning.network import Activation, Cell, Linear, Network, advance_history, with_integrals
-from finssim.learning.served import age_episodes
 from finssim.tasks import Environment
 
 ROLLOUT_SAMPLES = 4096

@@ -14,8 +14,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import nn
 
+from finssim.learning.adapter import age_episodes
 from finssim.learning.learners.base import ROLLOUT_SAMPLES, ActingLearner, OnPolicySettings
-from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import stack
 from finssim.tasks import Environment

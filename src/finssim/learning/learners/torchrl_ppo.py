@@ -18,8 +18,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
+from finssim.learning.adapter import age_episodes
 from finssim.learning.learners.base import ROLLOUT_SAMPLES, ActingLearner, OnPolicySettings
-from finssim.learning.served import age_episodes
 from finssim.learning.tensors import Tensors
 from finssim.learning.torch_networks import stack
 from finssim.tasks import Environment

@@ -33,7 +33,7 @@ Flags = npt.NDArray[np.bool_]
 
 _MAX_STEPS = 30
 _MAX_TURNS = 8
-_STILL_PLANE = 1e-13
+_PLANE_COST_TOLERANCE = 1e-13
 """Change of the cost below which a step is the last [px²]."""
 
 
@@ -105,7 +105,12 @@ def rigid_fit(Q: Array, points: Array, A: Array, huber: float) -> RigidFit | Non
 
     start = _evaluate(_least_squares(Q, points, A), Q, points, A, huber)
     now, _, steps, converged = descend(
-        start, lambda now: now.cost, linearise, steps=_MAX_STEPS, still=_STILL_PLANE, damping=1e-6
+        start,
+        lambda now: now.cost,
+        linearise,
+        steps=_MAX_STEPS,
+        tolerance=_PLANE_COST_TOLERANCE,
+        damping=1e-6,
     )
     inverse = _damped_inverse(now.H, 0.0)
     if inverse is None:

@@ -112,9 +112,9 @@ ExtraRows = Callable[[Array, Array, Array], tuple[Array, Array]]
 """Function of t_pb, R_pb and a shift of the picture [px] that returns residuals of prior knowledge (m,) and
 derivatives (m, 8), [px]."""
 
-_STILL = 1e-10
+_COST_TOLERANCE = 1e-10
 """Decrease of the cost below which a step is the last [px²]."""
-_STILL_SHARE = 1e-6
+_RELATIVE_COST_TOLERANCE = 1e-6
 """Relative decrease of the cost below which a step is the last [-]: a thousandth of the residuals."""
 
 
@@ -203,9 +203,15 @@ def refine_pose(
     start = at(position, rotation, np.zeros(2))
     if start is None:
         return None
-    share, damping = (_STILL_SHARE, 1e-3) if extra_rows is None else (0.0, 1e-6)
+    relative, damping = (_RELATIVE_COST_TOLERANCE, 1e-3) if extra_rows is None else (0.0, 1e-6)
     now, _, steps, converged = descend(
-        start, lambda now: now.cost, linearise, steps=max_steps, still=_STILL, share=share, damping=damping
+        start,
+        lambda now: now.cost,
+        linearise,
+        steps=max_steps,
+        tolerance=_COST_TOLERANCE,
+        relative_tolerance=relative,
+        damping=damping,
     )
     return replace(now, iterations=steps, converged=converged)
 

@@ -10,7 +10,7 @@ import numpy as np
 from finssim.tasks import Environment, EnvironmentSetupError, Task, make, task_named
 
 
-def served(
+def adapter_environment(
     task: str | Task | Environment,
     options: dict[str, Any],
     *,

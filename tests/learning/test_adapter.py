@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from finssim.learning.adapter import adapter_environment, age_episodes
 from finssim.learning.gymnasium_env import Env
 from finssim.learning.pettingzoo_env import PettingZooEnv
 from finssim.learning.rsl_rl_env import RslRlVecEnv
 from finssim.learning.sb3 import Sb3VecEnv
-from finssim.learning.served import age_episodes, served
 from finssim.learning.torchrl_env import TorchRlEnv
 from finssim.tasks import EnvironmentSetupError, StationKeeping, make
 from reference.pair import Pair
@@ -25,13 +25,13 @@ def test_every_adapter_takes_the_arguments_of_make(adapter):
 
 def test_an_environment_is_taken_as_it_is():
     environment = make("t1", worlds=2)
-    assert served(environment, {}) is environment
+    assert adapter_environment(environment, {}) is environment
     with pytest.raises(EnvironmentSetupError, match="together with seed, worlds: give the environment alone"):
-        served(environment, {"worlds": 3, "seed": 1})
+        adapter_environment(environment, {"worlds": 3, "seed": 1})
     with pytest.raises(EnvironmentSetupError, match="auto_reset=True, this adapter needs auto_reset=False"):
-        served(environment, {}, auto_reset=False)
+        adapter_environment(environment, {}, auto_reset=False)
     with pytest.raises(EnvironmentSetupError, match="the adapter sets it"):
-        served("t1", {"auto_reset": False})
+        adapter_environment("t1", {"auto_reset": False})
 
 
 def test_several_agents_are_sent_to_the_libraries_that_take_them():
