@@ -56,7 +56,7 @@ def photographed():
     """OpenCV's 13 photographs, 9x6 corners of 25 mm."""
     board = Board(columns=9, rows=6, square=0.025)
     found = []
-    for _, name, image in pictures(PHOTOGRAPHS, tell=lambda words: None):
+    for _, name, image in pictures(PHOTOGRAPHS, notify=lambda words: None):
         pixels, points = see_board(image, board)
         found.append(BoardView(name=name, width=640, height=480, pixels=pixels, points=points))
     return tuple(found)

@@ -37,7 +37,7 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
     """
     show = warnings.showwarning
 
-    def say_ours(
+    def show_warning(
         message: Warning | str,
         category: type[Warning],
         filename: str,
@@ -46,12 +46,12 @@ def run(app: typer.Typer, arguments: Sequence[str], *, script: str | None = None
         line: str | None = None,
     ) -> None:
         if _is_ours(category.__module__, script or "finssim"):
-            _say(f"warning: {message}")
+            _report_on_stderr(f"warning: {message}")
         else:
             show(message, category, filename, lineno, file, line)
 
     with warnings.catch_warnings(), lost_interrupts_repeated():
-        warnings.showwarning = say_ours
+        warnings.showwarning = show_warning
         status = _run(app, arguments, script)
         # If the last `exec` of a string was interrupted, `python -m` kills itself at exit, even if the
         # interrupt was handled.
@@ -78,10 +78,10 @@ def _run(app: typer.Typer, arguments: Sequence[str], script: str | None) -> int:
         elif sentence is None or os.environ.get("FINSSIM_DEBUG") == "1":
             raise
         else:
-            _say(sentence)
+            _report_on_stderr(sentence)
             return REFUSED
     if status == INTERRUPTED:
-        _say("interrupted: no incomplete file is left")
+        _report_on_stderr("interrupted: no incomplete file is left")
     return status if isinstance(status, int) else 0
 
 
@@ -132,6 +132,6 @@ def _is_ours(module: str, script: str) -> bool:
     return module.partition(".")[0] in ("finssim", script.partition(".")[0])
 
 
-def _say(sentence: str) -> None:
+def _report_on_stderr(sentence: str) -> None:
     sentence = re.sub(r"\n(?=\S)", "; ", sentence.strip())  # a line that is not indented is a further fault
     print(f"finssim: {' '.join(sentence.split())}", file=sys.stderr)

@@ -94,10 +94,10 @@ def new(kind: str, name: str, *, out: Path | None = None, as_json: bool = False)
             text = PROJECT.format(group=group, point=entry, **after)
             (temporary / "pyproject.toml").write_text(text, encoding="utf-8")
     shown = command.format(**after).replace(f"{name}/", f"{folder}/")
-    told = {"written": str(folder), "try it": shown, "test it": f"python -m pytest {folder}"}
+    messages = {"written": str(folder), "try it": shown, "test it": f"python -m pytest {folder}"}
     if point:
-        told["use it in every command"] = f"pip install -e {folder}"
-    print(json.dumps(told) if as_json else "\n".join(f"{key}: {text}" for key, text in told.items()))
+        messages["use it in every command"] = f"pip install -e {folder}"
+    print(json.dumps(messages) if as_json else "\n".join(f"{key}: {text}" for key, text in messages.items()))
     return folder
 
 

@@ -60,7 +60,7 @@ def _lines(name: str, screen: Console) -> Progress:
     began = time.monotonic()
     last = -EVERY
 
-    def tell(part: float, text: str = "") -> None:
+    def report(part: float, text: str = "") -> None:
         nonlocal last
         spent = time.monotonic() - began
         if spent < last + EVERY:
@@ -70,4 +70,4 @@ def _lines(name: str, screen: Console) -> Progress:
         words = f"{name}: {text}" if text else name
         screen.print(f"{words} ({part:.0%}{left})", highlight=False, markup=False, soft_wrap=True)
 
-    return tell
+    return report

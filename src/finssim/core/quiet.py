@@ -36,7 +36,7 @@ def start_warp() -> None:
             start()
     kernels = Path(str(wp.config.kernel_cache_dir))
     if not (kernels.is_dir() and any(kernels.iterdir())):
-        _tell(f"compiling kernels when they are first used, once on this machine, into {kernels}:")
+        _print_line(f"compiling kernels when they are first used, once on this machine, into {kernels}:")
 
 
 class _Compilations:
@@ -49,10 +49,10 @@ class _Compilations:
         compiled = _COMPILED.search(message)
         if compiled is not None:
             name = compiled["name"].split("__locals__")[0].removeprefix("finssim.")
-            _tell(f"compiled the kernels of {name} in {float(compiled['ms']) / 1000:.1f} s")
+            _print_line(f"compiled the kernels of {name} in {float(compiled['ms']) / 1000:.1f} s")
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     """Print a line on standard error, only in the command's main process: lines of child processes would
     interleave."""
     if multiprocessing.parent_process() is None:

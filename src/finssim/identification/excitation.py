@@ -79,8 +79,8 @@ def excitations(trials: Sequence[Streams], vehicle: Vehicle) -> list[set[str]]:
     if any("heave" in moved for moved in out):
         return out
     for s, moved in zip(trials, out, strict=True):
-        told = s.drive.source == "passive" or s.trial.header.axis
-        if not told and moved & {"roll", "pitch"} and answers(s.motion, AXES.index("heave")):
+        is_known = s.drive.source == "passive" or s.trial.header.axis
+        if not is_known and moved & {"roll", "pitch"} and answers(s.motion, AXES.index("heave")):
             moved.add("heave")
     return out
 

@@ -499,8 +499,8 @@ def _lead(fit: Fit) -> list[str]:
     free = {name.partition(".")[0] for name in fit.estimates if name.endswith(RATIOS)}
     assumed = [axis for axis in AXES if axis in free and f"{axis}.m_eff" not in fit.estimates]
     unknown += [f"{axis}.m_eff (assumed: give it by --fix {axis}.m=NUMBER)" for axis in assumed]
-    told = f": {', '.join(known)}" if known else ""
-    out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{told}."]
+    determined = f": {', '.join(known)}" if known else ""
+    out = [f"{len(known)} of {len(known) + len(unknown)} parameters are determined by the data{determined}."]
     out += [f"Given: {', '.join(given)}."] if given else []
     out += [f"Not determined: {', '.join(unknown)}."] if unknown else []
     out += [f"R{str(fit.next_dive)[1:]}."] if fit.next_dive is not None else []

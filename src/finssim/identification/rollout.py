@@ -303,7 +303,7 @@ def _segment(
     if sampled:
         changes = _changes(d, t0, steps, step)
         d = replace(d, t=np.concatenate([d.t[:1], 0.5 * (d.t[1:] + d.t[:-1])]))
-    force = _told(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
+    force = _commanded_force(d, np.asarray(t0 + step * np.arange(-memory, steps + 1)))
     if changes:
         inside = changes.which >= 0
         force[memory:][inside] = s.drive.at(t0 + step * (np.flatnonzero(inside) + 0.5))
@@ -341,7 +341,7 @@ def _segment(
     )
 
 
-def _told(d: InputForces, edges: Array) -> Array:
+def _commanded_force(d: InputForces, edges: Array) -> Array:
     """Return the command of the motors in each step between `edges` [s], (steps, k); see `Drive.force`."""
     if d.commanded:
         return _means(d, edges)

@@ -128,7 +128,7 @@ def record(
     _start(simulator, depth, speed, spread, seed)
     command = np.repeat(_commands(programmes, vehicle), per_command, axis=0)
     n, thrusters, k = len(command) + 1, len(vehicle.thrusters), len(vehicle.channel_names)
-    told = np.zeros((n, worlds, k), dtype=np.float32)
+    applied = np.zeros((n, worlds, k), dtype=np.float32)
     shapes = {"position": 3, "quaternion": 4, "velocity": 6, "acceleration": 6, "actuator": k}
     states = {name: np.empty((n, worlds, size), dtype=np.float32) for name, size in shapes.items()}
     thrust = simulator.command.thrust.numpy()[:, 0]
@@ -138,7 +138,7 @@ def record(
             thrust[:, :thrusters] = command[i - 1]
             if each_step is not None:
                 each_step(simulator)
-            told[i - 1] = thrust[:, :k]
+            applied[i - 1] = thrust[:, :k]
             simulator.step()
         for out, view in views:
             out[i] = view
@@ -148,8 +148,8 @@ def record(
     # There is no acceleration before the first step; that of the start is the first one after it.
     states["acceleration"][0] = states["acceleration"][1]
     nominal = _nominal_thrust(states.pop("actuator"), vehicle, bool(simulator.plant.speed_lag.numpy().any()))
-    told[-1] = told[-2]
-    return Recording(step=STEP, thrust=nominal, command=told, **states)
+    applied[-1] = applied[-2]
+    return Recording(step=STEP, thrust=nominal, command=applied, **states)
 
 
 def _longest_delay(vehicle: Vehicle, plant: Mapping[str, ArrayLike] | None) -> float:

@@ -370,7 +370,7 @@ def _seen(
     from finssim.localization.detection.pictures import pictures
 
     film, tracker = "", None
-    for time, name, image in pictures(list(inputs), times=times, tell=notes.append):
+    for time, name, image in pictures(list(inputs), times=times, notify=notes.append):
         if image.shape != (lens.height, lens.width):
             raise LocalizationError(
                 f"{name}: {image.shape[1]} x {image.shape[0]} pixels, expected {lens.width} x {lens.height} as the "

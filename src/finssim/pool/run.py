@@ -244,7 +244,7 @@ def run(
         world = plan.world(eye, start=begin, seed=choice.seed, truth=files.truth)
         if files.pool_file is not None and plan.calibrated is not None:
             write_pool(plan.calibrated, files.pool_file)
-        _tell_plant(plan, files)
+        _print_plant(plan, files)
         return world
 
     if lockstep:
@@ -286,9 +286,9 @@ def _serve_team(
             write_pool(calibrated, pool_file)
             _print(f"pool file: {pool_file}")
         if isinstance(fleet, TaskSite):
-            _tell_goal(fleet)
+            _print_goal(fleet)
             _print(f"messages: {_name(server.address)}")
-        notify = partial(_tell_episode, fleet)
+        notify = partial(_print_episode, fleet)
         pace = serve_realtime(
             fleet,
             SiteWires(transports, messages, sinks),
@@ -299,7 +299,7 @@ def _serve_team(
             wait=lambda duration: timing.wait(duration, interrupted),
         )
     if not fleet.over:
-        _tell_episode(fleet)
+        _print_episode(fleet)
     _print(f"ended after {pace.duration:.1f} s")
 
 
@@ -379,7 +379,7 @@ def swimming(bodies: Sequence[Vehicle], choice: SiteChoice, truth: Path | None) 
     return Fleet(worlds), calibrated
 
 
-def _tell_goal(site: TaskSite) -> None:
+def _print_goal(site: TaskSite) -> None:
     """Print the pose of the task's goal, if it does not move."""
     if site.task.moving:
         return
@@ -388,7 +388,7 @@ def _tell_goal(site: TaskSite) -> None:
     _print(f"goal: {x:.3f},{y:.3f},{z:.3f},{yaw:.1f}")
 
 
-def _tell_episode(site: Fleet) -> None:
+def _print_episode(site: Fleet) -> None:
     """Print the result of the episode in one line."""
     if not isinstance(site, TaskSite):
         return
@@ -484,7 +484,7 @@ def _next(address: tuple[str, int]) -> tuple[str, int]:
     return address[0], address[1] + 1
 
 
-def _tell_plant(plan: PoolPlan, files: PoolFiles) -> None:
+def _print_plant(plan: PoolPlan, files: PoolFiles) -> None:
     spec = plan.spec
     _print(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
     if plan.camera is not None:

@@ -456,7 +456,7 @@ class Perception:
         """Return the state at a time [s], in world and body axes."""
         estimate = self._estimate(now)
         health = health_of(estimate, self.estimator.settings, self.estimator.site, {}, "", {})
-        self._tell_let_in(now)
+        self._send_start_position(now)
         position, quaternion, velocity = self._frame.state(estimate)
         return Reading(
             time=now,
@@ -473,7 +473,7 @@ class Perception:
         """Return the estimator's health at the time of its newest sample, with counts of refused samples by reason."""
         return self.estimator.health(self.estimator.estimate())
 
-    def _tell_let_in(self, now: float) -> None:
+    def _send_start_position(self, now: float) -> None:
         """Provide the estimator once with the initial position of the vehicle, as soon as there is inertial data."""
         if self._let_in is None or (self.vehicle.sensors.imu is not None and self._omega_time == -math.inf):
             return

@@ -367,7 +367,7 @@ def run_team(
     return TeamOutcome(reports, max(abs(child.returncode) for child in children.values()))
 
 
-def _tell(report: dict[str, Any], as_json: bool) -> None:
+def _print_results(report: dict[str, Any], as_json: bool) -> None:
     """Print the result of each agent."""
     if as_json:
         print(json.dumps(report))
@@ -431,7 +431,7 @@ def run(
         if identify is not None:
             raise ControlError("--identify is for one vehicle: run each agent with --policy and --agent")
         outcome = run_team(mission, wiring, localization, record=record, arm=arm)
-        _tell(outcome.reports, as_json)
+        _print_results(outcome.reports, as_json)
         return outcome.status
     report = run_alone(mission, wiring, localization, record=record, identify=identify, arm=arm)
     if as_json:

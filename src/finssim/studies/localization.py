@@ -698,12 +698,12 @@ def _write(result: Mapping[str, Any], out: Path, first: LocalizationSeed) -> Non
         write_pool(calibration.pinhole, folder / "pool_pinhole.yaml")
         write_detections(calibration.frames, folder / "detections.csv")
         write_survey(calibration.survey, folder / "survey.csv")
-        told = calibration.fit.settings
+        settings = calibration.fit.settings
         survey = {
             "points": "survey.csv",
-            "sigma": told.survey_sigma,
-            "surface": {"height": told.water_height, "sigma": told.place_sigma},
-            "camera": {"focal_sigma": told.focal_sigma, "center_sigma_px": told.center_sigma},
+            "sigma": settings.survey_sigma,
+            "surface": {"height": settings.water_height, "sigma": settings.place_sigma},
+            "camera": {"focal_sigma": settings.focal_sigma, "center_sigma_px": settings.center_sigma},
         }
         (folder / "survey.yaml").write_text(yaml_text(survey), encoding="utf-8")
         write_json(folder / RESULT_FILE, result, tables_of(result))

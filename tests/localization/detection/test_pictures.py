@@ -86,7 +86,7 @@ def test_a_picture_cut_short_is_named_and_left_out(tmp_path, suffix, share):
     whole = (tmp_path / f"2{suffix}").read_bytes()
     (tmp_path / f"2{suffix}").write_bytes(whole[: int(share * len(whole))])
     told = []
-    assert [name for _, name, _ in listed(tmp_path, tell=told.append)] == [f"1{suffix}", f"3{suffix}"]
+    assert [name for _, name, _ in listed(tmp_path, notify=told.append)] == [f"1{suffix}", f"3{suffix}"]
     assert len(told) == 2 and f"2{suffix}" in told[0] and told[1] == "1 of 3 files were left out"
 
 
@@ -108,7 +108,7 @@ def test_a_run_of_which_nothing_can_be_read_is_refused(tmp_path):
         (tmp_path / f"{number}.png").write_bytes(b"no picture")
     told = []
     with pytest.raises(LocalizationError, match=r"none of 2 files can be read; the first: .*1\.png"):
-        listed(tmp_path, tell=told.append)
+        listed(tmp_path, notify=told.append)
     assert len(told) == 2
 
 
@@ -143,7 +143,7 @@ def test_a_video_gives_its_pictures_with_their_times(tmp_path, suffix, code):
         writer.write(cv2.cvtColor(scene(20 * number), cv2.COLOR_GRAY2BGR))
     writer.release()
     notes = []
-    got = listed(path, tell=notes.append)
+    got = listed(path, notify=notes.append)
     assert notes == []
     assert [name for _, name, _ in got] == [f"run{suffix}#{i}" for i in range(8)]
     assert np.allclose([time for time, _, _ in got], 0.1 * np.arange(8), atol=1e-3)
@@ -151,7 +151,7 @@ def test_a_video_gives_its_pictures_with_their_times(tmp_path, suffix, code):
     assert np.allclose(means, [scene(20 * i).mean() for i in range(8)], atol=4.0)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(LocalizationError, match="none of 1 files"):
-        listed(path, tell=lambda sentence: None)
+        listed(path, notify=lambda sentence: None)
 
 
 def test_notes_on_turning_the_picture_are_not_followed(tmp_path):

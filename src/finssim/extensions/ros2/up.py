@@ -75,7 +75,7 @@ class Supervisor:
         parameters: File that `plan.write` wrote.
         notify: Receives messages for the user.
         """
-        self._plan, self._parameters, self._say = plan, parameters, notify
+        self._plan, self._parameters, self._notify = plan, parameters, notify
         self.children: list[Child] = []
 
     def __enter__(self) -> Supervisor:
@@ -99,7 +99,7 @@ class Supervisor:
         )
         child = Child(one, name, process)
         self.children.append(child)
-        self._say(f"{name}: process {process.pid}")
+        self._notify(f"{name}: process {process.pid}")
         return child
 
     def look(self) -> list[Child]:
@@ -107,7 +107,7 @@ class Supervisor:
         died = [c for c in self.children if not c.dead and c.process.poll() is not None]
         for child in died:
             child.dead = True
-            self._say(
+            self._notify(
                 f"{child.name} has died: process {child.process.pid}, {_status(child.process.returncode)}"
             )
         return died
@@ -122,7 +122,7 @@ class Supervisor:
             try:
                 child.process.wait(max(limit - time.monotonic(), 0.1))
             except subprocess.TimeoutExpired:
-                self._say(f"{child.name} does not end: killed")
+                self._notify(f"{child.name} does not end: killed")
                 child.process.kill()
                 child.process.wait()
             child.dead = True

@@ -32,7 +32,7 @@ def pictures(
     sources: Path | str | Sequence[Path | str],
     *,
     times: Path | str | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Iterator[Timed]:
     """Return an iterator over time stamp [s], name and gray picture (h, w) of all sources, in sequence.
 
@@ -46,7 +46,7 @@ def pictures(
     Args:
         sources: Pictures, folders or videos.
         times: CSV file with the columns `image` and `time` [s].
-        tell: Function that receives one sentence for each excluded file and one with their number; None: print to
+        notify: Function that receives one sentence for each excluded file and one with their number; None: print to
             standard error.
 
     Raises:
@@ -60,7 +60,7 @@ def pictures(
         for file, name in names.items():
             if file.suffix.lower() in PICTURE_FILES and name not in clock and file.name not in clock:
                 raise LocalizationError(f"{times}: no time of {name}: add a line with it or omit the picture")
-    return _stream(files, names, clock or {}, tell or _print_note)
+    return _stream(files, names, clock or {}, notify or _print_note)
 
 
 def read_picture(path: Path) -> Image:

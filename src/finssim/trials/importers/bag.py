@@ -156,7 +156,7 @@ def read(path: Path, request: Request) -> TrialStreams:
             )
         _collect(reader, sources, findings)
         _localise(sources, findings)
-        told = [topic for topic, source in sources.items() if source.kind in PARAMETERS]
+        parameter_topics = [topic for topic, source in sources.items() if source.kind in PARAMETERS]
         parameters = _parameters(sources)
         logs = [
             topic for topic, source in sources.items() if source.rank >= 0 and _is_dvl(reader, source.kind)
@@ -171,7 +171,7 @@ def read(path: Path, request: Request) -> TrialStreams:
         if request.mapped.ardusub.outputs:
             raise
         findings.append(finding("topic_unusable", topic="the outputs", messages="all", reason=str(error)))
-    used = {*sources, *(stream.source for stream in events), *told}
+    used = {*sources, *(stream.source for stream in events), *parameter_topics}
     unread = [
         f"{topic} ({types[topic].replace('/msg/', '/')}, {counts.get(topic, 0)} messages)"
         for topic in sorted(types)
@@ -263,10 +263,10 @@ def _inputs(
         assumed = {"FRAME_CONFIG": frame, **{f"MOT_{i}_DIRECTION": sign for i, sign in signs}}
         log.parameters.update(assumed | parameters)
     streams = with_inputs(log, request, [])
-    told = vehicle is None or all(
+    directions_known = vehicle is None or all(
         f"MOT_{i + 1}_DIRECTION" in parameters for i in range(len(vehicle.thrusters))
     )
-    if streams and not told and not request.mapped.ardusub.outputs:
+    if streams and not directions_known and not request.mapped.ardusub.outputs:
         streams[0] = streams[0].noting(finding("directions_assumed"))
     return [replace(stream, source=named[stream.source], rank=0) for stream in streams]
 

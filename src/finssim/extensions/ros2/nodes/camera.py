@@ -36,7 +36,7 @@ class CameraNode(RobotNode):
                 self.event("error", f"{topic.name} is not sent: {error}")
         self.count = 0
         self.create_timer(1.0 / POLL, self._look)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
         self.event("start", self.source.describe())
 
     def _look(self) -> None:
@@ -64,7 +64,7 @@ class CameraNode(RobotNode):
         if self.heard("picture"):
             self.send("picture", self.make.compressed(stamp, picture.image))
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         level, self.count = ("ok" if self.count else "stale"), 0
         self.diagnose("pictures", level, self.source.describe(), {})
 

@@ -158,7 +158,7 @@ class ControllerNode(RobotNode):
             kind = "range" if not shape else "sonar" if shape[-1] == 1 else "image"
             self.hears(f"{name}/{kind}", partial(self._on_own, name))
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
 
     def _turn(self) -> None:
         if self.bridge.silent:  # not the same as disarmed: a trajectory continues with the next message
@@ -229,7 +229,7 @@ class ControllerNode(RobotNode):
         except (GoalError, ControlError, OSError) as error:
             self.event("refused", " ".join(str(error).split()))
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         counters = self.runtime.counters
         values = {"mode": self.modes.switch.mode, "decisions": counters.decisions, "missed": counters.missed}
         self.diagnose("control", "ok", self.bridge.state, values)

@@ -256,7 +256,7 @@ class Frames:
         node.send("fixed_transform", node.make.transforms(stamp, parts))
         node.send("robot", ros_type("std_msgs/msg/String")(data=urdf_of(node.vehicle)))
 
-    def tell(self, stamp: int, reading: Reading) -> None:
+    def publish(self, stamp: int, reading: Reading) -> None:
         """Publish map to odom and odom to base_link for a reading with a known position."""
         odom = self._odometer.take(reading)
         drift = FramePose(np.asarray(reading.position), np.asarray(reading.quaternion)).times(odom.inverse())

@@ -54,7 +54,7 @@ class BridgeTopics:
         service = SERVICES["set_armed"]
         node.create_service(ros_type(service.type), node.below(service.name), self._on_service)
 
-    def tell(self, now: float, **values: Any) -> None:
+    def publish(self, now: float, **values: Any) -> None:
         """Publish state and events; `values` are further fields of ThrusterState. `now` is the time [s]."""
         bridge, node = self._bridge, self._node
         state_values = {
@@ -163,7 +163,7 @@ class HardwareBridge(RobotNode):
         self.sends(*["actuators"] * bool(self.vehicle.actuators))
         self.topics = BridgeTopics(self, self.bridge)
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._turn)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
         self.event("start", self.transport.describe())
 
     def telemetry(self, now: float, telemetry: Telemetry, time: float) -> None:
@@ -212,9 +212,9 @@ class HardwareBridge(RobotNode):
         ):  # otherwise the process was suspended in between
             for data in self.intake.link.encode(now, command, self.bridge.state):
                 self.transport.send(data)
-        self.topics.tell(now, normalised=command.normalised, shaft_speed=self.shafts)
+        self.topics.publish(now, normalised=command.normalised, shaft_speed=self.shafts)
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         count, self._counted = self.counters.telemetry - self._counted, self.counters.telemetry
         level, text = ("ok", "telemetry") if count else ("error", "no telemetry in the last second")
         self.diagnose(

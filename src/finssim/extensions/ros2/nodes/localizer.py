@@ -54,7 +54,7 @@ class Localizer(RobotNode):
             raise ValueError(f"image_transport is '{form}', expected {' or '.join(FORMS)}")
         key, self._unpack = FORMS[form]
         self.hears(key, self._on_image)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
 
     def _on_telemetry(self, message: Any) -> None:
         times = self.seconds(message.received), self.seconds(message.header.stamp)
@@ -91,7 +91,7 @@ class Localizer(RobotNode):
             position, quaternion, covariance = self.frame.to_map(fix, self.perception.estimator)
             self.send("fix", self.make.fix(self.ns(fix.time), position, quaternion, covariance))
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         fixes = sum(self.verdicts[word] for word in ("accepted", "initialized", "reacquired"))
         self.diagnose("fixes", "ok" if fixes else "stale", f"{fixes} fixes", dict(self.verdicts))
         self.verdicts.clear()

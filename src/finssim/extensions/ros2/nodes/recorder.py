@@ -37,14 +37,14 @@ class RecorderNode(RobotNode):
             if key not in LEFT_OUT and topic.type != RAW and (pictures or not key.endswith("picture")):
                 with suppress(ImportError):  # a ROS 2 without marine_acoustic_msgs
                     self.hears(key, self._taker(key), raw=True)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
 
     def _taker(self, key: str) -> Any:
         record, clock = self.mcap, self.get_clock()
         assert record is not None
         return lambda data: record.message(key, clock.now().nanoseconds, bytes(data))
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         if self.mcap is not None:
             problem = self.mcap.problem
             self.diagnose(

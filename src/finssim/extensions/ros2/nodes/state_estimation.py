@@ -39,7 +39,7 @@ class StateEstimation(RobotNode):
         for key in ("positioning", "dvl", "compass"):
             self.hears(key, partial(self._on_aid, key))
         self.create_timer(1.0 / self.parameter("rate", 60.0), self._estimate)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_diagnostics)
 
     def _on_telemetry(self, message: Any) -> None:
         times = self.seconds(message.received), self.seconds(message.header.stamp)
@@ -63,10 +63,10 @@ class StateEstimation(RobotNode):
         reading, stamp = self.perception.reading(now), self.ns(now)
         if np.isfinite(reading.position).all():
             self.send("odometry", self.make.odometry(stamp, reading))
-            self.frames.tell(stamp, reading)
+            self.frames.publish(stamp, reading)
         self.send("estimator", self.make.estimator(stamp, reading, health_values(self.perception.health())))
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         reading, health = self.perception.reading(self.now()), self.perception.health()
         counts = {
             f"{s}: {word}": n

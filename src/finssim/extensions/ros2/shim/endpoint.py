@@ -152,7 +152,7 @@ class Endpoint(Limited):
         for wire in self.wires:
             wire.close()
 
-    def tell_mismatches(self) -> None:
+    def log_mismatches(self) -> None:
         """Log each newly discovered peer with incompatible QoS."""
         for wire in self.wires:
             policy = wire.incompatible()

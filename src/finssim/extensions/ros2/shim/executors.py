@@ -192,7 +192,7 @@ class SingleThreadedExecutor(Limited):
                 return
             happened = self._wait(remaining)
             work = self._search()
-            self._tell_mismatches(now=happened and work is None)
+            self._log_mismatches(now=happened and work is None)
         if work is not None:
             work()
 
@@ -225,9 +225,9 @@ class SingleThreadedExecutor(Limited):
         due = min((t.time_until_next_call() for t in timers), default=10**18) / 1e9
         return self._waiter.wait(max(min(longest, due, LONGEST_WAIT), 0.0))
 
-    def _tell_mismatches(self, *, now: bool) -> None:
+    def _log_mismatches(self, *, now: bool) -> None:
         if now or time.monotonic() - self._looked > MISMATCH_PERIOD:
             self._looked = time.monotonic()
             for node in self._nodes:
                 for end in node.endpoints():
-                    end.tell_mismatches()
+                    end.log_mismatches()

@@ -108,7 +108,7 @@ class Barrier:
         """
         self._node, self._again = node, again
         self._done: dict[str, float] = dict.fromkeys(names, -1.0)
-        self._time, self._since, self._told = -1.0, time.monotonic(), 0.0
+        self._time, self._since, self._reported = -1.0, time.monotonic(), 0.0
         quality: Any = quality_profile(node.table["done"].quality)
         quality.depth = DEPTH
         node.create_subscription(ros_type(node.table["done"].type), node.topic("done"), self._take, quality)
@@ -141,8 +141,8 @@ class Barrier:
                 node.event("error", f"{name} has left: time continues without it")
             elif name not in there and waited > STARTING:
                 raise Ros2Error(f"{name} did not start: see its output above")
-        if waited > PATIENCE and time.monotonic() - self._told > PATIENCE:
-            self._told = time.monotonic()
+        if waited > PATIENCE and time.monotonic() - self._reported > PATIENCE:
+            self._reported = time.monotonic()
             node.event("clock", f"time waits for {', '.join(missing)}")
 
 
@@ -161,14 +161,14 @@ class PacedClock:
         """
         self.time, self._count, self._factor, self._node = 0.0, 0, factor, node
         self.shared = SharedClock(node, None, lambda: None)
-        self._barrier = Barrier(node, names, self._tell) if node.lockstep else None
+        self._barrier = Barrier(node, names, self._publish_time) if node.lockstep else None
         self._due = 0.0
         self.spin: Callable[..., None] = partial(rclpy.spin_once, node)
         """Runs a callback; waits for one at most `timeout_sec` [s]."""
 
     def wait(self, until: Callable[[], bool]) -> None:
         """Publish the time, and return when the next step may begin, or when `until` returns true."""
-        self._tell()
+        self._publish_time()
         while self._barrier is not None and self._barrier.missing(self.time) and not until():
             self.spin(timeout_sec=0.1)
         # A delay is not made up for.
@@ -182,5 +182,5 @@ class PacedClock:
         self._count += 1
         self.time = self._count * STEP
 
-    def _tell(self) -> None:
+    def _publish_time(self) -> None:
         self._node.send("clock", self._node.make.clock(self._node.ns(self.time)))

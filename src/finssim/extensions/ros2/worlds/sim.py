@@ -110,7 +110,7 @@ class Sim(RobotNode):
         )
         self.clock = SharedClock(self, self._follow, self._lead)
         nodes = self.parameter("waits_for", "")
-        self._barrier = Barrier(self, nodes.split(), self._tell_time) if self.lockstep else None
+        self._barrier = Barrier(self, nodes.split(), self._publish_time) if self.lockstep else None
         period = STEP / self._factor if self._factor > 0.0 else POLL if self.lockstep else 0.0
         self.create_timer(period, self._turn, clock=self._steady)
 
@@ -144,7 +144,7 @@ class Sim(RobotNode):
         for _ in range(min(due, MOST_BEHIND)):
             self._step()
 
-    def _tell_time(self) -> None:
+    def _publish_time(self) -> None:
         if self.clock.ours:
             self.send("clock", self.make.clock(self.ns(self.time)))
 
@@ -158,9 +158,9 @@ class Sim(RobotNode):
 
     def _publish(self, normalised: Any) -> None:
         stamp, reading, make = self.ns(self.time), self._reading(), self.make
-        self._tell_time()
+        self._publish_time()
         self.send("odometry", make.odometry(stamp, reading))
-        self.frames.tell(stamp, reading)
+        self.frames.publish(stamp, reading)
         self.send("estimator", make.estimator(stamp, reading, {}))
         sample = self.sensors.sample(reading, STEP)
         self.send("imu", make.imu(stamp, sample))
@@ -168,7 +168,7 @@ class Sim(RobotNode):
         if self.vehicle.actuators:
             channels = self.sim.numpy("thrust")[0, 0, : len(self.vehicle.channel_names)]
             self.send("actuators", make.actuators(stamp, channels[len(self.vehicle.thrusters) :]))
-        self.topics.tell(self.time, normalised=normalised)
+        self.topics.publish(self.time, normalised=normalised)
 
     def _reading(self) -> Reading:
         position, q, nu = (
