@@ -12,7 +12,13 @@ from finssim.sim.randomize import Randomization
 from finssim.sim.ranges_file import Ranges
 from finssim.tasks import Environment, EnvironmentSetupError, MeasurementNoise, StationKeeping
 from finssim.tasks.check import check_task
-from finssim.tasks.sensing import Sensing, grown, rate_known, value_gain, value_known
+from finssim.tasks.sensing import (
+    Sensing,
+    covariance_after_rate,
+    covariance_after_value,
+    propagated_covariance,
+    value_gain,
+)
 from finssim.vehicles import load_vehicle
 from finssim.vehicles.equipment import DepthSensor, Dvl, Imu
 
@@ -74,8 +80,10 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
     there = position_filter.PositionState(np.zeros(6), square)
     motion = position_filter.MotionModel(density=(q, q, q))
     later = position_filter.predict(there, dt, motion)
-    np.testing.assert_allclose(grown(wp.vec3(*P), q, dt), later.P[[0, 0, 3], [0, 3, 3]], rtol=1e-5)
-    for column, known in ((0, value_known), (3, rate_known)):
+    np.testing.assert_allclose(
+        propagated_covariance(wp.vec3(*P), q, dt), later.P[[0, 0, 3], [0, 3, 3]], rtol=1e-5
+    )
+    for column, known in ((0, covariance_after_value), (3, covariance_after_rate)):
         H, noise = np.eye(6)[[column]], np.array([[R]])
         after = there.corrected(there.innovation(np.ones(1), H, noise))
         np.testing.assert_allclose(known(wp.vec3(*P), R), after.P[[0, 0, 3], [0, 3, 3]], rtol=1e-4)
@@ -84,7 +92,7 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
     np.testing.assert_allclose(value_gain(wp.vec3(*P), R), [after.yaw, -after.bias], rtol=1e-5)
     after = attitude.predict(yaw, 0.0, dt, attitude.YawNoise(rate=0.0, bias_walk=math.sqrt(q)))
     expected = [after.variance, -after.cross, after.bias_variance]
-    np.testing.assert_allclose(grown(wp.vec3(*P), q, dt), expected, rtol=1e-5)
+    np.testing.assert_allclose(propagated_covariance(wp.vec3(*P), q, dt), expected, rtol=1e-5)
 
 
 def test_a_late_fix_moves_the_path_since_its_own_time():

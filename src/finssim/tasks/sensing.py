@@ -186,7 +186,7 @@ class InstrumentReadings:
 
 
 @wp.func
-def grown(P: wp.vec3, q: float, dt: float) -> wp.vec3:
+def propagated_covariance(P: wp.vec3, q: float, dt: float) -> wp.vec3:
     """Propagate the covariance of a value and its rate, P <- A P A' + Q, for a rate driven by white noise of density q.
 
     `dt` is in [s]; P and q have the unit of the value squared.
@@ -206,7 +206,7 @@ def value_gain(P: wp.vec3, R: float) -> wp.vec2:
 
 
 @wp.func
-def value_known(P: wp.vec3, R: float) -> wp.vec3:
+def covariance_after_value(P: wp.vec3, R: float) -> wp.vec3:
     """Return the covariance after a measured value of variance R. P and R have the unit of the value squared."""
     s = P[0] + R
     return wp.vec3(P[0] * R / s, P[1] * R / s, P[2] - P[1] * P[1] / s)
@@ -220,14 +220,14 @@ def rate_gain(P: wp.vec3, R: float) -> wp.vec2:
 
 
 @wp.func
-def rate_known(P: wp.vec3, R: float) -> wp.vec3:
+def covariance_after_rate(P: wp.vec3, R: float) -> wp.vec3:
     """Return the covariance after a measured rate of variance R. P and R have the unit of the value squared."""
     s = P[2] + R
     return wp.vec3(P[0] - P[1] * P[1] / s, P[1] * R / s, P[2] * R / s)
 
 
 @wp.func
-def counted(noise: float, quantum: float) -> float:
+def measurement_variance(noise: float, quantum: float) -> float:
     """Return the variance of a measurement with noise that is rounded to a multiple of the quantum; never 0.
 
     Noise and quantum have one unit.
@@ -259,7 +259,7 @@ def turn_about_z(q: wp.quat, p: wp.quat) -> float:
 
 
 @wp.func
-def doubted(P: wp.vec3, a: float, b: float) -> wp.vec2:
+def drawn_errors(P: wp.vec3, a: float, b: float) -> wp.vec2:
     """Return errors of value and rate with the covariance P, from two standard normal numbers."""
     std = wp.sqrt(wp.max(P[0], 1.0e-12))
     return wp.vec2(std * a, P[1] / std * a + wp.sqrt(wp.max(P[2] - P[1] * P[1] / (std * std), 0.0)) * b)
@@ -282,10 +282,10 @@ def initialise(
     q = state.quaternion[w, v]
     a = normal3(key, WHITE)
     b = normal3(key, WALK)
-    px = doubted(filter_constants.plane, a[0], b[0])
-    py = doubted(filter_constants.plane, a[1], b[1])
-    pz = doubted(filter_constants.height, a[2], b[2])
-    turn = doubted(filter_constants.yaw, normal(key, WHITE_2), normal(key, WALK_2))
+    px = drawn_errors(filter_constants.plane, a[0], b[0])
+    py = drawn_errors(filter_constants.plane, a[1], b[1])
+    pz = drawn_errors(filter_constants.height, a[2], b[2])
+    turn = drawn_errors(filter_constants.yaw, normal(key, WHITE_2), normal(key, WALK_2))
     lasting = wp.vec3()
     if has_fixes:
         m = r.fix_errors[w, v]
@@ -334,9 +334,9 @@ def propagate(r: InstrumentReadings, e: Estimates, step: int, dt: float, w: int,
     e.position[w, v, now] = e.position[w, v, before] + dt * e.velocity[w, v, before]
     e.velocity[w, v, now] = e.velocity[w, v, before]
     noise = wp.max(imu.gyro_noise * imu.gyro_noise * dt, GYRO_FLOOR * GYRO_FLOOR) * dt
-    e.yaw[w, v] = grown(e.yaw[w, v], GYRO_WALK * GYRO_WALK, dt) + wp.vec3(noise, 0.0, 0.0)
-    e.plane[w, v] = grown(e.plane[w, v], ACCELERATION[0], dt)
-    e.height[w, v] = grown(e.height[w, v], ACCELERATION[2], dt)
+    e.yaw[w, v] = propagated_covariance(e.yaw[w, v], GYRO_WALK * GYRO_WALK, dt) + wp.vec3(noise, 0.0, 0.0)
+    e.plane[w, v] = propagated_covariance(e.plane[w, v], ACCELERATION[0], dt)
+    e.height[w, v] = propagated_covariance(e.height[w, v], ACCELERATION[2], dt)
 
 
 @wp.func
@@ -355,7 +355,7 @@ class Correction:
 
 
 @wp.func
-def moved(position: wp.vec3, velocity: wp.vec3) -> Correction:
+def translation_correction(position: wp.vec3, velocity: wp.vec3) -> Correction:
     """Return a correction of position [m] and velocity [m/s] alone, world frame."""
     c = Correction()
     c.position = position
@@ -409,17 +409,19 @@ def update_with_fix(state: State, r: InstrumentReadings, e: Estimates, seed: int
     off = x + lasting + fewer * m.position_std * normal3(key, WHITE) - e.position[w, v, k]
     angle = m.yaw_bias * normal(begun, TURN_ON_2) + fewer * m.yaw_std * normal(key, WHITE_2)
     turn_off = turn_about_z(about_z(angle) * q, e.quaternion[w, v, k])
-    R = counted(fewer * m.position_std, 0.0)
+    R = measurement_variance(fewer * m.position_std, 0.0)
     A = value_gain(e.plane[w, v], R)
     B = wp.vec2(0.0, 0.0)
-    e.plane[w, v] = value_known(e.plane[w, v], R)
+    e.plane[w, v] = covariance_after_value(e.plane[w, v], R)
     if not e.filter_constants[v].gauge:
         B = value_gain(e.height[w, v], R)
-        e.height[w, v] = value_known(e.height[w, v], R)
-    R_yaw = counted(fewer * m.yaw_std, 0.0)
-    c = moved(wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off), wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off))
+        e.height[w, v] = covariance_after_value(e.height[w, v], R)
+    R_yaw = measurement_variance(fewer * m.yaw_std, 0.0)
+    c = translation_correction(
+        wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off), wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off)
+    )
     c.turn = value_gain(e.yaw[w, v], R_yaw) * turn_off
-    e.yaw[w, v] = value_known(e.yaw[w, v], R_yaw)
+    e.yaw[w, v] = covariance_after_value(e.yaw[w, v], R_yaw)
     correct(e, w, v, at, step, dt, c)
 
 
@@ -431,10 +433,10 @@ def update_with_depth(r: InstrumentReadings, e: Estimates, step: int, dt: float,
     gauge = r.gauge_errors[w, v]
     port = wp.quat_rotate(e.quaternion[w, v, k], gauge.position)
     off = -r.gauge.depth[w, v] - port[2] - e.position[w, v, k][2]
-    R = counted(gauge.noise_std, gauge.quantisation)
+    R = measurement_variance(gauge.noise_std, gauge.quantisation)
     K = value_gain(e.height[w, v], R) * off
-    e.height[w, v] = value_known(e.height[w, v], R)
-    correct(e, w, v, at, step, dt, moved(wp.vec3(0.0, 0.0, K[0]), wp.vec3(0.0, 0.0, K[1])))
+    e.height[w, v] = covariance_after_value(e.height[w, v], R)
+    correct(e, w, v, at, step, dt, translation_correction(wp.vec3(0.0, 0.0, K[0]), wp.vec3(0.0, 0.0, K[1])))
 
 
 @wp.func
@@ -450,13 +452,13 @@ def update_with_velocity(r: InstrumentReadings, e: Estimates, step: int, dt: flo
         e.rate[w, v], dvl.position
     )
     off = wp.quat_rotate(e.quaternion[w, v, k], body_velocity) - e.velocity[w, v, k]
-    R = counted(dvl.noise_std, dvl.quantisation) + dvl.bias_initial * dvl.bias_initial
+    R = measurement_variance(dvl.noise_std, dvl.quantisation) + dvl.bias_initial * dvl.bias_initial
     A = rate_gain(e.plane[w, v], R)
     B = rate_gain(e.height[w, v], R)
-    e.plane[w, v] = rate_known(e.plane[w, v], R)
-    e.height[w, v] = rate_known(e.height[w, v], R)
+    e.plane[w, v] = covariance_after_rate(e.plane[w, v], R)
+    e.height[w, v] = covariance_after_rate(e.height[w, v], R)
     dx = wp.cw_mul(wp.vec3(A[0], A[0], B[0]), off)
-    correct(e, w, v, at, step, dt, moved(dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off)))
+    correct(e, w, v, at, step, dt, translation_correction(dx, wp.cw_mul(wp.vec3(A[1], A[1], B[1]), off)))
 
 
 @wp.kernel(enable_backward=False)
@@ -581,19 +583,27 @@ def _filter_constants(vehicle: Vehicle, sensing: Sensing, dt: float) -> Any:
     yaw = wp.vec3(0.0, 0.0, sensors.imu.gyro_bias_initial**2 if sensors.imu else 0.0)
     noise = 0.0 if sensors.imu is None else sensors.imu.gyro_noise_density**2 * sensors.imu.rate * dt
     for step in range(1, STANDING + 1):
-        plane, height = grown(plane, ACCELERATION[0], dt), grown(height, ACCELERATION[2], dt)
-        yaw = grown(yaw, GYRO_WALK**2, dt) + wp.vec3(max(noise, GYRO_FLOOR**2) * dt, 0.0, 0.0)
+        plane, height = (
+            propagated_covariance(plane, ACCELERATION[0], dt),
+            propagated_covariance(height, ACCELERATION[2], dt),
+        )
+        yaw = propagated_covariance(yaw, GYRO_WALK**2, dt) + wp.vec3(max(noise, GYRO_FLOOR**2) * dt, 0.0, 0.0)
         came = _due(sensing.rate, step, dt)
         if came:
-            R = counted(fixes.position_std, 0.0) / came
-            plane = value_known(plane, R)
-            height = height if filter_constants.gauge else value_known(height, R)
-            yaw = value_known(yaw, counted(fixes.yaw_std, 0.0) / came)
+            R = measurement_variance(fixes.position_std, 0.0) / came
+            plane = covariance_after_value(plane, R)
+            height = height if filter_constants.gauge else covariance_after_value(height, R)
+            yaw = covariance_after_value(yaw, measurement_variance(fixes.yaw_std, 0.0) / came)
         if sensors.depth is not None and _due(sensors.depth.rate, step, dt):
-            height = value_known(height, counted(sensors.depth.noise_std, sensors.depth.quantisation))
+            height = covariance_after_value(
+                height, measurement_variance(sensors.depth.noise_std, sensors.depth.quantisation)
+            )
         if sensors.dvl is not None and _due(sensors.dvl.rate, step, dt):
-            R = counted(sensors.dvl.noise_std, sensors.dvl.quantisation) + sensors.dvl.bias_initial**2
-            plane, height = rate_known(plane, R), rate_known(height, R)
+            R = (
+                measurement_variance(sensors.dvl.noise_std, sensors.dvl.quantisation)
+                + sensors.dvl.bias_initial**2
+            )
+            plane, height = covariance_after_rate(plane, R), covariance_after_rate(height, R)
     if not sensing.rate:  # without fixes, the start is known and only velocities are uncertain
         plane, yaw = wp.vec3(0.0, 0.0, min(plane[2], FASTEST**2)), wp.vec3(0.0, 0.0, yaw[2])
         if not filter_constants.gauge:
